@@ -60,9 +60,7 @@ gallery: .venv/dev.stamp
 		for file in $$here/examples/[0-9]*.py; do $$here/$(BIN)/python "$$file"; done; \
 		mkdir -p $$here/docs/images/gallery; cp ./*.png $$here/docs/images/gallery; rm -r $$work
 
-# parts of benchmarks, and scripts that need the name of a run or a data set: `make bench` leaves them out
-NOT_RUN := %/report.py %/problems.py %/searches.py %/curves.py %/encoders_on_views.py
-BENCHMARKS := $(filter-out $(NOT_RUN),$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out %/common.py,$(wildcard benchmarks/*.py))
 
 bench: .venv/dev.stamp
 	set -e; for file in $(BENCHMARKS); do echo "== $$file"; $(BIN)/python "$$file"; done
@@ -82,14 +80,9 @@ baselines: .venv/dev.stamp
 		--samples 1800000
 
 MBM ?=
-comma := ,
-SETS = rop,rop_dense$(if $(MBM),$(comma)$(MBM))
-RUN = $(BIN)/robotdiffuse bench run --out runs/table1 --problems $(SETS)
 
 table1: .venv/dev.stamp
-	$(RUN) --planners all --count 300 --time-limit 1 --equal-time
-	$(RUN) --planners all --count 60 --time-limit 10
-	$(RUN) --planners ompl_rrt_star,ompl_informed_rrt_star,ompl_bit_star --count 5 --time-limit 60
+	$(BIN)/robotdiffuse bench run --preset table1 --out runs/table1 $(if $(MBM),--problems $(MBM))
 	$(BIN)/robotdiffuse bench confirm runs/table1
 	$(BIN)/robotdiffuse bench report runs/table1
 

@@ -1,17 +1,17 @@
-"""Certificates: planners that check too little between waypoints, caught; and what proofs cost.
+"""Certificates: whether they catch motions that collide between waypoints, and what they cost.
 
     python benchmarks/certificates.py [--motions 100] [--resolution 0.01] [--commands 3]
 
-Planners of OMPL plan held-out problems of furniture and dense obstacles, without simplification, with a
-checker that looks at states a share of the space's extent apart (0.01 is OMPL's default). What they return is
-cut into waypoints as far apart as the checker looked, as MoveIt does: each waypoint is free on the exact
-meshes. The truth is Coal on those meshes every 0.002 rad. Each motion goes before the validator; what is valid is
-timed, certified, and re-checked. Times are CPU times of warm calls, the least of three, in one process;
-commands are wall times of processes of their own, verify and certificate check in turn.
+Prints benchmarks/results/certificates.txt. Planners of OMPL plan held-out problems of furniture and dense
+obstacles, without simplification, with a checker that looks at states a share of the space's extent apart
+(0.01 is OMPL's default). Their paths are cut into waypoints as far apart as the checker looked, as MoveIt
+does: each waypoint is free on the exact meshes. The truth is Coal on those meshes every 0.002 rad. The
+validator checks each motion; valid ones are timed, certified and checked again. Times are CPU times of warm
+calls, the least of three, in one process; commands are wall times of processes of their own, `verify` and
+`certificate check` in turn.
 """
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
@@ -21,13 +21,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy import ndarray
 from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
-from report import header, print_table, progress
 
 import robotdiffuse as rd
+from common import dense, header, parse, print_table, progress
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
@@ -47,8 +46,10 @@ PLANNERS = {
     "BKPIECE1": og.BKPIECE1,
 }
 FAMILIES = ("shelf", "table", "crate", "rop_dense")
-LIMIT, DENSE = 4.0, 0.002
-"""Wall time of a call [s]; between two looks at the truth [rad]."""
+LIMIT, TRUTH_STEP = 4.0, 0.002
+"""Wall time of a call [s]; largest joint motion between two configurations of the truth [rad]."""
+LENIENT = VerifySettings(reversals=1000)
+"""OMPL's raw paths go back and forth, which is no collision."""
 
 
 class Motion(NamedTuple):
@@ -57,7 +58,7 @@ class Motion(NamedTuple):
     path: JointPath
 
 
-class Seen(NamedTuple):
+class Checked(NamedTuple):
     planner: str
     waypoints_free: bool
     truth_free: bool
@@ -65,7 +66,7 @@ class Seen(NamedTuple):
 
 
 def motions(count: int, resolution: float) -> Iterator[Motion]:
-    """Planners and families in turn, each problem for all planners; what is not solved is left out."""
+    """Solved motions, planners and families in turn, each problem for all planners."""
     found, number = 0, 0
     while found < count:
         problem = held_out_problem(FAMILIES[number % len(FAMILIES)], number)
@@ -109,23 +110,13 @@ def _planned(problem: Problem, name: str, resolution: float, seed: int) -> Joint
     return JointPath(robot.joint_names, rows)
 
 
-def dense(q: ndarray) -> ndarray:
-    """Configurations at most DENSE apart in any joint."""
-    counts = np.maximum(np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1) / DENSE).astype(int), 1)
-    at = np.concatenate([i + np.arange(n) / n for i, n in enumerate(counts)] + [[len(q) - 1.0]])
-    return np.stack([np.interp(at, np.arange(len(q)), column) for column in q.T], axis=1)
-
-
-def seen(motion: Motion) -> Seen:
-    """The motion before the truth and the validator. Twitching is no collision, and OMPL's raw paths twitch."""
+def check(motion: Motion) -> Checked:
+    """Check a motion by the truth and by the validator."""
     exact = ExactCollision(motion.problem.robot, motion.problem.scene)
     q = motion.path.positions
     report = verify(motion.problem, motion.path, LENIENT)
     free = not exact.collides(q).any()
-    return Seen(motion.planner, free, not exact.collides(dense(q)).any(), report)
-
-
-LENIENT = VerifySettings(reversals=1000)
+    return Checked(motion.planner, free, not exact.collides(dense(q, TRUTH_STEP)).any(), report)
 
 
 def least(act: Callable[[], object]) -> float:
@@ -140,7 +131,7 @@ def least(act: Callable[[], object]) -> float:
 
 
 class Cost(NamedTuple):
-    """Of one certificate; times in ms of CPU."""
+    """Of one certificate; times are CPU times [ms]."""
 
     validator: float
     write: float
@@ -150,7 +141,7 @@ class Cost(NamedTuple):
     stretches: int
     planes: int
     share: float
-    """Of the validator's clearance that is proved."""
+    """Proved clearance over the validator's."""
 
 
 def cost(problem: Problem, motion: rd.Path | rd.Trajectory, folder: Path) -> Cost:
@@ -195,22 +186,21 @@ def commands(
                 cwd=folder,
                 check=True,
                 capture_output=True,
-                env={**os.environ},
             )
             times.append(time.perf_counter() - begun)
     return found
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--motions", type=int, default=100)
-    parser.add_argument("--resolution", type=float, default=0.01)
-    parser.add_argument("--commands", type=int, default=3)
-    arguments = parser.parse_args()
+    parser = argparse.ArgumentParser(description="What certificates catch, and what they cost.")
+    parser.add_argument("--motions", type=int, default=100, help="of OMPL's planners (100)")
+    parser.add_argument("--resolution", type=float, default=0.01, help="of their checks (0.01)")
+    parser.add_argument("--commands", type=int, default=3, help="calls of each command (3)")
+    arguments = parse(parser, motions=2, commands=1)
     ou.setLogLevel(ou.LOG_NONE)
     print(header("numpy", "coal", "ompl", "numba"))
     drawn = list(progress(list(motions(arguments.motions, arguments.resolution)), "motions"))
-    validated = [seen(motion) for motion in progress(drawn, "validating")]
+    validated = [check(motion) for motion in progress(drawn, "validating")]
     rows = []
     for name in (*PLANNERS, "all"):
         of = [one for one in validated if name in (one.planner, "all")]
@@ -241,8 +231,8 @@ def main() -> None:
         rows,
         [
             "collide between: by Coal every 0.002 rad, though every waypoint is free",
-            "missed: accepted by the validator, and not by that",
-            "refused beyond what collides: contact between two looks, or bodies nearer than 0.1 mm",
+            "missed: accepted by the validator, in collision by Coal",
+            "also refused: contact between two looks of Coal, bodies nearer than 0.1 mm",
         ],
     )
     with tempfile.TemporaryDirectory() as name:
@@ -262,7 +252,7 @@ REQUESTS: dict[str, dict[str, Any]] = {
 
 
 def of_requests(folder: Path, count: int) -> None:
-    """One motion over a table for each kind of request: what its proof costs."""
+    """Print what the proof of one motion over a table costs, for each kind of request."""
     robot, rows = rd.load_robot("panda"), []
     for name, asked in REQUESTS.items():
         problem = Problem(robot, rd.Scene([TABLE]), LOW, FAR, **asked)
@@ -285,8 +275,8 @@ def of_requests(folder: Path, count: int) -> None:
     )
 
 
-def measure(drawn: list[Motion], validated: list[Seen], folder: Path, count: int) -> None:
-    """What is valid, as the planner returned it, and what this package plans for the same problems."""
+def measure(drawn: list[Motion], validated: list[Checked], folder: Path, count: int) -> None:
+    """Print the costs of valid motions of OMPL, and of what this package plans for the same problems."""
     rough, smooth, failed = [], [], 0
     verified, checked = list[float](), list[float]()
     of_requests(folder, count)

@@ -1,38 +1,34 @@
-"""Speed, soundness and tightness of collision checking, for the Panda.
+"""Collision checking of the Panda: how fast, whether colliding configurations pass, how many free ones fail.
 
-    python benchmarks/collision.py [--problems FOLDER] [--configurations 1000000]
+    python benchmarks/collision.py [--problems FOLDER] [--configurations 1000000] [--each 8]
 
-Prints the report that is kept in benchmarks/results/collision.txt. FOLDER holds MotionBenchMaker families
-(scene and request files). Times are CPU times of one core, unless said.
+Prints benchmarks/results/collision.txt, and the table of the kernel in core.txt. FOLDER holds
+MotionBenchMaker families (scene and request files). Times are CPU times of one core.
 """
 
 import argparse
-import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
-# Threads that wait must not spin: on a busy machine they would take the time of those that work.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
 import numpy as np
-import torch
 from jaxtyping import Int
 from numba import njit
 from numpy import ndarray
 from numpy.random import Generator
-from report import header, print_table
-from rich.progress import track
 
+from common import FIRST, draw_hard_cases, header, parse, print_table, progress
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
+from robotdiffuse.collision.kernels.lane_collision import make_workspace, place_frames
 from robotdiffuse.collision.kernels.motions import Space, motion_free
+from robotdiffuse.collision.kernels.simd import W, lanes_array
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.collision.signed_distance import SignedDistance
+from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.search.rrt_connect import RRTConnectSettings
+from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
@@ -48,11 +44,15 @@ SCENES = 20
 """Scenes that a speed is averaged over."""
 EDGES = 500
 """Edges of 1 rad in each of them."""
-REPEATS = 5
-"""The fastest pass counts."""
-POINTS = 100_000
-PER_SCENE = 2_000
-"""Configurations per scene of the soundness check."""
+PASSES = 5
+"""The fastest one counts."""
+POINTS, POINT_RADIUS = 100_000, 0.01
+"""Of clouds; [m]."""
+CONFIGURATIONS_PER_SCENE = 2_000
+RESOLUTION = RRTConnectSettings().resolution
+"""Of searches [m]."""
+PATH_REPEATS = 50
+"""Times that each path is checked in `along_paths`, in both directions."""
 
 Place = tuple[Robot, Scene]
 
@@ -67,15 +67,14 @@ def cloud_places(robot: Robot, count: int) -> list[Place]:
     """Dense ROP scenes as point clouds of their surfaces."""
     rng = np.random.default_rng(SEED)
     places = rop_places(robot, True, count)
-    return [(robot, Scene([PointCloud(sample_surface(scene, POINTS, rng), 0.01)])) for _, scene in places]
+    return [
+        (robot, Scene([PointCloud(sample_surface(scene, POINTS, rng), POINT_RADIUS)])) for _, scene in places
+    ]
 
 
 def family_places(folder: Path) -> list[Place]:
     problems = [entry.problem for entry in load_motion_bench_maker(folder)]
     return [(p.robot, p.scene) for p in problems if p is not None]
-
-
-# -- speed of the kernel -------------------------------------------------------------------------------------
 
 
 @njit
@@ -102,16 +101,16 @@ def random_edges(checker: CollisionChecker, rng: Generator) -> tuple[ndarray, nd
 
 
 def checked_configurations(space: Space, starts: ndarray, ends: ndarray) -> Int[ndarray, "n"]:
-    """Configurations of each edge if it is checked in full."""
+    """How many configurations of each edge a full check looks at."""
     travel = np.abs(ends - starts) @ space.levers
     return W * np.maximum(np.ceil(travel / space.resolution / W), 1).astype(int)
 
 
 def fastest(call: Callable[[], object]) -> float:
-    """CPU time of the fastest of some calls, the first not counted [s]."""
+    """CPU time of the fastest of PASSES calls after a first one, which compiles [s]."""
     call()
     times = []
-    for _ in range(REPEATS):
+    for _ in range(PASSES):
         start = time.process_time()
         call()
         times.append(time.process_time() - start)
@@ -120,13 +119,13 @@ def fastest(call: Callable[[], object]) -> float:
 
 def kernel_speed(title: str, places: list[Place]) -> list[str]:
     """One row: mean times over some scenes."""
-    rng, resolution = np.random.default_rng(SEED), RRTConnectSettings().resolution
+    rng = np.random.default_rng(SEED)
     along, every, edge, share, build = [], [], [], [], []
     for robot, scene in places[:SCENES]:
         start = time.process_time()
         checker = CollisionChecker(robot, scene)
         build.append(time.process_time() - start)
-        space = search_space(checker, resolution)
+        space = search_space(checker, RESOLUTION)
         starts, ends = random_edges(checker, rng)
         if len(starts) < EDGES:
             continue
@@ -138,52 +137,24 @@ def kernel_speed(title: str, places: list[Place]) -> list[str]:
         share.append(free.mean())
         q = rng.uniform(robot.lower, robot.upper, (4096, robot.dof)).astype(np.float32)
         every.append(1e9 * fastest(lambda c=checker, q=q: c.free(q)) / len(q))
+    if not along:
+        return [title, *["-"] * 6]
     figures = [np.mean(along), np.max(along), np.mean(edge), 100 * np.mean(share), np.mean(every)]
     return [title, *(f"{x:.0f}" if x >= 20 else f"{x:.1f}" for x in figures), f"{1e3 * np.median(build):.1f}"]
 
 
-# -- signed distance in PyTorch ------------------------------------------------------------------------------
-
-
-def torch_speed(title: str, places: list[Place]) -> list[str]:
-    """Wall time of distances and gradient for 64 x 32 configurations [ms], one and two threads."""
-    row = [title]
-    for own in (False, True):
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            times = []
-            for robot, scene in places[:3]:
-                distance = SignedDistance(robot, scene)
-                rng = np.random.default_rng(SEED)
-                q = torch.tensor(
-                    rng.uniform(robot.lower, robot.upper, (64, 32, robot.dof)), dtype=torch.float32
-                )
-                q.requires_grad_()
-                for _ in range(8):
-                    start = time.perf_counter()
-                    cost = torch.relu(0.04 - distance(q)).square().sum()
-                    if own:
-                        cost = cost + torch.relu(0.01 - distance.self_distance(q)).square().sum()
-                    torch.autograd.grad(cost, q)
-                    times.append(time.perf_counter() - start)
-            row.append(f"{1e3 * np.median(times):.1f}")
-    return row
-
-
-# -- soundness and tightness ---------------------------------------------------------------------------------
-
-
 def without_pairs(robot: Robot) -> Robot:
-    """The robot with no links checked against each other."""
+    """The robot without checks between links."""
     return replace(robot, allowed_collisions=frozenset(map(frozenset, combinations(robot.link_names, 2))))
 
 
 def soundness(title: str, places: list[Place], configurations: int) -> tuple[ndarray, list[list[str]]]:
-    """Counts [scene, self, both; mesh free, refused of these, mesh colliding, called free of these]."""
+    """Counts [scene, self, both; free on meshes, of these refused, colliding on meshes, of these called
+    free], and their rows."""
     rng, counts = np.random.default_rng(SEED), np.zeros((3, 4), int)
-    per_scene = min(PER_SCENE, -(-configurations // len(places)))
+    per_scene = min(CONFIGURATIONS_PER_SCENE, -(-configurations // len(places)))
     rounds = -(-configurations // per_scene)
-    for i in track(range(rounds), title, transient=True):
+    for i in progress(range(rounds), title):
         robot, scene = places[i % len(places)]
         q = rng.uniform(robot.lower, robot.upper, (per_scene, robot.dof))
         bare = without_pairs(robot)
@@ -212,60 +183,104 @@ def count_row(title: str, counts: Int[ndarray, "4"]) -> list[str]:
     ]
 
 
+@njit
+def place_along(space, starts, ends, counts):
+    """The forward kinematics of a check of these edges, with so many configurations each."""
+    work, block = make_workspace(space.robot, space.scene), lanes_array(starts.shape[1], 1)
+    for i in range(len(starts)):
+        for j in range(starts.shape[1]):
+            block[j, :] = np.float32(0.5) * (starts[i, j] + ends[i, j])
+        for _ in range(counts[i] // W):
+            place_frames(space.robot, block, work.frames, work.centres)
+    return work.centres[0, 0]
+
+
+def free_edges(path: ndarray, space: Space) -> tuple[ndarray, ndarray]:
+    """The edges of a path that are free in both directions, repeated."""
+    starts, ends = np.concatenate([path[:-1], path[1:]]), np.concatenate([path[1:], path[:-1]])
+    free = check_edges(space, starts, ends)
+    free &= np.roll(free, len(path) - 1)
+    return np.tile(starts[free], (PATH_REPEATS, 1)), np.tile(ends[free], (PATH_REPEATS, 1))
+
+
+def along_paths(robot: Robot, families: list[str], each: int) -> None:
+    """Print what a configuration costs along the paths of aorrtc, and which part of the check takes it."""
+    planner, rows, rng = load_planner("aorrtc"), [], np.random.default_rng(SEED)
+    bare = search_space(CollisionChecker(robot, Scene()), RESOLUTION)
+    for family in families:
+        spent, checked = np.zeros(4), np.zeros(2)
+        for case in draw_hard_cases(family, each):
+            path = planner.plan(case.problem, 1.0, until=FIRST, clearance=0.0).path
+            if path is None:
+                continue
+            cloud = PointCloud(sample_surface(case.problem.scene, POINTS, rng), POINT_RADIUS)
+            for k, scene in enumerate((case.problem.scene, Scene([cloud]))):
+                space = search_space(CollisionChecker(robot, scene), RESOLUTION)
+                starts, ends = free_edges(path.positions.astype(np.float32), space)
+                if not len(starts):
+                    continue
+                counts = checked_configurations(space, starts, ends)
+                checked[k] += counts.sum()
+                spent[2 + k] += fastest(lambda a=starts, b=ends, s=space: check_edges(s, a, b))
+                if k == 0:
+                    spent[0] += fastest(lambda a=starts, b=ends, n=counts: place_along(bare, a, b, n))
+                    spent[1] += fastest(lambda a=starts, b=ends: check_edges(bare, a, b))
+        kinematics, itself, total = 1e9 * spent[:3] / max(checked[0], 1)
+        cloud_total = 1e9 * spent[3] / max(checked[1], 1)
+        nanoseconds = (kinematics, itself - kinematics, total - itself, total, cloud_total)
+        rows.append((family, *(f"{ns:.0f}" for ns in nanoseconds)))
+    columns = ["family", "kinematics", "self", "scene", "total", f"total, cloud of {POINTS:,}"]
+    note = f"ns a configuration, the fastest pass; cloud: on the obstacles, {1e3 * POINT_RADIUS:g} mm"
+    print_table("Collision check along free edges of paths", columns, rows, (note,))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Speed, soundness and tightness of collision checking.")
     parser.add_argument("--problems", type=Path, help="folder with MotionBenchMaker families")
     parser.add_argument(
-        "--configurations", type=int, default=1_000_000, help="of the soundness check, in all"
+        "--configurations", type=int, default=1_000_000, help="of the soundness check (1000000)"
     )
-    arguments = parser.parse_args()
-    robot = load_robot("panda")
-    print(header("numpy", "numba", "torch", "coal"))
+    parser.add_argument("--scenes", type=int, default=SCENES, help=f"of each speed ({SCENES})")
+    parser.add_argument("--each", type=int, default=8, help="problems of each family, for paths (8)")
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="for paths (all)")
+    arguments = parse(parser, configurations=200, scenes=1, each=1, families=["rop"])
+    robot, count = load_robot("panda"), arguments.scenes
+    print(header("numpy", "numba", "coal"))
     sizes = sum(map(len, robot.spheres.values()))
     print(f"Panda: {sizes} spheres, {len(CollisionChecker(robot, Scene()).pairs)} checked pairs of links")
 
     families = sorted(arguments.problems.iterdir()) if arguments.problems else []
     published = {path.name.removesuffix("_panda"): family_places(path) for path in families if path.is_dir()}
-    solid = {
-        "ROP, 2 obstacles + floor": rop_places(robot, False, SCENES),
-        "ROP dense, 3 to 12 + floor": rop_places(robot, True, SCENES),
-        **published,
+    places = {
+        "ROP, 2 obstacles + floor": rop_places(robot, False, count),
+        "ROP dense, 3 to 12 + floor": rop_places(robot, True, count),
+        **{name: of[:count] for name, of in published.items()},
+        f"ROP dense, cloud of {POINTS:,}": cloud_places(robot, min(5, count)),
     }
-    clouds = {f"ROP dense, cloud of {POINTS:,}": cloud_places(robot, 5)}
     columns = ["", "ns, free edges", "worst scene", "us per edge", "edges free %", "ns, random q", "build ms"]
-    rows = [kernel_speed(title, places) for title, places in (solid | clouds).items()]
-    resolution = RRTConnectSettings().resolution
     print_table(
-        f"Kernel, self-collision included, one core; edges of 1 rad checked every {1e3 * resolution:.0f} mm "
+        f"Kernel, self-collision included, one core; edges of 1 rad checked every {1e3 * RESOLUTION:.0f} mm "
         "(per configuration; per edge: free or not)",
         columns,
-        rows,
+        [kernel_speed(title, of) for title, of in places.items()],
     )
+    along_paths(robot, arguments.families, arguments.each)
 
-    columns = ["", "scene, 1 thread", "2 threads", "and self, 1 thread", "2 threads"]
-    rows = [torch_speed(title, places) for title, places in (solid | clouds).items()]
-    print_table("PyTorch signed distance and gradient, 64 x 32 configurations, median ms", columns, rows)
-
-    if arguments.configurations > 0:
-        sampled = {
-            "ROP": rop_places(robot, False, 500),
-            "ROP dense": rop_places(robot, True, 500),
-            **published,
-        }
-        total, rows = np.zeros((3, 4), int), []
-        for title, places in sampled.items():
-            counts, family = soundness(title, places, -(-arguments.configurations // len(sampled)))
-            total += counts
-            rows += family
-        rows += [count_row(f"all, {what}", total[k]) for k, what in enumerate(WHAT)]
-        columns = [
-            "random configurations",
-            "number",
-            "collide by mesh",
-            "called free of these",
-            "refused of free",
-        ]
-        print_table("Covering spheres against exact meshes (Coal)", columns, rows)
+    sampled = {"ROP": rop_places(robot, False, 500), "ROP dense": rop_places(robot, True, 500), **published}
+    total, rows = np.zeros((3, 4), int), []
+    for title, of in sampled.items():
+        counts, family = soundness(title, of, -(-arguments.configurations // len(sampled)))
+        total += counts
+        rows += family
+    rows += [count_row(f"all, {what}", total[k]) for k, what in enumerate(WHAT)]
+    columns = [
+        "random configurations",
+        "number",
+        "collide by mesh",
+        "called free of these",
+        "refused of free",
+    ]
+    print_table("Covering spheres against exact meshes (Coal)", [*columns, "refused of free"], rows)
 
 
 if __name__ == "__main__":

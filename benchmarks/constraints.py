@@ -2,39 +2,45 @@
 
     python benchmarks/constraints.py [--number 200] [--kinds upright,line] [--without-peer]
 
-Problems are drawn in the scenes of the held-out families shelf and table, with a cup in the hand that points
-down, at random places above the ground. Upright: from one place to another, the cup's axis within 10 degrees
-of the vertical. Line: to a place 15 to 40 cm away in the same orientation, the hand's origin within 2 mm of
-the segment and its orientation within 0.05 rad; drawn again until at nine places of the segment some
-configuration is free. Goals are up to ten configurations, the same ones for all planners.
+Prints benchmarks/results/constraints.txt. Problems are drawn in the scenes of the held-out families shelf and
+table, with a cup in the hand that points down, at random places above the ground. Upright: from one place to
+another, the cup's axis within 10 degrees of the vertical. Line: to a place 15 to 40 cm away in the same
+orientation, the hand's origin within 2 mm of the segment and its orientation within 0.05 rad; drawn again
+until a free configuration exists at nine places of the segment. Goals are up to ten configurations, the same
+ones for all planners.
 
-aorrtc searches on what the constraints leave; diffusion draws from the network, which knows of no
-constraints, under guidance by their cost, and projects every waypoint.
+aorrtc searches on what the constraints allow; diffusion draws from the network, which knows no constraints,
+under guidance by their cost, and projects every waypoint.
 
 sscbirrt (PyPI) plans with this project's compiled projection and collision check as its callbacks, in its
 Python core: its native one takes MuJoCo's scenes, analytical inverse kinematics and its own sets. It returns
-waypoints, checked every 0.05 rad; ours are timed motions, proved.
+waypoints, checked every 0.05 rad; ours are timed motions that the validator proved.
 
-Every motion goes before oracles: Coal on the exact meshes and PyBullet, at most 1 mm of motion of the hand
-apart, and PyBullet's own kinematics for what the constraint says there. Time limits are of processor time.
+Coal on the exact meshes and PyBullet check every motion, the hand moving at most 1 mm between two checks;
+PyBullet's own kinematics measure the constraint there. Time limits are of CPU time.
 """
 
 import argparse
 import time
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import pybullet
-import sscbirrt
 from numpy import ndarray
-from report import header, print_table, progress
-from sscbirrt.testing import PlanarIK
 
 import robotdiffuse as rd
+from common import (
+    contacts_on_meshes,
+    dense,
+    header,
+    parse,
+    parts_of,
+    print_table,
+    progress,
+    use_processor_time,
+)
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.transforms import (
     rotation_angle,
     rotation_from_quaternion,
@@ -42,7 +48,6 @@ from robotdiffuse.core.transforms import (
     transform,
 )
 from robotdiffuse.core.types import Path
-from robotdiffuse.planning import context
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.compiled_constraints import PathConstraints
@@ -51,7 +56,6 @@ from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.simulation.validator import PyBulletOracle
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.validator import verifier
 
@@ -60,37 +64,35 @@ SHORT, LONG = 1.0, 10.0
 HAND, CUP = "panda_hand", rd.Cylinder([0, 0, 0.14], 0.03, 0.06, name="cup")
 LOW, HIGH = np.array([0.25, -0.5, 0.25]), np.array([0.7, 0.5, 0.8])
 """Where the hand is drawn [m]."""
-UPRIGHT, OFF, TURNED = np.radians(10), 0.002, 0.05
-GOALS, PLACES = 10, 9
-APART, TOLERANCE = 0.001, 0.001
-"""Of the hand between two looks of the oracles [m]; PyBullet's own error [m]."""
+UPRIGHT, OFF_LINE, TURNED = np.radians(10), 0.002, 0.05
+"""Tolerances of the constraints [rad], [m], [rad]."""
+GOALS, LINE_PLACES = 10, 9
+"""Goal configurations of a problem; places of a line at which some configuration must be free."""
+STEP = 0.001
+"""Between two checks of a motion [rad]; links reach less than 1 m, so that the hand moves less than 1 mm."""
+CONTACT_FRAMES = 600
+"""Of a motion, that are checked for collisions."""
 ROUNDING = 1e-6
-"""PyBullet's kinematics are taken as known to this [m], [rad]."""
-
-
-class CpuClock:
-    """Time limits are of processor time here, for others share the machine."""
-
-    perf_counter = staticmethod(time.process_time)
+"""Error of PyBullet's kinematics [m], [rad]."""
 
 
 class Answer(NamedTuple):
     seconds: float
     first: float
-    """Until there was a path that the search calls free [s]; for sscbirrt the answer."""
+    """When the search had a free path [s]; for sscbirrt when it answered."""
     positions: ndarray | None
-    """What is executed: rows of the timed motion, or waypoints."""
+    """Rows of the timed motion, or waypoints."""
     length: float
     proved: bool
 
 
-class Seen(NamedTuple):
-    """What oracles say of a motion."""
+class Checked(NamedTuple):
+    """A motion as Coal and PyBullet see it."""
 
     coal: int
-    bullet: int
+    pybullet: bool
     excess: float
-    """The most beyond the tolerances, as a share of them; negative within."""
+    """The largest violation of a tolerance, as a share of it; negative within."""
 
 
 def drawn(kind: str, number: int) -> Iterator[Problem]:
@@ -109,7 +111,7 @@ def drawn(kind: str, number: int) -> Iterator[Problem]:
         constraint = (
             rd.AxisCone("cup", [0, 0, 1], [0, 0, -1], UPRIGHT)
             if kind == "upright"
-            else rd.CartesianLine(HAND, OFF, TURNED)
+            else rd.CartesianLine(HAND, OFF_LINE, TURNED)
         )
         yield Problem(robot, given.scene, start, JointGoal(goals), constraints=[constraint])
         found += 1
@@ -118,7 +120,7 @@ def drawn(kind: str, number: int) -> Iterator[Problem]:
 def _ends(
     kind: str, robot: Robot, checker: CollisionChecker, rng: np.random.Generator
 ) -> tuple[ndarray, ndarray] | None:
-    """A start, and configurations of a goal."""
+    """A start and configurations of a goal; None if 20 tries find none."""
     for _ in range(20):
         T = _pose(rng)
         start = inverse_kinematics(robot, HAND, T, 1, rng=rng, accept=checker.free)
@@ -129,7 +131,7 @@ def _ends(
             way = rng.normal(size=3)
             T_goal = T.copy()
             T_goal[:3, 3] += rng.uniform(0.15, 0.4) * way / np.linalg.norm(way)
-            shares = np.linspace(0, 1, PLACES)[1:-1]
+            shares = np.linspace(0, 1, LINE_PLACES)[1:-1]
             between = [transform((1 - s) * T[:3, 3] + s * T_goal[:3, 3], T[:3, :3]) for s in shares]
             if not all(_reached(robot, P, 1, checker, rng) is not None for P in between):
                 continue
@@ -140,7 +142,7 @@ def _ends(
 
 
 def _pose(rng: np.random.Generator) -> ndarray:
-    """The hand pointing down, at any turn about the vertical."""
+    """A random pose of the hand pointing down."""
     return transform(rng.uniform(LOW, HIGH), rotation_from_rpy(np.pi, 0.0, float(rng.uniform(-np.pi, np.pi))))
 
 
@@ -152,7 +154,7 @@ def _reached(
 
 
 def ours(planner: Planner, problem: Problem, seed: int) -> Answer:
-    """By a planner of this project."""
+    """The answer of a planner of this project."""
     result = planner.plan(problem, time_limit=LONG, seed=seed)
     if result.path is None or result.trajectory is None:
         return Answer(result.planning_time, np.inf, None, np.inf, False)
@@ -161,7 +163,7 @@ def ours(planner: Planner, problem: Problem, seed: int) -> Answer:
 
 
 class _Arm:
-    """This project's kinematics and collision check as sscbirrt asks for them."""
+    """This project's kinematics and collision check behind sscbirrt's interface."""
 
     def __init__(self, problem: Problem) -> None:
         self.robot, self.checker = problem.robot, CollisionChecker(problem.robot, problem.scene)
@@ -175,7 +177,7 @@ class _Arm:
 
 
 class _Set:
-    """This project's projection onto constraints as sscbirrt asks for it."""
+    """This project's projection onto constraints behind sscbirrt's interface."""
 
     def __init__(self, problem: Problem) -> None:
         self.ready = PathConstraints(problem)
@@ -192,7 +194,10 @@ class _Set:
 
 
 def peer(problem: Problem, seed: int) -> Answer:
-    """By sscbirrt, with its own settings."""
+    """The answer of sscbirrt with its default settings."""
+    import sscbirrt  # pyright: ignore[reportMissingImports]
+    from sscbirrt.testing import PlanarIK  # pyright: ignore[reportMissingImports]
+
     arm, goal = _Arm(problem), problem.goal
     assert isinstance(goal, JointGoal)
     began = time.process_time()
@@ -214,23 +219,15 @@ def peer(problem: Problem, seed: int) -> Answer:
     return Answer(spent, spent, rows, made.length, verifier(problem).path(made).valid)
 
 
-def looked_at(problem: Problem, rows: ndarray) -> Seen:
-    """A motion before Coal and PyBullet."""
-    robot, scene = problem.robot, problem.scene
-    parts = [rows[:1]]
-    for a, b in pairwise(rows):
-        count = max(1, int(np.ceil(np.abs(b - a).sum() / APART)))  # levers are below 1 m
-        parts.append(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
-    frames = np.concatenate(parts)
-    sparse = frames[:: max(1, len(frames) // 600)]
-    coal = int(ExactCollision(robot, scene).collides(sparse).sum())
-    with PyBulletOracle(robot, scene) as oracle:
-        bullet = int(oracle.check_frames(sparse, TOLERANCE) is not None)
-    return Seen(coal, bullet, _excess(problem, frames))
+def checked(problem: Problem, rows: ndarray) -> Checked:
+    """Check a motion on the meshes and against the constraint."""
+    frames = dense(rows, STEP)
+    contacts = contacts_on_meshes(problem, frames[:: max(1, len(frames) // CONTACT_FRAMES)])
+    return Checked(*contacts, _excess(problem, frames))
 
 
 def _excess(problem: Problem, frames: ndarray) -> float:
-    """By PyBullet's kinematics."""
+    """The largest violation of the constraint by PyBullet's kinematics, as a share of its tolerance."""
     [one] = problem.constraints
     with World(problem.robot, rd.Scene()) as world:
 
@@ -253,11 +250,11 @@ def _excess(problem: Problem, frames: ndarray) -> float:
     shares = np.clip((p - first[:3, 3]) @ way / (way @ way), 0, 1)
     off = np.linalg.norm(p - first[:3, 3] - shares[:, None] * way, axis=1).max()
     turned = max(rotation_angle(first[:3, :3].T @ T[:3, :3]) for T in poses)
-    return float(max((off - ROUNDING) / OFF, (turned - ROUNDING) / TURNED) - 1)
+    return float(max((off - ROUNDING) / OFF_LINE, (turned - ROUNDING) / TURNED) - 1)
 
 
 def compared(kind: str, number: int, with_peer: bool) -> None:
-    """Plan, show to the oracles, and print."""
+    """Plan with each planner, check on meshes, and print."""
     problems, answers = list(drawn(kind, number)), dict[str, list[Answer]]()
     for name in ("aorrtc", "diffusion"):
         planner = rd.load_planner(name)
@@ -272,10 +269,13 @@ def compared(kind: str, number: int, with_peer: bool) -> None:
     for name, found in answers.items():
         done = [(problems[i], a) for i, a in enumerate(found) if a.positions is not None]
         seen = [
-            looked_at(p, a.positions)
-            for p, a in progress(done, f"{kind}, oracles on {name}")
+            checked(p, a.positions)
+            for p, a in progress(done, f"{kind}, checks of {name}")
             if a.positions is not None
         ]
+        if not done:
+            columns.append([f"0 of {possible}", *["-"] * 9])
+            continue
         times, firsts = ([1e3 * t for t in each] for each in zip(*(a[:2] for _, a in done), strict=True))
         columns.append(
             [
@@ -283,9 +283,9 @@ def compared(kind: str, number: int, with_peer: bool) -> None:
                 f"{len(done)} of {possible}",
                 f"{np.median(firsts):.0f} / {np.percentile(firsts, 95):.0f} ms",
                 f"{np.median(times):.0f} / {np.percentile(times, 95):.0f} ms",
-                f"{np.median([found[i].length for i in both]):.2f} rad",
+                f"{np.median([found[i].length for i in both]):.2f} rad" if both else "-",
                 str(sum(s.coal > 0 for s in seen)),
-                str(sum(s.bullet > 0 for s in seen)),
+                str(sum(s.pybullet for s in seen)),
                 str(sum(s.excess > 0 for s in seen)),
                 f"{100 * (1 + max(s.excess for s in seen)):.1f} %",
                 f"{sum(a.proved for _, a in done)} of {len(done)}",
@@ -312,10 +312,10 @@ def main() -> None:
     parser.add_argument("--number", type=int, default=200, help="of problems of each kind (200)")
     parser.add_argument("--kinds", default="upright,line", help="(upright,line)")
     parser.add_argument("--without-peer", action="store_true", help="leave sscbirrt out")
-    arguments = parser.parse_args()
-    context.time = CpuClock  # type: ignore[attr-defined]
+    arguments = parse(parser, number=1, without_peer=True)
+    use_processor_time()
     print(header("numba", "numpy", "coal", "pybullet", "sscbirrt"))
-    for kind in arguments.kinds.split(","):
+    for kind in parts_of(arguments.kinds, ("upright", "line")):
         compared(kind, arguments.number, not arguments.without_peer)
 
 

@@ -1,243 +1,330 @@
-"""What learning buys: the network against unlearned starts and a sampling planner, at equal CPU time, paired.
+"""The diffusion model alone, with and without its inputs, under guidance; the whole planner beside it.
 
-    python benchmarks/learning.py [--sets rop,rop_dense,partial,motion_bench_maker] [--problems 200]
-        [--motion-bench-maker FOLDER] [--cases FOLDER] [--weights FOLDER]
+    python benchmarks/learning.py [--families rop,shelf] [--problems 500] [--cases FOLDER] [--weights FOLDER]
+        [--parts alone,planner,code]
+    python benchmarks/learning.py --parts guidance [--family rop] [--problems 60] [--plot guidance.png]
 
-Prints the report that is kept in benchmarks/results/learning.txt. Sets of problems:
+Parts `alone`, `planner` and `code` print benchmarks/results/network.txt and network_inputs.txt, `guidance`
+prints guidance.txt and draws guidance.png. FOLDER of cases keeps what is known of the problems. Problems are
+held out; the straight line does not solve them, and ten seconds of search do. What counts as solved passed
+the validator.
 
-- rop, rop_dense: held-out problems that the straight line does not solve and ten seconds of search do.
-- motion_bench_maker: the folder's families, the first so many problems, of all families alike.
-- partial: problems of all five families of training scenes in turn, seen by one depth camera somewhere around
-  the arm, which stands at the start. Planners know the floor and points of 2 cm radius; what the camera does
-  not see is not there for them. Solved means free in the whole scene.
-
-Methods, all with the same checks, and with the straight line where what they see leaves it free:
-
-- network: as RobotDiffuse plans, without its final search: one batch of 16 samples under guidance, refined if
-  none is free, shortcuts. `as sampled`: without the shortcuts.
-- bumps, as refined: the control for the latter, one batch of the line and 15 random bumps, refined.
-- network, repeated: small batches of samples from few steps, refined, shortened, until time is over.
-- bumps, repeated: the control. The line and 3 random bumps, refined and shortened alike; fresh bumps again.
-- shared tree: the anytime planner of the data factory, of which a round is some RRT-Connect and RRT*.
-
-Time is CPU time of this process from the ends to the shortened path, the encoder included; what all share
-(tables of robot and scene) and the validator are not in it. At a mark a method has the paths that it had by then,
-and answers with the shortest one that passes the validator for what it sees. Methods take turns on each problem.
+- alone: 16 samples, straight from the sampler. The model's inputs on obstacles are the code of their point
+cloud and
+  the clearances of the links along the noisy motion. Rows take each away: the code of another scene of the
+  family; the whole condition, which is code, start and goal; clearances as if there were no obstacles.
+  Guidance, where there is some, knows the obstacles in any case. The control is guidance of the straight line
+  and random bumps.
+- planner: the whole planner; PyBullet checks its motions on meshes.
+- code: the whole planner, which does without the code, beside itself with the code.
+- guidance: single samples and best of 16 against sampling steps, gradient steps and classifier-free scale.
+Every
+  setting of a table gets the same problems; classifier-free scales get half of them, and 50 and 200 sampling
+  steps are tried with no and with the usual number of gradient steps only.
 """
 
 import argparse
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import cycle
-from pathlib import Path as File
-from tempfile import TemporaryDirectory
+from pathlib import Path
 
 import numpy as np
-from report import WIDTH, header
-from searches import as_refined, as_sampled, bumps_repeated, network, network_repeated, search, shared_tree
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy import ndarray
 
-from problems import PANDA, SEED, Case, draw_cases, goal_of
+from common import TIME_LIMIT, WIDTH, draw_hard_cases, header, parse, parts_of, print_table
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.evaluation.methods import NETWORK_ALONE, searched
-from robotdiffuse.evaluation.problem_sets import gather_cases
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.evaluation.methods import (
+    NETWORK_ALONE,
+    Draw,
+    fields_of,
+    from_network,
+    measure_of,
+    planned,
+    sampled,
+    without_network,
+)
 from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import Trial, tried
-from robotdiffuse.evaluation.statistics import compare
-from robotdiffuse.evaluation.tables import Cell, Column, Table, show
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run, run_all
+from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
+from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, SOLVED, half_width, summary
+from robotdiffuse.evaluation.tables import show
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.planning.diffusion.diffusion import encode
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.simulation import DepthCamera, World, point_cloud
+from robotdiffuse.robots import load_robot
+from robotdiffuse.simulation.validator import PyBulletOracle
 
-MARKS = (0.02, 0.05, 0.1, 0.2)
-"""CPU times at which methods must have an answer [s]."""
-POINT_RADIUS = 0.02
-"""That planners give the points of a depth camera [m]."""
-CERTAIN = 1e-4
-"""Least p that is put down to chance: 0.05 over the tests that are done, 384 with all sets."""
-SETS = ("rop", "rop_dense", "partial", "motion_bench_maker")
-METHODS = {
-    "network": network,
-    "network, as sampled": as_sampled,
-    "bumps, as refined": as_refined,
-    "network, repeated": network_repeated,
-    "bumps, repeated": bumps_repeated,
-    "shared tree": shared_tree,
-}
-PAIRS = [
-    *((a, b) for a in ("network", "network, repeated") for b in ("bumps, repeated", "shared tree")),
-    *(("network, as sampled", b) for b in ("bumps, as refined", "shared tree")),
-]
-MEASURES = {"joint_length": "length", "link_length": "link path", "bending": "bending"}
+PANDA = load_robot("panda")
+PARTS = ("alone", "planner", "code", "guidance")
+PLANNER_LIMIT = 5.0
+"""Time limit of the whole planner [s]."""
+EQUAL_TIME = 0.5
+"""In which the whole planner is compared with itself with the code [s]."""
+STEPS = (1, 2, 5, 10, 50, 200)
+"""Sampling steps."""
+LONG_SAMPLING = 50
+"""From so many sampling steps on, not every number of gradient steps is tried."""
+GRADIENT_STEPS = (0, 2, 4, 8)
+"""At each guided sampling step; 0 is without collision guidance."""
+SCALES = (0.0, 1.0, 1.5, 2.0, 4.0)
+"""Of classifier-free guidance: 1 is the network itself, 0 hides its condition and leaves the clearances."""
+SCALED_STEPS = (1, 2, 5, 10)
+"""Sampling steps that the scales are tried with."""
+COLORS = ("#8a94a3", "#7fb3e0", "#3f7fc4", "#14487f", "#d1495b")
 
-Found = dict[tuple[str, float], list[Record]]
-"""By method and mark, in the order of the cases."""
+Setting = tuple[int, float, int]
+"""Gradient steps, classifier-free scale, sampling steps."""
+Found = dict[Setting, list[Record]]
 
 
-def try_all(cases: list[Case], wholes: Sequence[Problem], planner: RobotDiffuse, title: str) -> Found:
-    """`wholes`: what is true, where the cases are what planners see."""
+def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
+    """The network with guidance and without, and with fewer of its inputs."""
 
-    def whole(trial: Trial) -> Problem:
-        return wholes[trial.place]
+    def other(run: Run) -> Problem:
+        return cases[(run.index + 1) % len(cases)].problem
 
-    methods = {name: searched(search(planner, tries), MARKS, whole) for name, tries in METHODS.items()}
-    found = tried(cases, methods, seeds=(3,), title=title)
-    return {
-        (name, mark): [record for record in records if record.time_limit == mark]
-        for name, records in found.items()
-        for mark in MARKS
-    }
-
-
-def values(records: Sequence[Record], measure: str) -> np.ndarray:
-    """NaN where there is no answer."""
-    return np.array([record.measures.get(measure, np.nan) for record in records])
-
-
-def found_table(title: str, found: Found) -> Table:
-    lengths = {key: values(records, "joint_length") for key, records in found.items()}
-    shortest = np.fmin.reduce(list(lengths.values()), axis=0)
-    rows: list[list[Cell]] = []
-    for (name, mark), records in found.items():
-        solved = np.isfinite(lengths[name, mark])
-        plans = float(np.mean([record.passed or 0.0 for record in records]))
-        row: list[Cell] = [name, f"{1e3 * mark:.0f}", plans, float(solved.mean())]
-        if solved.any():
-            ratio = lengths[name, mark][solved] / shortest[solved]
-            row += [ratio.mean(), np.percentile(ratio, 95), values(records, "link_length")[solved].mean()]
-            row.append(np.median(values(records, "bending")[solved]))
-        rows.append(row + [None] * (8 - len(row)))
-    columns = (
-        "",
-        "CPU ms",
-        Column("has a plan", "%", ".1f", scale=100.0),
-        Column("solved", "%", ".1f", scale=100.0),
-        Column("length*", format=".3f"),
-        Column("95th", format=".3f"),
-        Column("link path, m", format=".2f"),
-        Column("bending**", format=".0f"),
-    )
-    return Table.of(title, columns, rows)
+    unguided = RobotDiffuse(replace(planner.settings, guidance_steps=0))
+    model = planner.model(PANDA)
+    assert model is not None
+    found: dict[str, Draw] = {}
+    for name, of in (("guided", planner), ("without guidance", unguided)):
+        found |= {
+            name: from_network(of),
+            f"{name}, code of another scene": from_network(of, other),
+            f"{name}, clearances hidden": from_network(of, hidden=True),
+            f"{name}, both": from_network(of, other, hidden=True),
+        }
+        if model.settings.null_condition:
+            found[f"{name}, condition hidden"] = from_network(of, guidance_scale=0.0)
+    control = without_network(planner.settings, model.settings.waypoints)
+    return found | {"control: guidance of line and bumps": control}
 
 
-def pairs_table(title: str, found: Found) -> tuple[Table, list[str]]:
-    """The table of paired tests, and what is certain, in words."""
-    rows: list[list[Cell]] = []
-    words: list[str] = []
-    for (a, b), mark in ((pair, mark) for pair in PAIRS for mark in MARKS):
-        where = f"{title}, {1e3 * mark:.0f} ms: {a} against {b}"
-        row: list[Cell] = [f"{a} / {b}", f"{1e3 * mark:.0f}"]
-        for measure, name in MEASURES.items():
-            pair = compare(*(values(found[method, mark], measure) for method in (a, b)))
-            if measure == "joint_length":
-                row += [f"{pair.a_only} / {pair.b_only}", f"{pair.p_success:.1g}"]
-                if pair.p_success < CERTAIN:
-                    more = "more" if pair.a_only > pair.b_only else "fewer"
-                    difference = 100 * abs(pair.a_only - pair.b_only) / len(found[a, mark])
-                    words.append(f"{where}: solves {more} ({difference:.1f} % of the problems)")
-            row += [pair.ratio and f"{100 * (pair.ratio - 1):+.1f} %", f"{pair.p_length:.1g}"]
-            if pair.ratio is not None and pair.ratio != 1 and pair.p_length < CERTAIN:
-                less = "less" if pair.ratio < 1 else "more"
-                words.append(f"{where}: {name} {100 * abs(pair.ratio - 1):.1f} % {less}")
-        rows.append(row)
-    columns = (
-        "",
-        "CPU ms",
-        "only / only",
-        "p",
-        *(text for name in MEASURES.values() for text in (name, "p")),
-    )
-    return Table.of(f"{title}: the first against the second", columns, rows), words
+def confirmed(planner: RobotDiffuse) -> Method:
+    """The whole planner; `refuted` is 1 if its path or motion collides by PyBullet."""
+
+    def call(run: Run) -> Iterator[Fields]:
+        with Clock() as clock:
+            result = planner.plan(run.problem, run.limit, seed=run.index)
+        hit = False
+        if result.path is not None and result.trajectory is not None:
+            moved = JointPath(result.trajectory.joint_names, result.trajectory.positions)
+            with PyBulletOracle(PANDA, run.problem.scene) as oracle:
+                hit = any(oracle.check_path(path) is not None for path in (result.path, moved))
+        yield fields_of(result, measure_of(PANDA)) | {"cpu": clock.cpu, "refuted": float(hit)}
+
+    return call
 
 
-def partial_views(count: int, folder: File | None) -> tuple[list[Case], list[Problem]]:
-    """What one camera sees, and what is true, without problems whose ends touch what is seen."""
-    each = -(-count // 3)  # of five families, as some are left out
-    queues = {family: iter(draw_cases(family, each, folder).hard) for family in FAMILIES}
-    seen: list[Case] = []
-    wholes: list[Problem] = []
-    rng, touched = np.random.default_rng([SEED, 4]), 0
-    with World(PANDA, Scene([]), look=True) as world:
-        for family in cycle(FAMILIES):
-            case = next(queues[family], None)
-            if case is None or len(seen) == count:
-                break
-            problem = case.problem
-            world.set_scene(problem.scene)
-            world.place(problem.start)
-            floor = [shape for shape in problem.scene.shapes if shape.name == "floor"]
-            cloud = point_cloud(
-                world, [around(rng)], rng, point_radius=POINT_RADIUS, without=[shape.name for shape in floor]
+class WithCode(RobotDiffuse):
+    """The planner whose network gets the code of the scene."""
+
+    def code(
+        self, model: MotionModel, checker: CollisionChecker, rng: np.random.Generator
+    ) -> Float[ndarray, "code"]:
+        return encode(model, checker, self.settings.points, rng)
+
+
+def compare_code(every: dict[str, list[Case]], settings: RobotDiffuseSettings) -> None:
+    """Print path lengths of the whole planner with the code over those without."""
+    planners = {"as it ships": RobotDiffuse(settings), "with the code": WithCode(settings)}
+    for planner in planners.values():
+        planner.warm_up(next(iter(every.values()))[0].problem, TIME_LIMIT)  # loads the network
+    methods = {name: planned(planner, until=TIME_LIMIT, clearance=0.0) for name, planner in planners.items()}
+    rows, ratios = [], dict[str, ndarray]()
+    own = {name: list[bool]() for name in planners}
+    for family, cases in every.items():
+        found = run_all(cases, methods, seeds=(1, 2), limit=EQUAL_TIME, title=family)
+        lengths = []
+        for name, records in found.items():
+            own[name] += [record.stage in ("network", "refinement") for record in records if record.solved]
+            lengths.append(
+                [record.measures["joint_length"] if record.solved else np.nan for record in records]
             )
-            view = Problem(PANDA, Scene([*floor, cloud]), problem.start, problem.goal)
-            ends = np.stack([view.start, goal_of(view)])
-            if CollisionChecker(PANDA, view.scene).free(ends).all():
-                seen.append(replace(case, problem=view))
-                wholes.append(problem)
-            else:
-                touched += 1
-    print(f"partial: {len(seen)} problems; {touched} left out as start or goal touches what is seen")
-    return seen, wholes
+        shipped, with_code = np.array(lengths).reshape(2, len(cases), -1)
+        ratio = np.exp(np.log(with_code / shipped).mean(axis=1))
+        ratios[family] = ratio[~np.isnan(ratio)]
+    for family, of in [*ratios.items(), ("all", np.concatenate(list(ratios.values())))]:
+        low, high = bootstrap_interval(of)
+        rows.append((family, len(of), f"{of.mean():.5f} ({low:.5f} to {high:.5f})"))
+    shares = ", ".join(f"{name} {np.mean(of):.1%}" for name, of in own.items())
+    print_table(
+        f"Whole planner with the code, lengths over those without, {EQUAL_TIME:g} s",
+        ["family", "problems", "mean (95 %)"],
+        rows,
+        (f"answers that are the network's: {shares}",),
+    )
 
 
-def around(rng: np.random.Generator) -> DepthCamera:
-    """Somewhere on a ring around the arm, looking at the middle of its workspace; noise as usual."""
-    angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(1.4, 1.8)
-    position = (distance * float(np.cos(angle)), distance * float(np.sin(angle)), rng.uniform(0.8, 1.6))
-    return DepthCamera(position=position, target=(0.0, 0.0, 0.4), noise=0.002, dropout=0.05)
+def print_worth_of_inputs(found: dict[str, list[Record]]) -> None:
+    """Print what each input of the network is worth on all families together."""
+    rows = []
+    for name in ("guided", "without guidance"):
+        own = np.array([record.passed or 0.0 for record in found[name]])
+        for taken in ("code of another scene", "condition hidden", "clearances hidden"):
+            less = own - [record.passed or 0.0 for record in found[f"{name}, {taken}"]]
+            low, high = (100 * x for x in bootstrap_interval(less))
+            rows.append((name, taken, f"{100 * less.mean():+.1f} ({low:+.1f} to {high:+.1f})"))
+    print_table(f"{len(own)} problems: single samples, points", ["network", "less", "mean (95 %)"], rows)
 
 
-def cases_of(name: str, arguments: argparse.Namespace) -> tuple[list[Case], list[Problem]]:
-    if name == "partial":
-        return partial_views(arguments.problems, arguments.cases)
-    if name == "motion_bench_maker":
-        with TemporaryDirectory() as folder:
-            place = str(arguments.motion_bench_maker)
-            cases = gather_cases([place], arguments.problems, File(folder), print)
+def report_alone(family: str, cases: list[Case], weights: str | None) -> dict[str, list[Record]]:
+    """Print how the network does alone; its records."""
+    planner = RobotDiffuse(replace(NETWORK_ALONE, weights=weights))
+    methods = {name: sampled(draw) for name, draw in network_methods(planner, cases).items()}
+    found = run_all(cases, methods, seeds=(1,), title=family)
+    show(summary("Network alone, 16 samples", found, (SINGLE, BEST, LENGTH, CPU)), width=WIDTH)
+    return found
+
+
+def report_planner(family: str, cases: list[Case], weights: str | None) -> None:
+    """Print how the whole planner does."""
+    whole = confirmed(RobotDiffuse(RobotDiffuseSettings(weights=weights)))
+    found = run_all(cases, {"robotdiffuse": whole}, limit=PLANNER_LIMIT, title=family)
+    show(summary("Whole planner", found, (SOLVED, LENGTH, CPU)), width=WIDTH)
+    print_stages(found["robotdiffuse"])
+
+
+def print_stages(records: list[Record]) -> None:
+    """Print which stages of the planner the answers come from, and what PyBullet says."""
+    stages = Counter(record.stage or "nothing" for record in records)
+    print("solved by " + ", ".join(f"{name} {n / len(records):.1%}" for name, n in sorted(stages.items())))
+    refuted = sum(record.measures["refuted"] for record in records)
+    print(f"motions that PyBullet finds in collision: {refuted:.0f} of {sum(r.solved for r in records)}")
+
+
+def name_of(setting: Setting) -> str:
+    gradient, scale, steps = setting
+    guided = f"{gradient} gradient steps" if gradient else "no gradient steps"
+    scaled = "" if scale == 1.0 else f", scale {scale:g}"
+    return f"{guided}{scaled}, {steps} sampling steps"
+
+
+def try_settings(loaded: RobotDiffuse, cases: list[Case], settings: Sequence[Setting], title: str) -> Found:
+    """The records of each setting, one batch for each problem, with the same random numbers."""
+    methods = {}
+    for gradient, scale, steps in settings:
+        changed = {"guidance_steps": gradient, "sampling_steps": steps}
+        planner = RobotDiffuse(replace(loaded.settings, **changed))
+        drawn = from_network(planner, guidance_scale=scale)
+        methods[name_of((gradient, scale, steps))] = sampled(drawn)
+    found = run_all(cases, methods, seeds=(5,), title=title)
+    show(summary(f"{title}, {len(cases)} problems", found, (SINGLE, BEST, CPU)), width=WIDTH)
+    return {setting: found[name_of(setting)] for setting in settings}
+
+
+def draw_line(axes: Axes, found: Found, what: str, place: int, label: str) -> None:
+    """Draw success over sampling steps with its interval; lines are shifted a little apart."""
+    at = np.array([steps for *_, steps in found]) * 1.035 ** (place - 2)
+    rows = []
+    for records in found.values():
+        single, best = [r.passed or 0.0 for r in records], [r.solved for r in records]
+        mean, half = float(np.mean(single)), half_width(single)
+        low, high = wilson_interval(sum(best), len(best))
+        rows.append((mean, mean - half, mean + half) if what == "single" else (np.mean(best), low, high))
+    middle, low, high = np.array(rows).clip(0, 1).T
+    error = 100 * np.stack([middle - low, high - middle]).clip(0)
+    axes.errorbar(at, 100 * middle, error, fmt="o-", color=COLORS[place], label=label, ms=4, elinewidth=0.8)
+
+
+def draw_guidance(collision: Found, free: Found, title: str, file: Path) -> None:
+    rows = 2 if free else 1
+    figure = Figure(figsize=(11, 4 * rows), layout="constrained")
+    panels = figure.subplots(rows, 2, sharey=True, squeeze=False)
+    for axes, what, name in zip(panels[0], ("single", "best"), ("single sample", "best of 16"), strict=True):
+        for place, gradient in enumerate(GRADIENT_STEPS):
+            label = f"{gradient} gradient steps" if gradient else "no collision guidance"
+            draw_line(axes, {s: r for s, r in collision.items() if s[0] == gradient}, what, place, label)
+        axes.set_title(f"{name}, {title}")
+    for axes, gradient in zip(panels[-1], sorted({s[0] for s in free}), strict=False):
+        for place, scale in enumerate(SCALES):
+            of = {s: r for s, r in free.items() if s[:2] == (gradient, scale)}
+            draw_line(axes, of, "single", place, f"scale {scale:g}")
+        guided = f"{gradient} gradient steps" if gradient else "no collision guidance"
+        axes.set_title(f"single sample by classifier-free scale, {guided}")
+    for axes in panels.flat:
+        ticks = STEPS if axes in panels[0] else SCALED_STEPS
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", color="#e3e6ea", lw=0.8)
+        axes.set(xscale="log", xlabel="sampling steps", ylim=(0, 102))
+        axes.set_xticks(ticks, [str(steps) for steps in ticks])
+        axes.minorticks_off()
+        axes.legend(frameon=False, loc="lower left")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("motions that pass the validator, %")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=130)
+
+
+def report_guidance(family: str, cases: list[Case], arguments: argparse.Namespace) -> None:
+    """Print and draw success against steps and scales."""
+    planner = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
+    model, usual = planner.model(PANDA), planner.settings.guidance_steps
+    assert model is not None
+    steps = [n for n in STEPS if n <= arguments.most_steps]
+    grid = [(g, 1.0, n) for g in GRADIENT_STEPS for n in steps if n < LONG_SAMPLING or g in (0, usual)]
+    collision, free = try_settings(planner, cases, grid, "Collision guidance"), {}
+    if model.settings.null_condition:
+        few = [n for n in SCALED_STEPS if n <= arguments.most_steps]
+        scaled = [(g, scale, n) for g in (0, usual) for scale in SCALES for n in few]
+        half = cases[: max(len(cases) // 2, 1)]
+        free = try_settings(planner, half, scaled, "Classifier-free guidance")
     else:
-        cases = draw_cases(name, arguments.problems, arguments.cases).hard
-    return cases, [case.problem for case in cases]
+        print("Classifier-free guidance: left out; these weights were trained without dropping the condition")
+    print("single: of 16 samples; best: problems with one that passes. 95 % intervals over the problems;")
+    print("CPU time of a batch, encoder included, without the validator")
+    if arguments.plot:
+        draw_guidance(collision, free, family, arguments.plot)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What learning buys, at equal CPU time.")
-    parser.add_argument("--sets", default=",".join(SETS), help=f"of {', '.join(SETS)} (all)")
-    parser.add_argument("--problems", type=int, default=200, help="of each set (200)")
-    parser.add_argument("--motion-bench-maker", type=File, help="folder with MotionBenchMaker families")
-    parser.add_argument("--cases", type=File, help="folder that keeps what is known of the problems")
-    parser.add_argument("--weights", help="folder of a trained model; default: the bundled one")
-    arguments = parser.parse_args()
-    for name in arguments.sets.split(","):
-        if name not in (*SETS, *FAMILIES):
-            raise InputError(f"--sets has {name!r}; known: {', '.join((*SETS, *FAMILIES))}")
-    print(header("numpy", "numba", "torch", "scipy"))
-    print(f"weights: {arguments.weights or 'the bundled ones'}")
-    planner = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
-    first = draw_cases("rop", 2).hard
-    try_all(first, [case.problem for case in first], planner, "compiling")
-    words = []
-    for name in arguments.sets.split(","):
-        if name == "motion_bench_maker" and arguments.motion_bench_maker is None:
-            print("motion_bench_maker: left out; give --motion-bench-maker FOLDER")
-            continue
-        cases, wholes = cases_of(name, arguments)
-        found = try_all(cases, wholes, planner, name)
-        pairs, certain = pairs_table(name, found)
-        show(found_table(f"\n== {name}, {len(cases)} problems", found), pairs, width=WIDTH)
-        words += certain
-    print(
-        "has a plan: it passes the validator for what the method sees; solved: it is free in the whole scene\n"
-        "*  joint-space length over the shortest that any method found, mean and 95th percentile over the\n"
-        "   problems that the method solved by then\n"
-        "** integral of |q''(u)|^2 du over u in [0, 1], over the squared length, of the path before it is\n"
-        "   timed; median; 0 is a straight line\n"
-        "only / only: problems that one of the two solved, p by McNemar's exact test; length, link path and\n"
-        "   bending: median of the ratios where both solved, p by Wilcoxon's signed ranks\n"
-        f"\nCertain (p < {CERTAIN}):"
+    parser = argparse.ArgumentParser(description="The network alone, guidance, and the whole planner.")
+    parser.add_argument(
+        "--parts", default="alone,planner,code", help=f"of {','.join(PARTS)} (the first three)"
     )
-    print("\n".join(f"- {line}" for line in words) or "- nothing")
+    parser.add_argument("--families", default=",".join(FAMILIES), help="of problems (all)")
+    parser.add_argument("--family", default="rop", choices=list(FAMILIES), help="for guidance (rop)")
+    parser.add_argument("--problems", type=int, help="non-trivial ones of each family (500; guidance: 60)")
+    parser.add_argument("--cases", type=Path, help="folder that keeps what is known of the problems")
+    parser.add_argument("--weights", help="folder of a trained model; default: the bundled one")
+    parser.add_argument("--most-steps", type=int, default=STEPS[-1], help="of sampling, for guidance (all)")
+    parser.add_argument("--plot", type=Path, help="file for the plot of guidance")
+    arguments = parse(parser, parts=",".join(PARTS), families="rop", problems=2, most_steps=2)
+    parts, families = parts_of(arguments.parts, PARTS), parts_of(arguments.families, FAMILIES)
+    print(header("numpy", "numba", "torch"))
+    print(f"weights: {arguments.weights or 'the bundled ones'}")
+    every = dict[str, list[Case]]()
+    if set(parts) - {"guidance"}:
+        every = {name: draw_hard_cases(name, arguments.problems or 500, arguments.cases) for name in families}
+    alone = dict[str, list[Record]]()
+    for family, cases in every.items():
+        print(f"\n== {family}, {len(cases)} problems\n", flush=True)
+        if "alone" in parts:
+            for name, records in report_alone(family, cases, arguments.weights).items():
+                alone.setdefault(name, []).extend(records)
+        if "planner" in parts:
+            report_planner(family, cases, arguments.weights)
+    if any("condition hidden" in name for name in alone):
+        print_worth_of_inputs(alone)
+    if "code" in parts:
+        compare_code(every, RobotDiffuseSettings(weights=arguments.weights))
+    if every:
+        print(
+            "\n* joint-space length against a path of `aorrtc`, mean of ratios\n"
+            "single: share of samples that pass the validator; best: problems with one that does; with "
+            "95 %\nintervals. Times are CPU time, as the machine may do other work."
+        )
+    if "guidance" in parts:
+        cases = draw_hard_cases(arguments.family, arguments.problems or 60, arguments.cases)
+        report_guidance(arguments.family, cases, arguments)
 
 
 if __name__ == "__main__":

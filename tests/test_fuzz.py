@@ -1,19 +1,11 @@
-"""Some thousand inputs of benchmarks/fuzz.py: an answer or a one-line error."""
+"""Some thousand damaged inputs: each gives an answer or a one-line error."""
 
-import importlib.util
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-spec = importlib.util.spec_from_file_location("fuzz", BENCHMARKS / "fuzz.py")
-assert spec is not None
-assert spec.loader is not None
-fuzz = importlib.util.module_from_spec(spec)
-sys.modules["fuzz"] = fuzz
-spec.loader.exec_module(fuzz)
+from helpers.fuzz.inputs import KINDS, outcome_of
 
 COUNTS = {
     "problem": 150,
@@ -36,14 +28,13 @@ COUNTS = {
 }
 
 
-@pytest.mark.parametrize("kind", fuzz.KINDS)
-def test_damaged_inputs(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_inputs(kind: str, tmp_path: Path) -> None:
     faults = []
     for seed in range(COUNTS[kind]):
         folder = tmp_path / str(seed)
         folder.mkdir()
-        outcome, said = fuzz.one(kind, seed, folder)
+        outcome, said = outcome_of(kind, seed, folder)
         if outcome == "fault":
             faults.append(f"{kind} {seed}: {said}")
         shutil.rmtree(folder)
@@ -67,7 +58,6 @@ def test_damaged_inputs(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         "a long link name",
     ],
 )
-def test_what_was_found(kind: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    outcome, said = fuzz.one(kind, seed, tmp_path)
+def test_inputs_that_once_failed(kind: str, seed: int, tmp_path: Path) -> None:
+    outcome, said = outcome_of(kind, seed, tmp_path)
     assert outcome == "error", said

@@ -105,7 +105,9 @@ def test_every_package_has_a_place_in_the_order() -> None:
 
 def test_no_module_imports_itself_through_others() -> None:
     names = {".".join(file.relative_to(SOURCE.parent).with_suffix("").parts): file for file in MODULES}
-    graph = {name: {n for full in imported(file) if (n := _module(full, names))} for name, file in names.items()}
+    graph = {
+        name: {n for full in imported(file) if (n := _module(full, names))} for name, file in names.items()
+    }
     circles = [ring for ring in strongly_connected(graph) if len(ring) > 1]
     assert not circles, "\n".join(" ".join(sorted(ring)) for ring in circles)
 
@@ -176,7 +178,7 @@ def test_a_plan_by_search_loads_what_it_needs_and_no_more(tmp_path: Path) -> Non
     )
     code = (
         "import sys\nfrom robotdiffuse import cli\nfrom robotdiffuse.cli import console\n"
-        "console.PATIENCE = 600.0\n"
+        "console.SPINNER_DELAY = 600.0\n"
         f"assert cli.main(['plan', {str(problem)!r}, '--planner', 'aorrtc', '--time-limit', '20']) == 0\n"
         "unwanted = ('torch', 'toppra', 'trimesh', 'rich', 'scipy.linalg', 'scipy.spatial')\n"
         "own = 'planners.constrained.kernel', 'planners.poses', 'problems.path_constraints'\n"

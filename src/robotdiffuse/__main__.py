@@ -1,20 +1,20 @@
-"""The command line from its first import on: `python -m robotdiffuse`, and the script of that name."""
+"""Entry point of `python -m robotdiffuse` and of the script `robotdiffuse`."""
 
 import gc
 import sys
 from typing import NoReturn
 
-YOUNG = 10_000
-"""Objects between two looks for garbage, of which imports, half a million objects, make none."""
+GC_THRESHOLD = 10_000
+"""New objects between two garbage collections. Imports create half a million objects, none of them garbage."""
 
 
 def main() -> int:
-    """As `cli.main`; Ctrl-C is one line while that is still imported, too."""
-    gc.set_threshold(YOUNG)
+    """Run `cli.main`; Ctrl-C during its import also ends the program with one line."""
+    gc.set_threshold(GC_THRESHOLD)
     try:
-        from robotdiffuse.core.processes import interrupts_at_once
+        from robotdiffuse.core.processes import exit_on_interrupt
 
-        with interrupts_at_once():
+        with exit_on_interrupt():
             from robotdiffuse import cli
     except KeyboardInterrupt:
         print("robotdiffuse: stopped", file=sys.stderr)
@@ -23,11 +23,11 @@ def main() -> int:
 
 
 def run() -> NoReturn:
-    """`main`, and the end of the process."""
+    """Run `main` and exit the process with its status."""
     status = main()
-    from robotdiffuse.core.processes import leave
+    from robotdiffuse.core.processes import exit_process
 
-    leave(status)
+    exit_process(status)
 
 
 if __name__ == "__main__":

@@ -12,16 +12,19 @@ import trimesh
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from robotdiffuse.certificates.proof import Certificate, Tolerances, load_certificate
+from robotdiffuse.certificates.bounds import Prover, Stretches
+from robotdiffuse.certificates.checker import described, hash_of
+from robotdiffuse.certificates.content import robot_parts, scene_parts
+from robotdiffuse.certificates.proof import Certificate, Proof, Tolerances, load_certificate
 from robotdiffuse.certificates.search import NotValidError, certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.validation.validator import VerifySettings, verify
+from robotdiffuse.validation.validator import Report, VerifySettings, verify
 
 SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3], [0.6, 0.9, 0.3]])
 
@@ -235,8 +238,6 @@ def test_whoever_forges_the_hashes_too_still_needs_a_proof(
     planned: tuple[Problem, rd.PlanResult], file: FilePath
 ) -> None:
     """An obstacle in the way, with a certificate that says that it always was there."""
-    from robotdiffuse.certificates.content import scene_parts
-
     problem, certificate = planned[0], load_certificate(file)
     blocked = replace(problem, scene=Scene([*problem.scene.shapes, Sphere([0.0, 0.0, 0.6], 0.3, "new")]))
     forged = replace(certificate, scene_parts=scene_parts(blocked.scene))
@@ -255,6 +256,62 @@ def test_rates_are_checked_anew(planned: tuple[Problem, rd.PlanResult]) -> None:
     )
     found = certificate.check(replace(problem, robot=slower)).differences
     assert any("exceeds its limit of velocity" in line for line in found)
+
+
+def timed(positions: np.ndarray, times: np.ndarray) -> tuple[Problem, Trajectory]:
+    """A motion that says that it stands still all the time."""
+    problem, path = problem_of(positions)
+    still = np.zeros_like(positions)
+    return problem, Trajectory(path.joint_names, times, positions, still, still)
+
+
+def micro_steps(step: float, time: float) -> tuple[Problem, Trajectory]:
+    count = round(0.01 / step)
+    return timed(np.outer(np.arange(count + 1) * step, [1, 0, 0]), np.arange(count + 1) * time)
+
+
+def one_short_step() -> tuple[Problem, Trajectory]:
+    """2 rad in 20 ms, and a row a nanosecond after the last."""
+    place = np.append(np.linspace(0, 2, 21), 2.0)
+    return timed(np.outer(place, [1, 0, 0]), np.append(np.arange(21) * 1e-3, 0.02 + 1e-9))
+
+
+TOO_QUICK = {
+    "one short step": (one_short_step, "mean velocity between rows"),
+    "1e-8 s": (lambda: micro_steps(1.9e-6, 1e-8), "mean velocity from one row to another"),
+    "1e-7 s": (lambda: micro_steps(1.9e-6, 1e-7), "mean velocity from one row to another"),
+    "5e-7 s": (lambda: micro_steps(1.9e-6, 5e-7), "mean velocity from one row to another"),
+    "1e-6 s": (lambda: micro_steps(1.9e-6, 1e-6), "mean acceleration by its positions"),
+}
+
+
+@pytest.mark.parametrize("name", TOO_QUICK)
+def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All else is proved: the validator that refuses them is made to pass them."""
+    made, wanted = TOO_QUICK[name]
+    problem, motion = made()
+    report = Report(True, None, 1.0, 0.2)
+    monkeypatch.setattr("robotdiffuse.certificates.search.verify_trajectory", lambda *_: report)
+    found = certify(problem, motion).check(problem).differences
+    assert any(wanted in line for line in found), found
+    assert all(line.startswith("motion: j0 exceeds its limit of mean") for line in found), found
+
+
+@pytest.mark.parametrize("with_times", [False, True])
+def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
+    """Start and goal within a box: a motion of one row leaves no gap between no stretches."""
+    robot, here = box_arm(), np.zeros((1, 3))
+    problem = Problem(robot, Scene([Box([0.3, 0, 0], [2, 2, 2])]), here[0], JointGoal(here))
+    motion = Trajectory(robot.joint_names, np.zeros(1), here, here, here)
+    motion = motion if with_times else Path(robot.joint_names, here)
+    none = np.zeros(0)
+    claims = Prover(robot, problem.scene, here).claims
+    proof = Proof(claims, Stretches(none.astype(int), none, none), none.astype(bool), none, none, ())
+    parts = robot_parts(robot), scene_parts(problem.scene), hash_of(motion)
+    certificate = Certificate(robot.name, *parts, Tolerances(), motion, none, 0.5, 0.5, proof)
+    assert certificate.check(problem).differences == tuple(
+        f"proof: nothing is said of {described(claim)} from row 0 to row 0" for claim in claims
+    )
 
 
 def test_tolerances_are_those_of_the_validator() -> None:

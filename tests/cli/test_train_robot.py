@@ -1,4 +1,4 @@
-"""train planner --robot: data and weights for an arm by one command, whatever interrupts it."""
+"""`train planner --robot` generates data and weights for an arm, and continues after interruptions."""
 
 import json
 from dataclasses import replace
@@ -11,7 +11,7 @@ import pytest
 import robotdiffuse as rd
 from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.cli import main, train_robot
-from robotdiffuse.cli.train_robot import data_for, train_for_robot
+from robotdiffuse.cli.train_robot import data_settings, train_for_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.generation import factory
 from robotdiffuse.generation.settings import GenerationSettings
@@ -34,9 +34,9 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(factory, "on_this_machine", in_this_process)
 
     def few(*asked: object) -> GenerationSettings:
-        return replace(data_for(*asked), mix={"rop": 1.0}, shard=4)  # type: ignore[arg-type]
+        return replace(data_settings(*asked), mix={"rop": 1.0}, shard=4)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(train_robot, "data_for", few)
+    monkeypatch.setattr(train_robot, "data_settings", few)
 
 
 def made(robot: str, out: Path | None = None) -> Path:
@@ -46,7 +46,7 @@ def made(robot: str, out: Path | None = None) -> Path:
     return kept
 
 
-def test_an_arm_of_five_joints_plans_with_what_it_learned(tmp_path: Path) -> None:
+def test_an_arm_of_five_joints_plans_with_its_trained_network(tmp_path: Path) -> None:
     robot = load_robot("so101")
     assert weights_for("model", robot) is None
     kept = made("so101")
@@ -55,19 +55,19 @@ def test_an_arm_of_five_joints_plans_with_what_it_learned(tmp_path: Path) -> Non
     model = planner.model(robot)
     assert model is not None and model.dof == 5
     drawn = family_for("rop_dense", robot).draw(robot, np.random.default_rng(1))
-    result = planner.plan(drawn.problem(robot), 20.0, until="short")
+    result = planner.plan(drawn.problem(robot), 20.0, until="converged")
     assert result.solved and rd.verify(drawn.problem(robot), result.path).valid  # type: ignore[arg-type]
     assert not any("there are no weights" in note for note in result.notes)
     assert weights_for("model", replace(load_robot("ur5e"), name="so101")) is None
 
 
 def test_data_are_in_the_size_of_the_arm() -> None:
-    large, small = (data_for(name, load_robot(name), None, None) for name in ("ur5e", "so101"))
+    large, small = (data_settings(name, load_robot(name), None, None) for name in ("ur5e", "so101"))
     assert large.search.safety_distance == 0.05 and small.search.safety_distance == pytest.approx(0.02)
 
 
 @pytest.mark.parametrize("phase", ["data", "training"])
-def test_it_goes_on_where_it_was_interrupted(
+def test_it_continues_where_it_was_interrupted(
     phase: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = made("ur5e", tmp_path / "whole")
@@ -88,7 +88,7 @@ def test_it_goes_on_where_it_was_interrupted(
 
 
 def interrupted(call, at: int, save: bool = False):
-    """The call, in place of whose `at`-th Ctrl-C comes."""
+    """The call, whose `at`-th use raises KeyboardInterrupt instead."""
     calls = 0
 
     def counted(*arguments: object) -> object:
@@ -111,15 +111,15 @@ def test_bad_input_is_a_clear_line(
         return capsys.readouterr().err
 
     assert "unknown robot 'ur5x'; known: " in error("--robot", "ur5x")
-    assert "name an arm with --robot" in error()
-    assert "--data is given, and no --out" in error("--data", str(tmp_path))
-    assert "--trajectories is for data that are made" in error(
+    assert "give --robot to generate data" in error()
+    assert "--data needs --out" in error("--data", str(tmp_path))
+    assert "--trajectories sets the number of motions" in error(
         *("--data", str(tmp_path), "--out", "x", "--trajectories", "3")
     )
     full = type("Usage", (), {"free": 1_000_000})
     with monkeypatch.context() as patch:
         patch.setattr(train_robot.shutil, "disk_usage", lambda folder: full)
-        assert "make room, or name another folder with --out" in error("--robot", "ur5e")
+        assert "free some space, or name another folder with --out" in error("--robot", "ur5e")
     (tmp_path / "half" / "data").mkdir(parents=True)
     (tmp_path / "half" / "data" / "manifest.json").write_text("{")
     assert "manifest.json is damaged" in error("--robot", "ur5e", "--out", str(tmp_path / "half"))

@@ -1,6 +1,5 @@
-"""What the denoiser is told of obstacles: the same for training and planning, gradients by differences."""
+"""The denoiser's inputs about obstacles: the same in training and planning, gradients by differences."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,17 +9,18 @@ import torch
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.collision.signed_distance import SignedDistance
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.checkpoint import load_model, save_network
 from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
 from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.training.losses import ArmDistance
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
@@ -49,13 +49,13 @@ def model_settings(**changes) -> MotionModelSettings:
     )
 
 
-def test_training_is_told_what_planning_is() -> None:
-    """In scenes of different size at once; clearances are those that are told without gradients."""
+def test_inputs_are_the_same_in_training_and_planning() -> None:
+    """In scenes of different size at once; clearances do not depend on the gradients beside them."""
     rng = np.random.default_rng(1)
     scenes = [family.scene(rng) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     scenes.append(Scene(scenes[0].shapes[:1]))
     packed = PackedScenes.pack(scenes, 12, floor=True)
-    q, config = configurations(len(packed), 60), model_settings(sees_gradients=True)
+    q, config = configurations(len(packed), 60), model_settings(clearance_gradients=True)
     given = compile_robot(PANDA), packed, q, config.clearance_high
     clearances, gradients = packed_clearances_and_gradients(*given, config.gradient_margin)
     np.testing.assert_array_equal(clearances, packed_link_clearances(*given))
@@ -69,13 +69,14 @@ def test_training_is_told_what_planning_is() -> None:
 
 def test_gradients_are_those_of_the_clearances() -> None:
     """Of a robot with one sphere for each link, whose clearances say all: against automatic differentiation
-    of the signed distance, and finite differences of it."""
+    of the signed distance of training's losses, and finite differences of it."""
     robot = replace(PANDA, spheres={link: balls[:1] for link, balls in PANDA.spheres.items()})
-    q = configurations(400).astype(np.float64)
-    checker, distance = CollisionChecker(robot, SHAPES), SignedDistance(robot, SHAPES, torch.float64)
+    q, scene = configurations(400).astype(np.float64), Scene(SHAPES.shapes[:2])
+    checker, packed = CollisionChecker(robot, scene), PackedScenes.pack([scene] * len(q), 2)
+    distance = ArmDistance(ForwardKinematics(robot, torch.float64))
 
     def too_close(at: torch.Tensor) -> torch.Tensor:
-        return torch.relu(MARGIN - distance(at)).square().sum(-1).sqrt()
+        return torch.relu(MARGIN - distance(at[:, None], packed)[:, 0]).square().sum(-1).sqrt()
 
     clearances, found = checker.clearances_and_gradients(q, LIMIT, MARGIN)
     at = torch.from_numpy(q).requires_grad_()
@@ -130,17 +131,21 @@ def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
     assert close.mean() > 0.9
 
 
-def test_what_the_denoiser_sees() -> None:
+def test_the_denoiser_s_inputs() -> None:
     """Rows, joints, clearances, and then gradients of order 1, whose sign tells the way into the obstacle."""
     scene, rng = Scene([Box((0.5, 0.0, 0.5), (0.4, 0.4, 0.4))]), np.random.default_rng(5)
     seen = {}
     q = configurations(2, 16, seed=6).astype(np.float64)
-    for sees in (False, True):
+    for with_gradients in (False, True):
         torch.manual_seed(0)
-        model = MotionModel(RobotIdentity.of(PANDA), model_settings(waypoints=16, sees_gradients=sees))
-        between = model.between(q[:, 0], q[:, -1])
-        told = link_clearances(CollisionChecker(PANDA, scene), model.settings)
-        seen[sees] = model.features(model.to_rows(q.astype(np.float32), between), between, told)
+        model = MotionModel(
+            RobotIdentity.of(PANDA), model_settings(waypoints=16, clearance_gradients=with_gradients)
+        )
+        reference = model.reference(q[:, 0], q[:, -1])
+        clearances = link_clearances(CollisionChecker(PANDA, scene), model.settings)
+        seen[with_gradients] = model.features(
+            model.normalize(q.astype(np.float32), reference), reference, clearances
+        )
     np.testing.assert_array_equal(seen[True][..., : seen[False].shape[-1]], seen[False])
     gradients = seen[True][..., seen[False].shape[-1] :]
     assert gradients.shape == q.shape and gradients.dtype == np.float32
@@ -152,21 +157,13 @@ def test_what_the_denoiser_sees() -> None:
         checker.cost_gradients(at, MARGIN, self_margin=-1.0)[0] for at in (q.reshape(-1, 7)[hit], inwards)
     ]
     assert hit.sum() > 3 and (costs[1] > costs[0]).all()
-    sampled = model.sample(np.zeros(model.settings.code), q[0, 0], q[0, -1], 2, rng, told, 2)
+    code, settings = np.zeros(model.settings.code), SamplingSettings(samples=2, sampling_steps=2)
+    sampled = model.sample(q[0, 0], q[0, -1], code, clearances, rng, settings)
     assert sampled.shape == (2, 16, 7)
 
 
 def test_gradients_need_clearances() -> None:
-    with pytest.raises(InputError, match="sees_gradients is True and sees_clearances is False"):
-        PlannerTraining(data="data", encoder="encoder", sees_clearances=False, sees_gradients=True)
-    with pytest.raises(InputError, match="sees_gradients"):
-        model_settings(sees_clearances=False, sees_gradients=True)
-
-
-def test_models_from_before_see_none(tmp_path) -> None:
-    save_network("model", MotionModel(RobotIdentity.of(PANDA), model_settings()), tmp_path, {})
-    about = json.loads((tmp_path / "model.json").read_text())
-    for name in ("sees_gradients", "gradient_margin", "gradient_unit"):
-        del about["settings"][name]
-    (tmp_path / "model.json").write_text(json.dumps(about))
-    assert load_model(tmp_path, PANDA).settings == model_settings()
+    with pytest.raises(InputError, match="clearance_gradients is True and clearance_features is False"):
+        PlannerTraining(data="data", encoder="encoder", clearance_features=False, clearance_gradients=True)
+    with pytest.raises(InputError, match="clearance_gradients"):
+        model_settings(clearance_features=False, clearance_gradients=True)

@@ -1,4 +1,4 @@
-"""Bounds on every number at the door, in float64."""
+"""Bounds on the numbers that users give."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -55,7 +55,7 @@ def test_numbers_out_of_bounds(make: Callable[[], object], message: str) -> None
 @pytest.mark.parametrize("distance", [10.0, 1e3, 9e3])
 @pytest.mark.parametrize("kind", [Sphere, Box, Cylinder, Capsule])
 def test_huge_shapes_are_never_called_valid(kind: type[Shape], distance: float) -> None:
-    """Their surfaces reach into the arm, or leave it by a centimetre."""
+    """The surface of each shape is 2 mm inside the arm, or 2 cm away from it."""
     robot = box_arm()
     rows = np.zeros((2, 3))
     rows[:, 0] = 0.0, 0.2
@@ -85,7 +85,7 @@ def test_naming_is_not_quadratic() -> None:
     assert [shape.name for shape in mixed.shapes] == ["a", "a_2", "a_3", "a_4", "a_2_2"]
 
 
-def test_poses_that_rounding_left_a_little_off_are_poses() -> None:
+def test_poses_with_rounding_errors_are_accepted() -> None:
     T = np.linalg.inv(transform(np.array([0.3, 0.1, 0.2])))
     T[3] += 1e-12
     assert (rigid_transform("a pose", T)[3] == [0, 0, 0, 1]).all()

@@ -1,4 +1,4 @@
-"""Compiled code is kept somewhere, wherever the package is."""
+"""There is always a folder for compiled code, even in a read-only installation."""
 
 import os
 import tempfile
@@ -9,24 +9,24 @@ import pytest
 from robotdiffuse.core import compile_cache
 
 
-def test_a_folder_of_temporary_files_where_nothing_can_be_written(
+def test_a_temporary_folder_is_used_if_nothing_else_is_writable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A read-only install without a home ended in a RuntimeError of Numba."""
+    """Numba raised RuntimeError in a read-only installation without a home."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(compile_cache, "_writable", lambda folder: False)
+    monkeypatch.setattr(compile_cache, "is_writable", lambda folder: False)
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     with pytest.warns(UserWarning, match=f"kept in {tmp_path}.*NUMBA_CACHE_DIR"):
         compile_cache.ensure_cache()
     assert Path(os.environ["NUMBA_CACHE_DIR"]).stat().st_mode & 0o777 == 0o700
 
 
-def test_what_can_be_written_is_left_to_numba(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numba_chooses_among_writable_folders(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     compile_cache.ensure_cache()
     assert "NUMBA_CACHE_DIR" not in os.environ
 
 
-def test_writable_is_found_by_writing(tmp_path: Path) -> None:
-    assert compile_cache._writable(tmp_path / "new" / "folder")
-    assert not compile_cache._writable(Path("/proc/nowhere"))
+def testis_writable_is_found_by_writing(tmp_path: Path) -> None:
+    assert compile_cache.is_writable(tmp_path / "new" / "folder")
+    assert not compile_cache.is_writable(Path("/proc/nowhere"))

@@ -1,32 +1,50 @@
-"""Files that others wrote: every door answers in one line, whatever stands behind it."""
+"""Readers of untrusted files return a value or raise one line, for any content."""
 
+import ast
 import json
 import os
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from trimesh.exchange.gltf import export_gltf
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.ply import export_ply
 
 from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
 from robotdiffuse.core.input_files import (
-    LONGEST_NAME,
+    MAX_SHOWN_NAME,
     input_file,
     is_file,
     parse_json,
     parse_xml,
     parse_yaml,
+    read_arrays,
     read_text,
     read_triangles,
 )
 
+SOURCE = Path(__file__).parents[2] / "src" / "robotdiffuse"
 DEEP = 100_000
+NESTED = "".join(f'<!ENTITY {b} "{10 * f"&{a};"}">' for a, b in pairwise("abcdefghij"))
 BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )
+
+
+SOLID = trimesh.creation.box((1.0, 1.0, 1.0))
+NAMED = {
+    "gltf": {name: bytes(part) for name, part in export_gltf(trimesh.Scene([SOLID])).items()},
+    "obj": {"model.obj": b"mtllib beside.bin\nusemtl x\n" + export_obj(SOLID).encode()},
+    "ply": {"model.ply": export_ply(SOLID).replace(b"format", b"comment TextureFile beside.bin\nformat", 1)},
+}
+"""Mesh files that name another, which glTF cannot do without."""
 
 
 def one_line(call: Callable[[], object]) -> str:
@@ -64,12 +82,12 @@ def test_brackets_in_texts_are_no_nesting() -> None:
     [
         ("[" * DEEP, "more than 64 levels deep"),
         ("- " * DEEP, "more than 64 levels deep"),
-        ("? " * DEEP, "a key is no plain text"),
+        ("? " * DEEP, "a key is not a plain string"),
         (BOMB, "stands for more than 2,000,000 values in line 7"),
         ("a: &a [*a]", "alias 'a' has no anchor before it in line 1"),
         ("a: !!int foo", "tag 'tag:yaml.org,2002:int' is not supported"),
         ("a: !!python/object/apply:os.system [ls]", "is not supported in line 1"),
-        ("? [1, 2]\n: 3", "a key is no plain text in line 1"),
+        ("? [1, 2]\n: 3", "a key is not a plain string in line 1"),
         ("9" * 5000, "integer 9999"),
         ("a: 1\n---\nb: 2", "more than one document"),
         ("a: [1, 2", "in line 2"),
@@ -157,7 +175,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         patch.setattr(os, "access", lambda *_: False)  # root may read everything
         assert "permission denied" in one_line(lambda: input_file(closed))
     long = tmp_path / ("y" * 200)
-    assert str(long) in one_line(lambda: input_file(long)) or len(str(long)) > LONGEST_NAME
+    assert str(long) in one_line(lambda: input_file(long)) or len(str(long)) > MAX_SHOWN_NAME
 
 
 def test_a_broken_mesh_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -181,3 +199,65 @@ def test_messages_quote_sixty_characters() -> None:
     spaced = "{a: " * 1000  # no word of it is long
     assert joined([spaced, "b"]) == f"{spaced[:57]}..., b"
     assert len(str(InputError("x" * 10**4))) == 60
+
+
+@pytest.mark.parametrize("kind", sorted(NAMED))
+def test_a_pipe_that_a_mesh_file_names_is_not_waited_for(kind: str, tmp_path: Path) -> None:
+    """A .gltf whose buffer is a named pipe hung."""
+    for name, content in NAMED[kind].items():
+        (tmp_path / name).write_bytes(content)
+    assert len(read_triangles(tmp_path / f"model.{kind}")[1]) == 12
+    beside = [*tmp_path.glob("*.bin"), tmp_path / "beside.bin"]
+    for file in beside:
+        file.unlink(missing_ok=True)
+        os.mkfifo(file)
+    if kind == "gltf":
+        assert "it is a device or a pipe" in one_line(lambda: read_triangles(tmp_path / "model.gltf"))
+    else:
+        assert len(read_triangles(tmp_path / f"model.{kind}")[1]) == 12
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'<!DOCTYPE robot [<!ENTITY a "lol">{NESTED}]><robot>&j;</robot>',
+        f'<!DOCTYPE robot [<!ENTITY a "{50_000 * "x"}">]><robot>{2000 * "&a;"}</robot>',
+        '<!DOCTYPE robot [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot name="&a;"/>',
+        '<!DOCTYPE robot [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot>&a;</robot>',
+    ],
+    ids=["nested entities", "a long entity many times", "a file in an attribute", "a file as text"],
+)
+def test_xml_bombs_are_refused_in_one_line(text: str) -> None:
+    with pytest.raises(InputError, match="not well-formed XML"):
+        parse_xml(text.encode(), "it")
+
+
+@pytest.mark.parametrize("ending", [".npy", ".npz"])
+def test_arrays_of_python_objects_are_refused(ending: str, tmp_path: Path) -> None:
+    file, objects = tmp_path / f"points{ending}", np.array([{"a": 1}], object)
+    if ending == ".npy":
+        np.save(file, objects, allow_pickle=True)
+    else:
+        np.savez(file, points=objects)
+    with pytest.raises(InputError, match="is damaged"):
+        read_arrays(file)
+
+
+def test_nothing_unpickles_files() -> None:
+    """Worker processes exchange pickled objects through the standard library; files never hold any."""
+    assert list(SOURCE.rglob("*.py"))
+    for file in SOURCE.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            found = {name.partition(".")[0] for name in names} & {
+                "pickle",
+                "dill",
+                "joblib",
+                "shelve",
+                "marshal",
+            }
+            assert not found, f"{file}: {found}"
+            call = isinstance(node, ast.Call) and ast.unparse(node.func)
+            assert call != "torch.load", f"{file}: {call}"
+            if call in ("np.load", "numpy.load"):
+                allowed = [key.value for key in node.keywords if key.arg == "allow_pickle"]  # type: ignore[attr-defined]
+                assert all(isinstance(one, ast.Constant) and one.value is False for one in allowed), file

@@ -1,4 +1,4 @@
-"""Processes that plan for another: a new one for one that died, and none that outlives it."""
+"""Worker processes are replaced when they die, and do not outlive their parent."""
 
 import multiprocessing
 import os
@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from robotdiffuse.core.processes import LoneWorker, end
+from robotdiffuse.core.processes import SingleWorker, terminate
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 HELD = 60
 """Longer than a worker may outlive its parent [s]."""
 
@@ -23,7 +23,7 @@ def nothing() -> None:
 
 
 class AliveWhenAsked(multiprocessing.get_context("spawn").Process):
-    """It has ended, and been waited for, as soon as it said that it runs."""
+    """Ends and is reaped as soon as it has reported that it is alive."""
 
     def is_alive(self) -> bool:
         alive = super().is_alive()
@@ -31,14 +31,14 @@ class AliveWhenAsked(multiprocessing.get_context("spawn").Process):
         return alive
 
 
-def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
-    worker = LoneWorker(nothing, ())
+def test_a_single_worker_is_replaced_when_it_dies_or_is_ended() -> None:
+    worker = SingleWorker(nothing, ())
     try:
         first = worker.call(os.getpid)
         with pytest.raises(BrokenProcessPool):
             worker.call(os.kill, first, signal.SIGKILL)
         second = worker.call(os.getpid)
-        worker.end(signal.SIGKILL)
+        worker.terminate(signal.SIGKILL)
         third = worker.call(os.getpid)
         assert len({first, second, third, os.getpid()}) == 4
         sent = worker.submit(time.sleep, HELD)
@@ -52,15 +52,15 @@ def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
 
 
 def test_a_process_that_ends_on_its_own_meanwhile_is_no_error() -> None:
-    """`LoneWorker.close` raised ProcessLookupError where the pool's thread had waited for the process."""
+    """`SingleWorker.close` raised ProcessLookupError if a thread of the pool had reaped the process."""
     process = AliveWhenAsked(target=nothing)
     process.start()
-    end([process], signal.SIGTERM, patience=float(HELD))
+    terminate([process], signal.SIGTERM, patience=float(HELD))
     assert process.exitcode == 0
 
 
-@pytest.mark.skipif(not hasattr(os, "O_ASYNC"), reason="the system cannot tell of a pipe that closes")
-def test_a_worker_in_compiled_code_does_not_outlive_a_parent_that_is_killed() -> None:
+@pytest.mark.skipif(not hasattr(os, "O_ASYNC"), reason="needs a signal on a closed pipe")
+def test_a_worker_in_compiled_code_does_not_outlive_a_killed_parent() -> None:
     paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
     with subprocess.Popen(
         [sys.executable, "-m", "helpers.deaf_worker", str(HELD)],
@@ -80,10 +80,35 @@ def test_a_worker_in_compiled_code_does_not_outlive_a_parent_that_is_killed() ->
             time.sleep(0.02)
 
 
+CHECKS = """
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.processes import on_this_machine
+try:
+    print(sorted(on_this_machine(abs, [(-1,), (-2,)], 2)))
+except InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("by", ["file", "stdin", "text"])
+def test_shared_calls_of_a_script_that_processes_cannot_import_say_what_to_do(
+    by: str, tmp_path: Path
+) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(CHECKS)
+    arguments = {"file": [str(script)], "stdin": ["-"], "text": ["-c", CHECKS]}[by]
+    command = [sys.executable, *arguments]
+    ended = subprocess.run(command, input=CHECKS, capture_output=True, text=True, timeout=60, check=True)
+    if by == "text":
+        assert ended.stdout == "[(0, 1), (1, 2)]\n"
+    else:
+        assert ended.stdout.endswith('below the line: if __name__ == "__main__":\n')
+
+
 SWALLOWING = """
 import ctypes, signal, time
-from robotdiffuse.core.processes import interrupts_at_once
-with interrupts_at_once(lambda: print("tidy", flush=True)):
+from robotdiffuse.core.processes import exit_on_interrupt
+with exit_on_interrupt(lambda: print("tidy", flush=True)):
     try:
         ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
         time.sleep(0.1)
@@ -94,8 +119,8 @@ with interrupts_at_once(lambda: print("tidy", flush=True)):
 
 
 def test_ctrl_c_is_not_lost_in_callbacks() -> None:
-    """`robot add` went on for minutes after a Ctrl-C that came while compiled code was loaded."""
-    # which jobs in the background ignore
+    """`robot add` ran on for minutes after Ctrl-C was pressed while compiled code was loaded."""
+    # background jobs of a shell ignore SIGINT
     heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     ended = subprocess.run([sys.executable, "-c", heard + SWALLOWING], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "tidy\n", "robotdiffuse: stopped\n")

@@ -1,4 +1,4 @@
-"""Result and trajectory files: what is written comes back; what is damaged is refused in one line."""
+"""Result and trajectory files: round trips, and one-line errors for damaged files."""
 
 import csv
 import json
@@ -77,7 +77,7 @@ def test_fields_are_those_that_the_design_promises(solved: PlanResult, tmp_path:
 
 
 def test_progress_and_refused_survive_save_and_load(solved: PlanResult, tmp_path: FilePath) -> None:
-    """They were lost."""
+    """Reading a file lost them."""
     for result in (solved, replace(solved, progress=(), refused="")):
         result.save(tmp_path / "r.json")
         read = load_result(tmp_path / "r.json").result
@@ -168,10 +168,10 @@ DAMAGE = [
     ({"accelerations": "none"}, "accelerations must be rows of numbers"),
     ({"waypoints": None}, "waypoints has shape none; it must be nx2"),
     ({"waypoints": [[0.0, None]]}, "waypoints holds numbers that are not finite"),
-    ({"joint_names": [1, 2]}, r"joint_names is \[1, 2\]; it must be a list of texts"),
+    ({"joint_names": [1, 2]}, r"joint_names is \[1, 2\]; it must be a list of strings"),
     ({"planning_time": "soon"}, "planning_time is 'soon'; it must be a finite number"),
     ({"progress": [[0.1]]}, r"progress has shape 1x1; it must be nx2"),
-    ({"reason": 7}, "reason is 7; it must be text"),
+    ({"reason": 7}, "reason is 7; it must be a string"),
     ({"problem": [1]}, "problem is a list; it must be an object"),
 ]
 

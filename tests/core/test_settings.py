@@ -1,8 +1,9 @@
-"""Settings: bounds in the type, JSON and back, NAME=VALUE, and what people are told of them."""
+"""Settings: bounds in the types, JSON round trips, NAME=VALUE, and descriptions."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
@@ -66,6 +67,25 @@ def test_bounds(values: dict[str, Any], message: str) -> None:
     assert str(error.value) == message
 
 
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"step": "1"}, "search.step is '1'; it takes float positive"),
+        ({"step": None}, "search.step is None; it takes float positive"),
+        ({"step": True}, "search.step is True; it takes float positive"),
+        ({"range": []}, r"search.range is \[\]; it takes float positive or none"),
+        ({"order": 1}, "search.order is 1; it takes first, best"),
+        ({"inner": 3}, "search.inner is 3; it takes Coarse"),
+        ({"levels": 0.1}, "search.levels is 0.1; it takes tuple"),
+    ],
+)
+def test_values_of_another_type_are_refused(values: dict[str, Any], message: str) -> None:
+    """They were taken, and ended later with a traceback."""
+    with pytest.raises(InputError, match=f"^{message}"):
+        Search(**values)
+    assert Search(step=np.float32(0.5), range=2).step == 0.5  # type: ignore[arg-type]
+
+
 def test_json_and_back() -> None:
     settings = Search(
         step=2.0, range=0.5, levels=(1.0,), grid="fine", grid_settings=Fine(0.3), inner=Coarse(7)
@@ -118,7 +138,7 @@ def test_assignments_that_are_wrong(text: str, message: str) -> None:
 
 
 def test_tuples_of_a_fixed_length_have_it() -> None:
-    """It was an IndexError, from weights whose description had lost a number; found by fuzzing."""
+    """It raised IndexError for weights whose description lacked a number; found by fuzzing."""
     with pytest.raises(InputError, match=r"region.center is \[0.0, 0.1\]; it must have 3 entries"):
         VisibleRegion.from_json({"center": [0.0, 0.1]}, "region")
 

@@ -212,6 +212,21 @@ def damage(store, case):
         zarr.open_group(shard, mode="a").attrs["format"] = 2
     elif case == "moved":
         zarr.open_group(shard, mode="a").attrs["index"] = 4
+    elif case == "attributes":
+        describe(shard / "seed", attributes=[])
+    elif case == "huge":
+        describe(shard / "seed", shape=[10**30])
+    elif case == "endless":
+        describe(shard / "seed", shape=[10**15])
+    elif case == "one endless chunk":
+        grid = {"name": "regular", "configuration": {"chunk_shape": [10**15]}}
+        describe(shard / "seed", shape=[10**15], chunk_grid=grid)
+
+
+def describe(array, **values):
+    """Replace values in the description of an array."""
+    file = array / "zarr.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | values))
 
 
 @pytest.mark.parametrize(
@@ -230,6 +245,10 @@ def damage(store, case):
         ("bit", r"array trajectories is damaged: its fingerprint is not the one that was written"),
         ("version", r"shard_00000\.zarr: format is 2; this version reads 1"),
         ("moved", r"shard_00000\.zarr is damaged: its attributes are not those of shard 0"),
+        ("attributes", r"array seed is damaged: its fingerprint is not the one that was written"),
+        ("huge", r"array seed is damaged: "),
+        ("endless", r"array seed is damaged: a chunk is missing"),
+        ("one endless chunk", r"array seed is damaged: "),
     ],
 )
 def test_damage_gives_one_line(store, case, message):
@@ -271,28 +290,19 @@ def test_manifest(tmp_path):
         read_manifest(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("families", "size"),
-    [
-        ({"rop": {}, "shelf": {}}, [[2.0, 2.0, 0.1], [3.0, 3.0, 0.1]]),
-        ({"rop": {"floor": True, "floor_size": 4.0, "floor_thickness": 0.2}}, [[4.0, 4.0, 0.2]]),
-        ({"rop": {"floor": False}}, [None]),
-    ],
-)
-def test_old_manifests_have_the_floors_of_their_families(tmp_path, families, size):
-    """Those that were written before floors were kept in them."""
+@pytest.mark.parametrize("value", [None, [], {}, [[]], {"a": 1}, "", 1.5, -1, 10**30])
+def test_values_of_the_wrong_type_in_a_manifest_are_damage(tmp_path, value):
+    """The name of the robot as a list, and families as a list, ended `data check` with a traceback."""
     write_manifest(tmp_path, manifest_of(ARM))
-    data = json.loads((tmp_path / "manifest.json").read_text()) | {"families": families}
-    del data["floors"]
-    (tmp_path / "manifest.json").write_text(json.dumps(data))
-    manifest = read_manifest(tmp_path)
-    floors = [manifest.floor(i) for i in range(len(families))]
-    assert [floor and floor.size.tolist() for floor in floors] == size
-    assert all(floor is None or floor.bounds[1, 2] == pytest.approx(0, abs=1e-12) for floor in floors)
-    data["families"] = {"rap": {}}
-    (tmp_path / "manifest.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=r"manifest\.json is damaged: .*'rap'"):
-        read_manifest(tmp_path)
+    file = tmp_path / "manifest.json"
+    data = json.loads(file.read_text())
+    fits = {"dof"}  # which is told from the names of the joints
+    fits |= {name for name in data if type(value) is type(data[name]) and value in (10**30, "", {"a": 1}, {})}
+    for name in data.keys() - fits:
+        file.write_text(json.dumps(data | {name: value}))
+        with pytest.raises(InputError, match=r"manifest\.json( is damaged)?: ") as caught:
+            read_manifest(tmp_path)
+        assert "\n" not in str(caught.value)
 
 
 def test_the_robot_must_be_that_of_the_data():

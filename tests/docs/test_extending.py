@@ -74,7 +74,7 @@ def test_parts_of_the_learned_stack_are_used_by_name(names: dict[str, Any]) -> N
     for result in (names["at_once"], names["faced"]):
         assert result.planner == "diffusion" and "samples of the network" in result.reason
     guidance = CollisionGuidance(CollisionChecker(names["problem"].robot, names["problem"].scene))
-    facing = replace(guidance.settings, margin=None, self_margin=None, further={"facing": 0.5})
+    facing = replace(guidance.settings, margin=None, self_margin=None, extra_costs={"facing": 0.5})
     q = np.linspace(names["problem"].start, names["problem"].start + 0.5, 48, dtype=np.float32)[None]
     moved, _ = CollisionGuidance(guidance.checker, facing)(q, 4)
     assert np.abs(moved[:, 1:-1, 0]).mean() < 0.5 * np.abs(q[:, 1:-1, 0]).mean()

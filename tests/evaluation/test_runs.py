@@ -1,4 +1,4 @@
-"""The one loop: methods take turns, what is kept is not made again; planners, networks, searches validated."""
+"""Runs: methods take turns, kept records are not made again, planners and networks are validated."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.methods import planned, sampled, searched
+from robotdiffuse.evaluation.methods import planned, sampled
 from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import Fields, Trial, tried
+from robotdiffuse.evaluation.runs import Fields, Run, run_all
 from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, summary
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.held_out import Case
@@ -31,16 +31,16 @@ CASES = [
 
 
 def quick(length: float, calls: list[tuple[str, str, int]]) -> dict:
-    def call(trial: Trial) -> Iterator[Fields]:
-        calls.append((trial.method, trial.case.name, trial.seed))
-        yield {"status": "solved", "time": 0.1, "joint_length": length + trial.rng().random()}
+    def call(run: Run) -> Iterator[Fields]:
+        calls.append((run.method, run.case.name, run.seed))
+        yield {"status": "solved", "time": 0.1, "joint_length": length + run.rng().random()}
 
     return {"x": call, "y": call}
 
 
 def test_methods_take_turns_on_each_case_with_the_same_random_numbers() -> None:
     calls: list[tuple[str, str, int]] = []
-    found = tried(CASES, quick(1.0, calls), seeds=(0, 4), bar=False)
+    found = run_all(CASES, quick(1.0, calls), seeds=(0, 4), bar=False)
     assert calls == [(m, c, s) for s in (0, 4) for c in "ab" for m in "xy"]
     assert [(r.name, r.seed, r.planner) for r in found["y"]] == [(c, s, "y") for s in (0, 4) for c in "ab"]
     assert [r.joint_length for r in found["x"]] == [r.joint_length for r in found["y"]]
@@ -50,36 +50,36 @@ def test_methods_take_turns_on_each_case_with_the_same_random_numbers() -> None:
 
 def test_what_is_kept_is_not_made_again(tmp_path: Path) -> None:
     calls: list[tuple[str, str, int]] = []
-    first = tried(CASES[:1], quick(1.0, calls), folder=tmp_path, bar=False)
-    again = tried(CASES, quick(2.0, calls), folder=tmp_path, bar=False)
+    first = run_all(CASES[:1], quick(1.0, calls), folder=tmp_path, bar=False)
+    again = run_all(CASES, quick(2.0, calls), folder=tmp_path, bar=False)
     assert calls == [("x", "a", 0), ("y", "a", 0), ("x", "b", 0), ("y", "b", 0)]
     assert again["x"][0] == first["x"][0]
-    backwards = tried(CASES[::-1], quick(3.0, calls), folder=tmp_path, bar=False)
+    backwards = run_all(CASES[::-1], quick(3.0, calls), folder=tmp_path, bar=False)
     assert len(calls) == 4 and [record.name for record in backwards["x"]] == ["b", "a"]
 
 
-def test_a_trial_that_is_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_interrupted_runs_continue(tmp_path: Path) -> None:
     calls: list[tuple[str, str, int]] = []
 
-    def stopping(trial: Trial) -> Iterator[Fields]:
-        if trial.case.name == "b":
+    def stopping(run: Run) -> Iterator[Fields]:
+        if run.case.name == "b":
             raise KeyboardInterrupt
         yield {"status": "solved", "time": 0.1}
 
     with pytest.raises(KeyboardInterrupt):
-        tried(CASES, {"x": stopping}, folder=tmp_path, bar=False)
-    tried(CASES, {"x": quick(1.0, calls)["x"]}, folder=tmp_path, bar=False)
+        run_all(CASES, {"x": stopping}, folder=tmp_path, bar=False)
+    run_all(CASES, {"x": quick(1.0, calls)["x"]}, folder=tmp_path, bar=False)
     assert calls == [("x", "b", 0)]
 
 
 def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measured() -> None:
-    def draw(trial: Trial, checker: CollisionChecker) -> np.ndarray:
+    def draw(run: Run, checker: CollisionChecker) -> np.ndarray:
         middle = (START + GOAL) / 2
         bent = [np.stack([START, middle + np.array([0, 0, bend, 0, 0, 0, 0.0]), GOAL]) for bend in (0.4, 0.2)]
         past = np.stack([START, START + 20.0, GOAL])
         return np.stack([bent[0], bent[1], past]).astype(np.float32)
 
-    free, blocked = tried(CASES, {"x": sampled(draw)}, bar=False)["x"]
+    free, blocked = run_all(CASES, {"x": sampled(draw)}, bar=False)["x"]
     assert free.solved and free.passed == pytest.approx(2 / 3)
     assert free.joint_length == pytest.approx(2 * np.hypot(LENGTH_OF_LINE / 2, 0.2), rel=1e-5)
     assert {"scene_clearance", "link_length", "turning"} <= free.measures.keys()
@@ -88,29 +88,8 @@ def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measu
     assert table.texts[0][1].startswith("33.3 ±") and table.texts[0][2].startswith("50.0 % (9.5 to 90.5)")
 
 
-def test_a_search_answers_at_each_mark_with_the_shortest_that_passes() -> None:
-    """For what it sees, and is right if it passes for what is true."""
-
-    def search(trial: Trial) -> Iterator[np.ndarray | None]:
-        yield np.stack([START, (START + GOAL) / 2 + np.array([0, 0, 0.4, 0, 0, 0, 0]), GOAL])
-        yield None
-        yield np.stack([START, GOAL + 10.0])
-        yield np.stack([START, GOAL])
-
-    seen = [Case(case.name, "free", FREE, True, None, "mine") for case in CASES]
-
-    def whole(trial: Trial) -> Problem:
-        return CASES[trial.place].problem
-
-    records = tried(seen, {"x": searched(search, (1e-9, np.inf), whole)}, bar=False)["x"]
-    of = {(record.name, record.time_limit): record for record in records}
-    assert [of[name, 1e-9].passed for name in "ab"] == [0.0, 0.0]
-    assert of["a", np.inf].solved and of["a", np.inf].joint_length == pytest.approx(LENGTH_OF_LINE)
-    assert not of["b", np.inf].solved and of["b", np.inf].passed == 1.0
-
-
 def test_a_planner_in_this_process_gives_the_bench_records() -> None:
-    free, blocked = tried(CASES, {"x": planned(RRTConnect())}, limit=5.0, bar=False)["x"]
+    free, blocked = run_all(CASES, {"x": planned(RRTConnect())}, limit=5.0, bar=False)["x"]
     assert isinstance(free, Record) and free.solved and blocked.solved
     assert blocked.joint_length is not None and blocked.joint_length > LENGTH_OF_LINE
     assert blocked.cpu is not None and blocked.restarts is None and blocked.time_limit == 5.0

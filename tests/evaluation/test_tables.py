@@ -69,7 +69,7 @@ def test_pairs_are_printed_without_rich_in_lines_that_fit() -> None:
         "        more",
         "seed    0",
     ]
-    assert max(map(len, tables.pair_lines(table, 1))) <= len("reason  ") + tables.LEAST_WIDTH
+    assert max(map(len, tables.pair_lines(table, 1))) <= len("reason  ") + tables.MIN_TEXT_WIDTH
 
 
 def test_terminal() -> None:

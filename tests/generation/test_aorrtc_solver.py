@@ -11,10 +11,8 @@ from helpers.factory_runs import in_this_process
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path
-from robotdiffuse.datasets.manifest import write_manifest
 from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
-from robotdiffuse.generation.factory import manifest_of
 from robotdiffuse.generation.shard_maker import draw, solve
 from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.robots import load_robot
@@ -94,14 +92,11 @@ def test_settings_are_those_of_the_planner() -> None:
     assert SEARCHES.defaults("aorrtc") == SETTINGS.search
 
 
-def test_data_sets_of_before_there_was_a_choice_go_on(
+def test_a_data_set_continues_with_its_own_planner_only(
     tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(factory, "on_this_machine", in_this_process)
     settings = GenerationSettings(trajectories=2, shard=1, waypoints=8)
-    manifest = manifest_of(settings)
-    manifest.settings.pop("planner")
-    write_manifest(tmp_path, manifest)
     assert generate(settings, tmp_path) == 2
     with pytest.raises(InputError, match=r'begun with planner "shared_tree_rrt_star", not "aorrtc"'):
         generate(replace(settings, planner="aorrtc", search=AORRTCSearchSettings()), tmp_path)

@@ -23,7 +23,7 @@ from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.datasets.shards import check_shard, path_of, problem_of, read_shard
 from robotdiffuse.generation import GenerationSettings, factory, generate
-from robotdiffuse.generation.shard_maker import NUMBERS, draw, make_shard
+from robotdiffuse.generation.shard_maker import PROBLEMS_PER_SHARD, draw, make_shard
 from robotdiffuse.problems.families import family, rop
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
@@ -91,7 +91,7 @@ def test_shards_are_whole_and_what_the_manifest_says(folder: Path) -> None:
         assert counts["solved"] == 4 and counts.pop("tried") == sum(counts.values())
         # numbers of problems rise, and no other shard has them
         assert (np.diff(shard["seed"].astype(np.int64)) > 0).all()
-        assert (shard["seed"] // NUMBERS == index).all()
+        assert (shard["seed"] // PROBLEMS_PER_SHARD == index).all()
 
 
 def checked_problem(row: dict[str, Any]) -> tuple[Problem, CollisionChecker]:

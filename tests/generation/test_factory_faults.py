@@ -105,7 +105,7 @@ def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(
             (worker,) = multiprocessing.active_children()
             os.kill(worker.pid or 0, signal.SIGKILL)
 
-    with pytest.raises(InputError, match=r"worker process was killed.*give the same command again$"):
+    with pytest.raises(InputError, match=r"worker process was killed.*run the same command again$"):
         generate(SETTINGS, tmp_path, progress=kill)
     assert 0 < shards(tmp_path) < SHARDS
     monkeypatch.setattr(factory, "on_this_machine", in_this_process)

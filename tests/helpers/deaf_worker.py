@@ -4,7 +4,7 @@ import ctypes
 import os
 import sys
 
-from robotdiffuse.core.processes import LoneWorker
+from robotdiffuse.core.processes import SingleWorker
 
 
 def nothing() -> None:
@@ -16,7 +16,7 @@ def hold(seconds: int) -> None:
 
 
 if __name__ == "__main__":
-    worker = LoneWorker(nothing, ())
+    worker = SingleWorker(nothing, ())
     print(worker.call(os.getpid), flush=True)
     worker.submit(hold, int(sys.argv[1]))
     print("begun", flush=True)

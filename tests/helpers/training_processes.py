@@ -14,7 +14,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from helpers.box_arm import box_arm
-from robotdiffuse.core.processes import leave
+from robotdiffuse.core.processes import exit_process
 from robotdiffuse.learning.checkpoint import write_tensors
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
@@ -92,4 +92,4 @@ if __name__ == "__main__":
     training.load_robot = lambda name: arm
     given = PlannerTraining.from_json(json.loads(Path(values).read_text()), "settings")
     {"slow": slow, "two": two}[kind](given, Path(folder))
-    leave(0)
+    exit_process(0)

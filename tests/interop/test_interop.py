@@ -1,6 +1,8 @@
-"""What is exported is read again and validated the same; what others write is read, or refused in one line."""
+"""Round trips of exported motions, and motions of other programs."""
 
 import json
+import os
+import resource
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,8 +18,8 @@ from helpers.box_arm import box_arm
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import READERS, WRITERS, read_motion, write_motion
-from robotdiffuse.interop.plain_messages import joint_trajectory, motion_of
-from robotdiffuse.interop.recorded_motion import fitted, own_problem, recorded
+from robotdiffuse.interop.plain_messages import joint_trajectory, motion_from_record
+from robotdiffuse.interop.recorded_motion import checked_motion, motion_of_robot, problem_of_motion
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify_trajectory
@@ -49,7 +51,7 @@ def test_what_is_exported_is_read_again_and_validated_the_same(
     file = tmp_path / f"motion{ending}"
     for _ in range(2):  # a file that is there is replaced
         write_motion(problem, trajectory, file)
-    found = fitted(read_motion(file), problem.robot)
+    found = motion_of_robot(read_motion(file), problem.robot)
     assert found.notes == ()
     assert isinstance(found.motion, Trajectory)
     np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
@@ -138,9 +140,9 @@ def test_a_urdf_goes_along(tmp_path: Path) -> None:
 def test_joint_states_are_a_motion_too(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
     problem, trajectory = planned
     write_motion(problem, trajectory, tmp_path / "m.mcap")
-    found = fitted(read_motion(tmp_path / "m.mcap", "/joint_states"), problem.robot)
+    found = motion_of_robot(read_motion(tmp_path / "m.mcap", "/joint_states"), problem.robot)
     assert isinstance(found.motion, Trajectory)
-    assert "panda_finger_joint1, panda_finger_joint2 stand still where the robot holds them" in found.notes
+    assert "panda_finger_joint1, panda_finger_joint2 stay at their locked values" in found.notes
     np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
     assert verify_trajectory(problem, found.motion).valid
     with pytest.raises(InputError, match=r"topic '/tf' holds no motion; topics: .*/joint_trajectory"):
@@ -160,6 +162,32 @@ def test_rerun_recordings_hold_the_joints(planned: tuple[Problem, Trajectory], t
         np.testing.assert_array_equal(values, trajectory.positions[:, j])
 
 
+def test_a_bag_is_not_read_from_a_pipe(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+    bag = tmp_path / "m.rosbag2"
+    write_motion(*planned, bag)
+    (database,) = bag.glob("*.db3")
+    database.unlink()
+    os.mkfifo(database)
+    with pytest.raises(InputError, match=r"\.db3 cannot be read: it is a device or a pipe"):
+        read_motion(bag)
+
+
+@pytest.mark.parametrize("ending", sorted([*WRITERS, *OWN]))
+def test_a_disk_that_fills_up_is_one_line(
+    planned: tuple[Problem, Trajectory], tmp_path: Path, ending: str
+) -> None:
+    """ROS 2 bags and Rerun's recordings ended with tracebacks of SQLite and of Rerun."""
+    problem, trajectory = planned
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))  # bytes of a file
+    try:
+        with pytest.raises(InputError, match=r"m\.\w+ cannot be written: ") as caught:
+            write_motion(problem, trajectory, tmp_path / f"m{ending}")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
+
+
 def panda_record(**changes: Any) -> dict[str, Any]:
     names = [f"panda_joint{i}" for i in range(1, 8)]
     points = [
@@ -174,10 +202,10 @@ def test_joints_are_put_into_order_by_name() -> None:
     record["joint_names"].reverse()
     for point in record["points"]:
         point["positions"] = point["positions"][::-1]
-    found = fitted(motion_of(record, "it"), rd.load_robot("panda"))
+    found = motion_of_robot(motion_from_record(record, "it"), rd.load_robot("panda"))
     assert found.motion.positions[0].tolist() == START
-    assert "joints were put into the robot's order by their names" in found.notes
-    assert "no accelerations are given: those of the velocities are validated" in found.notes
+    assert "joints were reordered by name" in found.notes
+    assert "no accelerations are given: the rates of change of velocity are validated" in found.notes
 
 
 def test_all_forms_of_messages_hold_the_same_motion() -> None:
@@ -195,91 +223,98 @@ def test_all_forms_of_messages_hold_the_same_motion() -> None:
         {"trajectory": {"joint_trajectory": record}},
     )
     for form in forms:
-        found = motion_of(form, "it")
+        found = motion_from_record(form, "it")
         assert found.times is not None
         assert found.times.tolist() == [0, 1]
         assert found.positions[1].tolist() == START
 
 
 def test_times_that_begin_later_and_no_times() -> None:
-    found = recorded(["a"], [[0.0], [1.0]], [0.5, 1.0])
+    found = checked_motion(["a"], [[0.0], [1.0]], [0.5, 1.0])
     assert found.times is not None and found.times.tolist() == [0.0, 0.5]
-    assert found.notes == ("times begin at 0.5 s, counted from there",)
-    assert recorded(["a"], [[0.0], [1.0]], [0, 0]).times is None
-    assert recorded(["a"], [[0.0], [1.0]]).times is None
+    assert found.notes == ("times begin at 0.5 s; they were shifted to 0",)
+    assert checked_motion(["a"], [[0.0], [1.0]], [0, 0]).times is None
+    assert checked_motion(["a"], [[0.0], [1.0]]).times is None
 
 
 def test_positions_and_times_alone_are_validated_on_the_smoothest_curve() -> None:
     robot, t = box_arm(), np.linspace(0, 2, 41)
     s = 10 * (t / 2) ** 3 - 15 * (t / 2) ** 4 + 6 * (t / 2) ** 5
     q = np.outer(s, [0.5, -0.4, 0.3])
-    found = fitted(recorded(robot.joint_names, q, t), robot)
+    found = motion_of_robot(checked_motion(robot.joint_names, q, t), robot)
     assert isinstance(found.motion, Trajectory)
     report = verify_trajectory(Problem(robot, Scene(), q[0], q[-1]), found.motion)
     assert report.valid, report.violation
-    hasty = fitted(recorded(robot.joint_names, q, t / 10), robot).motion
+    hasty = motion_of_robot(checked_motion(robot.joint_names, q, t / 10), robot).motion
     assert isinstance(hasty, Trajectory)
     refused = verify_trajectory(Problem(robot, Scene(), q[0], q[-1]), hasty).violation
     assert refused is not None and refused.kind in ("velocity", "acceleration", "jump")
 
 
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
-    "no joints": (lambda: recorded([], [[]]), "joint_names is \\[\\]; it must be a list of names"),
-    "twice": (lambda: recorded(["a", "a"], [[0, 0]]), "joint_names has a more than once"),
-    "no rows": (lambda: recorded(["a"], []), "positions is empty: a motion has at least one row"),
-    "ragged": (lambda: recorded(["a"], [[0], [0, 1]]), "positions is not rows of numbers"),
-    "nan": (lambda: recorded(["a"], [[0], [float("nan")]]), r"positions\[1\] is \[nan\]; its numbers"),
-    "huge": (lambda: recorded(["a"], [[1e30]]), "must be finite and within ±10000"),
-    "short rates": (lambda: recorded(["a"], [[0], [1]], [0, 1], [[0]]), "velocities has 1 rows"),
-    "nan time": (lambda: recorded(["a"], [[0], [1]], [0, float("nan")]), r"times\[1\] is nan"),
-    "backwards": (lambda: recorded(["a"], [[0], [1]], [1, 1]), "times do not increase: 1 s in row 0, 1 s"),
-    "few times": (lambda: recorded(["a"], [[0], [1]], [0]), "it must be 2 numbers, one for each row"),
+    "no joints": (lambda: checked_motion([], [[]]), "joint_names is \\[\\]; it must be a list of names"),
+    "twice": (lambda: checked_motion(["a", "a"], [[0, 0]]), "joint_names has a more than once"),
+    "no rows": (lambda: checked_motion(["a"], []), "positions is empty: a motion has at least one row"),
+    "ragged": (lambda: checked_motion(["a"], [[0], [0, 1]]), "positions is not rows of numbers"),
+    "nan": (lambda: checked_motion(["a"], [[0], [float("nan")]]), r"positions\[1\] is \[nan\]; its numbers"),
+    "huge": (lambda: checked_motion(["a"], [[1e30]]), "must be finite and within ±10000"),
+    "short rates": (lambda: checked_motion(["a"], [[0], [1]], [0, 1], [[0]]), "velocities has 1 rows"),
+    "nan time": (lambda: checked_motion(["a"], [[0], [1]], [0, float("nan")]), r"times\[1\] is nan"),
+    "backwards": (
+        lambda: checked_motion(["a"], [[0], [1]], [1, 1]),
+        "times do not increase: 1 s in row 0, 1 s",
+    ),
+    "few times": (lambda: checked_motion(["a"], [[0], [1]], [0]), "it must be 2 numbers, one for each row"),
     "another robot": (
-        lambda: fitted(recorded(["shoulder", "elbow"], [[0, 0]]), rd.load_robot("panda")),
-        "the motion lacks panda_joint1, .* and has shoulder, elbow, which panda has not",
+        lambda: motion_of_robot(checked_motion(["shoulder", "elbow"], [[0, 0]]), rd.load_robot("panda")),
+        "the motion lacks panda_joint1, .* and has shoulder, elbow, which panda lacks",
     ),
     "a joint is missing": (
-        lambda: fitted(
-            motion_of(panda_record(joint_names=[f"panda_joint{i}" for i in range(2, 9)]), "it"),
+        lambda: motion_of_robot(
+            motion_from_record(panda_record(joint_names=[f"panda_joint{i}" for i in range(2, 9)]), "it"),
             rd.load_robot("panda"),
         ),
         "the motion lacks panda_joint1",
     ),
     "a finger elsewhere": (
-        lambda: fitted(
-            recorded([f"panda_joint{i}" for i in range(1, 8)] + ["panda_finger_joint1"], [[*START, 0.01]]),
+        lambda: motion_of_robot(
+            checked_motion(
+                [f"panda_joint{i}" for i in range(1, 8)] + ["panda_finger_joint1"], [[*START, 0.01]]
+            ),
             rd.load_robot("panda"),
         ),
-        "has panda_finger_joint1 at 0.01, the problem holds it at 0.04: write `locked: {panda_finger_joint1",
+        "has panda_finger_joint1 at 0.01, the problem locks it at 0.04: write `locked: {panda_finger_joint1",
     ),
     "a finger moves": (
-        lambda: fitted(
-            recorded(
+        lambda: motion_of_robot(
+            checked_motion(
                 [f"panda_joint{i}" for i in range(1, 8)] + ["panda_finger_joint1"],
                 [[*START, 0.04], [*START, 0.0]],
             ),
             rd.load_robot("panda"),
         ),
-        "moves panda_finger_joint1 from 0 to 0.04, which the problem holds at 0.04",
+        "moves panda_finger_joint1 from 0 to 0.04, which the problem locks at 0.04",
     ),
-    "no points": (lambda: motion_of(panda_record(points=[]), "it"), "it: points is empty"),
-    "points of text": (lambda: motion_of(panda_record(points=["x"]), "it"), r"points\[0\] is 'x'"),
+    "no points": (lambda: motion_from_record(panda_record(points=[]), "it"), "it: points is empty"),
+    "points of text": (lambda: motion_from_record(panda_record(points=["x"]), "it"), r"points\[0\] is 'x'"),
     "no time": (
-        lambda: motion_of(panda_record(points=[{"positions": START, "time_from_start": "soon"}]), "it"),
+        lambda: motion_from_record(
+            panda_record(points=[{"positions": START, "time_from_start": "soon"}]), "it"
+        ),
         "time_from_start is 'soon'; it must be a duration",
     ),
     "a base that drives": (
-        lambda: motion_of(
+        lambda: motion_from_record(
             {"joint_trajectory": panda_record(), "multi_dof_joint_trajectory": {"points": [{}]}}, "it"
         ),
         "multi_dof_joint_trajectory has points; only arms on a fixed base can be validated",
     ),
-    "two parts": (lambda: motion_of({"trajectory": [{}, {}]}, "it"), "trajectory holds 2 parts"),
+    "two parts": (lambda: motion_from_record({"trajectory": [{}, {}]}, "it"), "trajectory holds 2 parts"),
     "no plan": (
-        lambda: motion_of({"status": "timeout"}, "it"),
+        lambda: motion_from_record({"status": "timeout"}, "it"),
         "it holds no motion: its status is 'timeout'",
     ),
-    "nothing": (lambda: motion_of({}, "it"), "it holds no motion: it must hold a result"),
+    "nothing": (lambda: motion_from_record({}, "it"), "it holds no motion: it must hold a RobotDiffuse result"),
 }
 
 
@@ -308,9 +343,9 @@ def test_truncated_files_are_one_line(planned: tuple[Problem, Trajectory], tmp_p
             read_motion(tmp_path / "m.rosbag2")
         assert "\n" not in str(error.value)
     (tmp_path / "m.rosbag2" / "metadata.yaml").unlink()
-    with pytest.raises(InputError, match=r"is no ROS 2 bag: it has no metadata\.yaml"):
+    with pytest.raises(InputError, match=r"is not a ROS 2 bag: it has no metadata\.yaml"):
         read_motion(tmp_path / "m.rosbag2")
-    with pytest.raises(InputError, match="is a part of a ROS 2 bag; give the folder"):
+    with pytest.raises(InputError, match="is part of a ROS 2 bag; give the folder"):
         read_motion(database)
 
 
@@ -346,10 +381,10 @@ def test_yaml_as_ros2_topic_echo_prints_it(tmp_path: Path) -> None:
 
 def test_a_motion_alone_says_what_it_solves() -> None:
     names = [f"panda_joint{i}" for i in range(1, 8)] + ["panda_finger_joint1", "panda_finger_joint2"]
-    motion = recorded(names, [[*START, 0.01, 0.02], [*GOAL, 0.01, 0.02]])
-    problem = own_problem(motion, rd.load_robot("panda"), Scene())
+    motion = checked_motion(names, [[*START, 0.01, 0.02], [*GOAL, 0.01, 0.02]])
+    problem = problem_of_motion(motion, rd.load_robot("panda"), Scene())
     assert problem.robot.locked == {"panda_finger_joint1": 0.01, "panda_finger_joint2": 0.02}
-    assert fitted(motion, problem.robot).motion.positions[-1].tolist() == GOAL
+    assert motion_of_robot(motion, problem.robot).motion.positions[-1].tolist() == GOAL
 
 
 def test_unknown_endings_list_the_known_ones(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
@@ -374,7 +409,7 @@ def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: 
     import subprocess
     import sys
 
-    modules = {"rosbags": "bag", "mcap": "mcap_file", "rerun": "rerun_file", "roslibpy": "rosbridge"}
+    modules = {"rosbags": "rosbag", "mcap": "mcap_file", "rerun": "rerun_file", "roslibpy": "rosbridge"}
     code = (
         f"import sys; sys.modules[{module!r}] = None\n"
         f"try: import robotdiffuse.interop.{modules[module]}\nexcept ValueError as error: print(error)"
@@ -387,7 +422,7 @@ def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: 
 
 @contextmanager
 def rosbridge() -> Iterator[tuple[int, list[dict[str, Any]]]]:
-    """A small server that speaks as much of rosbridge's protocol as publishers need."""
+    """A small server for the part of the rosbridge protocol that publishers use."""
     from websockets.sync.server import ServerConnection, serve
 
     heard: list[dict[str, Any]] = []
@@ -416,7 +451,7 @@ def test_motions_are_published_to_a_rosbridge(planned: tuple[Problem, Trajectory
     assert (advertised["op"], advertised["type"]) == ("advertise", "trajectory_msgs/msg/JointTrajectory")
     assert (published["op"], published["topic"]) == ("publish", "/arm/joint_trajectory")
     assert published["msg"] == joint_trajectory(trajectory.joint_names, trajectory)
-    found = fitted(motion_of(published["msg"], "it"), rd.load_robot("panda")).motion
+    found = motion_of_robot(motion_from_record(published["msg"], "it"), rd.load_robot("panda")).motion
     np.testing.assert_array_equal(found.positions, trajectory.positions)
 
 

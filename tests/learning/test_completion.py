@@ -1,4 +1,4 @@
-"""The completing network: what it is told and says, its training, and its weights."""
+"""The occupancy completion network: its inputs and outputs, its training, and its weights."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from robotdiffuse.learning.completion.network import (
     CompletionNetwork,
     CompletionSettings,
     folded,
+    reachable,
     unfolded,
     voxel_centers,
 )
@@ -35,7 +36,7 @@ from robotdiffuse.learning.training.completion import (
     fitted_temperature,
     train_completion,
 )
-from robotdiffuse.learning.training.prefetch import SamplesAhead
+from robotdiffuse.learning.training.prefetch import SamplePrefetcher
 from robotdiffuse.perception.observed_volume import SHAPE, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.problems.families import FAMILIES, load_family
@@ -51,13 +52,13 @@ TINY = CompletionTraining(samples=8, batch=2, workers=0, network=SMALL, families
 
 @pytest.fixture(autouse=True)
 def few_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("VALIDATION", "CALIBRATION", "CHECKED", "FITTED"):
+    for name in ("VALIDATION_SAMPLES", "CALIBRATION_SAMPLES", "TEST_SAMPLES"):
         monkeypatch.setattr(training, name, 1)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_samples_tell_the_truth(family: str) -> None:
-    """Next to nothing of what is seen free is occupied, and most of what is seen occupied is."""
+def test_samples_agree_with_the_scene(family: str) -> None:
+    """Almost none of the voxels seen free are occupied, and most of those seen occupied are."""
     samples = draw_samples((family,), PANDA, range(4))
     truth = unpack_fine(samples.truth)
     free, occupied = (samples.seen & FREE) > 0, (samples.seen & OCCUPIED) > 0
@@ -83,15 +84,15 @@ def test_folding_and_unfolding_are_inverse() -> None:
     assert folded(x)[1, 2, 3, 1].tolist() == x[1, 4:6, 6:8, 2:4].ravel().tolist()
 
 
-def test_what_the_network_is_told() -> None:
+def test_the_network_s_inputs() -> None:
     scene = Scene([Box((0.5, 0.0, 0.3), (0.1, 0.6, 0.6))])
     T = looking_at(np.array([-1.0, 0.3, 1.0]), np.array([0.5, 0.0, 0.3]))
     view = ray_cast(scene, T, (130.0, 130.0, 79.5, 59.5), (160, 120), PANDA, HOME)
     volume = observe([view], PANDA, HOME)
     seen, behind = (torch.from_numpy(array)[None] for array in pack(volume))
     network = CompletionNetwork(SMALL)
-    told = network.features(seen, behind)[0].reshape(7, 8, 28, 28, 16).permute(0, 2, 3, 4, 1)
-    planes = [unfolded(plane[None])[0, ..., 0].numpy() for plane in told]
+    inputs = network.features(seen, behind)[0].reshape(7, 8, 28, 28, 16).permute(0, 2, 3, 4, 1)
+    planes = [unfolded(plane[None])[0, ..., 0].numpy() for plane in inputs]
     for plane, of in zip(
         planes, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=False
     ):
@@ -101,10 +102,10 @@ def test_what_the_network_is_told() -> None:
     np.testing.assert_allclose(planes[6], np.hypot(*np.moveaxis(voxel_centers()[..., :2], -1, 0)), atol=1e-6)
 
 
-def test_what_is_predicted_is_where_it_was_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small network learns one sample by heart: the voxels of its answer are those of the truth."""
+def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small network that has memorised one sample predicts the true voxels."""
     settings = replace(TINY, learning_rate=1e-2)
-    trainee = training._CompletionTrainee(settings, training.Processes("cpu"))
+    task = training.CompletionTask(settings, training.Processes("cpu"))
     rng = np.random.default_rng(1)
     scene = load_family("table").scene(rng)
     T = looking_at(np.array([-1.2, 0.4, 1.0]), np.array([0.3, 0.0, 0.2]))
@@ -113,26 +114,26 @@ def test_what_is_predicted_is_where_it_was_learnt(monkeypatch: pytest.MonkeyPatc
     fine = true_voxels(scene)
     seen, behind = pack(volume)
     sample = Samples(seen[None], behind[None], pack_fine(fine)[None])
-    monkeypatch.setattr(trainee.ahead, "next", lambda rng: sample)
-    optimizer = torch.optim.Adam(trainee.module.parameters(), lr=5e-3)
+    monkeypatch.setattr(task.prefetcher, "next", lambda rng: sample)
+    optimizer = torch.optim.Adam(task.module.parameters(), lr=5e-3)
     losses = []
     for _ in range(60):
         optimizer.zero_grad()
-        loss = trainee.loss(0.0, rng)
+        loss = task.loss(0.0, rng)
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < 0.3 * losses[0]
-    p = predict(volume, trainee.module)
+    p = predict(volume, task.module)
     assert p.shape == tuple(2 * n for n in SHAPE) and p.dtype == np.float32
     free = volume.free.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     assert (p[free] == 0).all()
-    reach = trainee._reachable.repeat(2, 0).repeat(2, 1).repeat(2, 2)
-    asked = ~free & reach
-    assert average_precision(p[asked], fine[asked]) > 2 * fine[asked].mean()
+    reach = reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    counted = ~free & reach
+    assert average_precision(p[counted], fine[counted]) > 2 * fine[counted].mean()
 
 
-def test_training_is_resumed_exactly_with_samples_drawn_ahead_or_not(tmp_path: Path) -> None:
+def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path) -> None:
     report = train_completion(TINY, str(tmp_path / "whole"))
     train_completion(replace(TINY, samples=4), str(tmp_path / "parts"))
     again = train_completion(TINY, str(tmp_path / "parts"))
@@ -140,7 +141,7 @@ def test_training_is_resumed_exactly_with_samples_drawn_ahead_or_not(tmp_path: P
     whole = load_completion(tmp_path / "whole")
     assert whole.temperature > 0 and not any(p.requires_grad for p in whole.parameters())
     rng, other = np.random.default_rng(2), np.random.default_rng(2)
-    ahead, alone = (SamplesAhead(("rop",), PANDA, 2, workers) for workers in (1, 0))
+    ahead, alone = (SamplePrefetcher(("rop",), PANDA, 2, workers) for workers in (1, 0))
     for _ in range(3):
         a, b = ahead.next(rng), alone.next(other)
         assert all((x == y).all() for x, y in zip(a, b, strict=True))
@@ -182,8 +183,8 @@ def test_temperature_and_calibration() -> None:
     )
 
 
-def test_nothing_is_predicted_where_nothing_was_learned() -> None:
-    """Walls of the network's fancy stood a metre around the arm."""
+def test_nothing_is_predicted_beyond_reach() -> None:
+    """Training covers no voxels there, so the network would predict walls a metre around the arm."""
     unknown = np.zeros((1, *SHAPE), np.uint8)
     p = load_completion().probabilities(*(torch.from_numpy(unknown) for _ in range(2))).detach().numpy()
     reachable = training.reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
@@ -191,15 +192,16 @@ def test_nothing_is_predicted_where_nothing_was_learned() -> None:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_bundled_weights_know_more_than_how_much_is_occupied(family: str) -> None:
-    """Average precision over unknown voxels of 2 cm above ground: of a guess, the share that is occupied."""
+def test_bundled_weights_are_better_than_a_constant(family: str) -> None:
+    """Average precision over unknown voxels of 2 cm above the ground; a constant has the share of occupied
+    ones."""
     samples = draw_samples((family,), PANDA, [11, 12, 13, 14])
     network, above = load_completion(), training.voxel_centers()[..., 2] > 0.02
     with torch.no_grad():
         p = network.probabilities(*(torch.from_numpy(a) for a in (samples.seen, samples.behind))).numpy()
     truth = unpack_fine(samples.truth)
-    asked = ((samples.seen & (FREE | OCCUPIED)) == 0) & training.reachable() & above
+    counted = ((samples.seen & (FREE | OCCUPIED)) == 0) & training.reachable() & above
     stated = np.stack([unpack_fine(pack_fine(one > 0.1)) for one in p])
-    called, true = stated[asked], truth[asked]
+    called, true = stated[counted], truth[counted]
     assert called[true].mean() > 0.4, "recall"
     assert true[called].mean() > 3 * true.mean(), "precision"

@@ -1,4 +1,4 @@
-"""Every denoiser of the table: what it sees, what it learns, its files; classifier-free guidance."""
+"""Every denoiser of the table: its inputs, what it learns, its files; classifier-free guidance."""
 
 import json
 from dataclasses import replace
@@ -15,11 +15,12 @@ from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import Denoiser
 from robotdiffuse.learning.denoisers.decoder_only import DecoderOnlySettings
 from robotdiffuse.learning.denoisers.encoder_decoder import EncoderDecoderSettings
-from robotdiffuse.learning.denoisers.layers import DENSE_TOKENS, Linear, attend
+from robotdiffuse.learning.denoisers.layers import MAX_UNFUSED_TOKENS, Linear, attend
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 
 DOF, FEATURES, CODE = 3, 9, 8
@@ -90,7 +91,7 @@ def test_output_depends_on_level_and_on_every_number_of_the_condition(name):
         assert (slopes.abs() > 1e-9).all()
 
 
-def seen_by(name: str, waypoints: int = 12) -> np.ndarray:
+def dependencies(name: str, waypoints: int = 12) -> np.ndarray:
     """[waypoints, waypoints]: whether the output of one waypoint (row) depends on the input of another
     (column)."""
     network = denoiser(name, waypoints)
@@ -102,9 +103,9 @@ def seen_by(name: str, waypoints: int = 12) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", DENOISERS)
-def test_frames_see_each_other(name):
+def test_waypoints_attend_to_each_other(name):
     wanted = np.ones((12, 12), bool)
-    np.testing.assert_array_equal(seen_by(name), np.tril(wanted) if name == "decoder_only" else wanted)
+    np.testing.assert_array_equal(dependencies(name), np.tril(wanted) if name == "decoder_only" else wanted)
 
 
 def test_samples_of_a_batch_do_not_mix():
@@ -170,23 +171,25 @@ def test_z_tk_as_a_token_only():
     added.load_state_dict(network.state_dict())
     assert not torch.allclose(network(*inputs()), added(*inputs()))
     for parameter, values in network.named_parameters():
-        if parameter.endswith("merge.weight"):  # attention is the only way from the token to the waypoints
+        if parameter.endswith("merge.weight"):  # only attention connects the token to the waypoints
             torch.nn.init.zeros_(values)
     features, level, condition = inputs()
     torch.testing.assert_close(network(features, level, condition), network(features, level, 2 * condition))
 
 
 @pytest.mark.parametrize("causal", [False, True])
-def test_fused_and_written_out_attention_agree(monkeypatch, causal):
-    q, k, v = torch.randn(3, 2, 4, DENSE_TOKENS, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
-    written_out = attend(q, k, v, causal)
-    monkeypatch.setattr("robotdiffuse.learning.denoisers.layers.DENSE_TOKENS", 0)
-    torch.testing.assert_close(attend(q, k, v, causal), written_out, atol=1e-6, rtol=1e-5)
+def test_fused_and_unfused_attention_agree(monkeypatch, causal):
+    q, k, v = torch.randn(3, 2, 4, MAX_UNFUSED_TOKENS, 8, generator=torch.Generator().manual_seed(0)).unbind(
+        0
+    )
+    unfused = attend(q, k, v, causal)
+    monkeypatch.setattr("robotdiffuse.learning.denoisers.layers.MAX_UNFUSED_TOKENS", 0)
+    torch.testing.assert_close(attend(q, k, v, causal), unfused, atol=1e-6, rtol=1e-5)
 
 
 def test_unet_pads_and_crops():
-    """Of a length that can be halved, nothing is added; of another, what is added is the last waypoint
-    again."""
+    """Nothing is added to a length that can be halved often enough; others are extended by the last
+    waypoint."""
     for waypoints, padding in ((12, 0), (13, 3), (254, 2), (1, 3)):
         network = denoiser("unet", waypoints)
         assert network.padding == padding
@@ -217,7 +220,7 @@ def test_bad_settings(kind, values, message):
 
 
 @pytest.mark.parametrize("name", ["transformer", "encoder_decoder", "decoder_only"])
-def test_frames_must_fill_the_patches(name):
+def test_waypoints_must_fill_the_patches(name):
     with pytest.raises(InputError, match=f"{name}.patch is 5; it must divide the 12 waypoints"):
         denoiser(name, 12, replace(SMALL[name], patch=5))
 
@@ -246,7 +249,8 @@ def sample(model: MotionModel, scale: float = 1.0) -> np.ndarray:
         return np.full((*q.shape[:-1], len(model.robot.links)), 0.1, np.float32)
 
     rng = np.random.default_rng(0)
-    return model.sample(code, start, goal, 3, rng, clearances, steps=3, guidance_scale=scale)
+    settings = SamplingSettings(samples=3, sampling_steps=3, guidance_scale=scale)
+    return model.sample(start, goal, code, clearances, rng, settings)
 
 
 @pytest.mark.parametrize("null_condition", [False, True])
@@ -262,18 +266,6 @@ def test_files(tmp_path, name, null_condition):
     assert type(loaded.denoiser) is DENOISERS.load(name)
     scale = 2.0 if null_condition else 1.0
     np.testing.assert_array_equal(sample(loaded, scale), sample(model.for_inference(), scale))
-
-
-def test_files_from_before_there_was_a_choice(tmp_path):
-    model = model_with("transformer")
-    save_network("model", model, tmp_path, {})
-    file = tmp_path / "model.json"
-    about = json.loads(file.read_text())
-    del about["settings"]["null_condition"], about["settings"]["denoiser"]
-    del about["settings"]["denoiser_settings"]["add_z_tk"]
-    file.write_text(json.dumps(about))
-    assert load_model(tmp_path).settings == model.settings
-    assert load_model("panda").settings.denoiser == "transformer"
 
 
 @pytest.mark.parametrize("name", DENOISERS)
@@ -318,7 +310,7 @@ def test_share_of_dropped_conditions_is_checked(share):
 
 
 @pytest.mark.parametrize("name", DENOISERS)
-def test_dropped_conditions_are_not_seen(name):
+def test_dropped_conditions_have_no_effect(name):
     model = model_with(name, null_condition=True)
     dropped = torch.tensor([True, False, True])
     features, level, condition = inputs(batch=3)

@@ -1,4 +1,4 @@
-"""Encoders of the scene: what all promise, what each learns, and training along with the planner."""
+"""Encoders of the scene: what all guarantee, what each learns, and joint training with the planner."""
 
 from dataclasses import replace
 from functools import partial
@@ -16,11 +16,9 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.manifest import write_manifest
 from robotdiffuse.datasets.shards import write_shard
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
-from robotdiffuse.learning.completion.network import CompletionSettings
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Autoencoder
-from robotdiffuse.learning.encoders.completing_autoencoder import CompletingAutoencoderSettings
 from robotdiffuse.learning.encoders.compression_autoencoder import (
     CompressionAutoencoder,
     CompressionAutoencoderSettings,
@@ -37,8 +35,6 @@ from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraini
 from robotdiffuse.learning.training.encoder import linear_readout, train_encoder
 from robotdiffuse.learning.training.loop import TrainingRun
 from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.scenes.scene_arrays import SPHERE
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 
@@ -50,14 +46,10 @@ SMALL = {
         code=8, cloud=32, first=(8, 12), second=(12, 24), transform=(8, 8), transform_head=(8,), head=(16,)
     ),
     "dgcnn": DGCNNSettings(code=8, cloud=32, neighbours=4, edges=(8, 12), embedding=16, head=(16,)),
-    "completing_autoencoder": CompletingAutoencoderSettings(
-        code=8, cloud=400, kept=4, network=CompletionSettings(channels=(8, 8, 8), blocks=(1, 1, 1))
-    ),
 }
 ALONE = [name for name, entry in ENCODERS.items() if entry.kind == "alone"]
 JOINTLY = [name for name, entry in ENCODERS.items() if entry.kind == "jointly"]
 every_encoder = pytest.mark.parametrize("name", ENCODERS)
-every_trained_along = pytest.mark.parametrize("name", [*ALONE, *JOINTLY])
 
 
 def small(name, seed=0):
@@ -116,7 +108,7 @@ def test_order_does_not_matter(name, n, seed):
 @pytest.mark.parametrize("name", [name for name in ENCODERS if name != "dgcnn"])
 @pytest.mark.parametrize("n", [1, 2, 20])
 def test_repetition_does_not_matter(name, n):
-    """Not so for DGCNN: repeated points are each other's nearest neighbours."""
+    """DGCNN is left out: repeated points are each other's nearest neighbours."""
     encoder, points = small(name), cloud(n)
     torch.testing.assert_close(encoder(points.repeat(1, 3, 1)), encoder(points), atol=1e-5, rtol=1e-5)
 
@@ -130,7 +122,7 @@ def test_points_out_of_the_region_do_not_count(name):
     assert not torch.allclose(encoder(points), encoder(out))
 
 
-@every_trained_along
+@every_encoder
 def test_gradients_reach_every_parameter(name):
     """Some clouds are empty, and one has fewer points than neighbours: no gradient may be NaN there."""
     encoder = small(name)
@@ -190,8 +182,6 @@ def test_sizes_of_the_papers(name):
         (PointNetSettings, {"second": (8, 0)}, "encoder.second is"),
         (DGCNNSettings, {"neighbours": 0}, "encoder.neighbours is 0"),
         (CompressionAutoencoderSettings, {"code": 0}, "encoder.code is 0"),
-        (CompletingAutoencoderSettings, {"kept": 129}, "kept is 129; the bottleneck has 128 features"),
-        (CompletingAutoencoderSettings, {"kept": 1, "code": 197}, "code is 197; it must be at most 196"),
     ],
 )
 def test_bad_settings(kind, changes, message):
@@ -211,7 +201,7 @@ def test_compression_autoencoder_has_the_papers_layers():
 
 
 def test_arranged_clouds():
-    """Sorted as the ordered clouds of `surface_clouds` are already, and thinned or repeated evenly."""
+    """Points are sorted like the ordered clouds of `surface_clouds`, and thinned or repeated evenly."""
     encoder = CompressionAutoencoder(SMALL_CAE)
     scenes = random_scenes(20, 12, np.random.default_rng(0))
     clouds = partial(surface_clouds, scenes, region=encoder.settings.region)
@@ -246,7 +236,7 @@ def test_compression_autoencoder_reconstructs_a_small_set():
 
 
 def test_edge_convolution_is_the_maximum_over_edges():
-    """The layer as it is written in the paper, edge by edge."""
+    """Against the layer as in the paper, edge by edge."""
     torch.manual_seed(0)
     layer, x = EdgeConvolution(5, 7, 4), torch.randn(2, 12, 5)
     near = torch.ones(2, 12, dtype=torch.bool)
@@ -271,7 +261,7 @@ def test_neighbours_count():
 
 @pytest.mark.parametrize("name", ALONE)
 def test_training_alone(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(encoder_training, "READ", 256)
+    monkeypatch.setattr(encoder_training, "READOUT_SCENES", 256)
     training_settings = EncoderTraining(
         name=name, minutes=None, samples=1600, batch=16, points=64, warmup_steps=10, encoder=SMALL[name]
     )
@@ -302,18 +292,18 @@ def test_not_alone(name):
 
 
 def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(encoder_training, "READ", 32)
+    monkeypatch.setattr(encoder_training, "READOUT_SCENES", 32)
     out = str(tmp_path / "out")
     command = ["train", "encoder", "--samples", "4", "--batch", "2", "--out", out, "--encoder"]
     assert main([*command, "compression_autoencoder"]) == 0
     assert "reconstruction: " in capsys.readouterr().out
     assert load_encoder(out).settings == CompressionAutoencoderSettings()
     assert main([*command, "pointnett"]) == 2
-    assert "known: completing_autoencoder, compression_autoencoder, dgcnn" in capsys.readouterr().err
+    assert "known: compression_autoencoder, dgcnn" in capsys.readouterr().err
 
 
-def test_readout_of_codes_that_tell_nothing(monkeypatch):
-    monkeypatch.setattr(encoder_training, "READ", 256)
+def test_readout_of_constant_codes(monkeypatch):
+    monkeypatch.setattr(encoder_training, "READOUT_SCENES", 256)
     encoder = small("pointnet")
     report = linear_readout(encoder, 4, np.random.default_rng(0))
     assert report["readout"] < report["readout_of_constant"]
@@ -343,9 +333,9 @@ def planner(data, encoder, **changes) -> PlannerTraining:
     return replace(planned, **changes)
 
 
-@every_trained_along
+@every_encoder
 def test_joint_training_changes_the_encoder(name, data, tmp_path):
-    """And the planner's file holds it."""
+    """The planner's file holds the trained encoder."""
     planned = planner(data, name, encoder_settings=SMALL[name], learning_rate=1e-2)
     fresh = small(name)
     train_planner(planned, str(tmp_path / "out"))
@@ -388,48 +378,6 @@ def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
     assert fingerprint(load_encoder(tmp_path / "encoder")) == before
 
 
-@every_encoder
-def test_training_on_what_one_camera_sees(name, data, tmp_path):
-    """Frozen encoders by codes of views, kept apart from those of whole scenes; the others by clouds."""
-    arm, encoder = box_arm(), small(name)
-    frozen = name not in JOINTLY
-    read = partial(load_data, str(data), arm, encoder if frozen else None, 12, lambda text: None)
-    along = None if frozen else encoder
-    seen, again, whole = read(views=True, along=along), read(views=True, along=along), read()
-    if frozen:
-        assert seen.codes is not None and again.codes is not None and whole.codes is not None
-        assert np.array_equal(seen.codes, again.codes) and not np.array_equal(seen.codes, whole.codes)
-        assert seen.clouds is None and len(list((data / "codes").iterdir())) == 2
-    else:
-        assert seen.codes is None and whole.clouds is None
-        assert seen.clouds is not None and again.clouds is not None
-        assert seen.clouds.shape == (len(seen), encoder.settings.cloud, 3)
-        assert np.array_equal(seen.clouds, again.clouds) and (seen.clouds != 0).any(-1).mean() > 0
-        held_out = seen.split(9)[1].clouds
-        assert held_out is not None and len(held_out) == seen.validation
-    save_encoder(encoder, tmp_path / "encoder", {})
-    told = str(tmp_path / "encoder") if frozen else name
-    settings = planner(data, told, views=True, encoder_settings=None if frozen else SMALL[name])
-    train_planner(settings, str(tmp_path / "out"))
-    assert load_model(tmp_path / "out", arm).encoder is not None
-    with pytest.raises(InputError, match="views is True and encoder is None"):
-        replace(settings, encoder=None, encoder_settings=None)
-
-
-@pytest.mark.parametrize("name", ["compression_autoencoder", "pointnet"])
-def test_of_views_is_the_code_of_the_points_that_are_told(name):
-    encoder, arm = small(name), box_arm()
-    points = cloud(300)[0].numpy()
-    view = DepthView.from_cloud(points, looking_at(np.array([-1.5, 0.0, 1.0]), np.array([0.0, 0.0, 0.4])))
-    start = np.zeros(arm.dof)
-    told = encoder.told_points([view], arm, start)
-    assert 0 < len(told) <= encoder.settings.cloud
-    apart = np.linalg.norm(told[:, None] - points, axis=-1).min(1)
-    assert apart.max() < 0.05
-    z = encoder.of_views([view], arm, start)
-    torch.testing.assert_close(z, encoder(torch.from_numpy(told)[None])[0])
-
-
 def test_batches_with_clouds_instead_of_codes(data):
     arm = box_arm()
     encoder = small("dgcnn")
@@ -445,6 +393,6 @@ def test_batches_with_clouds_instead_of_codes(data):
     assert (first.condition[:, :8] == 0).all() and (first.condition[:, 8:] != 0).any()
 
 
-def test_settings_of_an_encoder_that_is_not_trained_along(data):
+def test_a_frozen_encoder_takes_no_settings(data):
     with pytest.raises(InputError, match="unknown encoder 'runs/encoder'"):
         planner(data, "runs/encoder", encoder_settings=SMALL["pointnet"])

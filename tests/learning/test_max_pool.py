@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from robotdiffuse.learning.max_pool import greatest
+from robotdiffuse.learning.max_pool import max_pool
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -14,7 +14,7 @@ def test_it_is_the_maximum_and_has_its_gradient(dtype: torch.dtype) -> None:
     x[1, 3] = x[1, 8] = 9.0
     x.requires_grad_()
     weight = torch.randn(5, 7).to(dtype)
-    best = greatest(x)
+    best = max_pool(x)
     assert torch.equal(best, x.amax(1))
     (own,) = torch.autograd.grad((best * weight).sum(), x)
     (wanted,) = torch.autograd.grad((x.max(1).values * weight).sum(), x)
@@ -24,4 +24,4 @@ def test_it_is_the_maximum_and_has_its_gradient(dtype: torch.dtype) -> None:
 
 def test_slices_of_other_arrays_are_taken_as_they_are() -> None:
     x = torch.arange(24.0).reshape(2, 3, 4).transpose(1, 2).requires_grad_()
-    assert torch.equal(greatest(x), x.amax(1))
+    assert torch.equal(max_pool(x), x.amax(1))

@@ -102,12 +102,12 @@ def test_pybullets_camera_sees_the_same() -> None:
         [Box((0.5, 0.1, 0.2), (0.2, 0.3, 0.4), (0.9, 0.1, 0.2, 0.3)), Sphere((0.2, 0.5, 0.5), 0.15)]
     )
     camera = DepthCamera((1.4, 0.6, 0.9), (0.3, 0.1, 0.3), width=160, height=120)
-    with World(PANDA, scene, look=True) as world:
+    with World(PANDA, scene, visuals=True) as world:
         world.place(q)
         image = render(world, camera)
     focal = camera.height / 2 / np.tan(camera.field_of_view / 2)
     T = looking_at(np.array(camera.position), np.array(camera.target))
-    # PyBullet samples at the lower left corner of its pixels: see simulation.camera.PIXEL
+    # PyBullet samples at the lower left corner of its pixels: see simulation.camera.SAMPLE_OFFSET
     view = ray_cast(scene, T, (focal, focal, 80.0, 59.0), (160, 120))
     both = (image.labels > 0) & np.isfinite(view.depth)
     off = np.abs(image.depth[both] - view.depth[both])

@@ -68,7 +68,7 @@ def test_the_long_way_where_something_blocks_the_short_one() -> None:
 
 def test_a_pose_is_reached_across_half_a_turn() -> None:
     goal = PoseGoal("tip", link_pose(ARM, np.array([-2.9, 0.5, 0.2]), "tip"))
-    path = planned("aorrtc", [2.9, 0.5, 0.2], goal, until="limit")
+    path = planned("aorrtc", [2.9, 0.5, 0.2], goal, until="time_limit")
     assert path.length < 0.6
 
 

@@ -78,4 +78,4 @@ def test_misuse_is_refused(problem: Problem, result: PlanResult, capsys: pytest.
     with pytest.raises(InputError, match="T_base_camera"):
         next_view(problem, result, [2 * np.eye(4)])
     assert main(["plan", "examples/two_spheres.yaml", "--next-view"]) == 2
-    assert "--next-view is for problems that cameras saw" in capsys.readouterr().err
+    assert "--next-view needs a problem with views" in capsys.readouterr().err

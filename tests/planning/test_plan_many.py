@@ -1,6 +1,9 @@
 """Many problems: results in order, as alone; a process that dies costs one problem."""
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,3 +72,42 @@ def test_robots_that_hold_something_go_to_processes_too() -> None:
     results = list(rd.plan_many(held, "rrt_connect", workers=1, time_limit=20.0))
     for problem, result in zip(held, results, strict=True):
         assert result.path is not None and rd.verify(problem, result.path).valid
+
+
+PLANS = """
+import robotdiffuse as rd
+panda = rd.load_robot("panda")
+middle = (panda.lower + panda.upper) / 2
+problems = [rd.Problem(panda, rd.Scene([]), middle, middle + 0.1)] * 2
+for result in rd.plan_many(problems, "rrt_connect", workers=2):
+    print(result.status.value, result.reason)
+"""
+NOT_MAIN = """if __name__ != "__main__":
+    {}
+"""
+
+
+@pytest.mark.parametrize(
+    "beginning",
+    ["", *map(NOT_MAIN.format, ("raise ValueError", "raise SystemExit", "import os; os._exit(0)"))],
+    ids=["unguarded", "raises", "exits", "ends"],
+)
+def test_a_script_that_processes_cannot_import_is_an_error(beginning: str, tmp_path: Path) -> None:
+    """It hung: what a process is given as it starts, robots, does not fit a pipe that nobody reads."""
+    script = tmp_path / "script.py"
+    script.write_text(beginning + PLANS)
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    lines = ended.stdout.splitlines()
+    assert len(lines) == 2 and len({*lines}) == 1
+    assert lines[0].startswith("error a worker process could not import the main script")
+    assert lines[0].endswith('below the line: if __name__ == "__main__":')
+
+
+def test_a_script_from_standard_input_is_an_error_that_says_what_to_do() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-"], input=PLANS, capture_output=True, text=True, timeout=120, check=True
+    )
+    for line in ended.stdout.splitlines():
+        assert line.startswith("error worker processes cannot import a script from standard input; save it")
+        assert line.endswith('below the line: if __name__ == "__main__":')
+    assert len(ended.stdout.splitlines()) == 2 and ended.stderr == ""

@@ -181,5 +181,5 @@ def test_a_link_twice_in_a_file_is_one_line(tmp_path: Path) -> None:
     file = tmp_path / "problem.yaml"
     pose = "{xyz: [0, 0, 0], wxyz: [1, 0, 0, 0]}"
     file.write_text(f"robot: baxter\ngoal: {{poses: {{left_gripper: {pose}, left_gripper: {pose}}}}}\n")
-    with pytest.raises(InputError, match="left_gripper stands twice in line 2"):
+    with pytest.raises(InputError, match="left_gripper appears twice in line 2"):
         load_problem(file)

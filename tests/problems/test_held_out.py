@@ -84,7 +84,7 @@ def test_line_that_was_cut_off_is_made_again(tmp_path: Path) -> None:
 
 def test_damaged_lines_are_named(tmp_path: Path) -> None:
     file = tmp_path / "rop.jsonl"
-    for line, message in (("[1, 2]", "line 1 is no JSON object"), ('{"drawn": 3}', "line 1 has drawn")):
+    for line, message in (("[1, 2]", "line 1 is not a JSON object"), ('{"drawn": 3}', "line 1 has drawn")):
         file.write_text(line + "\n")
         with pytest.raises(InputError, match=message):
             CaseFile(file)

@@ -441,7 +441,7 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
 )
 def test_records_of_others_name_no_files_that_are_read(changed: dict[str, Any]) -> None:
     record = {"robot": "panda", "scene": [], "start": READY, "goal": {"joints": READY}} | changed
-    with pytest.raises(InputError, match="is a file, and none is read here"):
+    with pytest.raises(InputError, match="is a file, and files are not read here"):
         problem_from_record(record, {"panda": load_robot("panda")})
 
 
@@ -454,5 +454,5 @@ def test_records_of_others_have_the_robots_that_are_given(robot: object) -> None
 
 def test_a_request_of_others_is_a_file_too() -> None:
     record = {"robot": "panda", "scene": [], "request": "/etc/passwd"}
-    with pytest.raises(InputError, match="none is read here"):
+    with pytest.raises(InputError, match="files are not read here"):
         problem_from_record(record, {"panda": load_robot("panda")})

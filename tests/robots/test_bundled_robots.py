@@ -30,7 +30,7 @@ def test_no_sampled_point_of_the_meshes_is_outside_the_spheres(name: str) -> Non
             others = parts[:k] + parts[k + 1 :]
             if others:  # what lies in another part is no surface
                 points = points[~within(points, *stacked_planes(others), 1e-9)]
-            assert (gaps(points, robot.spheres[link]) <= 0).all(), link
+            assert (gaps(points, robot.spheres[link].copy()) <= 0).all(), link
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -16,8 +16,8 @@ from helpers.made_arms import chain, row, written
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.constraints import kept
 from robotdiffuse.cli import main, plan
-from robotdiffuse.cli.console import Waiting
-from robotdiffuse.cli.plan import solve
+from robotdiffuse.cli.console import Spinner
+from robotdiffuse.cli.plan import load_and_plan
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import reach_bound
@@ -237,10 +237,10 @@ def test_the_first_robot_of_several_arms_compiles_which_is_said_and_takes_no_tim
 ) -> None:
     """Code for trees of joints is compiled at their first plan: who waits need not have a new machine."""
     robot, shown = two_arms(), []
-    monkeypatch.setattr(plan, "Waiting", lambda text: (shown.append(text), Waiting(text))[1])
+    monkeypatch.setattr(plan, "Spinner", lambda text: (shown.append(text), Spinner(text))[1])
     q = np.zeros(robot.dof)
     problem = rd.Problem(robot=robot, scene=rd.Scene(), start=q, goal=q)
-    solve(problem, "rrt_connect", time_limit=20.0)
+    load_and_plan(problem, "rrt_connect", time_limit=20.0)
     assert "the first robot of several arms compiles first" in shown[0]
     began, call = time.perf_counter(), PlanningContext("test", problem, time_limit=20.0, seed=0)
     before = call.elapsed

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from numpy import ndarray
 from trimesh.triangles import closest_point
 
@@ -15,7 +16,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import read_triangles, read_yaml
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
-from robotdiffuse.scenes.point_cloud import crop, read_points, voxel_thin
+from robotdiffuse.scenes.point_cloud import crop, distinct, read_points, voxel_thin
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.scenes.surface_points import DRAWS, VisibleRegion, sample_surface
@@ -178,6 +179,14 @@ def test_wrong_shapes(make: Callable[[], Shape], message: str) -> None:
 def test_names_are_made_unique() -> None:
     ball = Sphere([0, 0, 0], 1)
     assert [shape.name for shape in Scene([ball, ball, ball]).shapes] == ["sphere", "sphere_2", "sphere_3"]
+
+
+@given(
+    arrays(np.float64, st.tuples(st.integers(0, 30), st.just(3)), elements=st.sampled_from([-0.0, 0.0, 1.5]))
+)
+def test_distinct_points_are_the_first_of_each_in_the_old_order(points: np.ndarray) -> None:
+    first = [row for i, row in enumerate(points) if not (points[:i] == row).all(axis=1).any()]
+    assert np.array_equal(distinct(points), np.array(first).reshape(-1, 3))
 
 
 @given(

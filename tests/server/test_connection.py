@@ -1,4 +1,4 @@
-"""Clients that speak no HTTP, send or take too slowly, or go: each found by benchmarks/fuzz_socket.py."""
+"""Clients that speak no HTTP, send or read too slowly, or disconnect: found by tests/helpers/fuzz/server.py."""
 
 import asyncio
 import json
@@ -33,7 +33,7 @@ def server() -> Iterator[httpx.Client]:
 
 
 def answer(server: httpx.Client, sent: bytes) -> tuple[int, Any]:
-    """Code and body of what raw bytes are answered with."""
+    """Status code and body of the answer to raw bytes."""
     with socket.create_connection((server.base_url.host, server.base_url.port or 0), 10) as client:
         client.sendall(sent)
         stream = client.makefile("rb")
@@ -48,7 +48,7 @@ def answer(server: httpx.Client, sent: bytes) -> tuple[int, Any]:
 RIGHT = b"Host: localhost\r\n"
 CASES = {
     "a host without its bracket": (b"GET /robots HTTP/1.1\r\nHost: [::1\r\n\r\n", 421, "the host is '[::1'"),
-    "no HTTP": (b"hello\r\n\r\n", 400, "this is no request of HTTP/1.1"),
+    "no HTTP": (b"hello\r\n\r\n", 400, "not an HTTP/1.1 request"),
     "a huge head": (b"GET / HTTP/1.1\r\n" + RIGHT + b"X: " + b"y" * 100_000, 400, "head is too large"),
     "a slash more": (b"GET /robots/ HTTP/1.1\r\n" + RIGHT + b"\r\n", 404, "there is no '/robots/'"),
     "a damaged chunk": (
@@ -57,7 +57,7 @@ CASES = {
         + b"Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
         b"0x5\r\n{}\r\n",
         400,
-        "this is no request",
+        "not an HTTP/1.1 request",
     ),
 }
 
@@ -77,7 +77,7 @@ def test_a_damaged_chunk_after_head_is_answered_without_a_body(server: httpx.Cli
 
 
 class Transport(asyncio.Transport):
-    """Keeps what is written."""
+    """Records the bytes written."""
 
     def __init__(self, connection: Connection) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ def connected(application: Any) -> Connection:
 
 
 def talked(sent: bytes, monkeypatch: pytest.MonkeyPatch, stuck: bool = False) -> tuple[bytes, bool]:
-    """What a connection has written a while after it got these bytes, and whether it closed itself; its
+    """What a connection wrote in the first 0.2 s after these bytes, and whether it closed itself; its
     application never answers."""
 
     async def never(scope: Any, receive: Any, send: Any) -> None:
@@ -126,15 +126,15 @@ def talked(sent: bytes, monkeypatch: pytest.MonkeyPatch, stuck: bool = False) ->
         transport.close()
         return found
 
-    monkeypatch.setattr(connection, "SENDING", 0.05)
-    monkeypatch.setattr(connection, "TAKING", 0.05)
+    monkeypatch.setattr(connection, "READ_TIMEOUT", 0.05)
+    monkeypatch.setattr(connection, "WRITE_TIMEOUT", 0.05)
     return asyncio.run(talk())
 
 
 WHOLE = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
-def test_half_a_head_is_waited_for_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_half_a_head_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     written, closed = talked(WHOLE[:-5], monkeypatch)
     assert closed and written.startswith(b"HTTP/1.1 408") and b"took more than 0.05 s" in written
 
@@ -147,12 +147,12 @@ def test_a_request_that_is_being_answered_is_not_late(monkeypatch: pytest.Monkey
     assert talked(WHOLE, monkeypatch) == (b"", False)
 
 
-def test_a_client_that_does_not_read_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_does_not_read_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
     assert talked(WHOLE, monkeypatch, stuck=True) == (b"", True)
 
 
 def test_nothing_is_written_after_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A chunk went wrong while the application was about to answer: h11 raised LocalProtocolError."""
+    """h11 raised LocalProtocolError for a damaged chunk just before the application answered."""
 
     async def slow(scope: Any, receive: Any, send: Any) -> None:
         await asyncio.sleep(0.01)
@@ -173,7 +173,7 @@ def test_nothing_is_written_after_a_refusal(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("head", [b"HTTP/1.0\r\n", b"HTTP/1.1\r\nHost: a\r\nConnection: close\r\n"])
 def test_bytes_after_the_last_request_do_not_cut_its_answer_off(head: bytes) -> None:
-    """They were taken for what is no HTTP, and the connection closed before the body was written."""
+    """They were refused as not HTTP, and the connection closed before the body was written."""
 
     async def slow(scope: Any, receive: Any, send: Any) -> None:
         await send({"type": "http.response.start", "status": 200, "headers": []})
@@ -194,8 +194,8 @@ def test_bytes_after_the_last_request_do_not_cut_its_answer_off(head: bytes) -> 
     assert ended.written.startswith(b"HTTP/1.1 200") and b"late" in ended.written and ended.closed
 
 
-def test_a_call_that_was_left_before_it_began_is_left() -> None:
-    """The signal came while the worker still took the request: it planned on, and was killed for it."""
+def test_a_call_cancelled_before_it_began_is_left() -> None:
+    """A call cancelled while its worker was still reading it went on planning, and the worker was killed."""
     shared = worker.Shared(cancelled=7)
     worker.accept({}, 1.0, shared)
     with pytest.raises(worker.Cancelled):
@@ -203,9 +203,9 @@ def test_a_call_that_was_left_before_it_began_is_left() -> None:
     assert worker.respond(8, worker.PLAN, b"{}").code == 400
 
 
-def test_a_call_is_left_when_it_looks_at_its_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A signal's handler raised wherever the call was: where compiled code handed its results over, the
-    worker died of it."""
+def test_a_cancelled_call_is_left_when_it_checks_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A signal handler raised the exception anywhere in the call; inside a callback of compiled code it
+    killed the worker."""
     shared = worker.Shared()
     worker.accept({}, 1.0, shared)
 
@@ -216,7 +216,7 @@ def test_a_call_is_left_when_it_looks_at_its_clock(monkeypatch: pytest.MonkeyPat
         assert call.remaining > 0
         return worker.failed(500, "it was not left")
 
-    monkeypatch.setattr(worker, "_plan", planning)
+    monkeypatch.setattr(worker, "answer_plan", planning)
     with pytest.raises(worker.Cancelled):
         worker.respond(7, worker.PLAN, b"{}")
     assert worker.respond(8, worker.PLAN, b"{}").code == 500

@@ -1,4 +1,4 @@
-"""A real server on a port of its own: what it answers, refuses, and survives."""
+"""A real server on a port of its own: answers, errors, cancellation, and recovery from dead workers."""
 
 import json
 import os
@@ -21,10 +21,13 @@ import robotdiffuse as rd
 from helpers.faulty_planner import DIES, HANGS, RAISES, SEARCHES
 from helpers.serving import serving
 from robotdiffuse.cli.serve import served_robots
+from robotdiffuse.core.types import UNTIL
 from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.robots import DATA, ROBOTS
 
 pytest.importorskip("fastapi")
+
+from robotdiffuse.server import worker
 
 LEFT = [0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
 RIGHT = [-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
@@ -44,7 +47,10 @@ def asked(seed: int = 0, planner: str = "rrt_connect", height: float = 0.4, **mo
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[httpx.Client]:
-    with serving("--workers", "1", "--queue", "2", "--longest", "5", "--largest", "1") as (client, _):
+    with serving("--workers", "1", "--queue", "2", "--max-time-limit", "5", "--max-request-size", "1") as (
+        client,
+        _,
+    ):
         yield client
 
 
@@ -114,25 +120,28 @@ def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None
     [
         ("/plan", b"[" * 100_000, 400, "nested more than 64"),
         ("/plan", b"\xff{}", 400, "not UTF-8"),
-        ("/plan", b'{"problem": ' + b"9" * 5000 + b"}", 400, "no number there can be so large"),
+        ("/plan", b'{"problem": ' + b"9" * 5000 + b"}", 400, "no field takes such a large number"),
         ("/plan", b"{}", 400, "no problem"),
         ("/plan", {"problem": problem(), "time": 1}, 400, "unknown field of the request: 'time'"),
         ("/plan", asked(planner="rrt"), 400, "unknown planner 'rrt'; known: "),
         ("/plan", asked(time_limit=6.0), 400, "at most 5 s here"),
         ("/plan", asked(time_limit="1"), 400, "time_limit is '1'; it must be a number"),
         ("/plan", asked(until=[1]), 400, r"unknown until \[1\]; known: "),
-        ("/plan", asked(seed=2**40), 400, "it must be a whole number from 0 to"),
+        ("/plan", asked(seed=2**40), 400, "it must be an integer from 0 to"),
         ("/plan", asked(clearance=-1.0), 400, "clearance is -1.0"),
+        ("/plan", asked(velocity_scaling=1e-300), 400, "velocity_scaling is 1e-300; it must be between"),
+        ("/plan", asked(acceleration_scaling=1e-6), 400, "acceleration_scaling is 1e-06; it must be between"),
+        ("/plan", asked(jerk=1e-300), 400, "jerk is 1e-300; it must be at least 0.01"),
         ("/plan", {"problem": problem(robot="/etc/passwd")}, 400, "unknown robot '/etc/passwd'; known: "),
         ("/plan", {"problem": problem(robot="../panda")}, 400, "unknown robot"),
-        ("/plan", {"problem": problem(scene="scene.yaml")}, 400, "is a file, and none is read here"),
+        ("/plan", {"problem": problem(scene="scene.yaml")}, 400, "is a file, and files are not read here"),
         (
             "/plan",
             {"problem": problem(scene=[{"mesh": {"file": "/etc/passwd.stl"}}])},
             400,
-            "none is read here",
+            "files are not read here",
         ),
-        ("/plan", {"problem": problem(scene=[{"mesh": {"file": "no.stl"}}])}, 400, "none is read here"),
+        ("/plan", {"problem": problem(scene=[{"mesh": {"file": "no.stl"}}])}, 400, "files are not read here"),
         ("/verify", {"problem": problem()}, 400, "neither path nor trajectory"),
         ("/verify", {"problem": problem(), "path": {"joint_names": JOINTS}}, 400, "path has no positions"),
         (
@@ -153,16 +162,16 @@ def test_wrong_requests_are_one_line(
     assert re.search(message, error(answer))
 
 
-def test_other_pages_hosts_and_methods_are_refused(server: httpx.Client) -> None:
-    led = server.post("/plan", json=asked(), headers={"Host": "evil.example"})
+def test_other_hosts_content_types_and_methods_are_refused(server: httpx.Client) -> None:
+    rebound = server.post("/plan", json=asked(), headers={"Host": "evil.example"})
     form = server.post("/plan", content=json.dumps(asked()), headers={"Content-Type": "text/plain"})
-    assert (led.status_code, form.status_code) == (421, 415)
+    assert (rebound.status_code, form.status_code) == (421, 415)
     assert server.get("/plan").status_code == 405 and server.get("/../../etc/passwd").status_code == 404
-    for answer in (led, form, server.get("/plan"), server.get("/etc"), server.delete("/requests/x")):
+    for answer in (rebound, form, server.get("/plan"), server.get("/etc"), server.delete("/requests/x")):
         error(answer)
 
 
-def test_lists_health_metrics_and_a_page_that_loads_nothing(server: httpx.Client) -> None:
+def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -> None:
     robots = {robot["name"]: robot for robot in server.get("/robots").json()}
     assert [joint["name"] for joint in robots["panda"]["joints"]] == JOINTS
     assert "robotdiffuse" in {planner["name"] for planner in server.get("/planners").json()}
@@ -170,7 +179,14 @@ def test_lists_health_metrics_and_a_page_that_loads_nothing(server: httpx.Client
     assert gauge(server, "workers_ready") == 1
     page = server.get("/docs").text
     assert "/requests/{name}" in page and "http://" not in page and "https://" not in page
-    assert set(server.get("/openapi.json").json()["paths"]) >= {"/plan", "/verify", "/batch", "/robots"}
+    description = server.get("/openapi.json").json()
+    assert set(description["paths"]) >= {"/plan", "/verify", "/batch", "/robots"}
+    schemas = description["components"]["schemas"]
+    for name in re.findall(r'"#/components/schemas/(\w+)"', json.dumps(description)):
+        assert name in schemas
+    assert tuple(schemas["PlanRequest"]["properties"]["until"]["enum"]) == UNTIL
+    assert set(schemas["PlanRequest"]["properties"]) == {"problem", *worker.ARGUMENTS}
+    assert schemas["Error"]["required"] == ["error"] and "HTTPValidationError" not in schemas
 
 
 def test_an_exception_is_one_line(server: httpx.Client) -> None:
@@ -189,7 +205,7 @@ def test_a_worker_that_dies_costs_one_request(server: httpx.Client) -> None:
     assert gauge(server, "workers_lost_total") == lost + 1
 
 
-def test_requests_are_cancelled_by_their_names_and_the_worker_lives_on(server: httpx.Client) -> None:
+def test_cancelling_a_request_by_name_keeps_its_worker(server: httpx.Client) -> None:
     lost = gauge(server, "workers_lost_total")
     with ThreadPoolExecutor(1) as threads:
         named = {"X-Request-ID": "mine"}
@@ -203,7 +219,7 @@ def test_requests_are_cancelled_by_their_names_and_the_worker_lives_on(server: h
     assert gauge(server, "workers_lost_total") == lost
 
 
-def test_a_client_that_goes_frees_its_worker(server: httpx.Client) -> None:
+def test_a_client_that_disconnects_frees_its_worker(server: httpx.Client) -> None:
     lost = gauge(server, "workers_lost_total")
     lines = "\n".join([json.dumps(asked(SEARCHES, "faulty"))] * 3)
     with pytest.raises(httpx.ReadTimeout):
@@ -215,7 +231,7 @@ def test_a_client_that_goes_frees_its_worker(server: httpx.Client) -> None:
     assert gauge(server, "workers_lost_total") == lost
 
 
-def test_a_planner_that_never_looks_at_its_clock_costs_its_worker(server: httpx.Client) -> None:
+def test_a_planner_that_ignores_its_time_limit_costs_its_worker(server: httpx.Client) -> None:
     lost = gauge(server, "workers_lost_total")
     with pytest.raises(httpx.ReadTimeout):
         server.post("/plan", json=asked(HANGS, "faulty"), timeout=0.5)
@@ -223,7 +239,7 @@ def test_a_planner_that_never_looks_at_its_clock_costs_its_worker(server: httpx.
     assert gauge(server, "workers_lost_total") == lost + 1
 
 
-def test_a_full_queue_says_when_to_come_again(server: httpx.Client) -> None:
+def test_a_full_queue_says_when_to_try_again(server: httpx.Client) -> None:
     with ThreadPoolExecutor(3) as threads:
         jobs = []
         for i in range(3):
@@ -240,8 +256,8 @@ def test_a_full_queue_says_when_to_come_again(server: httpx.Client) -> None:
     assert server.post("/plan", json=asked(3)).status_code == 200
 
 
-def test_a_worker_that_holds_too_much_is_replaced_between_requests() -> None:
-    with serving("--workers", "1", "--memory", "1") as (client, _):
+def test_a_worker_that_holds_too_much_memory_is_replaced_between_requests() -> None:
+    with serving("--workers", "1", "--max-worker-memory", "1") as (client, _):
         for _ in range(2):
             assert client.post("/plan", json=asked(3)).json()["status"] == "solved"
         assert gauge(client, "workers_renewed_total") == 2 and gauge(client, "workers_lost_total") == 0
@@ -250,13 +266,13 @@ def test_a_worker_that_holds_too_much_is_replaced_between_requests() -> None:
 def test_it_stops_gracefully_and_leaves_no_worker() -> None:
     with serving("--workers", "1") as (client, process), ThreadPoolExecutor(2) as threads:
         workers = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout
-        slow = asked(planner="aorrtc", time_limit=2.0, until="limit")
+        slow = asked(planner="aorrtc", time_limit=2.0, until="time_limit")
         first = threads.submit(client.post, "/plan", json=slow)
         until(lambda: gauge(client, "workers_busy") == 1)
         second = threads.submit(client.post, "/plan", json=asked())
         until(lambda: gauge(client, "requests_waiting") == 1)
         process.send_signal(signal.SIGTERM)
-        for worker in workers.split():  # as a service's manager does
+        for worker in workers.split():  # as a service manager does
             os.kill(int(worker), signal.SIGTERM)
         assert first.result().json()["status"] == "solved"
         assert second.result().status_code == 503 and "stopping" in error(second.result())
@@ -264,7 +280,7 @@ def test_it_stops_gracefully_and_leaves_no_worker() -> None:
         until(lambda: not any(os.path.exists(f"/proc/{worker}") for worker in workers.split()))
 
 
-def test_elsewhere_than_on_loopback_there_is_a_token() -> None:
+def test_a_server_for_other_machines_needs_a_token() -> None:
     arguments = [sys.executable, "-m", "robotdiffuse", "serve", "--host", "0.0.0.0", "--port", "0"]
     refused = subprocess.run(arguments, capture_output=True, text=True)
     assert refused.returncode == 2 and "ROBOTDIFFUSE_TOKEN" in refused.stderr
@@ -275,19 +291,19 @@ def test_elsewhere_than_on_loopback_there_is_a_token() -> None:
         assert client.get("/robots", headers={"Authorization": "Bearer open"}).status_code == 401
 
 
-def test_an_address_that_is_taken_is_one_line(server: httpx.Client) -> None:
+def test_an_address_in_use_is_one_line(server: httpx.Client) -> None:
     port = str(server.base_url.port)
     arguments = [sys.executable, "-m", "robotdiffuse", "serve", "--port", port]
     refused = subprocess.run(arguments, capture_output=True, text=True)
-    assert refused.returncode == 2 and "cannot listen at 127.0.0.1" in refused.stderr
+    assert refused.returncode == 2 and "cannot listen on 127.0.0.1" in refused.stderr
 
 
-def test_robots_that_are_named_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_robots_named_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path))
     shutil.copytree(DATA / "panda", tmp_path / "mine")
     assert set(served_robots(["mine"])) == {*ROBOTS, "mine"}
-    for name in ("panda", str(tmp_path / "mine")):  # the folder's robot is called panda, too
-        with pytest.raises(rd.InputError, match="would be called panda, which another robot is"):
+    for name in ("panda", str(tmp_path / "mine")):  # the robot in the folder is also called panda
+        with pytest.raises(rd.InputError, match="has the name panda of another robot"):
             served_robots([name])
     with pytest.raises(rd.InputError, match="unknown robot 'yours'"):
         served_robots(["yours"])

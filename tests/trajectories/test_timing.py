@@ -4,15 +4,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.trajectories import speed_limits as speeds_module
 from robotdiffuse.trajectories.corner_rounding import DEVIATION, BlendedPolyline, half_widths
-from robotdiffuse.trajectories.speed_limits import TimingSettings
+from robotdiffuse.trajectories.speed_limits import LEAST_JERK, TimingSettings, symmetric, timing_grid
 from robotdiffuse.trajectories.timing import SAME, time_parameterize
+from robotdiffuse.trajectories.timing_kernel import fastest
 from robotdiffuse.validation.rates import RateTolerances, wrong_rates
 
 VELOCITY = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
@@ -253,7 +255,7 @@ def test_a_limit_of_jerk_is_kept_with_the_others(
 
 
 def test_a_limit_of_jerk_costs_what_it_must() -> None:
-    """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs next to nothing."""
+    """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs a row or two."""
     robot = arm((20.0,), (80.0,))
     p = path(robot, [[0.0], [1.0]])
     free, gentle, slight = (
@@ -262,7 +264,7 @@ def test_a_limit_of_jerk_costs_what_it_must() -> None:
     )
     least = (32 / 50.0) ** (1 / 3)
     assert least <= gentle < 1.4 * least
-    assert slight == pytest.approx(free, abs=0.005)
+    assert slight == pytest.approx(free, abs=0.015)
 
 
 def test_fine_rows_keep_the_limits_to_the_letter() -> None:
@@ -286,3 +288,104 @@ def test_durations_are_those_of_toppra(seed: int, deviation: float) -> None:
         for solver in ("compiled", "toppra")
     )
     assert ours == pytest.approx(theirs, rel=1e-3)
+
+
+TORSO = (0.1, 1.25, 1.45, 1.57, 1.52, 1.57, 2.26, 2.26)
+"""Velocity limits of Fetch, a slow torso first [m/s] and [rad/s]."""
+
+
+@pytest.mark.parametrize("seed", [1868, 2571, 2972])
+def test_a_slow_torso_has_a_timing(seed: int) -> None:
+    """A corner where the torso turns back was gone so fast at a grid point that only a stop could follow: no
+    timing was found."""
+    robot = arm(TORSO, tuple(4 * v for v in TORSO))
+    q = np.cumsum(np.random.default_rng(seed).normal(0, 0.4, (7, 8)), axis=0)
+    q[:, 0] *= 0.3
+    p = path(robot, q)
+    check(robot, p, time_parameterize(robot, p, always, always), TimingSettings())
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    dof=st.integers(3, 14),
+    count=st.integers(2, 10),
+    scale=st.floats(-3, 0.3),
+    decades=st.floats(0, 4),
+    kind=st.sampled_from(["random", "there and back", "few joints", "steps of all sizes"]),
+)
+@example(seed=930, dof=8, count=7, scale=0.0, decades=4.0, kind="random")
+def test_every_path_has_a_timing(
+    seed: int, dof: int, count: int, scale: float, decades: float, kind: str
+) -> None:
+    """Whatever the limits: speeds within them at the grid points, above 0 but at the ends, and no slower than
+    toppra's where these do not fall to nearly 0 on the way."""
+    rng = np.random.default_rng(seed)
+    velocity, acceleration = 10 ** rng.uniform(-decades / 2, decades / 2, (2, dof))
+    q = np.cumsum(10**scale * rng.normal(0, 1, (count, dof)), axis=0)
+    if kind == "there and back":
+        q = q[np.arange(count) % 2]
+    elif kind == "few joints":
+        q[:, 2:] = q[:1, 2:]
+    elif kind == "steps of all sizes":
+        q = np.cumsum(10 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(0, 1, (count, dof)), axis=0)
+    line = BlendedPolyline(q, half_widths(q, 10 ** rng.uniform(-4, 0, count - 2)))
+    grid = timing_grid(line, TimingSettings())
+    first, second = line(grid, 1), line(grid, 2)
+    found = fastest(first, second, grid, velocity, *symmetric(acceleration, len(grid)))
+    assert (found[1:-1] > 0).all() and np.isfinite(found).all()
+    assert (np.abs(first) * found[:, None] <= velocity * (1 + 1e-9)).all()
+    pull = (np.diff(found**2) / (2 * np.diff(grid)))[:, None]
+    for end in (slice(0, -1), slice(1, None)):
+        rates = first[end] * pull + second[end] * found[end, None] ** 2
+        assert (np.abs(rates) <= acceleration * (1 + 1e-4)).all()
+
+    theirs = speeds_module._speeds_by_toppra(line, grid, velocity, acceleration, 0.0)
+    if np.isfinite(theirs).all() and (theirs[1:-1] > 0.01 * theirs.max()).all():
+        ours, least = ((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum() for speeds in (found, theirs))
+        assert ours == pytest.approx(least, rel=1e-3)
+
+    robot = arm(tuple(velocity), tuple(acceleration))
+    t = time_parameterize(robot, path(robot, q), always, always)
+    assert (np.abs(t.velocities) <= 1.01 * velocity).all()
+    assert (np.abs(t.accelerations) <= 1.01 * acceleration).all()
+
+
+@pytest.mark.parametrize("value", [1e-300, 1e-12, 1e-6, float("nan")])
+@pytest.mark.parametrize("field", ["velocity_scale", "acceleration_scale", "jerk"])
+def test_settings_that_make_a_motion_endless_are_refused(field: str, value: float) -> None:
+    right = "at least 0.01" if field == "jerk" else "between 0.001 and 1"
+    with pytest.raises(InputError, match=rf"timing\.{field} is {value}; it must be {right}"):
+        TimingSettings(**{field: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("limit", [1e-300, 1e-7, float("nan")])
+def test_limits_that_make_a_motion_endless_are_refused(limit: float) -> None:
+    for robot in (arm((1.0, limit), (1.0, 1.0)), arm((1.0, 1.0), (1.0, limit))):
+        with pytest.raises(InputError, match=rf"limit of j1 is {limit}; it must be at least 1e-06"):
+            time_parameterize(robot, path(robot, [[0.0, 0.0], [1.0, 1.0]]), always, always)
+
+
+@pytest.mark.parametrize("jerk", [None, 10.0])
+def test_rows_of_a_motion_without_end_are_counted(jerk: float | None) -> None:
+    """A joint limited to 1e-6 rad/s had 1e8 rows: MemoryError."""
+    robot = arm((1e-6,), (1.0,))
+    t = time_parameterize(robot, path(robot, [[0.0], [1.0]]), always, always, TimingSettings(jerk=jerk))
+    assert t.duration == pytest.approx(1e6, rel=0.05)
+    assert len(t.times) <= speeds_module.MOST_ROWS + 1
+    assert wrong_rates(robot, t, VALIDATOR) == []
+
+
+@pytest.mark.parametrize("jerk", [2e3, 7.5e3, 1e5, 1e300])
+def test_rows_tell_the_acceleration_under_a_high_limit_of_jerk(jerk: float) -> None:
+    """It rose to its most between two rows, whose rates then did not agree: no motion was valid."""
+    robot, q = arm(), np.cumsum(np.random.default_rng(0).normal(0, 0.5, (5, 7)), axis=0)
+    t = time_parameterize(robot, path(robot, q), always, always, TimingSettings(jerk=jerk))
+    assert wrong_rates(robot, t, VALIDATOR) == []
+
+
+def test_the_least_limit_of_jerk_costs_little_more_than_it_must() -> None:
+    """With the accelerations of seven fixed shares of the limits it was 20 times the least."""
+    robot = arm((20.0,), (80.0,))
+    t = time_parameterize(robot, path(robot, [[0.0], [1.0]]), always, always, TimingSettings(jerk=LEAST_JERK))
+    least = (32 / LEAST_JERK) ** (1 / 3)
+    assert least <= t.duration < 1.4 * least

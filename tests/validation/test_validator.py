@@ -414,12 +414,13 @@ def test_motions_begin_and_end_at_rest(end: int) -> None:
     refused(verify_trajectory(problem, at_once), "acceleration")
 
 
-@given(st.integers(0, 2**31), st.sampled_from([0.01, 0.05, 0.3]))
+@given(st.integers(0, 2**31), st.sampled_from([1e-4, 0.01, 0.05, 0.3]))
 def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     """Full acceleration, coasting and braking in random turns, from rest to rest, at random rows."""
     rng, robot = np.random.default_rng(seed), box_arm()
     limit = robot.acceleration[0]
-    fine = np.repeat(rng.choice([-1.0, 0.0, 1.0], (12, 3)), 40, axis=0) * limit
+    count = 800 if most < 1e-3 else 40
+    fine = np.repeat(rng.choice([-1.0, 0.0, 1.0], (12, 3)), count, axis=0) * limit
     step = 0.5 * robot.velocity[0] / np.abs(np.cumsum(fine, axis=0)).max()
     fine = np.concatenate([fine, -fine])  # back to rest
     speed = np.concatenate([np.zeros((1, 3)), np.cumsum(fine, axis=0)]) * step
@@ -427,9 +428,43 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     every = max(int(most / step), 1)
     rows = np.unique([0, *np.sort(rng.choice(len(place), len(place) // every + 1)), len(place) - 1])
     accelerations = np.concatenate([fine, fine[-1:]])[rows]
+    place += rng.uniform(-1, 1, place.shape) * 0.99 * RATES.resolution
     motion = Trajectory(robot.joint_names, rows * step, place[rows], speed[rows], accelerations)
     wrong = {w.message for w in wrong_rates(robot, motion, replace(RATES, agreement=2.0))}
     assert not wrong
+
+
+def in_micro_steps(step: float, time: float, way: float) -> Trajectory:
+    """Evenly, in steps that positions are not known better than, with rates of zero."""
+    count = round(way / step)
+    rows = np.zeros((count + 1, 3))
+    rows[:, 0] = np.arange(count + 1) * step
+    still = np.zeros_like(rows)
+    return Trajectory(box_arm().joint_names, np.arange(count + 1) * time, rows, still, still)
+
+
+@pytest.mark.parametrize(("step", "time"), [(1.9e-6, 1e-8), (1.9e-6, 1e-7), (1.9e-6, 5e-7), (1.0, 5e-324)])
+def test_micro_steps_hide_no_velocity(step: float, time: float) -> None:
+    """Each of them within the resolution of positions, all of them 1.9 to 95 times as fast as the arm."""
+    quick = in_micro_steps(step, time, max(step, 0.01))
+    problem = Problem(box_arm(), Scene(), quick.positions[0], JointGoal(quick.positions[-1:]))
+    found = {wrong.kind: wrong.message for wrong in wrong_rates(problem.robot, quick, RATES)}
+    assert "j0 at" in found["velocity"]
+    assert not verify_trajectory(problem, quick).valid
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_micro_steps_hide_no_acceleration(back: bool) -> None:
+    """Within the velocity limit, but from rest to 1.9 rad/s at once; and there and back in a millisecond."""
+    quick = in_micro_steps(1.9e-6, 1e-6, 0.01)
+    if back:
+        place = 1e-3 * np.abs((quick.times / 1e-3 + 0.5) % 1 - 0.5)
+        quick = replace(quick, positions=np.outer(place, [1.9, 0, 0]))
+    problem = Problem(box_arm(), Scene(), quick.positions[0], JointGoal(quick.positions[-1:]))
+    found = {wrong.kind: wrong.message for wrong in wrong_rates(problem.robot, quick, RATES)}
+    assert set(found) == {"rates", "acceleration"}
+    assert "by its positions over 1 ms and more" in found["acceleration"]
+    assert not verify_trajectory(problem, quick).valid
 
 
 def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None:

@@ -1,4 +1,4 @@
-"""rd.show: a replay in a cell."""
+"""rd.show: replays in notebook cells."""
 
 import html
 import sys
@@ -25,7 +25,7 @@ def result(problem: rd.Problem) -> rd.PlanResult:
 
 @pytest.fixture
 def notebook(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As a kernel of Jupyter has it."""
+    """A shell like that of a Jupyter kernel."""
     shell = SimpleNamespace(kernel=object())
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))  # type: ignore
 
@@ -44,7 +44,7 @@ def test_a_result_file_in_a_cell(result: rd.PlanResult, problem: rd.Problem, tmp
     assert "moon" in rd.show(rd.load_result(tmp_path / "with.json"))._repr_html_()
     result.save(tmp_path / "without.json")
     without = rd.load_result(tmp_path / "without.json")
-    with pytest.raises(rd.InputError, match=r"give it: rd\.show\(result, problem\)"):
+    with pytest.raises(rd.InputError, match=r"use rd\.show\(result, problem\)"):
         rd.show(without)
     assert "moon" in rd.show(without, problem)._repr_html_()
 

@@ -16,6 +16,12 @@ from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 
+WINDOWS = (1e-3, 4e-3, 16e-3)
+"""Rows closer to each other than the first of these [s] must keep limits over windows of at least these
+lengths too: from one row to the next, the slack of positions hides any rate."""
+SHORTEST = 1e-12
+"""Shorter times count as this one [s]: rates over them are not finite."""
+
 
 def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> Float[ndarray, "n dof"]:
     """The rows of a motion, and between them further ones: on the cubics through positions and velocities at
@@ -126,7 +132,7 @@ def _wrong_rates(
     if len(np.unique(times)) != len(times) or times[0] < motion.times[0] or times[-1] > motion.times[-1]:
         yield "motion: the times between its rows are not between them"
         return
-    if len(motion.times) > 1 and _widest_chord(motion, times) > tolerances.chord * (1 + 1e-6) + 1e-12:
+    if len(motion.times) > 1 and not _widest_chord(motion, times) <= tolerances.chord * (1 + 1e-6) + 1e-12:
         yield "motion: its cubics leave the straight lines that were certified"
     v, a, share = motion.velocities, motion.accelerations, 1 + tolerances.rate_slack
     mean, change = np.diff(motion.positions, axis=0) / step, np.diff(v, axis=0) / step
@@ -136,17 +142,75 @@ def _wrong_rates(
         ("acceleration", a, robot.acceleration),
         ("mean acceleration between rows", change, robot.acceleration),
     )
-    blur = {"mean velocity between rows": 2 * tolerances.limit_slack / step.min(initial=np.inf)}
+    unsure = 2 * tolerances.limit_slack
+    blur = {"mean velocity between rows": unsure / np.maximum(step, SHORTEST)}
     for what, values, limit in rates:
-        over = (np.abs(values) > share * limit + blur.get(what, 0.0)) & (limit > 0)
+        over = ~(np.abs(values) <= share * limit + blur.get(what, 0.0)) & (limit > 0)
         for j in np.flatnonzero(over.any(axis=0)):
             most = np.abs(values[:, j]).max()
             yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {most:.4g} > {limit[j]:.4g}"
+    yield from _too_far(robot, motion, share, unsure)
+    yield from _too_bent(robot, motion, begins, share, unsure, tolerances.rate_slack)
     known = np.where(robot.velocity > 0, robot.velocity, np.abs(v).max(axis=0, initial=0.0))
     off = np.abs(np.stack([v[0] - begins, v[-1]]))
     if (off > tolerances.rate_slack * known + tolerances.rest).any():
         how = "at the problem's start_velocity, or end" if begins.any() else "and end"
         yield f"motion: it does not begin {how} at rest"
+
+
+def _too_far(robot: Robot, motion: Trajectory, share: float, unsure: float) -> Iterator[str]:
+    """Joints that get further, from any row to any later one, than their velocity limits allow in that time.
+
+    Positions are not known better than `unsure`, once for the two rows and, for rows far apart, once for each
+    step between them.
+    """
+    step, q = np.diff(motion.times)[:, None], motion.positions
+    allowed = np.zeros_like(q)
+    most = share * robot.velocity * step + unsure * np.minimum(step / WINDOWS[0], 1.0)
+    np.cumsum(most, axis=0, out=allowed[1:])
+    furthest = np.zeros(q.shape[1])
+    for way in (q, -q):
+        # the greatest of what each earlier row leaves room for, less what is allowed since then
+        least = np.minimum.accumulate(way - allowed, axis=0)
+        furthest = np.maximum(furthest, (way - allowed - least).max(axis=0))
+    for j in np.flatnonzero((furthest > unsure) & (robot.velocity > 0)):
+        name, limit = robot.joint_names[j], robot.velocity[j]
+        how = f"it gets {furthest[j]:.3g} further than {limit:.4g} allows"
+        yield f"motion: {name} exceeds its limit of mean velocity from one row to another: {how}"
+
+
+def _too_bent(
+    robot: Robot,
+    motion: Trajectory,
+    begins: Float[ndarray, "dof"],
+    share: float,
+    unsure: float,
+    rest_slack: float,
+) -> Iterator[str]:
+    """Joints whose positions, over windows, are accelerated more than their limits allow.
+
+    Before the first row the arm moves on as it begins, and after the last it stands. Each mean acceleration,
+    from the mean velocity before a row to that after it, is one of those that the joint must have had.
+    """
+    times, q, limit = motion.times, motion.positions, robot.acceleration
+    fine = np.diff(times).min(initial=np.inf) < WINDOWS[0]
+    for window in WINDOWS if fine else WINDOWS[:1]:
+        at = np.concatenate([[times[0] - window], times, [times[-1] + window]])
+        rows = np.concatenate([q[:1] - window * begins, q, q[-1:]])
+        first = np.searchsorted(at, times - window, side="right") - 1
+        last = np.searchsorted(at, times + window, side="left")
+        before, after = (times - at[first])[:, None], (at[last] - times)[:, None]
+        apart = (before + after) / 2
+        bent = np.abs((rows[last] - q) / after - (q - rows[first]) / before) / apart
+        outside = ((first == 0) * 1.0 + (last == len(at) - 1))[:, None]
+        room = unsure / before + unsure / after + outside * rest_slack * robot.velocity
+        over = ~(bent <= share * limit + room / apart) & (limit > 0)
+        for j in np.flatnonzero(over.any(axis=0)):
+            name, most = robot.joint_names[j], bent[over[:, j], j].max()
+            what = "mean acceleration by its positions"
+            yield f"motion: {name} exceeds its limit of {what}: {most:.4g} > {limit[j]:.4g}"
+        if over.any():
+            return
 
 
 def _widest_chord(motion: Trajectory, times: Float[ndarray, "n"]) -> float:

@@ -21,10 +21,10 @@ from robotdiffuse.certificates.planes import PlaneFinder
 from robotdiffuse.certificates.proof import DECIMALS, Certificate, Proof, Tolerances
 from robotdiffuse.certificates.requests import configurations, not_covered
 from robotdiffuse.certificates.torques import most_torques
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.validation.validator import DEFAULT, VerifySettings, verify, verify_trajectory
+from robotdiffuse.problems.problem import Problem, check_problem
+from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify, verify_trajectory
 
 SHARE = 0.5
 """Of the clearances that the validator certifies: what the certificate proves. More takes more stretches."""
@@ -52,6 +52,9 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     Raises `NotValidError`, an InputError, with what the validator found if it does not; and InputError for
     obstacles and requests that certificates do not know, and where no proof is found in reasonable size.
     """
+    check_problem(problem)
+    check_motion("motion", motion, (Path, Trajectory))
+    check_type("settings", settings, VerifySettings, "VerifySettings")
     beside = not_covered(problem, motion)
     if beside:
         raise InputError(

@@ -2,6 +2,7 @@
 written, 130 stopped by Ctrl-C."""
 
 import argparse
+import errno
 import io
 import os
 import sys
@@ -12,11 +13,14 @@ from typing import NoReturn
 from robotdiffuse import __version__
 from robotdiffuse.cli import (
     bench,
+    certificate,
     data,
-    interop,
+    demo,
+    export,
     live,
     plan,
     planners,
+    publish,
     robot,
     serve,
     simulate,
@@ -26,16 +30,16 @@ from robotdiffuse.cli import (
 )
 from robotdiffuse.core.errors import InputError
 
-SOLVED, NO_PLAN, BAD_INPUT, UNWRITTEN, STOPPED = 0, 1, 2, 3, 130
+SOLVED, NO_PLAN, BAD_INPUT, WRITE_FAILED, STOPPED = 0, 1, 2, 3, 130
 
 COMMANDS = (
-    plan.add_plan,
-    plan.add_demo,
-    view.add_view,
-    verify.add_verify,
-    verify.add_certificate,
-    interop.add_export,
-    interop.add_publish,
+    plan.add,
+    demo.add,
+    view.add,
+    verify.add,
+    certificate.add,
+    export.add,
+    publish.add,
     live.add,
     simulate.add,
     planners.add,
@@ -45,19 +49,20 @@ COMMANDS = (
     bench.add,
     serve.add,
 )
-"""Each adds one command to the parser and sets its function as `run`."""
+"""Each function adds one command to the parser and sets its `run` function."""
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports misuse in one line."""
+    """An argument parser that reports errors in one line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(BAD_INPUT, f"{self.prog}: error: {message}; see {self.prog} --help\n")
+        self.exit(BAD_INPUT, f"{self.prog}: error: {InputError(message)}; see {self.prog} --help\n")
 
 
 def build_parser() -> Parser:
+    """The parser of all commands."""
     parser = Parser(
-        prog="robotdiffuse", description="Motion planning for redundant arms, every motion verified."
+        prog="robotdiffuse", description="Motion planning for redundant robot arms; every motion is verified."
     )
     parser.add_argument("--version", action="version", version=f"robotdiffuse {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
@@ -67,7 +72,7 @@ def build_parser() -> Parser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit status; bad input is one line on standard error."""
+    """Run one command and return its exit status; bad input is reported as one line on standard error."""
     _prepare_streams()
     try:
         arguments = build_parser().parse_args(argv)
@@ -81,17 +86,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("robotdiffuse: stopped", file=sys.stderr)
         return STOPPED
     except BrokenPipeError:
-        return _unwritten("its reader has gone")
+        return _write_failed("its reader has closed the pipe")
     except SystemExit as stop:
-        if isinstance(stop.__context__, BrokenPipeError):  # by rich, which would end with status 1
-            return _unwritten("its reader has gone")
+        if isinstance(stop.__context__, BrokenPipeError):  # from rich, which would exit with status 1
+            return _write_failed("its reader has closed the pipe")
         raise
     except OSError as error:
-        return _unwritten(error.strerror or str(error))
+        if error.errno == errno.ENAMETOOLONG:
+            named = InputError(f"{error.filename}: {error.strerror}")
+            print(f"robotdiffuse: error: {named}", file=sys.stderr)
+            return BAD_INPUT
+        return _write_failed(error.strerror or str(error))
 
 
 def _prepare_streams() -> None:
-    """Characters that the terminal lacks become question marks; closed streams lead nowhere."""
+    """Replace characters that the terminal lacks by question marks, and closed streams by /dev/null."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -100,10 +109,11 @@ def _prepare_streams() -> None:
             stream.reconfigure(errors="replace")
 
 
-def _unwritten(why: str) -> int:
-    """Standard output leads nowhere from here on, so that nothing fails as the process ends."""
+def _write_failed(why: str) -> int:
+    """Report the failure, and redirect standard output to /dev/null so that flushing it at exit cannot
+    fail."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     with suppress(OSError):
         print(f"robotdiffuse: the output could not be written: {why}", file=sys.stderr)
-    return UNWRITTEN
+    return WRITE_FAILED

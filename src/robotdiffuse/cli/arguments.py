@@ -1,11 +1,15 @@
-"""Kinds of values on the command line, for argparse."""
+"""Types of command-line values, for argparse."""
 
 import argparse
 import math
 
+IGNORE_JOINTS = (
+    "note joints of MoveIt files that the robot lacks rather than refuse them; what they move is ignored"
+)
+
 
 def _number(text: str) -> float:
-    """nan if it is none."""
+    """The text as a number; nan if it is not one."""
     try:
         return float(text)
     except ValueError:
@@ -68,7 +72,7 @@ def share(text: str) -> float:
 
 
 def shares(text: str) -> dict[str, float]:
-    """NAME=SHARE,NAME=SHARE,... with shares of at least 0."""
+    """NAME=FRACTION,NAME=FRACTION,... with fractions of at least 0."""
     pairs = [part.strip().partition("=") for part in text.split(",")]
     if len({name for name, _, _ in pairs}) < len(pairs):
         raise argparse.ArgumentTypeError(f"{text!r} names a family twice")

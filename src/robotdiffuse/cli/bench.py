@@ -1,4 +1,4 @@
-"""robotdiffuse bench run, bench report, bench confirm, bench ablation"""
+"""The commands `robotdiffuse bench run`, `report`, `confirm` and `ablation`."""
 
 import argparse
 import os
@@ -13,123 +13,189 @@ if TYPE_CHECKING:
 
     from robotdiffuse.evaluation.bench.figures import Section
     from robotdiffuse.evaluation.bench.run_folder import Bench
+    from robotdiffuse.evaluation.bench.runner import BenchSettings
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser("bench", help="measure", description="Measure planners and networks.")
+    parser = commands.add_parser(
+        "bench", help="benchmark planners", description="Benchmark planners and networks."
+    )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     run = actions.add_parser(
         "run",
-        help="planners on problems, every call a record that is kept",
-        description="Call planners on the same problems, each planner in a process of its own; they take "
-        "turns. Results are lines of JSON in the folder; Ctrl-C or a crash loses at most the calls in hand, "
-        "the same command goes on. A call that a shorter time limit has answered for good is not made again.",
+        help="run planners on problems and record every call",
+        description="Run planners on the same problems, in turns, each planner in a process of its own. "
+        "Results are lines of JSON in the folder. Ctrl-C or a crash loses at most the running calls; run "
+        "the same command again to continue. A call whose result a longer time limit cannot change is not "
+        "repeated.",
     )
     run.add_argument(
         "--planners",
-        required=True,
         metavar="NAME,...",
-        help="see `robotdiffuse planners`, or all; with settings, NAME:SETTING=VALUE:SETTING=VALUE, among "
-        "them until=first|short|limit and clearance=M of its calls, or with weights of its own, NAME@FOLDER",
+        help="names from `robotdiffuse planners`, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
+        "or until=first|converged|time_limit and clearance=M of the calls; NAME@FOLDER uses other weights",
     )
     run.add_argument(
         "--problems",
-        required=True,
         metavar="SET,...",
-        help=f"{', '.join(FAMILIES)}, each also with _nontrivial; files or folders of problems",
+        help=f"{', '.join(FAMILIES)}, each also with _nontrivial; or files or folders of problems; with "
+        "--preset, sets in addition to its own",
+    )
+    run.add_argument(
+        "--preset",
+        metavar="NAME",
+        help="a comparison of docs/results.md with its planners, limits and seeds: table1, equal_time, "
+        "learning, anytime or restarts",
     )
     run.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems and results")
-    run.add_argument("--time-limit", type=positive, default=1.0, metavar="S", help="of a call [s] (1)")
-    run.add_argument("--seeds", type=count, default=1, metavar="N", help="calls on each problem (1)")
-    run.add_argument("--count", type=count, metavar="N", help="problems of each set (100; all of a folder)")
+    run.add_argument(
+        "--time-limit", type=positive, default=1.0, metavar="S", help="time limit of a call [s] (default: 1)"
+    )
+    run.add_argument(
+        "--seeds",
+        type=count,
+        default=1,
+        metavar="N",
+        help="calls per problem, with different seeds (default: 1)",
+    )
+    run.add_argument(
+        "--count", type=count, metavar="N", help="problems per set (default: 100; all of a folder)"
+    )
     run.add_argument(
         "--equal-time",
         action="store_true",
-        help="call planners that end early again until the limit, in rows of their own, to compare lengths",
+        help="also call planners that end early again until the time limit, as extra rows, to compare "
+        "lengths",
     )
     run.add_argument(
         "--workers", type=count, metavar="N", help="planners that run at once (default: half of the cores)"
     )
-    run.add_argument("--cluster", metavar="NAME", help="ray: on the cluster that RAY_ADDRESS names")
+    run.add_argument("--cluster", metavar="NAME", help="ray: use the Ray cluster at RAY_ADDRESS")
     run.set_defaults(run=run_run)
     report = actions.add_parser(
         "report",
-        help="tables, plots and replays of what `bench run` found",
+        help="write tables, plots and replays of a run",
         description="Write report.md, report.tex, index.html (plots and tables), replays.html (motions in "
         "3D) and curves of success and length over time as .svg, and print the table of each problem set.",
     )
     report.add_argument("folder", metavar="FOLDER", help="folder of `robotdiffuse bench run`")
     report.add_argument(
-        "--limits", metavar="S,...", help="time limits [s] (those of the run, and 0.1, 1, 10, 60 below them)"
+        "--limits",
+        metavar="S,...",
+        help="time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)",
     )
-    report.add_argument("--planners", metavar="NAME,...", help="some of the planners (all)")
-    report.add_argument("--out", metavar="OUT", help="folder to write to (FOLDER)")
-    report.add_argument("--no-replays", action="store_true", help="write no replays.html")
+    report.add_argument("--planners", metavar="NAME,...", help="planners to include (default: all)")
+    report.add_argument("--out", metavar="OUT", help="folder to write to (default: FOLDER)")
+    report.add_argument("--no-replays", action="store_true", help="do not write replays.html")
     report.set_defaults(run=run_report)
     confirm = actions.add_parser(
         "confirm",
-        help="the returned motions before a second validator, PyBullet",
-        description="Look at every motion that `bench run` kept as solved by PyBullet, on the meshes. The "
-        "exit status is 1 if it finds one in collision.",
+        help="check the motions of a run with PyBullet",
+        description="Check every solved motion of `bench run` with PyBullet, on meshes, as a second "
+        "validator. The exit status is 1 if it finds a collision.",
     )
     confirm.add_argument("folder", metavar="FOLDER", help="folder of `bench run`")
-    confirm.add_argument("--count", type=count, metavar="N", help="first problems of each set (default: all)")
+    confirm.add_argument(
+        "--count", type=count, metavar="N", help="check only the first N problems of each set (default: all)"
+    )
     confirm.set_defaults(run=run_confirm)
     ablation = actions.add_parser(
         "ablation",
-        help="the rows of the paper's Table 2, trained and tried at equal budget",
-        description="Train every row of the paper's Table 2 on the same number of samples, and try it on the "
-        "same held-out problems. Ctrl-C stops; the same command goes on.",
+        help="train and compare the rows of the paper's Table 2",
+        description="Train every row of the paper's Table 2 on the same number of samples, and test it on "
+        "the same held-out problems. Ctrl-C stops; run the same command again to continue.",
     )
     ablation.add_argument("--data", required=True, metavar="FOLDER", help="data set of `data generate`")
     ablation.add_argument("--out", required=True, metavar="FOLDER", help="folder for the trained networks")
-    ablation.add_argument("--samples", type=count, metavar="N", help="training samples of a row (300000)")
     ablation.add_argument(
-        "--encoder-samples", type=count, metavar="N", help="clouds for the frozen encoder (300000)"
+        "--samples", type=count, metavar="N", help="training samples per row (default: 300000)"
     )
-    ablation.add_argument("--problems", type=count, metavar="N", help="held-out problems (500)")
-    ablation.add_argument("--family", metavar="NAME", help="family of these problems (rop)")
-    ablation.add_argument("--rows", metavar="NAME,...", help="some of the rows (default: all ten)")
     ablation.add_argument(
-        "--workers", type=count, default=os.cpu_count() or 1, metavar="N", help="processes (all cores)"
+        "--encoder-samples",
+        type=count,
+        metavar="N",
+        help="point clouds to train the frozen encoder on (default: 300000)",
+    )
+    ablation.add_argument("--problems", type=count, metavar="N", help="held-out problems (default: 500)")
+    ablation.add_argument("--family", metavar="NAME", help="family of these problems (default: rop)")
+    ablation.add_argument("--rows", metavar="NAME,...", help="rows to train (default: all ten)")
+    ablation.add_argument(
+        "--workers",
+        type=count,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="processes (default: all cores)",
     )
     ablation.set_defaults(run=run_ablation)
 
 
 def run_run(arguments: argparse.Namespace) -> int:
     import sys
-    from pathlib import Path
 
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
-
-    if arguments.cluster is not None and arguments.workers is not None:
-        raise InputError("--workers is for this machine's processes; --cluster uses all cores that it has")
-    settings = BenchSettings(
-        planners=tuple(arguments.planners.split(",")),
-        problems=tuple(arguments.problems.split(",")),
-        out=Path(arguments.out),
-        time_limit=arguments.time_limit,
-        seeds=arguments.seeds,
-        count=arguments.count,
-        workers=arguments.workers or max(1, (os.cpu_count() or 1) // 2),
-        cluster=arguments.cluster,
-        equal_time=arguments.equal_time,
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskID,
+        TextColumn,
+        TimeElapsedColumn,
     )
+
+    from robotdiffuse.evaluation.bench.runner import run_bench
+
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        bars = {name: bar.add_task(name, total=None, start=False) for name in settings.contestants}
+    made = 0
+    for settings in _bench_settings(arguments):
+        with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+            bars = {name: bar.add_task(name, total=None, start=False) for name in settings.specs}
 
-        def done(planner: str, calls: int, all_calls: int) -> None:
-            bar.start_task(bars[planner])
-            bar.update(bars[planner], completed=calls, total=all_calls)
+            def done(
+                planner: str,
+                calls: int,
+                all_calls: int,
+                bar: Progress = bar,
+                bars: dict[str, TaskID] = bars,
+            ) -> None:
+                bar.start_task(bars[planner])
+                bar.update(bars[planner], completed=calls, total=all_calls)
 
-        made = run_bench(settings, lambda text: print(text, file=sys.stderr, flush=True), done)
+            made += run_bench(settings, lambda text: print(text, file=sys.stderr, flush=True), done)
     print(f"{made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}")
     return 0
+
+
+def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
+    """The settings of each pass: of the preset, or one from the options."""
+    from pathlib import Path
+
+    from robotdiffuse.evaluation.bench.presets import preset_settings
+    from robotdiffuse.evaluation.bench.runner import BenchSettings
+
+    if arguments.cluster is not None and arguments.workers is not None:
+        raise InputError("--workers sets the processes on this machine; --cluster always uses all its cores")
+    out, workers = Path(arguments.out), arguments.workers or max(1, (os.cpu_count() or 1) // 2)
+    problems = () if arguments.problems is None else tuple(arguments.problems.split(","))
+    if arguments.preset is not None:
+        if arguments.planners is not None or arguments.cluster is not None or arguments.equal_time:
+            raise InputError("--preset cannot be combined with --planners, --cluster or --equal-time")
+        return preset_settings(arguments.preset, out, problems, arguments.count, workers)
+    if arguments.planners is None or arguments.problems is None:
+        raise InputError("name --planners and --problems, or a --preset")
+    return [
+        BenchSettings(
+            planners=tuple(arguments.planners.split(",")),
+            problems=problems,
+            out=out,
+            time_limit=arguments.time_limit,
+            seeds=arguments.seeds,
+            count=arguments.count,
+            workers=workers,
+            cluster=arguments.cluster,
+            equal_time=arguments.equal_time,
+        )
+    ]
 
 
 def run_report(arguments: argparse.Namespace) -> int:
@@ -158,21 +224,23 @@ def run_report(arguments: argparse.Namespace) -> int:
 
 
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
-    """The name of the file; None if there is nothing to replay."""
+    """The name of the written file; None if there is no motion to replay."""
     from robotdiffuse.core.types import Path as Waypoints
-    from robotdiffuse.evaluation.bench.page import worth_showing
-    from robotdiffuse.visualization.gallery import Exhibit, write_gallery
+    from robotdiffuse.evaluation.bench.page import motions_to_replay
+    from robotdiffuse.visualization.gallery import GalleryEntry, write_gallery
 
-    shown = worth_showing(bench, parts)
+    shown = motions_to_replay(bench, parts)
     if not shown:
         return None
     robot = shown[0].case.problem.robot
-    exhibits = [
-        Exhibit(motion.title, motion.caption, problem.scene, Waypoints(robot.joint_names, motion.positions))
+    entries = [
+        GalleryEntry(
+            motion.title, motion.caption, problem.scene, Waypoints(robot.joint_names, motion.positions)
+        )
         for motion in shown
         if (problem := motion.case.problem).robot.name == robot.name
     ]
-    write_gallery(robot, exhibits, file, "Motions")
+    write_gallery(robot, entries, file, "Motions")
     return file.name
 
 
@@ -180,11 +248,13 @@ def _limits(text: str) -> list[float]:
     try:
         return [positive(part) for part in text.split(",")]
     except (argparse.ArgumentTypeError, ValueError):
-        raise InputError(f"limits are {shown(text)}; they must be positive times [s], as 0.1,1,10") from None
+        raise InputError(
+            f"limits are {shown(text)}; they must be positive times [s], such as 0.1,1,10"
+        ) from None
 
 
 def print_bench(bench: "Bench", parts: "list[Section]") -> None:
-    """For each problem set the table of the limit that most planners were run for."""
+    """Print a table for each problem set, at the time limit that most planners were run with."""
     from robotdiffuse.evaluation.bench.report import main_table, missing_line
     from robotdiffuse.evaluation.tables import show
 
@@ -215,7 +285,7 @@ def run_confirm(arguments: argparse.Namespace) -> int:
             lambda done, total: bar.update(task, completed=done, total=total),
         )
     rows = [(planner, of.checked, len(of.refuted)) for planner, of in found.items()]
-    show(Table.of("", ("planner", "motions", "in collision by PyBullet"), rows))
+    show(Table.of("", ("planner", "motions", "in collision (PyBullet)"), rows))
     refuted = [each for confirmation in found.values() for each in confirmation.refuted]
     for record, contact in refuted:
         print(

@@ -1,4 +1,4 @@
-"""Tables on the terminal, and what keeps a person waiting."""
+"""Terminal output of commands: result tables, and a spinner for long waits."""
 
 from threading import Timer
 from typing import TYPE_CHECKING
@@ -11,23 +11,25 @@ if TYPE_CHECKING:
     from robotdiffuse.validation.validator import Report
 
 
-PATIENCE = 2.0
-"""After which a person is told what they wait for [s]."""
-KEEPS_CLEAR = {"as seen": "what was seen", "unknown is occupied": "all that was not seen free"}
-"""Of some assumptions."""
+SPINNER_DELAY = 2.0
+"""Time until the spinner appears [s]."""
+ASSUMPTION_TEXTS = {"as seen": "what was seen", "unknown is occupied": "all that was not seen free"}
+"""How `print_result` words some assumptions about unknown space."""
 
 
-class Waiting:
-    """A spinner on standard error beside what keeps a person waiting, while the block runs: from PATIENCE on,
-    so that a short wait does not pay for importing rich."""
+class Spinner:
+    """A context manager that shows a spinner with a text on standard error while the block runs.
+
+    It appears after SPINNER_DELAY, so that short commands need not import rich.
+    """
 
     def __init__(self, text: str) -> None:
         self.text = text
         self._status: Status | None = None
-        self._timer = Timer(PATIENCE, self._show)
+        self._timer = Timer(SPINNER_DELAY, self._show)
         self._timer.daemon = True
 
-    def __enter__(self) -> "Waiting":
+    def __enter__(self) -> "Spinner":
         self._timer.start()
         return self
 
@@ -37,7 +39,7 @@ class Waiting:
         self.stop()
 
     def stop(self) -> None:
-        """Take the spinner away, if it has come."""
+        """Remove the spinner, if it has appeared."""
         if self._status is not None:
             self._status.stop()
 
@@ -49,7 +51,7 @@ class Waiting:
 
 
 def clearances(motion: "PlanResult | Report") -> str:
-    """The least [mm], and where they are known those to the scene and between links."""
+    """The smallest clearance [mm] and, if known, those to the scene and between links."""
     names = ("min_clearance", "scene_clearance", "self_clearance")
     least, scene, itself = (f"{1e3 * (getattr(motion, name) or 0.0):.1f} mm" for name in names)
     return (
@@ -58,7 +60,7 @@ def clearances(motion: "PlanResult | Report") -> str:
 
 
 def print_result(result: "PlanResult") -> None:
-    """The outcome of a call to plan(), as a table; status and reason also where there is no plan."""
+    """Print the result of plan() as a table; without a plan, its status and reason."""
     from robotdiffuse.evaluation.tables import Table, show
 
     rows = [
@@ -70,16 +72,16 @@ def print_result(result: "PlanResult") -> None:
         rows.append(("path", f"{len(result.path.positions)} waypoints, length {result.path.length:.3f} rad"))
         rows.append(("verified", "yes"))
     if result.assumption:
-        rows.append(
-            ("keeps clear of", KEEPS_CLEAR.get(result.assumption, f"what was seen, and {result.assumption}"))
-        )
+        text = ASSUMPTION_TEXTS.get(result.assumption, f"what was seen, and {result.assumption}")
+        rows.append(("keeps clear of", text))
     if result.confidence is not None:
-        rows.append(("confidence", f"{100 * result.confidence:.0f} % that it is free of what was not seen"))
+        text = f"{100 * result.confidence:.0f} % that unknown space on the way is free"
+        rows.append(("confidence", text))
     if result.unknown_region is not None:
         low, high = (", ".join(f"{at:.2f}" for at in corner) for corner in result.unknown_region)
         rows.append(("crosses unknown", f"from ({low}) to ({high}) m"))
     if result.min_clearance is not None:
-        rows.append(("least clearance", clearances(result)))
+        rows.append(("clearance", f"at least {clearances(result)}"))
     if result.trajectory is not None:
         rows.append(("motion", f"{result.trajectory.duration:.2f} s, {len(result.trajectory.times)} rows"))
     rows += [("note", note) for note in result.notes]
@@ -88,7 +90,7 @@ def print_result(result: "PlanResult") -> None:
 
 
 def print_next_view(problem: "Problem", result: "PlanResult") -> None:
-    """Where a camera is to look next, as problem files say it."""
+    """Print the proposed next camera pose in the form of problem files."""
     from robotdiffuse.core.transforms import pose_entry
     from robotdiffuse.planning.next_view import next_view
 
@@ -97,5 +99,5 @@ def print_next_view(problem: "Problem", result: "PlanResult") -> None:
         f"{name}: [{', '.join(f'{number:.4g}' for number in numbers)}]"
         for name, numbers in pose_entry(proposed.T_base_camera).items()
     )
-    print(f"next view, which sees {100 * proposed.seen:.0f} % of what the motion may run into:")
+    print(f"next view, which shows {100 * proposed.seen:.0f} % of the unknown space that the motion crosses:")
     print(f"  camera: {{{camera}}}")

@@ -1,18 +1,366 @@
-"""robotdiffuse data: its actions are in data_generate.py and data_look.py"""
+"""The commands `robotdiffuse data generate`, `info`, `check`, `view`, `export` and `import`."""
 
 import argparse
+import os
+import sys
+import time
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from robotdiffuse.cli import data_generate, data_inspect
+from robotdiffuse.cli.arguments import count, natural, not_negative, positive, share, shares
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.families import FAMILIES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rich.progress import Progress
+
+    from robotdiffuse.generation import GenerationSettings
+    from robotdiffuse.robots.robot import Robot
+    from robotdiffuse.visualization.gallery import GalleryEntry
+
+LOG_INTERVAL = 60.0
+"""Time between two progress lines without a terminal [s]."""
+GENERATE_OPTIONS = (
+    "robot",
+    "planner",
+    "trajectories",
+    "seed",
+    "mix",
+    "trivial_share",
+    "target",
+    "goals",
+    "waypoints",
+    "timing",
+    "shard",
+)
+"""Options that are fields of GenerationSettings."""
+CLEAN, VIOLATIONS = 0, 1
+FOLDER_HELP = "folder of `robotdiffuse data generate`"
+ROBOT_HELP = "the robot of the data, if the name in the manifest is not known here"
 
 
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
-        "data", help="make and look at training data", description="Make training data, and look at it."
+        "data",
+        help="generate and inspect training data",
+        description="Generate and inspect training data.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    data_generate.add_generate(actions)
-    data_inspect.add_info(actions)
-    data_inspect.add_check(actions)
-    data_inspect.add_view(actions)
-    data_inspect.add_export(actions)
-    data_inspect.add_import(actions)
+    for add_action in (add_generate, add_info, add_check, add_view, add_export, add_import):
+        add_action(actions)
+
+
+def add_generate(actions: argparse._SubParsersAction) -> None:
+    parser = actions.add_parser(
+        "generate",
+        help="plan motions for many random problems",
+        description="Solve many random problems with Shared-Tree Informed RRT* or another planner, and "
+        "write the motions that pass the validator to shards. Ctrl-C or a crash loses at most the "
+        "unfinished shards; run the same command again to continue.",
+    )
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")
+    parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF (default: panda)")
+    parser.add_argument("--trajectories", type=count, metavar="N", help="motions to make (default: 140000)")
+    parser.add_argument("--seed", type=natural, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--mix",
+        type=shares,
+        metavar="NAME=P,...",
+        help=f"fractions of the problem families {', '.join(FAMILIES)} (default: rop=1)",
+    )
+    parser.add_argument(
+        "--trivial-share",
+        type=share,
+        metavar="P",
+        help="fraction to keep of the problems that a straight line solves (default: 1, as in the paper)",
+    )
+    parser.add_argument(
+        "--target", metavar="KIND", help="what targets give: position (default) or pose of the tip"
+    )
+    parser.add_argument(
+        "--goals", type=count, metavar="N", help="most goal configurations per target (default: 10)"
+    )
+    parser.add_argument(
+        "--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion (default: 254)"
+    )
+    parser.add_argument(
+        "--timing",
+        metavar="KIND",
+        help="waypoints equally spaced in arc length (arc, default) or in time (time)",
+    )
+    parser.add_argument(
+        "--safety-distance",
+        type=not_negative,
+        metavar="M",
+        help="distance to keep to obstacles [m] (default: 0.05)",
+    )
+    parser.add_argument(
+        "--planner", metavar="NAME", help="shared_tree_rrt_star (default, as in the paper) or aorrtc"
+    )
+    parser.add_argument("--shard", type=count, metavar="N", help="motions per shard (default: 500)")
+    parser.add_argument(
+        "--workers",
+        type=count,
+        metavar="N",
+        help="processes (default: all cores)",
+    )
+    parser.add_argument("--cluster", metavar="NAME", help="ray: use the Ray cluster at RAY_ADDRESS")
+    parser.set_defaults(run=run_generate)
+
+
+def add_info(actions: argparse._SubParsersAction) -> None:
+    parser = actions.add_parser(
+        "info",
+        help="print statistics and write a page of plots",
+        description="Print the statistics of a data set and write a page of plots.",
+    )
+    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
+    parser.add_argument("--page", metavar="FILE.html", help="page of plots (default: FOLDER/report.html)")
+    parser.add_argument("--robot", metavar="NAME", help=ROBOT_HELP)
+    parser.set_defaults(run=run_info)
+
+
+def add_check(actions: argparse._SubParsersAction) -> None:
+    parser = actions.add_parser(
+        "check",
+        help="check all shards and validate their motions again",
+        description="Check the structure of all shards and validate their motions again, with RobotDiffuse's "
+        "validator and with PyBullet on meshes. Exit status: 0 clean, 1 violations found, 2 bad input.",
+    )
+    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
+    parser.add_argument("--count", type=count, metavar="N", help="validate N random motions (default: all)")
+    parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--workers",
+        type=count,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="processes (default: all cores)",
+    )
+    parser.add_argument("--no-pybullet", action="store_true", help="do not validate with PyBullet")
+    parser.add_argument("--robot", metavar="NAME", help=ROBOT_HELP)
+    parser.set_defaults(run=run_check)
+
+
+def add_view(actions: argparse._SubParsersAction) -> None:
+    parser = actions.add_parser(
+        "view",
+        help="show random motions as 3D replays",
+        description="Write random motions of a data set as 3D replays in one page. Without --out, the page "
+        "opens in the browser.",
+    )
+    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
+    parser.add_argument("--count", type=count, default=6, metavar="N", help="motions (default: 6)")
+    parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument("--out", metavar="FILE.html", help="page (default: FOLDER/samples.html)")
+    parser.add_argument("--robot", metavar="NAME", help=ROBOT_HELP)
+    parser.set_defaults(run=run_view)
+
+
+def add_export(actions: argparse._SubParsersAction) -> None:
+    parser = actions.add_parser(
+        "export",
+        help="write the data in the format of the paper's robot.npz",
+        description="Write the motions among exactly two spheres in the layout of the paper's robot.npz: "
+        "x_train n x 254 x 7, y_train n x 23.",
+    )
+    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
+    parser.add_argument("file", metavar="FILE.npz", help="file to write")
+    parser.set_defaults(run=run_export)
+
+
+def add_import(actions: argparse._SubParsersAction) -> None:
+    parser = actions.add_parser(
+        "import",
+        help="make a data set from the paper's robot.npz",
+        description="Make a data set from a file in the layout of the paper's robot.npz, to check and "
+        "train on like any other. The file does not contain the radius of its spheres.",
+    )
+    parser.add_argument("file", metavar="FILE.npz", help="x_train n x 254 x 7, y_train n x 23")
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")
+    parser.add_argument(
+        "--robot", default="panda", metavar="NAME", help="bundled name or URDF (default: panda)"
+    )
+    parser.add_argument(
+        "--radius", type=positive, default=0.25, metavar="M", help="radius of the spheres [m] (default: 0.25)"
+    )
+    parser.set_defaults(run=run_import)
+
+
+def _robot(name: str | None) -> "Robot | None":
+    from robotdiffuse.robots import load_robot
+
+    return None if name is None else load_robot(name)
+
+
+def _bar() -> "Progress":
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(
+        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
+    )
+
+
+def run_generate(arguments: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from robotdiffuse.generation import GenerationSettings
+    from robotdiffuse.generation.solvers import SEARCHES
+
+    if arguments.cluster is not None and arguments.workers is not None:
+        raise InputError(
+            "--workers sets the processes on this machine; --cluster always uses all cores of the cluster"
+        )
+    given = {
+        name: getattr(arguments, name) for name in GENERATE_OPTIONS if getattr(arguments, name) is not None
+    }
+    if arguments.planner is not None and arguments.planner != GenerationSettings.planner:
+        given["search"] = SEARCHES.defaults(arguments.planner)
+    settings = GenerationSettings(**given)
+    if arguments.safety_distance is not None:
+        search = replace(settings.search, safety_distance=arguments.safety_distance)
+        settings = replace(settings, search=search)
+    made = generate_with_progress(settings, arguments.out, arguments.workers, arguments.cluster)
+    print(f"{made:,} trajectories of {settings.waypoints} waypoints in {arguments.out}")
+    return 0
+
+
+def generate_with_progress(
+    settings: "GenerationSettings", out: str | Path, workers: int | None = None, cluster: str | None = None
+) -> int:
+    """Run `generation.generate` with a progress bar; returns the number of motions made. Default: all
+    cores."""
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from robotdiffuse.generation import generate
+
+    console = Console(stderr=True)
+    columns = (
+        *Progress.get_default_columns()[:2],
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("trajectories", rate="", left="", total=settings.trajectories)
+        before, said = list[int](), [time.monotonic()]
+
+        def show(done: int, total: int) -> None:
+            if not before:
+                before.append(done)
+                bar.reset(task, completed=done)
+            elapsed, new = bar.tasks[0].elapsed, done - before[0]
+            if elapsed and new:
+                left = timedelta(seconds=round((total - done) * elapsed / new))
+                bar.update(task, completed=done, rate=f"{new / elapsed:.1f}/s", left=f"{left} left")
+                if not console.is_terminal and time.monotonic() > said[-1] + LOG_INTERVAL:
+                    said.append(time.monotonic())
+                    print(f"{done:,} of {total:,} trajectories, {left} left", file=sys.stderr, flush=True)
+
+        return generate(settings, Path(out), workers or os.cpu_count() or 1, cluster, show)
+
+
+def run_info(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.evaluation.datasets.page import write_page
+    from robotdiffuse.evaluation.datasets.report import tables
+    from robotdiffuse.evaluation.tables import show
+
+    page = Path(arguments.page or Path(arguments.folder) / "report.html")
+    show(*tables(write_page(arguments.folder, page, _robot(arguments.robot))))
+    print(f"wrote {page}")
+    return 0
+
+
+def run_check(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.evaluation.datasets.check import check_data
+    from robotdiffuse.evaluation.tables import show
+
+    with _bar() as bar:
+        task = bar.add_task("motions", total=None)
+        check = check_data(
+            arguments.folder,
+            _robot(arguments.robot),
+            arguments.count,
+            arguments.seed,
+            arguments.workers,
+            not arguments.no_pybullet,
+            lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    show(*check.tables)
+    return CLEAN if check.clean else VIOLATIONS
+
+
+def run_view(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.cli.drawing import show
+    from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.datasets.manifest import read_manifest
+    from robotdiffuse.robots import load_robot
+    from robotdiffuse.visualization.gallery import write_gallery
+
+    folder = Path(arguments.folder)
+    manifest = read_manifest(folder)
+    out = check_output(arguments.out or folder / "samples.html", (".html", ".htm"))
+    robot = _robot(arguments.robot) or load_robot(manifest.robot)
+    manifest.check_robot(robot)
+    entries = list(_gallery_entries(folder, robot, arguments.count, arguments.seed))
+    if not entries:
+        raise InputError(f"{folder} holds no motions yet; continue `robotdiffuse data generate` first")
+    with _bar() as bar:
+        task = bar.add_task("drawing", total=len(entries))
+        write_gallery(
+            robot, entries, out, folder.resolve().name, lambda done, _: bar.update(task, completed=done)
+        )
+    print(f"wrote {out}")
+    if not arguments.out:
+        show(out)
+    return 0
+
+
+def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[GalleryEntry]":
+    """Random motions, in the order of the shards."""
+    from robotdiffuse.datasets.manifest import read_manifest
+    from robotdiffuse.datasets.shards import motion_of, random_rows, scenes_of
+    from robotdiffuse.visualization.gallery import GalleryEntry
+
+    manifest = read_manifest(folder)
+    for shard, rows in random_rows(folder, number, seed):
+        for row in rows.tolist():
+            family = list(manifest.families)[int(shard["family"][row])]
+            scene = scenes_of(manifest, shard, slice(row, row + 1)).scene(0)
+            cost, detour, clearance = (float(shard[name][row]) for name in ("cost", "detour", "clearance"))
+            line = "line free" if shard["line_free"][row] else f"detour {detour:.2f}"
+            caption = f"{cost:.2f} rad · {line} · {100 * clearance:.1f} cm clear"
+            title = f"{family} · shard {shard.index}, row {row}"
+            yield GalleryEntry(title, caption, scene, motion_of(robot, shard, row))
+
+
+def run_export(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.datasets.robot_npz import export_npz
+
+    made = export_npz(arguments.folder, arguments.file)
+    print(f"wrote {arguments.file}: {made:,} motions")
+    return 0
+
+
+def run_import(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.datasets.robot_npz import import_npz
+
+    with _bar() as bar:
+        task = bar.add_task("motions", total=None)
+        made = import_npz(
+            arguments.file,
+            arguments.out,
+            arguments.robot,
+            arguments.radius,
+            lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    print(f"{made:,} motions in {arguments.out}; validate them with: robotdiffuse data check {arguments.out}")
+    return 0

@@ -1,4 +1,4 @@
-"""Replays (.html) and pictures (.png): the only place that imports the viewer."""
+"""Draws results as replays (.html) or pictures (.png)."""
 
 import os
 import sys
@@ -14,8 +14,10 @@ ENDINGS = (".html", ".png")
 
 
 def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
-    """Draw the motion of a solved result in its scene, by the ending of the file; with it what was predicted
-    beside what cameras saw, if it was."""
+    """Draw the motion of a solved result in its scene, as the ending of the file says.
+
+    For a problem with views and the policy `predicted`, the predicted obstacles are drawn too.
+    """
     motion = result.trajectory or result.path
     assert motion is not None, "only a solved result has a motion"
     if file.suffix.lower() == ".html":
@@ -33,7 +35,7 @@ def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
 
 
 def show(file: Path) -> None:
-    """Open a file in the browser, where there is a screen to show it on."""
+    """Open a file in the browser, if there is a display."""
     import webbrowser
 
     if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):

@@ -1,4 +1,4 @@
-"""robotdiffuse live"""
+"""The command `robotdiffuse live`."""
 
 import argparse
 import os
@@ -18,31 +18,28 @@ PORT = 8080
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "live",
-        help="an interactive page: drag target and obstacles, see plan and certificate",
-        description="Serve an interactive page until Ctrl-C: drag the target, the start and obstacles; it "
-        "plans anew and says at once whether the motion shown is still free. Without PROBLEM, the demo's.",
+        help="plan interactively in the browser",
+        description="Serve an interactive page until Ctrl-C. Drag the target, the start and obstacles: the "
+        "page plans again after each change and shows at once whether the current motion is still valid. "
+        "Without PROBLEM, it shows the demo problem.",
+    )
+    parser.add_argument("problem", metavar="PROBLEM", nargs="?", help="problem file (.yaml or .json) to open")
+    parser.add_argument("--robot", metavar="NAME", help="instead of PROBLEM: name or URDF file of an arm")
+    parser.add_argument(
+        "--planner", metavar="NAME", help="planner; see `robotdiffuse planners` (default: robotdiffuse)"
     )
     parser.add_argument(
-        "problem", metavar="PROBLEM", nargs="?", help="problem file (.yaml or .json) to begin with"
-    )
-    parser.add_argument(
-        "--robot", metavar="NAME", help="in place of PROBLEM: an arm, by its name or a URDF file"
-    )
-    parser.add_argument(
-        "--planner", metavar="NAME", help="see `robotdiffuse planners` (default: robotdiffuse)"
-    )
-    parser.add_argument(
-        "--time-limit", type=positive, default=1.0, metavar="S", help="for each plan (default: 1 s)"
+        "--time-limit", type=positive, default=1.0, metavar="S", help="time limit of each plan (default: 1 s)"
     )
     parser.add_argument(
         "--host",
         default=LOOPBACK,
         metavar="ADDRESS",
-        help="address to serve on (default: 127.0.0.1, this machine alone); elsewhere the page's address "
-        "ends with a token, without which nothing is served",
+        help="address to listen on (default: 127.0.0.1, this machine only); on other addresses the URL of "
+        "the page ends with a secret token that every visitor needs",
     )
     parser.add_argument(
-        "--port", type=port, default=PORT, metavar="N", help=f"default: {PORT}; 0: any that is free"
+        "--port", type=port, default=PORT, metavar="N", help=f"port; 0 for any free one (default: {PORT})"
     )
     parser.set_defaults(run=run)
 
@@ -60,30 +57,30 @@ def run(arguments: argparse.Namespace) -> NoReturn:
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
-        raise InputError("the page needs viser: pip install 'robotdiffuse[live]'") from None
+        raise InputError("live needs viser: pip install 'robotdiffuse[live]'") from None
     from rich.console import Console
 
     from robotdiffuse.cli import STOPPED
     from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
-    from robotdiffuse.visualization.live.access import bound, is_loopback, new_token
+    from robotdiffuse.visualization.live.access import is_loopback, listen, new_token
     from robotdiffuse.visualization.live.files import first_problem
-    from robotdiffuse.visualization.live.session import Choice, Session
+    from robotdiffuse.visualization.live.session import PageOptions, Session
 
     planner = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(planner)
-    choice = Choice(planner, arguments.time_limit)
-    listening = bound(arguments.host, arguments.port)
-    with Console(stderr=True).status("loading the robot (a new URDF is fitted with spheres, for a minute)"):
+    options = PageOptions(planner, arguments.time_limit)
+    listening = listen(arguments.host, arguments.port)
+    with Console(stderr=True).status("loading the robot (preparing a new URDF takes a minute)"):
         problem = first_problem(arguments.problem, arguments.robot)
     host, number = listening.getsockname()[:2]
     token = "" if is_loopback(host) else new_token()
-    page = Page(Session(problem, choice), listening, token)
+    page = Page(Session(problem, options), listening, token)
     ended = threading.Event()
-    for wish in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(wish, lambda *_: ended.set())
+    for stop_signal in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(stop_signal, lambda *_: ended.set())
     name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-    print(f"the page is at http://{name}:{number}/{token} (Ctrl-C ends it)", flush=True)
+    print(f"the page is at http://{name}:{number}/{token} (stop with Ctrl-C)", flush=True)
     ended.wait()
     page.close()
     print("robotdiffuse: stopped", file=sys.stderr, flush=True)
-    os._exit(STOPPED)  # threads that plan or compile would be waited for otherwise, and nothing is lost
+    os._exit(STOPPED)  # a normal exit would wait for threads that plan or compile

@@ -1,4 +1,4 @@
-"""robotdiffuse planners"""
+"""The command `robotdiffuse planners`."""
 
 import argparse
 
@@ -7,9 +7,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "planners",
         help="list the planners, or the settings of one",
-        description="List the planners, or the settings of one, which `robotdiffuse plan --set` takes.",
+        description="List the planners, or the settings of one for `robotdiffuse plan --set`.",
     )
-    parser.add_argument("planner", nargs="?", metavar="NAME", help="whose settings to list")
+    parser.add_argument("planner", nargs="?", metavar="NAME", help="list the settings of this planner")
     parser.set_defaults(run=run)
 
 
@@ -19,10 +19,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.planner is None:
         rows = [(name, entry.kind, entry.description) for name, entry in PLANNERS.items()]
-        show(Table.of("", ("planner", Column("kind", left=True), Column("what it does", left=True)), rows))
+        show(Table.of("", ("planner", Column("kind", left=True), Column("description", left=True)), rows))
         return 0
     settings = planner_settings(arguments.planner, ())
     rows = [(one.name, one.value, one.rule, one.description) for one in settings.describe()]
-    columns = ("setting", *(Column(name, left=True) for name in ("default", "values", "what it is")))
+    columns = ("setting", *(Column(name, left=True) for name in ("default", "values", "description")))
     show(Table.of(f"{arguments.planner}: {PLANNERS[arguments.planner].description}", columns, rows))
     return 0

@@ -1,4 +1,4 @@
-"""robotdiffuse robot info, robotdiffuse robot add"""
+"""The commands `robotdiffuse robot list`, `info` and `add`."""
 
 import argparse
 import sys
@@ -15,22 +15,27 @@ if TYPE_CHECKING:
     from robotdiffuse.robots.fitting.add import AddReport
     from robotdiffuse.robots.robot import Joint, Robot
 
+MAX_PAIRS = 8
+"""Most pairs of links in the report of `robot add`."""
+
 
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
-        "robot", help="show or prepare a robot", description="Show a robot, or prepare one for planning."
+        "robot", help="list, show or prepare robots", description="List or show robots, or prepare a new one."
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
 
     listing = actions.add_parser(
         "list",
-        help="the robots that problems can name",
-        description="List the bundled robots and those that were added.",
+        help="list the robots that problems can name",
+        description="List the bundled robots and those added by `robot add`.",
     )
     listing.set_defaults(run=run_list)
 
     info = actions.add_parser(
-        "info", help="joints, limits and collision model", description="Show what is known of a robot."
+        "info",
+        help="show joints, limits and collision model",
+        description="Show joints, limits and collision model of a robot.",
     )
     info.add_argument("robot", metavar="ROBOT", help="a bundled name, a prepared folder or a URDF file")
     info.set_defaults(run=run_info)
@@ -38,16 +43,17 @@ def add(commands: argparse._SubParsersAction) -> None:
     make = actions.add_parser(
         "add",
         help="prepare a robot from its URDF",
-        description="Fit covering spheres to the collision meshes of a URDF and find the pairs of links that "
-        "need no check; write it all to a folder that problems can name.",
+        description="Prepare a robot for planning: fit covering spheres to the collision meshes of its "
+        "URDF, find the pairs of links that need no collision check, and write a folder that problems can "
+        "name.",
     )
     make.add_argument("urdf", metavar="URDF", help="URDF or xacro file of an arm")
     make.add_argument("--name", metavar="NAME", help="name that problems use (default: the URDF's)")
-    make.add_argument("--out", metavar="FOLDER", help="where to write it (default: the user's robots)")
+    make.add_argument("--out", metavar="FOLDER", help="folder to write (default: one in the user's robots)")
     make.add_argument(
         "--group",
         metavar="NAME",
-        help="group of the SRDF, or arm, that is planned; 'both' or 'all' arms as one robot (default: the "
+        help="group of the SRDF, or arm, to plan for; both or all: several arms as one robot (default: the "
         "only arm)",
     )
     make.add_argument("--base", metavar="LINK", help="first link of the arm (default: the root)")
@@ -63,8 +69,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     make.add_argument(
         "--srdf",
         metavar="FILE",
-        help="SRDF with groups, poses, passive joints and pairs of links to allow (default: groups, poses "
-        "and passive joints of the one beside the URDF)",
+        help="SRDF with groups, poses, passive joints and allowed pairs of links (default: the SRDF beside "
+        "the URDF, without its pairs)",
     )
     make.add_argument(
         "--allow",
@@ -72,7 +78,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         action="append",
         default=[],
         metavar=("LINK", "LINK"),
-        help="two links that need no check against each other; repeatable",
+        help="two links not to check against each other; repeatable",
     )
     make.add_argument(
         "--package",
@@ -80,12 +86,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         action="append",
         default=[],
         metavar="NAME=FOLDER",
-        help="where a package:// is (default: ROS_PACKAGE_PATH, AMENT_PREFIX_PATH, upwards of the URDF)",
+        help="folder of a ROS package (default: search ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders "
+        "above the URDF)",
     )
+    make.add_argument("--limits", metavar="FILE", help="file of joint limits, as MoveIt's joint_limits.yaml")
     make.add_argument(
-        "--limits", metavar="FILE", help="joint limits in the form of MoveIt's joint_limits.yaml"
+        "--licence", metavar="TEXT", help="licence of the URDF's geometry, to keep in the folder"
     )
-    make.add_argument("--licence", metavar="TEXT", help="licence of the URDF's geometry, kept as a note")
     make.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
     make.set_defaults(run=run_add)
 
@@ -107,7 +114,7 @@ def run_list(arguments: argparse.Namespace) -> int:
         weights = "no" if weights_for("model", robot) is None else "yes"
         refused, pairs = read_source(place).get("refused"), len(robot.checked_pairs())
         rows.append((name, robot.dof, spheres, pairs, refused, weights, str(place)))
-    refused = Column("refused", "%", ".1f", scale=100.0)
+    refused = Column("false collisions", "%", ".1f", scale=100.0)
     columns = ("robot", "joints", "spheres", "checked pairs", refused, "weights", Column("folder", left=True))
     show(Table.of("", columns, rows))
     return 0
@@ -124,12 +131,11 @@ def run_add(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from robotdiffuse.core.processes import interrupts_at_once
+    from robotdiffuse.core.processes import exit_on_interrupt
 
     console = Console(stderr=True)
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
-    with interrupts_at_once(bar.stop), bar:
-        from robotdiffuse.cli.robot_report import print_preparation
+    with exit_on_interrupt(bar.stop), bar:
         from robotdiffuse.robots.fitting.add import add_robot
 
         task = bar.add_task("reading")
@@ -163,8 +169,39 @@ def run_add(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def print_preparation(report: "AddReport") -> None:
+    """Print links, the pairs with most false collisions, and the time and memory of preparation; warnings go
+    to standard error."""
+    from robotdiffuse.evaluation.tables import Column, Table, show
+
+    columns = ("link", "convex parts", "spheres", Column("sticking out", "mm", ".1f", scale=1e3), "covered")
+    links = [
+        (of.link, of.parts, of.spheres, of.stick_out, "yes" if of.covered else "no") for of in report.links
+    ]
+    share = [
+        Column(name, "%", ".1f", scale=100.0) for name in ("colliding", "refused by parts", "by spheres")
+    ]
+    pairs = [
+        (", ".join(of.links), of.colliding, of.by_parts, of.by_spheres)
+        for of in report.refusals.pairs[:MAX_PAIRS]
+    ]
+    of = report.refusals
+    parts = sum(link.parts for link in report.links)
+    summary = [
+        ("convex parts, spheres", f"{parts}, {report.sphere_count}"),
+        ("configurations free of self-collision", f"{of.free:.1%}"),
+        ("of these refused by convex parts, by spheres", f"{of.by_parts:.1%}, {of.by_spheres:.1%}"),
+        ("processor time, memory", f"{report.seconds:.0f} s, {report.memory / 2**20:.0f} MiB"),
+    ]
+    show(
+        Table.of("", columns, links), Table.of("", ("pair of links", *share), pairs), Table.pairs("", summary)
+    )
+    for warning in report.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
 def _print_pairs(report: "AddReport") -> None:
-    """How many pairs of links are allowed for which reason, and where the SRDF sees it otherwise."""
+    """Print the number of allowed pairs of links by reason, and where they differ from the SRDF."""
     from robotdiffuse.evaluation.tables import Column, Table, show
 
     reasons = Counter(pair.reason for pair in report.pairs)
@@ -174,11 +211,12 @@ def _print_pairs(report: "AddReport") -> None:
         return
     columns = ("link", "link", "by sampling", Column("colliding", "%", ".1f", scale=100.0), "by the SRDF")
     rows = [(*pair.links, pair.sampled, pair.colliding, pair.srdf) for pair in report.differences]
-    title = f"pairs that {report.srdf.name} sees differently"
+    title = f"pairs that differ from {report.srdf.name}"
     show(Table.of(title, columns, rows) if rows else Table.pairs("", [(title, "none")]))
 
 
 def print_robot(robot: "Robot") -> None:
+    """Print joints, limits, collision model and notes of a robot."""
     from robotdiffuse.core.transforms import inverse
     from robotdiffuse.evaluation.tables import Column, Table, show
 
@@ -189,7 +227,7 @@ def print_robot(robot: "Robot") -> None:
     ends = [("tip", tip) for tip in robot.tips] if robot.other_tips else []
     pairs = [("base", robot.base), *ends] if ends else [("base, tip", f"{robot.base}, {robot.tip}")]
     if robot.root not in ("", robot.base):
-        at = "on a joint that moves it" if robot.T_base_root is None else _place(inverse(robot.T_base_root))
+        at = "on a moving joint" if robot.T_base_root is None else _place(inverse(robot.T_base_root))
         pairs.append((f"base in {robot.root}", at))
     pairs += [
         ("links", f"{len(robot.link_names)}"),

@@ -1,4 +1,4 @@
-"""robotdiffuse serve"""
+"""The command `robotdiffuse serve`."""
 
 import argparse
 import os
@@ -16,51 +16,50 @@ TOKEN = "ROBOTDIFFUSE_TOKEN"
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "serve",
-        help="plan and verify over HTTP",
-        description="Plan and verify over HTTP until SIGTERM or Ctrl-C: requests that a worker has are "
-        "finished then, others are answered with 503. The address itself shows a page of what there is. "
-        f"Listening elsewhere than at this machine's own address needs a token in {TOKEN}.",
+        help="plan and validate over HTTP",
+        description="Plan and validate over HTTP until SIGTERM or Ctrl-C. Running requests then finish; "
+        "waiting ones are answered with 503. The server's address in a browser lists all endpoints. A server "
+        f"that other machines can reach needs a token in the environment variable {TOKEN}.",
     )
     parser.add_argument(
         "--robot",
         action="append",
         default=[],
         metavar="NAME",
-        help="a robot that requests may name beside the bundled ones: one of `robot add`, or its URDF; "
-        "repeatable",
+        help="another robot that requests may name: one of `robot add`, or a URDF file; repeatable",
     )
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: 127.0.0.1)")
-    parser.add_argument("--port", type=natural, default=8000, help="0: any that is free (default: 8000)")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
+    parser.add_argument("--port", type=natural, default=8000, help="port; 0 for any free one (default: 8000)")
     parser.add_argument(
-        "--workers", type=count, metavar="N", help="processes that plan (default: one a core)"
+        "--workers", type=count, metavar="N", help="processes that plan (default: one per core)"
     )
     parser.add_argument(
         "--queue",
         type=natural,
         default=16,
         metavar="N",
-        help="requests that may wait for a worker; others are answered with 429 (default: 16)",
+        help="requests that may wait for a worker; further ones are answered with 429 (default: 16)",
     )
     parser.add_argument(
-        "--longest",
+        "--max-time-limit",
         type=positive,
         default=10.0,
         metavar="S",
-        help="time limit that a request may ask for at most (default: 10 s)",
+        help="largest time limit of a request (default: 10 s)",
     )
     parser.add_argument(
-        "--largest",
+        "--max-request-size",
         type=count,
         default=8,
         metavar="MB",
-        help="size that a request may have (default: 8 MB)",
+        help="largest size of a request (default: 8 MB)",
     )
     parser.add_argument(
-        "--memory",
+        "--max-worker-memory",
         type=count,
         default=2048,
         metavar="MB",
-        help="what a worker may hold after an answer; one that holds more is replaced (default: 2048 MB)",
+        help="a worker that holds more memory than this after an answer is replaced (default: 2048 MB)",
     )
     parser.set_defaults(run=run)
 
@@ -72,7 +71,9 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         from robotdiffuse.server.server import serve
     except ImportError:
-        raise InputError('serve needs fastapi and uvicorn: pip install "robotdiffuse[serve]"') from None
+        raise InputError(
+            'serve needs fastapi, prometheus-client and uvicorn: pip install "robotdiffuse[serve]"'
+        ) from None
     from robotdiffuse.server.settings import ServeSettings
 
     settings = ServeSettings(
@@ -80,21 +81,21 @@ def run(arguments: argparse.Namespace) -> int:
         port=arguments.port,
         workers=arguments.workers or os.cpu_count() or 1,
         queue=arguments.queue,
-        longest=arguments.longest,
-        largest=arguments.largest * MEGABYTE,
-        memory=arguments.memory * MEGABYTE,
+        max_time_limit=arguments.max_time_limit,
+        max_request_size=arguments.max_request_size * MEGABYTE,
+        max_worker_memory=arguments.max_worker_memory * MEGABYTE,
         token=os.environ.get(TOKEN, ""),
     )
     if not settings.on_loopback and not settings.token:
-        raise InputError(f"host is {shown(settings.host)}, where others can connect: set a token in {TOKEN}")
+        raise InputError(f"host is {shown(settings.host)}, which others can reach: set a token in {TOKEN}")
     serve(served_robots(arguments.robot), settings, lambda line: print(line, flush=True))
     return 0
 
 
 def served_robots(names: Sequence[str]) -> "dict[str, Robot]":
-    """The bundled robots and those named, by the names that requests use: a URDF's robot by its own.
+    """The bundled robots and those named, by the names for requests; a robot from a URDF has its own name.
 
-    Raises InputError where two would have one name.
+    Raises InputError if two robots have the same name.
     """
     from robotdiffuse.core.errors import InputError, shown
     from robotdiffuse.robots import ROBOTS, known_robots, load_robot
@@ -104,6 +105,6 @@ def served_robots(names: Sequence[str]) -> "dict[str, Robot]":
         robot = load_robot(name)
         known = name if name in known_robots() else robot.name
         if known in robots:
-            raise InputError(f"robot {shown(name)} would be called {known}, which another robot is")
+            raise InputError(f"robot {shown(name)} has the name {known} of another robot")
         robots[known] = robot
     return robots

@@ -1,9 +1,9 @@
-"""robotdiffuse simulate"""
+"""The command `robotdiffuse simulate`."""
 
 import argparse
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.view import read
+from robotdiffuse.cli.view import read_solved
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,9 +15,9 @@ ENDINGS = (".gif", ".png")
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "simulate",
-        help="replay a result under PyBullet's position control",
-        description="Replay the motion of a result file under PyBullet's position control; print tracking "
-        "errors and contacts. Exit status: 0 free of contacts, 1 contacts, 2 bad input.",
+        help="replay a result in the PyBullet simulator",
+        description="Replay the motion of a result file in PyBullet with position control, and print "
+        "tracking errors and contacts. Exit status: 0 no contacts, 1 contacts, 2 bad input.",
     )
     parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
     parser.add_argument(
@@ -41,10 +41,10 @@ def run(arguments: argparse.Namespace) -> int:
         if error.name != "pybullet":
             raise
         raise InputError(
-            "simulate needs PyBullet, whose wheels stop at Python 3.11: pip install 'robotdiffuse[sim]'"
+            "simulate needs PyBullet, which has no wheels above Python 3.11: pip install 'robotdiffuse[sim]'"
         ) from None
     outputs = [check_output(file, ENDINGS) for file in arguments.out]
-    result, problem = read(arguments.result)
+    result, problem = read_solved(arguments.result)
     if result.trajectory is None:
         raise InputError(f"{arguments.result} holds a path without times; a replay needs a trajectory")
     robot, scene = problem.standing()
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def print_replay(robot: str, duration: float, done: "Replay") -> None:
-    """Tracking errors and contacts, as tables."""
+    """Print tracking errors and contacts."""
     from robotdiffuse.evaluation.tables import Column, Table, show
 
     title = f"{robot}: {'free' if done.free else 'contact'}, {duration:.2f} s"
@@ -67,7 +67,7 @@ def print_replay(robot: str, duration: float, done: "Replay") -> None:
     show(
         Table.of(
             title,
-            ("", "greatest", "RMS"),
+            ("", "maximum", "RMS"),
             [
                 *(
                     (f"error of {name}", f"{1e3 * most:.3f} mrad", f"{1e3 * rms:.3f} mrad")

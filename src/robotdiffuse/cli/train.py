@@ -1,122 +1,127 @@
-"""robotdiffuse train encoder, train completion, train planner, train baseline"""
+"""The commands `robotdiffuse train encoder`, `completion`, `planner` and `baseline`."""
 
 import argparse
 import os
-from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
 from robotdiffuse.cli.arguments import count, names, natural, positive, share
 from robotdiffuse.core.errors import InputError, shown
 
-SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
-PARTS = (
-    *("denoiser", "objective", "sampler", "sampling_steps", "parametrization", "rows", "target"),
-    *("condition_drop", "waypoints", "views"),
+TRAINING_OPTIONS = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
+MODEL_OPTIONS = (
+    *("denoiser", "objective", "sampler", "sampling_steps", "target"),
+    *("condition_drop", "waypoints"),
 )
-"""Of the planner's config."""
+"""Options of `train planner` that replace parts of its config."""
 
 
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "train",
-        help="train the encoder, the completing network, the planner's or a baseline",
-        description="Train a network. Ctrl-C stops after a checkpoint; the same command continues. Several "
-        "processes, each with a GPU of its own if there are as many: "
+        help="train networks",
+        description="Train a network. Ctrl-C stops after writing a checkpoint; run the same command again to "
+        "continue. To train with N processes, on a GPU each if there are enough: "
         "torchrun --nproc-per-node N -m robotdiffuse train ...",
     )
     kinds = parser.add_subparsers(title="networks", metavar="NETWORK", required=True)
 
     encoder = kinds.add_parser(
         "encoder",
-        help="an auto-encoder of point clouds",
-        description="Train an auto-encoder of point clouds on random scenes; it is frozen afterwards.",
+        help="train an auto-encoder of point clouds",
+        description="Train an auto-encoder of point clouds on random scenes. The planner's training keeps "
+        "it frozen.",
     )
-    encoder.add_argument("--encoder", dest="name", metavar="NAME", help="which one (point_autoencoder)")
+    encoder.add_argument(
+        "--encoder", dest="name", metavar="NAME", help="encoder to train (default: point_autoencoder)"
+    )
     _add_shared(encoder)
     _add_device(encoder)
     encoder.set_defaults(run=run_encoder)
 
     completion = kinds.add_parser(
         "completion",
-        help="the network that completes what cameras see",
-        description="Train the network that says what is where depth cameras do not see, on random scenes.",
+        help="train the occupancy completion network",
+        description="Train the occupancy completion network, which predicts the obstacles that depth "
+        "cameras do not see, on random scenes.",
     )
-    completion.add_argument("--families", type=names, metavar="NAMES", help="of the scenes (all of them)")
-    completion.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the arm in the pictures")
-    completion.add_argument("--workers", type=natural, metavar="N", help="processes that draw samples (1)")
+    completion.add_argument(
+        "--families", type=names, metavar="NAMES", help="families of the scenes (default: all)"
+    )
+    completion.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the arm in the images")
+    completion.add_argument(
+        "--workers", type=natural, metavar="N", help="processes that draw samples (default: 1)"
+    )
     _add_shared(completion)
     _add_device(completion)
     completion.set_defaults(run=run_completion)
 
     planner = kinds.add_parser(
         "planner",
-        help="the network that predicts motions",
+        help="train the network that predicts motions",
         description="Train the network that predicts motions, on planned trajectories. With --robot and "
-        "without --data: makes data for the arm, trains on them, and puts the weights where planners find "
-        "them, in about two hours of two cores.",
+        "without --data, generate data for the arm, train on them, and install the weights where planners "
+        "find them; this takes about two hours on two cores.",
     )
     planner.add_argument(
-        "--data", metavar="FOLDER", help="folder with shards of trajectories (default: made for --robot)"
+        "--data",
+        metavar="FOLDER",
+        help="folder with shards of trajectories (default: generate them for --robot)",
     )
     planner.add_argument(
         "--config",
         default="compact",
         metavar="NAME",
-        help="compact (default), paper, trajectory_prior (of MPD and EDMP), or a row of the paper's Table 2: "
-        "table2_jpc, table2_unet, ...",
+        help="compact (default), paper, trajectory_prior (for MPD and EDMP), or a row of the paper's Table "
+        "2: table2_jpc, table2_unet, ...",
     )
     planner.add_argument(
         "--encoder",
         metavar="FOLDER",
-        help="folder with a trained encoder, or the name of one to train along, pointnet or dgcnn, or "
-        "completing_autoencoder, which comes trained; needed for --data unless the config names one "
-        "(default: the one that comes with the package)",
+        help="folder of a trained encoder; or pointnet or dgcnn, which are trained with the planner. Required "
+        "with --data unless the config names one (default: the bundled encoder)",
     )
-    planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (panda)")
+    planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (default: panda)")
     planner.add_argument(
-        "--trajectories", type=count, metavar="N", help="motions to make, without --data (60,000)"
-    )
-    planner.add_argument(
-        "--generate",
+        "--trajectories",
         type=count,
         metavar="N",
-        help="meanwhile fill the data folder with N processes; training begins with the first shard, and "
-        "takes in the others. Without --data: make them first, with N processes (all cores)",
+        help="motions to generate, without --data (default: 60,000)",
+    )
+    planner.add_argument(
+        "--workers", type=count, metavar="N", help="processes that generate data without --data (all cores)"
     )
     _add_shared(planner, out_required=False)
     _add_device(planner)
-    parts = planner.add_argument_group("parts of the model, instead of the config's")
+    parts = planner.add_argument_group("parts of the model that replace those of the config")
     parts.add_argument(
         "--denoiser", metavar="NAME", help="transformer, encoder_decoder, decoder_only or unet"
     )
-    parts.add_argument("--objective", metavar="NAME", help="what is predicted: clean, noise or velocity")
-    parts.add_argument("--schedule", metavar="NAME", help="of the noise: cosine, linear or flow")
-    parts.add_argument("--sampler", metavar="NAME", help="for planning: ddim, ddpm, dpm_solver or euler")
+    parts.add_argument("--sampler", metavar="NAME", help="sampler for planning: ddim or ddpm")
+    parts.add_argument("--objective", metavar="NAME", help="what the denoiser predicts: clean or noise")
     parts.add_argument(
-        "--sampling-steps", type=count, metavar="N", help="for planning: calls of the denoiser for a batch"
+        "--target",
+        metavar="NAME",
+        help="what motions are relative to: residual (the straight line), absolute or limits",
     )
-    parts.add_argument("--parametrization", metavar="NAME", help="of motions: waypoints or b_spline")
-    parts.add_argument("--rows", type=count, metavar="N", help="control points of b_spline")
-    parts.add_argument("--target", metavar="NAME", help="residual, to the straight line, or absolute")
+    parts.add_argument("--sampling-steps", type=count, metavar="N", help="denoising steps for planning")
     parts.add_argument(
-        "--condition-drop", type=share, metavar="P", help="share without condition, for its guidance"
+        "--condition-drop",
+        type=share,
+        metavar="P",
+        help="fraction of samples without condition, for classifier-free guidance",
     )
-    parts.add_argument(
-        "--views",
-        action="store_const",
-        const=True,
-        help="tell the encoder what one camera sees of each scene, not of all its surfaces",
-    )
-    parts.add_argument("--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion")
+    parts.add_argument("--waypoints", type=count, metavar="N", help="waypoints of a motion")
     planner.set_defaults(run=run_planner)
 
     baseline = kinds.add_parser(
         "baseline",
-        help="the network of a learned baseline: mpnet, mpinets, trajectory_prior",
+        help="train the network of a learned baseline: mpnet, mpinets, trajectory_prior",
         description="Train the network of a learned baseline on planned trajectories.",
     )
-    baseline.add_argument("name", metavar="NAME", help="mpnet, mpinets or trajectory_prior (MPD and EDMP)")
+    baseline.add_argument(
+        "name", metavar="NAME", help="mpnet, mpinets or trajectory_prior (for MPD and EDMP)"
+    )
     baseline.add_argument("--data", required=True, metavar="FOLDER", help="data set of `data generate`")
     baseline.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the data's robot")
     _add_shared(baseline)
@@ -124,7 +129,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> None:
-    default = "" if out_required else "; without --data for data too (default: beside the user's robots)"
+    default = "" if out_required else "; without --data also for the data (default: beside the user's robots)"
     parser.add_argument(
         "--out",
         required=out_required,
@@ -132,12 +137,12 @@ def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> N
         help=f"folder for weights, settings and checkpoints{default}",
     )
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--minutes", type=positive, metavar="MIN", help="length of the run in wall time")
-    length.add_argument("--samples", type=count, metavar="N", help="length of the run in training samples")
+    length.add_argument("--minutes", type=positive, metavar="MIN", help="length of the training [minutes]")
+    length.add_argument("--samples", type=count, metavar="N", help="length of the training [samples]")
     parser.add_argument("--seed", type=natural, metavar="N", help="random seed")
     parser.add_argument("--batch", type=count, metavar="N", help="samples per step")
-    parser.add_argument("--learning-rate", type=positive, metavar="X", help="highest learning rate")
-    parser.add_argument("--threads", type=count, metavar="N", help="threads of PyTorch")
+    parser.add_argument("--learning-rate", type=positive, metavar="X", help="largest learning rate")
+    parser.add_argument("--threads", type=count, metavar="N", help="number of PyTorch threads")
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
@@ -154,54 +159,45 @@ def run_encoder(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.config import EncoderTraining
     from robotdiffuse.learning.training.encoder import train_encoder
 
-    given = _given(arguments, ("name", "device", *SHARED))
+    given = _given(arguments, ("name", "device", *TRAINING_OPTIONS))
     if "samples" in given:
         given["minutes"] = None
     settings = EncoderTraining(**given)  # type: ignore[arg-type]
-    _report(train_encoder(settings, arguments.out), arguments.out)
+    _print_report(train_encoder(settings, arguments.out), arguments.out)
     return 0
 
 
 def run_completion(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
 
-    given = _given(arguments, ("families", "robot", "workers", "device", *SHARED))
+    given = _given(arguments, ("families", "robot", "workers", "device", *TRAINING_OPTIONS))
     if "minutes" in given:
         given["samples"] = None
     settings = CompletionTraining(**given)  # type: ignore[arg-type]
-    _report(train_completion(settings, arguments.out), arguments.out)
+    _print_report(train_completion(settings, arguments.out), arguments.out)
     return 0
 
 
 def run_planner(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.cli.background_factory import filled_meanwhile
     from robotdiffuse.learning.denoisers import DENOISERS
-    from robotdiffuse.learning.diffusion import ScheduleSettings
     from robotdiffuse.learning.training.configs import CONFIGS, planner_training
     from robotdiffuse.learning.training.planner import train_planner
 
     if arguments.config not in CONFIGS:
         known = [f"{name}: {config.description}" for name, config in CONFIGS.items()]
         raise InputError(f"unknown config {shown(arguments.config)}; known:", known)
-    given = _given(arguments, ("data", "encoder", "robot", "device", *SHARED, *PARTS))
+    given = _given(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
     if "denoiser" in given and CONFIGS[arguments.config].changes.get("denoiser_settings") is not None:
-        # the config's are of its own denoiser; those of another of the same size
+        # the config's settings are for its own denoiser; another one gets settings of the same size
         given["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
-    if arguments.schedule is not None:
-        given["schedule"] = ScheduleSettings(kind=arguments.schedule)
     if arguments.data is None:
         return _run_for_robot(arguments, given)
     if arguments.out is None:
-        raise InputError("--data is given, and no --out: name a folder for the weights")
-    if arguments.trajectories is not None:
-        raise InputError("--trajectories is for data that are made; --data names a folder that has some")
-    settings = planner_training(arguments.config, given)
-    meanwhile = nullcontext()
-    if arguments.generate is not None:
-        meanwhile = filled_meanwhile(settings.data, arguments.generate, settings.robot)
-    with meanwhile:
-        report = train_planner(settings, arguments.out)
-    _report(report, arguments.out)
+        raise InputError("--data needs --out, a folder for the weights")
+    for option in ("trajectories", "workers"):
+        if getattr(arguments, option) is not None:
+            raise InputError(f"--{option} is for data to be generated; --data names existing data")
+    _print_report(train_planner(planner_training(arguments.config, given), arguments.out), arguments.out)
     return 0
 
 
@@ -210,16 +206,16 @@ def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
     from robotdiffuse.learning.training.configs import planner_training
 
     if arguments.robot is None:
-        raise InputError("name an arm with --robot, whose data are made, or a folder of data with --data")
+        raise InputError("give --robot to generate data for an arm, or --data to use existing data")
     report, kept = train_for_robot(
         arguments.robot,
         given,
         partial(planner_training, arguments.config),
         arguments.out,
         arguments.trajectories,
-        arguments.generate,
+        arguments.workers,
     )
-    _report(report, str(kept))
+    _print_report(report, str(kept))
     return 0
 
 
@@ -228,18 +224,18 @@ def run_baseline(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.configs import planner_training
     from robotdiffuse.learning.training.planner import train_planner
 
-    given = _given(arguments, ("data", "robot", *SHARED))
+    given = _given(arguments, ("data", "robot", *TRAINING_OPTIONS))
     if arguments.name == "trajectory_prior":
         report = train_planner(planner_training(arguments.name, given), arguments.out)
     else:
         report = train_baseline(baseline_training(arguments.name, given), arguments.out)
-    _report(report, arguments.out)
+    _print_report(report, arguments.out)
     return 0
 
 
-def _report(figures: dict[str, float], out: str) -> None:
+def _print_report(figures: dict[str, float], out: str) -> None:
     if int(os.environ.get("RANK", "0")) > 0:
-        return  # torchrun's first process tells
+        return  # only the first process of torchrun prints
     for name, value in figures.items():
         print(f"{name}: {value:.6g}")
     print(f"wrote {out}")

@@ -1,10 +1,10 @@
-"""robotdiffuse verify, robotdiffuse certificate check"""
+"""The command `robotdiffuse verify`."""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import natural
+from robotdiffuse.cli.arguments import IGNORE_JOINTS, natural
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError
 
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from robotdiffuse.core import types
     from robotdiffuse.problems.problem import Problem
 
-HELD, NOT_HELD = 0, 1
+VALID, NOT_VALID = 0, 1
 
 
-def add_verify(commands: argparse._SubParsersAction) -> None:
+def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "verify",
-        help="validate anybody's motion, and certify it",
-        description="Validate a motion, whoever planned it: a result of ours, CSV, JSON, YAML of a ROS "
+        help="validate a motion from any source",
+        description="Validate a motion from any planner: a RobotDiffuse result, CSV, JSON, YAML of a ROS "
         "JointTrajectory or MoveIt RobotTrajectory, a ROS 2 bag or MCAP. Exit status: 0 valid, 1 not valid, "
         "2 bad input.",
     )
@@ -30,54 +30,36 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
     where.add_argument(
         "--problem",
         metavar="FILE",
-        help="problem file (default: the one that a result or an .mcap of ours holds)",
+        help="problem file (default: the problem in the result or .mcap file)",
     )
     where.add_argument(
         "--scene",
         metavar="FILE",
-        help="MoveIt planning scene; start and goal are the motion's own. Needs --robot",
+        help="MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs "
+        "--robot",
     )
     parser.add_argument(
         "--index", type=natural, default=0, help="which problem of a .jsonl file (default: 0)"
     )
-    parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF, beside --scene")
-    parser.add_argument("--topic", metavar="NAME", help="of a bag or MCAP file that holds several motions")
+    parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF, with --scene")
+    parser.add_argument("--ignore-joints", action="store_true", help=IGNORE_JOINTS)
     parser.add_argument(
-        "--all", action="store_true", help="print all that is wrong, not only what comes first"
+        "--topic", metavar="NAME", help="topic of the motion in a bag or MCAP file with several"
     )
+    parser.add_argument("--all", action="store_true", help="print all violations, not only the first")
     parser.add_argument(
         "--certificate",
         metavar="FILE.json",
-        help="write a proof of a valid motion, for `robotdiffuse certificate check`",
+        help="write a proof that the motion is valid, for `robotdiffuse certificate check`",
     )
-    parser.set_defaults(run=run_verify)
+    parser.set_defaults(run=run)
 
 
-def add_certificate(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "certificate",
-        help="re-check certificates of motions",
-        description="Re-check certificates of motions.",
-    )
-    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    check = actions.add_parser(
-        "check",
-        help="re-check a certificate, without search",
-        description="Re-check a certificate by code that shares nothing with the validator. Exit status: 0 it "
-        "holds, 1 it does not, 2 bad input.",
-    )
-    check.add_argument("file", metavar="FILE", help="certificate of `robotdiffuse verify --certificate`")
-    check.add_argument(
-        "--problem", metavar="FILE", help="for this problem file (default: the problem that it holds)"
-    )
-    check.set_defaults(run=run_check)
-
-
-def run_verify(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
 
     out = None if arguments.certificate is None else check_output(arguments.certificate, (".json",))
-    problem, motions, notes = _asked(arguments)
+    problem, motions, notes = _read(arguments)
     for note in notes:
         print(f"note: {note}")
     valid = all([_validated(problem, what, motion, arguments.all) for what, motion in motions.items()])
@@ -88,27 +70,13 @@ def run_verify(arguments: argparse.Namespace) -> int:
         certificate.save(out)
         proof = certificate.proof
         print(f"wrote {out}: {len(proof.stretches.claim)} stretches, {len(proof.planes)} planes")
-    return HELD if valid else NOT_HELD
-
-
-def run_check(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.certificates.proof import load_certificate
-    from robotdiffuse.problems.files import load_problem
-
-    certificate = load_certificate(arguments.file)
-    problem = None if arguments.problem is None else load_problem(arguments.problem)
-    found = certificate.check(problem).differences
-    for line in found:
-        print(line)
-    if not found:
-        scene, itself = 1e3 * certificate.scene_clearance, 1e3 * certificate.self_clearance
-        print(f"holds: at least {scene:.1f} mm to the scene, {itself:.1f} mm between links")
-    return NOT_HELD if found else HELD
+    return VALID if valid else NOT_VALID
 
 
 def _validated(
     problem: "Problem", what: str, motion: "types.Path | types.Trajectory", everything: bool
 ) -> bool:
+    """Whether the motion is valid; prints its clearance, or its violations."""
     from robotdiffuse.core.types import Trajectory
     from robotdiffuse.validation.validator import verify, verify_trajectory
 
@@ -127,8 +95,8 @@ def _validated(
     return False
 
 
-def _along(file: str) -> "Problem":
-    """The problem in a file of ours; InputError if it has none."""
+def _stored_problem(file: str) -> "Problem":
+    """The problem stored in an .mcap file. Raises InputError if there is none."""
     problem = None
     if file.lower().endswith(".mcap"):
         from robotdiffuse.interop.mcap_file import problem_in
@@ -139,38 +107,39 @@ def _along(file: str) -> "Problem":
     return problem
 
 
-def _asked(
+def _read(
     arguments: argparse.Namespace,
 ) -> "tuple[Problem, dict[str, types.Path | types.Trajectory], tuple[str, ...]]":
-    """The problem, the motions to validate, and what was changed to read them."""
+    """The problem, the motions to validate by name, and notes on changes made to read them."""
     from robotdiffuse.core.types import Trajectory
     from robotdiffuse.interop import read_motion
-    from robotdiffuse.interop.recorded_motion import fitted, own_problem
+    from robotdiffuse.interop.recorded_motion import motion_of_robot, problem_of_motion
     from robotdiffuse.problems.files import load_problem
 
     if (arguments.scene is None) != (arguments.robot is None):
-        raise InputError("--scene and --robot belong together: a planning scene does not say which robot")
+        raise InputError("--scene and --robot belong together: a planning scene does not name its robot")
     alone = arguments.problem is None and arguments.scene is None
     if alone and arguments.motion.lower().endswith(".json"):
-        from robotdiffuse.cli.view import read
+        from robotdiffuse.cli.view import read_solved
 
-        result, problem = read(arguments.motion)
+        result, problem = read_solved(arguments.motion)
         both = {"path": result.path, "trajectory": result.trajectory}
         return problem, {what: motion for what, motion in both.items() if motion is not None}, ()
-    recorded = read_motion(arguments.motion, arguments.topic)
+    recorded, more = read_motion(arguments.motion, arguments.topic), ()
     if alone:
-        problem = _along(arguments.motion)
+        problem = _stored_problem(arguments.motion)
     elif arguments.problem is not None:
-        problem = load_problem(arguments.problem, arguments.index)
+        problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     else:
-        from robotdiffuse.problems.moveit import read_moveit_scene
+        from robotdiffuse.problems.moveit import read_noted_moveit_scene
         from robotdiffuse.robots import load_robot
 
         robot = load_robot(arguments.robot)
-        problem = own_problem(recorded, robot, read_moveit_scene(str(arguments.scene), robot))
+        scene, more = read_noted_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
+        problem = problem_of_motion(recorded, robot, scene)
     try:
-        fit = fitted(recorded, problem.robot)
+        fit = motion_of_robot(recorded, problem.robot)
     except InputError as error:
         raise InputError(f"{arguments.motion}: {error}") from None
     what = "trajectory" if isinstance(fit.motion, Trajectory) else "path"
-    return problem, {what: fit.motion}, fit.notes
+    return problem, {what: fit.motion}, (*more, *fit.notes)

@@ -6,6 +6,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import clearance_gradients, distance, lane_clearance, lane_collision
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -84,4 +85,4 @@ class CollisionChecker:
             raise InputError(f"q has {q.shape[1]} columns; it must have the {self.robot.dof} planned joints")
         if not np.isfinite(q).all():
             raise InputError("q holds values that are not finite; configurations must be numbers")
-        return np.ascontiguousarray(q, np.float32)
+        return for_kernels(q, np.float32)

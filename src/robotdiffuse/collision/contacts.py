@@ -9,6 +9,7 @@ from robotdiffuse.collision.exact_meshes import Distance, ExactCollision
 from robotdiffuse.collision.kernels import motion_certificate as kernel
 from robotdiffuse.collision.kernels.motion_certificate import Motion
 from robotdiffuse.collision.motions import EPISODE_TRAVEL, Contact, ContinuousCollision
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -24,7 +25,7 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
     motion.
     """
     validator, exact = ContinuousCollision(robot, scene, contact, 0.5), ExactCollision(robot, scene)
-    motion = Motion(np.ascontiguousarray(q), kernel.way_along(q, validator.checks.levers))
+    motion = Motion(for_kernels(q), kernel.way_along(q, validator.checks.levers))
     end, at, found = float(motion.way[-1]), 0.0, list[Contact]()
     for _ in range(MOST_LOOKS):
         low = kernel.segment_at(motion.way, at)[0]

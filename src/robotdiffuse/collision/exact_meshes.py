@@ -27,6 +27,7 @@ from robotdiffuse.collision.convex_geometry import (
     solids_of,
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_surface
@@ -78,7 +79,7 @@ class _Obstacle(NamedTuple):
 def forward_frames(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n frames 4 4"]:
     """T_base_frame of frames 0 to dof, in float64 and independent of the PyTorch kinematics."""
     slides = np.array(robot.prismatic, np.bool_)
-    return kernel.forward(robot.frame_offsets, robot.branching, slides, np.asarray(q, np.float64))
+    return kernel.forward(for_kernels(robot.frame_offsets), robot.branching, slides, for_kernels(q))
 
 
 def _piece(part: Part) -> _Piece:
@@ -117,7 +118,8 @@ def _obstacle(solid: Solid) -> _Obstacle:
             geometry = coal_surface(shape.mesh.world_vertices, shape.mesh.faces)
         case PointCloud():
             # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
-            geometry = coal_surface(shape.points, np.repeat(np.arange(len(shape.points))[:, None], 3, axis=1))
+            points = shape.distinct_points
+            geometry = coal_surface(points, np.repeat(np.arange(len(points))[:, None], 3, axis=1))
         case _:
             raise TypeError(f"no collision geometry for a {type(shape).__name__}")
     # surfaces are given in the base frame
@@ -143,7 +145,7 @@ def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
 def _surfaces(shape: Shape) -> tuple[int, str]:
     """How many surfaces Coal sorts into a tree, and what they are."""
     if isinstance(shape, PointCloud):
-        return len(shape.points), "points"
+        return len(shape.distinct_points), "points"
     return (len(shape.mesh.faces), "triangles") if isinstance(shape, Triangulated) else (0, "")
 
 

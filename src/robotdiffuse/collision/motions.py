@@ -33,6 +33,7 @@ from robotdiffuse.collision.kernels.motion_certificate import (
     Round,
 )
 from robotdiffuse.collision.kernels.motions import Space
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
@@ -119,7 +120,7 @@ class ContinuousCollision:
 
     def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
         """Validate the motion along straight joint-space lines through the waypoints (at least one)."""
-        q = np.ascontiguousarray(q, dtype=np.float64)
+        q = for_kernels(q)
         motion = Motion(q, kernel.way_along(q, self.checks.levers))
         todo = kernel.first_pieces(motion, self.checks, FIRST_TRAVEL)
         best, certified = np.full(2, CAP), np.full(2, CAP)
@@ -214,7 +215,7 @@ def _groups(robot: Robot) -> tuple[dict[str, int], dict[frozenset[str | None], i
 @once_per_robot
 def _arm(robot: Robot) -> Arm:
     slides = np.array(robot.prismatic, np.bool_)
-    offsets = np.ascontiguousarray(robot.frame_offsets)
+    offsets = for_kernels(robot.frame_offsets)
     return Arm(compile_robot(robot), hulls_of(robot)[0], offsets, robot.branching, slides)
 
 

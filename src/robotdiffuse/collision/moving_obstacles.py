@@ -21,6 +21,7 @@ from robotdiffuse.collision.kernel_arrays import robot_groups
 from robotdiffuse.collision.kernels import moving_obstacles as kernel
 from robotdiffuse.collision.kernels.moving_obstacles import CAP, Links, Tasks, Tracks
 from robotdiffuse.collision.motions import covered
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
@@ -72,7 +73,7 @@ class MovingCollision:
 
     def sweep(self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> TimedSweep:
         """Validate the motion on straight lines between rows at increasing times."""
-        times, q = np.ascontiguousarray(times, np.float64), np.ascontiguousarray(q, np.float64)
+        times, q = for_kernels(times), for_kernels(q)
         best, certified = np.array([CAP]), CAP
         every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
         ends = times[[0, -1]]
@@ -117,6 +118,7 @@ class MovingCollision:
         """The time [s] of the first place where the covering spheres are not proved to keep `least` [m], None
         for a motion that is proved. Fast, for searches and loops: what spheres cannot settle is refused."""
         every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
+        times, q = for_kernels(times), for_kernels(q)
         tasks = Tasks(times[:1], times[-1:], every)
         left = kernel.certify(self.links, self.tracks, times, q, tasks, least, 0.0, np.array([CAP]))[1]
         return min((start for start, *_ in left), default=None)
@@ -190,7 +192,7 @@ def links_of(robot: Robot) -> tuple[tuple[str, ...], Links]:
         far = np.linalg.norm(of_link[:, :3] - bounds[i, :3], axis=1) + of_link[:, 3]
         bounds[i, 3] = far.max()
     links = Links(
-        np.ascontiguousarray(robot.frame_offsets, np.float64),
+        for_kernels(robot.frame_offsets),
         robot.branching,
         np.array(robot.prismatic, np.bool_),
         np.array([whole.link_frame(link) for link in names], np.int64),

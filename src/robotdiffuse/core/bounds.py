@@ -1,24 +1,87 @@
-"""Numbers at the door: arrays of what anybody gave, within bounds that all code behind can work with."""
+"""Checks of numbers that users give: converted to arrays, kept within bounds that all other code can handle,
+and read-only where they belong to a value."""
+
+from dataclasses import fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shown
 
-LARGEST = 1e4
-"""Of all coordinates, sizes and joint values, either way [m] or [rad]: ten kilometres. float32 keeps a
-millimetre there, which compiled code makes up for."""
-SMALLEST = 1e-9
-"""Of all sizes [m]: what is smaller is nothing in float32."""
-FASTEST = 1e6
-"""Of all rates, in their units."""
+MAX_COORDINATE = 1e4
+"""Largest absolute coordinate, size or joint value [m] or [rad]: ten kilometres. At this distance float32
+resolves about a millimetre, and compiled code adds a margin for it."""
+MIN_SIZE = 1e-9
+"""Smallest size [m]; float32 cannot resolve smaller ones beside coordinates."""
+MIN_RATE, MAX_RATE = 1e-6, 1e6
+"""Smallest limit of a joint's velocity or acceleration, and largest rate, in their own units."""
 RIGID_SLACK = 1e-4
-"""How far the rotation of a pose may be from orthonormal and its last row from 0 0 0 1, by entry."""
+"""Largest deviation of any entry: of the rotation from orthonormal, of the last row from 0 0 0 1."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
+
+T = TypeVar("T")
+
+
+class Value:
+    """Base of the dataclasses that are values: the arrays in their fields are read-only.
+
+    What is prepared for a value, and verdicts on it, are kept by its identity. An array that can be written
+    to is copied, so that whoever gave it keeps it as it was. Subclasses with a `__post_init__` of their own
+    call this one at its end.
+    """
+
+    def __post_init__(self) -> None:
+        for name in (field.name for field in fields(self)):  # type: ignore[arg-type]
+            given = getattr(self, name)
+            kept = read_only(given)
+            if kept is not given:
+                object.__setattr__(self, name, kept)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # arrays can be written to when they come out of a pickle or a deep copy
+        self.__dict__.update({name: read_only(value) for name, value in state.items()})
+
+
+def read_only(value: T) -> T:
+    """An array, or what tuples and dictionaries hold of arrays, without anyone who can write to it: itself if
+    that is so, else a copy. Anything else is returned as it is."""
+    if isinstance(value, ndarray):
+        if not _writable(value):
+            return value
+        kept = np.array(value)
+        kept.setflags(write=False)
+        return kept  # type: ignore[return-value]
+    if isinstance(value, tuple):
+        kept = [read_only(one) for one in value]
+        if all(a is b for a, b in zip(kept, value, strict=True)):
+            return value
+        return value._make(kept) if hasattr(value, "_make") else tuple(kept)  # type: ignore
+    if isinstance(value, dict):
+        kept = {key: read_only(one) for key, one in value.items()}
+        return value if all(kept[key] is value[key] for key in value) else kept  # type: ignore[return-value]
+    return value
+
+
+def for_kernels(array: ndarray, dtype: type = np.float64) -> ndarray:
+    """The array as compiled code takes it, contiguous and not read-only: to Numba a read-only one is of
+    another type, for which it would compile everything once more."""
+    array = np.ascontiguousarray(array, dtype)
+    return array if array.flags.writeable else array.copy()
+
+
+def _writable(array: ndarray) -> bool:
+    """Whether anyone can write to it, by the array that it is a view of too."""
+    owner: Any = array
+    while isinstance(owner, ndarray):
+        if owner.flags.writeable:
+            return True
+        owner = owner.base
+    return owner is not None and not isinstance(owner, bytes)
 
 
 def numbers(value: object) -> ndarray | None:
-    """A float64 array, or None where the value is anything but (nested lists of) numbers."""
+    """The value as a float64 array; None if it is not a number or nested lists of numbers."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, OverflowError, RecursionError):
@@ -26,13 +89,13 @@ def numbers(value: object) -> ndarray | None:
     return array.astype(np.float64) if array.dtype.kind in "iuf" else None
 
 
-def within(array: ndarray, most: float = LARGEST) -> bool:
-    """Whether all numbers are finite and at most so large either way."""
+def within(array: ndarray, most: float = MAX_COORDINATE) -> bool:
+    """Whether all numbers are finite and at most `most` in absolute value."""
     return bool((np.abs(array) <= most).all())
 
 
-def vector(owner: str, name: str, value: object, size: int, most: float = LARGEST) -> ndarray:
-    """`size` numbers within ±most, or an InputError that names owner.name."""
+def vector(owner: str, name: str, value: object, size: int, most: float = MAX_COORDINATE) -> ndarray:
+    """The value as `size` numbers within ±most. Raises InputError, naming owner.name, for anything else."""
     array = numbers(value)
     if array is None or array.shape != (size,) or not np.isfinite(array).all():
         raise InputError(f"{owner}.{name} is {shown(value)}; it must be {size} finite numbers")
@@ -42,34 +105,39 @@ def vector(owner: str, name: str, value: object, size: int, most: float = LARGES
 
 
 def points(owner: str, name: str, value: object) -> ndarray:
-    """n x 3 coordinates within ±LARGEST [m], or an InputError that names the first wrong row."""
+    """The value as n x 3 coordinates within ±MAX_COORDINATE [m].
+
+    Raises InputError, naming the first wrong row, for anything else.
+    """
     array = numbers(value)
     if array is not None and array.size == 0:
         array = array.reshape(0, 3)
     if array is None or array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"{owner}.{name} is {form(array)}; it must be n x 3 finite numbers")
-    bad = np.flatnonzero(~(np.abs(array) <= LARGEST).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(array) <= MAX_COORDINATE).all(axis=1))
     if len(bad):
         row, more = array[bad[0]], "" if len(bad) == 1 else f" and {len(bad) - 1} more"
-        rule = f"finite numbers within ±{LARGEST:g} m"
+        rule = f"finite numbers within ±{MAX_COORDINATE:g} m"
         raise InputError(f"{owner}.{name}[{bad[0]}]{more} is {shown(row)}; it must be {rule}")
+    array.setflags(write=False)  # so that large ones are not copied once more
     return array
 
 
-def positive(owner: str, name: str, value: object, most: float = LARGEST) -> float:
-    """A number from SMALLEST to `most`, or an InputError that names owner.name."""
+def positive(owner: str, name: str, value: object, most: float = MAX_COORDINATE) -> float:
+    """The value as a number from MIN_SIZE to `most`. Raises InputError, naming owner.name, for anything
+    else."""
     array = numbers(value)
     if array is None or array.ndim != 0 or not np.isfinite(array) or array <= 0:
         raise InputError(f"{owner}.{name} is {shown(value)}; it must be a positive number")
-    if not SMALLEST <= array <= most:
+    if not MIN_SIZE <= array <= most:
         raise InputError(
-            f"{owner}.{name} is {shown(value)}; it must be a number from {SMALLEST:g} to {most:g}"
+            f"{owner}.{name} is {shown(value)}; it must be a number from {MIN_SIZE:g} to {most:g}"
         )
     return float(array)
 
 
 def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
-    """The quaternion scaled to length 1; one that has it already is kept bit for bit."""
+    """The quaternion scaled to length 1; one of length 1 is returned unchanged, bit for bit."""
     wxyz = vector(owner, name, value, 4)
     norm = np.linalg.norm(wxyz)
     if norm < 1e-6:
@@ -78,10 +146,12 @@ def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
 
 
 def rigid_transform(what: str, value: object) -> ndarray:
-    """A pose as a 4 x 4 array, or an InputError that names `what`."""
+    """The value as a 4 x 4 pose. Raises InputError, naming `what`, for anything else."""
     T = numbers(value)
     if T is None or T.shape != (4, 4) or not within(T):
-        raise InputError(f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{LARGEST:g}")
+        raise InputError(
+            f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{MAX_COORDINATE:g}"
+        )
     rotation = T[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
     if off > RIGID_SLACK or np.linalg.det(rotation) < 0:
@@ -91,5 +161,5 @@ def rigid_transform(what: str, value: object) -> ndarray:
 
 
 def form(array: ndarray | None) -> str:
-    """What an array is, for messages."""
+    """The shape of an array in words, for error messages."""
     return "not numbers" if array is None else f"an array of {' x '.join(map(str, array.shape))}"

@@ -1,5 +1,5 @@
-"""Where compiled code is kept: beside the package, or in the user's cache; where neither can be written, for
-as long as the machine is up."""
+"""Chooses the folder for compiled code: Numba's own choice, or a temporary folder if that cannot be
+written."""
 
 import os
 import sys
@@ -9,24 +9,24 @@ from pathlib import Path
 
 
 def ensure_cache() -> None:
-    """Give Numba a folder of temporary files where it would find no folder to write to, and refuse to work.
+    """Give Numba a temporary cache folder if it can write neither beside the package nor in the user's cache.
 
-    So it is in a container or a service with a read-only installation and no home. To be called before
-    anything compiled is imported; NUMBA_CACHE_DIR, where it is set, is obeyed.
+    Numba refuses to compile without a writable cache folder, as in a container with a read-only installation
+    and no home. Call this before importing compiled code. NUMBA_CACHE_DIR, if set, takes precedence.
     """
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "numba"
-    if os.environ.get("NUMBA_CACHE_DIR") or any(map(_writable, (Path(__file__).parent, user))):
+    if os.environ.get("NUMBA_CACHE_DIR") or any(map(is_writable, (Path(__file__).parent, user))):
         return
     folder = Path(tempfile.gettempdir()) / f"robotdiffuse-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         if folder.is_symlink() or folder.stat().st_uid != os.getuid():
-            raise PermissionError(f"{folder} is somebody else's")
+            raise PermissionError(f"{folder} belongs to another user")
     except OSError:
         folder = Path(tempfile.mkdtemp(prefix="robotdiffuse-"))
     warnings.warn(
-        f"neither the package nor {user} can be written to: compiled code is kept in {folder}; "
-        "NUMBA_CACHE_DIR names another folder",
+        f"neither the package nor {user} is writable: compiled code is kept in {folder}; "
+        "set NUMBA_CACHE_DIR to choose another folder",
         stacklevel=2,
     )
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
@@ -34,8 +34,8 @@ def ensure_cache() -> None:
         sys.modules["numba"].core.config.reload_config()
 
 
-def _writable(folder: Path) -> bool:
-    """Found by writing: permissions do not tell of a read-only disk."""
+def is_writable(folder: Path) -> bool:
+    """Whether a file can be written in the folder; permissions alone do not show that a disk is read-only."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()

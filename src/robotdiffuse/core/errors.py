@@ -1,36 +1,41 @@
-"""The one exception for bad input, and how its messages quote what was given."""
+"""InputError, the exception for bad input, and helpers that quote values in its message."""
 
 from collections.abc import Iterable
 
 import numpy as np
 
-LONGEST_QUOTE = 60
-"""Characters of a given value that a message repeats."""
-LONGEST_WORD = 300
-"""Characters of any word of a message, as the name of a file."""
-MOST_NAMES = 100
-"""Known names that a message lists."""
+MAX_QUOTE = 60
+"""Longest quote of a given value in a message [characters]."""
+MAX_WORD = 300
+"""Longest word of a message, such as a file name [characters]."""
+MAX_NAMES = 100
+"""Most known names that a message lists."""
 
 
 class InputError(ValueError):
-    """Bad input: the message is one line that names the field, the value and what would be right; after it
-    `listed`, a line each.
+    """Bad input. The message is one line that names the field, its value and what would be right.
 
-    The command line prints it and exits with status 2.
+    `listed` adds one line each below it. The command line prints the message and exits with status 2.
     """
 
     def __init__(self, message: str = "", listed: Iterable[str] = ()) -> None:
         words = _printable(message).split()
-        line = " ".join(shortened(word) if len(word) > LONGEST_WORD else word for word in words)
+        line = " ".join(shortened(word) if len(word) > MAX_WORD else word for word in words)
         super().__init__("\n  ".join([line, *listed]))
 
 
+def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
+    """Raises InputError unless the value is of one of these types; `wanted` says what it must be."""
+    if not isinstance(value, kind):
+        raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
+
+
 def shown(value: object) -> str:
-    """A value as one short line, for error messages."""
+    """The value as one short line, for error messages."""
     if isinstance(value, np.ndarray):
-        value = (value if value.size <= LONGEST_QUOTE else value.ravel()[:LONGEST_QUOTE]).tolist()
+        value = (value if value.size <= MAX_QUOTE else value.ravel()[:MAX_QUOTE]).tolist()
     if isinstance(value, str | bytes):
-        value = value[: LONGEST_QUOTE + 1]
+        value = value[: MAX_QUOTE + 1]
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of too many digits, lists within lists
@@ -39,23 +44,23 @@ def shown(value: object) -> str:
 
 
 def shortened(text: str) -> str:
-    """Text that others wrote, as one short line."""
+    """Foreign text as one short printable line."""
     text = " ".join(_printable(text).split())
-    return text if len(text) <= LONGEST_QUOTE else text[: LONGEST_QUOTE - 3] + "..."
+    return text if len(text) <= MAX_QUOTE else text[: MAX_QUOTE - 3] + "..."
 
 
-def joined(names: Iterable[object], most: int = MOST_NAMES) -> str:
-    """Names that others wrote, as one line of short ones."""
+def joined(names: Iterable[object], most: int = MAX_NAMES) -> str:
+    """Foreign names as one line, each shortened; beyond `most` only their number."""
     short = [shortened(str(name)) for name in names]
     more = f" and {len(short) - most} more" if len(short) > most else ""
     return ", ".join(short[:most]) + more
 
 
 def unknown_name(what: str, name: object, known: Iterable[object]) -> InputError:
-    """An error for a name that is not in a table; lists the known ones."""
+    """An InputError for a name that is not in a table; it lists the known names."""
     return InputError(f"unknown {what} {shown(name)}; known: {joined(sorted(map(str, known)))}")
 
 
 def _printable(text: str) -> str:
-    """Without terminal codes and the halves of surrogate pairs, which cannot be printed."""
+    """The text without terminal codes and lone surrogates, which cannot be printed."""
     return "".join(c if c.isprintable() or c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text)

@@ -1,8 +1,8 @@
-"""Files that others wrote, with bounds on what they may hold: JSON and YAML alike.
+"""Readers of untrusted files: JSON, YAML, XML, NumPy arrays and meshes, with bounds on size and nesting.
 
-Whatever a file or its name holds, these return a value or raise InputError, in time that grows with the size
-of the file: devices and pipes are not opened, nesting is measured before it is followed, and what aliases
-stand for is counted.
+For any content and any file name these functions return a value or raise InputError, in time that grows with
+the size of the file: devices and pipes are not opened, nesting is measured before parsing, and the values
+that YAML aliases stand for are counted.
 """
 
 import json
@@ -25,20 +25,20 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 
 MEGABYTE = 2**20
-LARGEST_FILE = 256 * MEGABYTE
+MAX_FILE_SIZE = 256 * MEGABYTE
 MESH_FORMATS = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-LARGEST_YAML = 16 * MEGABYTE
-"""Ten seconds of reading; JSON takes less than one."""
-DEEPEST = 64
-"""Lists and mappings within each other."""
-MOST_VALUES = 2_000_000
-"""Values that a YAML file may stand for, aliases followed."""
-LONGEST_NAME = 300
-"""Of a file, in messages."""
-LONGEST_INTEGER = 30
-"""Digits."""
+MAX_YAML_SIZE = 16 * MEGABYTE
+"""Parsing this much YAML takes ten seconds; the same JSON takes less than one [bytes]."""
+MAX_DEPTH = 64
+"""Deepest nesting of lists and mappings."""
+MAX_VALUES = 2_000_000
+"""Most values in a YAML file after its aliases are expanded."""
+MAX_SHOWN_NAME = 300
+"""Longest file name that a message shows in full [characters]."""
+MAX_DIGITS = 30
+"""Most digits of an integer."""
 
-# trimesh logs the tracebacks of what it then raises, which without a handler go to standard error
+# trimesh logs a traceback of each error that it raises; without a handler that goes to standard error
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 _STRING = re.compile(r'"(?:[^"\\]|\\.)*"?')
@@ -47,7 +47,7 @@ _closed: ContextVar[bool] = ContextVar("closed", default=False)
 
 @contextmanager
 def no_files() -> Iterator[None]:
-    """No file is read while this lasts, nor said whether there is one: for data that came from elsewhere."""
+    """Within the block, no file is read and none is said to exist: for requests from the network."""
     before = _closed.set(True)
     try:
         yield
@@ -55,24 +55,31 @@ def no_files() -> Iterator[None]:
         _closed.reset(before)
 
 
+def file_name(file: object, what: str = "file") -> Path:
+    """The path that a name stands for; InputError for what is neither text nor a path."""
+    if not isinstance(file, str | os.PathLike):
+        raise InputError(f"{what} is {shown(file)}; it must be the name of a file, a text or a pathlib.Path")
+    return Path(file)
+
+
 def is_file(file: str | Path) -> bool:
-    """Whether there is a regular file of this name that may be looked at; False also for impossible names."""
+    """Whether a regular file of this name exists and may be read; False also for impossible names."""
     try:
         return not _closed.get() and stat.S_ISREG(os.stat(file).st_mode)
     except (OSError, ValueError):
         return False
 
 
-def input_file(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> Path:
-    """The path of a regular file of at most `largest` bytes; `what` stands before its name in messages.
+def input_file(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -> Path:
+    """The path of a regular file of at most `largest` bytes; messages put `what` before its name.
 
-    Raises InputError for one that is missing, no regular file (a folder, a device, a pipe), too large, not
-    permitted, or whose name cannot be one.
+    Raises InputError if the file is missing, not regular (a folder, a device, a pipe), too large or not
+    readable, or if no file can have this name.
     """
-    text = str(file)
-    named = f"{what} {text if len(text) <= LONGEST_NAME else shortened(text)}".strip()
+    text = str(file_name(file, what or "file"))
+    named = f"{what} {text if len(text) <= MAX_SHOWN_NAME else shortened(text)}".strip()
     if _closed.get():
-        raise InputError(f"{named} is a file, and none is read here: give what it holds instead")
+        raise InputError(f"{named} is a file, and files are not read here: give its content instead")
     try:
         found = os.stat(file)
         permitted = os.access(file, os.R_OK)
@@ -93,8 +100,8 @@ def input_file(file: str | Path, what: str = "", largest: int = LARGEST_FILE) ->
     return Path(file)
 
 
-def read_bytes(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> bytes:
-    """The content of a file; InputError as `input_file`."""
+def read_bytes(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -> bytes:
+    """The content of a file. Raises InputError as `input_file` does."""
     path = input_file(file, what, largest)
     try:
         return path.read_bytes()
@@ -102,8 +109,8 @@ def read_bytes(file: str | Path, what: str = "", largest: int = LARGEST_FILE) ->
         raise InputError(f"{what} {path} cannot be read: {error.strerror}".strip()) from None
 
 
-def read_text(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> str:
-    """The content of a UTF-8 text file; InputError as `input_file`, and if it is not text."""
+def read_text(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -> str:
+    """The content of a UTF-8 text file. Raises InputError as `input_file` does, and if it is not UTF-8."""
     try:
         return read_bytes(file, what, largest).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -112,8 +119,11 @@ def read_text(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> 
 
 
 def read_triangles(file: str | Path, what: str = "mesh file", merge: bool = False) -> tuple[ndarray, ndarray]:
-    """Vertices [v, 3] and faces [f, 3] of a mesh file, in its own units; `merge` makes corners that are the
-    same one vertex. InputError as `input_file`, for other formats, and for one that is empty or damaged."""
+    """Vertices [v, 3] and faces [f, 3] of a mesh file, in the units of the file.
+
+    `merge` joins vertices at the same place. Raises InputError as `input_file` does, for other formats, and
+    for empty or damaged files.
+    """
     import trimesh
 
     path = input_file(file, what)
@@ -123,44 +133,65 @@ def read_triangles(file: str | Path, what: str = "mesh file", merge: bool = Fals
         raise InputError(f"{what} {file} is empty")
     try:
         with np.errstate(all="ignore"):
-            mesh = trimesh.load_mesh(path, process=merge)
-    except Exception as error:  # trimesh raises whatever its parsers meet in a damaged file
+            mesh = trimesh.load_mesh(path, process=merge, resolver=_beside(path))
+    except InputError as error:
+        raise InputError(f"{what} {file}: {error}") from None
+    except Exception as error:  # trimesh raises many kinds of errors for a damaged file
         raise InputError(f"{what} {file} cannot be read: {shortened(str(error))}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{what} {file} holds no triangles")
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
+def _beside(mesh: Path) -> Any:
+    """Opens for trimesh what a mesh file names, such as buffers and materials: regular files alone."""
+    from trimesh.resolvers import FilePathResolver
+
+    class RegularFiles(FilePathResolver):
+        def get(self, name: str) -> Any:
+            for place in (name.strip(), name.strip().lstrip("/"), Path(name).name):  # which trimesh tries
+                file = Path(self.parent, place)
+                if os.path.lexists(file):
+                    input_file(file)
+            return super().get(name)
+
+    return RegularFiles(str(mesh))
+
+
 def read_arrays(file: str | Path, what: str = "") -> dict[str, ndarray]:
-    """The arrays of an .npz file, or of an .npy file under the name "". InputError as `input_file`, for a
-    damaged file, and for an archive that unpacks to more than LARGEST_FILE."""
+    """The arrays of an .npz file by name; that of an .npy file under the name "".
+
+    Raises InputError as `input_file` does, for damaged files, and for archives that unpack to more than
+    MAX_FILE_SIZE.
+    """
     path = input_file(file, what)
     try:
         if path.suffix.lower() != ".npz":
             return {"": np.load(path, allow_pickle=False)}
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
-        if size <= LARGEST_FILE:
+        if size <= MAX_FILE_SIZE:
             with np.load(path, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
-    except Exception as error:  # NumPy, zipfile and zlib raise whatever they meet in a damaged file
+    except Exception as error:  # NumPy, zipfile and zlib raise many kinds of errors for a damaged file
         raise InputError(f"{what} {file} is damaged: {shortened(str(error))}".strip()) from None
-    most = LARGEST_FILE // MEGABYTE
+    most = MAX_FILE_SIZE // MEGABYTE
     raise InputError(f"{what} {file} unpacks to {size // MEGABYTE} MB; at most {most} MB are read".strip())
 
 
 def read_json(file: str | Path, what: str = "") -> Any:
-    """The content of a JSON file; InputError as `read_text` and `parse_json`."""
+    """The content of a JSON file. Raises InputError as `read_text` and `parse_json` do."""
     return parse_json(read_text(file, what), str(file))
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The value in a JSON text; InputError, naming the place, for invalid, deep and endless ones."""
-    if text.count("[") + text.count("{") > DEEPEST:
+    """The value of a JSON text. Raises InputError, naming `where`, for invalid or too deeply nested JSON and
+    for integers of more than MAX_DIGITS digits."""
+    if text.count("[") + text.count("{") > MAX_DEPTH:
         marks = np.frombuffer(_STRING.sub("", text).encode("utf-8", "replace"), np.uint8)
         opened = (marks == ord("[")) | (marks == ord("{"))
         closed = (marks == ord("]")) | (marks == ord("}"))
-        if (np.cumsum(opened.astype(np.int64) - closed)).max(initial=0) > DEEPEST:
+        if (np.cumsum(opened.astype(np.int64) - closed)).max(initial=0) > MAX_DEPTH:
             _too_deep(where)
     try:
         return json.loads(text, parse_int=lambda digits: _integer(digits, where))
@@ -172,14 +203,15 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def read_yaml(file: str | Path, what: str = "") -> Any:
-    """The content of a YAML (or JSON) file; InputError as `read_text` and `parse_yaml`."""
-    return parse_yaml(read_text(file, what, LARGEST_YAML), str(file))
+    """The content of a YAML (or JSON) file. Raises InputError as `read_text` and `parse_yaml` do."""
+    return parse_yaml(read_text(file, what, MAX_YAML_SIZE), str(file))
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """The value of a YAML text: null, booleans, numbers, texts, lists, and mappings by texts.
+    """The value of a YAML text: null, booleans, numbers, strings, lists, and mappings with string keys.
 
-    Dates are texts. InputError, naming the place, for invalid, deep and endless ones, and for tags.
+    Dates are strings. Raises InputError, naming `where`, for invalid, too deeply nested or too large YAML and
+    for tags.
     """
     try:
         loader = _Loader(text)
@@ -194,8 +226,8 @@ def parse_yaml(text: str, where: str) -> Any:
 
 
 def parse_xml(text: bytes, where: str) -> ET.Element:
-    """The root of an XML text; InputError, naming the place, for one that is not well-formed, too deep, or in
-    an encoding that is not known."""
+    """The root of an XML text. Raises InputError, naming `where`, if it is not well-formed, too deeply nested
+    or in an unknown encoding."""
     depth, parser = 0, ET.XMLPullParser(("start", "end"))
     try:
         parser.feed(text)
@@ -203,7 +235,7 @@ def parse_xml(text: bytes, where: str) -> ET.Element:
         events: list[Any] = list(parser.read_events())
         for event, _ in events:
             depth += 1 if event == "start" else -1
-            if depth > DEEPEST:
+            if depth > MAX_DEPTH:
                 _too_deep(where)
     except (ET.ParseError, ValueError, LookupError) as error:
         if isinstance(error, InputError):
@@ -213,7 +245,7 @@ def parse_xml(text: bytes, where: str) -> ET.Element:
 
 
 class _Loader(yaml.CSafeLoader):
-    """Reads 1e-3 and 2.5e3 as numbers, which YAML 1.1 takes for texts."""
+    """Reads 1e-3 and 2.5e3 as numbers; in YAML 1.1 they are strings."""
 
 
 _Loader.add_implicit_resolver(
@@ -224,12 +256,12 @@ _Loader.add_implicit_resolver(
 
 
 class _Composer:
-    """Values from the events of a parser; libyaml's own composer recurses without bounds."""
+    """Builds values from parser events, because libyaml's own composer recurses without bounds."""
 
     def __init__(self, loader: _Loader, where: str) -> None:
         self.loader, self.where, self.count = loader, where, 0
         self.anchors: dict[str, tuple[Any, int]] = {}
-        """The value of each, and how many values it stands for."""
+        """Value of each anchor, and the number of values within it."""
 
     def document(self) -> Any:
         loader, value = self.loader, None
@@ -256,7 +288,7 @@ class _Composer:
         self._add(1, event)
         if isinstance(event, yaml.ScalarEvent):
             value = self._scalar(event)
-        elif depth >= DEEPEST:
+        elif depth >= MAX_DEPTH:
             _too_deep(self.where)
         elif isinstance(event, yaml.SequenceStartEvent):
             value = []
@@ -268,9 +300,9 @@ class _Composer:
             while not self.loader.check_event(yaml.MappingEndEvent):
                 key: Any = self.loader.get_event()
                 if not isinstance(key, yaml.ScalarEvent) or key.tag is not None:
-                    self._refuse(key, "a key is no plain text")
+                    self._refuse(key, "a key is not a plain string")
                 if key.value in value:
-                    self._refuse(key, f"{key.value} stands twice")
+                    self._refuse(key, f"{key.value} appears twice")
                 value[key.value] = self._node(depth + 1)
             self.loader.get_event()
         if event.anchor is not None:
@@ -296,8 +328,8 @@ class _Composer:
 
     def _add(self, count: int, event: Any) -> None:
         self.count += count
-        if self.count > MOST_VALUES:
-            self._refuse(event, f"it stands for more than {MOST_VALUES:,} values")
+        if self.count > MAX_VALUES:
+            self._refuse(event, f"it stands for more than {MAX_VALUES:,} values")
 
     def _refuse(self, event: Any, why: str) -> NoReturn:
         raise InputError(f"{self.where} is not valid YAML: {why} in line {event.start_mark.line + 1}")
@@ -316,9 +348,9 @@ def _integer(digits: str, where: str) -> int:
 
 
 def _check_digits(text: str, where: str) -> None:
-    if len(text) > LONGEST_INTEGER:
-        raise InputError(f"{where} holds the integer {shortened(text)}; no number there can be so large")
+    if len(text) > MAX_DIGITS:
+        raise InputError(f"{where} holds the integer {shortened(text)}; no field takes such a large number")
 
 
 def _too_deep(where: str) -> NoReturn:
-    raise InputError(f"{where} is nested more than {DEEPEST} levels deep")
+    raise InputError(f"{where} is nested more than {MAX_DEPTH} levels deep")

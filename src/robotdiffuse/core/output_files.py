@@ -1,4 +1,4 @@
-"""Files written whole or not at all, or line by line; folders that one process fills at a time."""
+"""Atomic and line-by-line writing of files, and locks on output folders."""
 
 import fcntl
 import json
@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.input_files import file_name
 
 
 def write_atomically(file: Path, content: str | bytes, make_folder: bool = False) -> None:
-    """Write beside the file, then rename over it, so that nobody sees it half written.
+    """Write a temporary file and rename it over `file`, so that no reader sees it half written.
 
-    An interruption or a full disk leaves the old file, or none. Raises InputError when it cannot be written.
+    An interruption or a full disk leaves the old file, if there was one. Raises InputError if the file cannot
+    be written.
     """
     temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
@@ -31,11 +33,11 @@ def write_atomically(file: Path, content: str | bytes, make_folder: bool = False
 
 
 def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:
-    """The file as a path, after a check that it can be written.
+    """The file as a path, after checking that it can be written.
 
-    Raises InputError for an ending that is not among `endings` and for a folder that is missing or read-only.
+    Raises InputError for an ending that is not in `endings` and for a folder that is missing or read-only.
     """
-    path = Path(file)
+    path = file_name(file)
     if path.suffix.lower() not in endings:
         raise InputError(f"{path}: unknown ending {shown(path.suffix)}; known: {', '.join(endings)}")
     if path.is_dir():
@@ -48,14 +50,17 @@ def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:
 
 
 class JsonLines:
-    """JSON objects, one a line; each is on the disk when `append` returns. Without a file, in memory."""
+    """A file of JSON objects, one a line. A row is on disk when `append` returns; without a file, in
+    memory."""
 
     def __init__(self, file: Path | None) -> None:
-        """What is there already, but for a last line that was cut off. Raises InputError, naming file and
-        line, for any other line that is no JSON object."""
+        """Read the existing rows; a last line that was cut off is dropped.
+
+        Raises InputError, naming file and line, for any other line that is not a JSON object.
+        """
         self.rows: list[dict[str, Any]] = []
         self._file = file
-        self._mended: bytes | None = None
+        self._without_cut_line: bytes | None = None
         if file is None or not file.is_file():
             return
         content = file.read_bytes()
@@ -64,23 +69,25 @@ class JsonLines:
             try:
                 self.rows.append(dict(json.loads(line)))
             except (ValueError, TypeError) as error:
-                raise InputError(f"{file}, line {number} is no JSON object: {error}") from None
+                raise InputError(f"{file}, line {number} is not a JSON object: {error}") from None
         if whole != content:
-            self._mended = whole
+            self._without_cut_line = whole
 
     def replace(self, rows: list[dict[str, Any]]) -> None:
-        """Write these in place of what is there, whole or not at all."""
+        """Replace all rows, atomically."""
         self.rows = rows
         if self._file is not None:
             write_atomically(self._file, "".join(json.dumps(row) + "\n" for row in rows), make_folder=True)
 
     def append(self, row: dict[str, Any]) -> None:
+        """Add a row and flush it to the disk."""
         self.rows.append(row)
         if self._file is None:
             return
-        if self._mended is not None:  # only now: another process may be about to end that line
-            write_atomically(self._file, self._mended)
-            self._mended = None
+        if self._without_cut_line is not None:
+            # not earlier: another process may still have been writing that line
+            write_atomically(self._file, self._without_cut_line)
+            self._without_cut_line = None
         self._file.parent.mkdir(parents=True, exist_ok=True)
         with self._file.open("a") as stream:
             stream.write(json.dumps(row) + "\n")
@@ -89,10 +96,10 @@ class JsonLines:
 
 
 @contextmanager
-def alone_in(out: Path) -> Iterator[None]:
-    """Make the folder and lock it; the lock ends with this process, however that ends.
+def lock_folder(out: Path) -> Iterator[None]:
+    """Make the folder and lock it; the lock is released when the process ends, even if it is killed.
 
-    Raises InputError if another process has the lock, or there can be no such folder.
+    Raises InputError if another process holds the lock or the folder cannot be made.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -106,7 +113,7 @@ def alone_in(out: Path) -> Iterator[None]:
         except BlockingIOError:
             raise InputError(f"another process is filling {out}; wait for it") from None
         except OSError:
-            pass  # a file system without locks
+            pass  # this file system has no locks
         yield
     finally:
         os.close(folder)

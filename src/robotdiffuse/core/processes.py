@@ -1,7 +1,7 @@
-"""Calls shared out over processes of this machine or over a Ray cluster; who hears Ctrl-C, and how they end.
+"""Worker processes on this machine or on a Ray cluster, and how Ctrl-C ends them.
 
-Ctrl-C is for the process that a person started: it ends the others. They end with it too, even where it is
-killed.
+Only the process that the user started handles Ctrl-C; it ends its workers. Workers also exit when their
+parent dies, even if it is killed.
 """
 
 import atexit
@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -27,28 +28,71 @@ from typing import Any, NoReturn
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.registry import Added, added, take_over
+from robotdiffuse.core.registry import AddedEntries, added_entries, adopt_entries
 
 Results = Generator[tuple[int, Any], None, None]
-"""Results of calls as they are done, each with the number of its call; to be closed, so that none goes on."""
-PATIENCE = 5.0
-"""Until a process that was told to end is killed [s]."""
-CONNECT_SECONDS = 5.0
-"""Until a Ray cluster that does not answer is given up; Ray itself tries for minutes."""
-LOST_NODES = 20
-"""Times that a call is made again on another node of a Ray cluster."""
-AGAIN = "give the same command again"
+"""Results in order of completion, each with the index of its call. Close the generator to stop the calls."""
+TERMINATE_TIMEOUT = 5.0
+"""Time from asking a process to end until it is killed [s]."""
+CONNECT_TIMEOUT = 5.0
+"""Time for a Ray cluster to answer [s]; Ray itself would try for minutes."""
+MAX_RETRIES = 20
+"""How often a call is repeated on another node of a Ray cluster after its node is lost."""
+RERUN_HINT = "run the same command again"
+GUARD = 'if __name__ == "__main__":'
+
+
+class NotStartedError(BrokenProcessPool):
+    """A worker process ended before its first call; the message says what to change."""
+
+
+def check_not_importing() -> None:
+    """End this process if it is a worker that still imports the main script, and the script starts workers on
+    import because it lacks GUARD. The process that the user started reports it."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        sys.exit(1)
+
+
+def _check_script() -> None:
+    """Raise NotStartedError if the main script is not a file that worker processes can import."""
+    main = sys.modules["__main__"]
+    script = getattr(main, "__file__", None)
+    if main.__spec__ is None and script is not None and not Path(script).is_file():
+        raise NotStartedError(
+            "worker processes cannot import a script from standard input; save it to a file, and put what it "
+            f"does below the line: {GUARD}"
+        )
+
+
+def _not_started() -> NotStartedError:
+    """The error for a process that ended before its first call."""
+    script = getattr(sys.modules["__main__"], "__file__", None)
+    if script is None:
+        return NotStartedError("a worker process was killed as it started")
+    return NotStartedError(
+        f"a worker process could not import the main script {script}, or was killed as it started; put what "
+        f"the script does below the line: {GUARD}"
+    )
+
+
+def _nothing() -> None:
+    """A first call, which shows that the process runs."""
 
 
 class Workers:
-    """Processes of this machine, started when they are first asked and ended when the block is left."""
+    """A pool of local processes, started at the first call and ended at the end of the `with` block."""
 
-    def __init__(self, count: int, patience: float = PATIENCE) -> None:
-        """`count` 0: this process makes the calls itself. `patience`: for those that are stopped [s]."""
+    def __init__(self, count: int, patience: float = TERMINATE_TIMEOUT) -> None:
+        """count: processes; 0 runs the calls in this process. patience: time from SIGTERM to SIGKILL [s]."""
+        if count:
+            check_not_importing()
         # fresh interpreters: forked ones could inherit locks of running threads
         context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(count, context, prepare_worker, (added(),)) if count else None
+        self._pool = (
+            ProcessPoolExecutor(count, context, prepare_worker, (added_entries(),)) if count else None
+        )
         self._count, self._patience = count, patience
+        self._begun: Future[None] | None = None
 
     def __enter__(self) -> "Workers":
         return self
@@ -57,111 +101,151 @@ class Workers:
         if self._pool is not None:
             processes = list((self._pool._processes or {}).values())
             self._pool.shutdown(wait=False, cancel_futures=True)
-            end(processes, signal.SIGTERM, self._patience)
+            terminate(processes, signal.SIGTERM, self._patience)
 
     def each(self, call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
         """Results of `call(*arguments)` for each of `calls`.
 
-        At most one more than there are processes is under way or waits to be taken. Raises InputError if a
-        process is killed from outside, as when memory runs out.
+        At most one call more than there are processes is running or queued. Raises InputError if a process is
+        killed from outside, e.g. when memory runs out.
         """
         left, running = list(enumerate(calls))[::-1], {}
         while left and self._pool is None:
             number, arguments = left.pop()
             yield number, call(*arguments)
         try:
+            if self._pool is not None and self._begun is None:
+                _check_script()
+                with block_interrupts_in_children():
+                    self._begun = self._pool.submit(_nothing)
             while left or running:
                 while self._pool is not None and left and len(running) < self._count + 1:
                     number, arguments = left.pop()
-                    with interrupts_not_passed_on():
+                    with block_interrupts_in_children():
                         running[self._pool.submit(call, *arguments)] = number
                 for job in wait(running, return_when=FIRST_COMPLETED).done:
                     yield running.pop(job), job.result()
+        except NotStartedError as error:
+            raise InputError(str(error)) from None
         except BrokenProcessPool:
-            raise InputError(f"a worker process was killed, or could not be started; {AGAIN}") from None
+            if self._begun is None or self._begun.exception() is not None:
+                raise InputError(str(_not_started())) from None
+            raise InputError(f"a worker process was killed; {RERUN_HINT}") from None
 
 
-class LoneWorker:
-    """A process that makes calls in turn. One that dies of a call costs that call alone: the next has a new
-    one."""
+class SingleWorker:
+    """A worker process that runs one call at a time. If a call kills it, the next call starts a new
+    process."""
 
-    def __init__(self, prepare: Callable[..., None], arguments: tuple) -> None:
-        """`prepare(*arguments)` is called once in each process."""
-        self._prepare, self._arguments = prepare, arguments
+    def __init__(
+        self, prepare: Callable[..., None], arguments: tuple, inherited: tuple[Any, ...] = ()
+    ) -> None:
+        """`prepare(*arguments, *inherited)` runs once in each new process. inherited: objects that only a
+        starting process can receive, such as shared memory."""
+        self._prepare, self._arguments, self._inherited = prepare, arguments, inherited
         self._pool: ProcessPoolExecutor | None = None
         self._closed = False
 
     def call(self, call: Callable[..., Any], *arguments: Any) -> Any:
-        """The result of `call(*arguments)` there; what it raises is raised here. Raises BrokenProcessPool if
-        the process dies or was closed."""
-        return self.submit(call, *arguments).result()
+        """The result of `call(*arguments)` in the process; its exceptions are raised here.
+
+        Raises BrokenProcessPool if the process dies or was closed, NotStartedError if it could not start.
+        """
+        return self._submit(call, arguments, wait=True).result()
 
     def submit(self, call: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        """The same, to be waited for."""
+        """`call` without waiting: the future of its result."""
+        return self._submit(call, arguments, wait=False)
+
+    def _submit(self, call: Callable[..., Any], arguments: tuple, wait: bool) -> "Future[Any]":
+        """wait: whether to wait until a new process runs before it is sent anything that does not fit a pipe;
+        writing to a pipe that nobody reads would block forever."""
         if self._closed:
             raise BrokenProcessPool("closed")
-        with interrupts_not_passed_on():
+        with block_interrupts_in_children():
             if self._pool is not None:
                 with suppress(BrokenProcessPool):
                     return self._pool.submit(call, *arguments)
+            _check_script()
             context = multiprocessing.get_context("spawn")
-            given = added(), self._prepare, self._arguments
-            self._pool = ProcessPoolExecutor(1, context, _prepare_lone, given)
-            return self._pool.submit(call, *arguments)
+            given = added_entries(), self._inherited
+            self._pool = pool = ProcessPoolExecutor(1, context, _begin_single, given)
+            begun = pool.submit(_nothing)
+        if wait:
+            try:
+                begun.result()
+            except BrokenProcessPool:
+                raise _not_started() from None
+        pool.submit(_prepare_single, self._prepare, self._arguments)
+        return pool.submit(call, *arguments)
 
-    def end(self, by: signal.Signals = signal.SIGTERM) -> None:
-        """End the process, whatever anybody waits for; the next call has a new one."""
+    def terminate(self, by: signal.Signals = signal.SIGTERM) -> None:
+        """End the process, even during a call; the next call starts a new one."""
         pool, processes = self._pool, self._processes()
         self._pool = None
         if pool is not None:
             pool.shutdown(wait=False, cancel_futures=True)
-            end(processes, by, PATIENCE)
+            terminate(processes, by, TERMINATE_TIMEOUT)
 
     def close(self, by: signal.Signals = signal.SIGTERM) -> None:
-        """End the process for good."""
+        """End the process; later calls raise BrokenProcessPool."""
         self._closed = True
-        self.end(by)
+        self.terminate(by)
 
     def _processes(self) -> list[BaseProcess]:
         return list((self._pool._processes or {}).values()) if self._pool is not None else []
 
 
-def _prepare_lone(entries: Added, prepare: Callable[..., None], arguments: tuple) -> None:
+_inherited: tuple[Any, ...] = ()
+"""What this process, a single worker, received when it started."""
+
+
+def _begin_single(entries: AddedEntries, inherited: tuple[Any, ...]) -> None:
+    global _inherited
     prepare_worker(entries)
-    prepare(*arguments)
+    _inherited = inherited
+
+
+def _prepare_single(prepare: Callable[..., None], arguments: tuple) -> None:
+    """Prepare the process; an error ends it, since it could not run any call."""
+    try:
+        prepare(*arguments, *_inherited)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
 
 
 def on_this_machine(call: Callable[..., Any], calls: Sequence[tuple], workers: int) -> Results:
-    """As `Workers.each`, by processes for these calls alone."""
+    """`Workers.each` with a pool for these calls only."""
     with Workers(min(workers, len(calls))) as pool:
         yield from pool.each(call, calls)
 
 
 def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
-    """The same by a Ray cluster, a core for each call; those of a lost node are made again elsewhere.
+    """Run the calls on a Ray cluster, one core each; calls of a lost node are repeated on another.
 
-    See `ray_cluster`. The nodes need this package, and files at the same places.
+    See `ray_cluster`. The nodes need this package, and files under the same paths.
     """
     left, running = list(enumerate(calls))[::-1], {}
     with ray_cluster() as ray:
-        task = ray.remote(num_cpus=1, max_retries=LOST_NODES)(_on_node)
+        task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_on_node)
         while left or running:
             most = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
             while left and len(running) < most:
                 number, arguments = left.pop()
-                running[task.remote(added(), call, arguments)] = number
+                running[task.remote(added_entries(), call, arguments)] = number
             done, _ = ray.wait(list(running), num_returns=1)
             for reference in done:
                 yield running.pop(reference), ray.get(reference)
 
 
-def _on_node(entries: Added, call: Callable[..., Any], arguments: tuple) -> Any:
-    take_over(entries)
+def _on_node(entries: AddedEntries, call: Callable[..., Any], arguments: tuple) -> Any:
+    adopt_entries(entries)
     return call(*arguments)
 
 
 CLUSTERS: dict[str, Callable[[Callable[..., Any], Sequence[tuple]], Results]] = {"ray": on_ray}
-"""By the name that --cluster takes."""
+"""Cluster backends by the name that --cluster takes."""
 
 
 def in_order(results: Results) -> Iterator[Any]:
@@ -176,12 +260,12 @@ def in_order(results: Results) -> Iterator[Any]:
 
 
 @contextmanager
-def interrupts_not_passed_on() -> Iterator[None]:
-    """Ctrl-C never reaches processes that are started meanwhile: they inherit the signal mask.
+def block_interrupts_in_children() -> Iterator[None]:
+    """Processes started within the block never receive SIGINT, because they inherit the signal mask.
 
-    So it is the parent alone that handles it, even while they are still importing.
+    Only the parent handles Ctrl-C then, even while the children are still importing.
     """
-    resource_tracker.ensure_running()  # the first process starts it, which would lift the mask again
+    resource_tracker.ensure_running()  # else the first process starts it and unblocks the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -190,8 +274,8 @@ def interrupts_not_passed_on() -> Iterator[None]:
 
 
 @contextmanager
-def interrupts_afterwards() -> Iterator[None]:
-    """Ctrl-C takes effect when this is left."""
+def delay_interrupts() -> Iterator[None]:
+    """Delay Ctrl-C until the end of the block."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -206,11 +290,11 @@ def interrupts_afterwards() -> Iterator[None]:
 
 
 @contextmanager
-def interrupts_at_once(tidy: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Ctrl-C ends this process, after `tidy`, wherever it is: for work that leaves nothing half-done.
+def exit_on_interrupt(tidy: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Within the block, Ctrl-C calls `tidy` and exits at once; for work that leaves nothing half-done.
 
-    An exception would be lost while compiled code is loaded, whose callbacks swallow it, and mistaken for an
-    error of theirs by some packages that are being imported.
+    A KeyboardInterrupt would get lost in callbacks while compiled code is loaded, and some packages mistake
+    it for an import error.
     """
 
     def stop(*_: object) -> None:
@@ -230,52 +314,55 @@ def interrupts_at_once(tidy: Callable[[], None] = lambda: None) -> Iterator[None
         signal.signal(signal.SIGINT, before)
 
 
-def prepare_worker(entries: Added) -> None:
-    """A worker has what its parent has `added` to the tables, and ends with it, even where that is killed."""
-    take_over(entries)
+def prepare_worker(entries: AddedEntries) -> None:
+    """Set up a worker: add the parent's registry entries, and exit when the parent dies, even if it is
+    killed."""
+    adopt_entries(entries)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-        _end_by_signal_with(parent)
+        threading.Thread(target=_exit_with, args=(parent,), daemon=True).start()
+        _exit_by_signal_with(parent)
 
 
-def _end_with(parent: BaseProcess) -> None:
+def _exit_with(parent: BaseProcess) -> None:
     parent.join()
     os._exit(1)
 
 
-def _end_by_signal_with(parent: BaseProcess) -> None:
-    """Linux ends this process when the pipe from its parent closes, by SIGIO, which nothing here waits for:
-    a thread has to wait until compiled code and imports let go of the interpreter."""
+def _exit_by_signal_with(parent: BaseProcess) -> None:
+    """Let Linux send SIGIO, which ends this process, when the pipe from its parent closes.
+
+    The thread of `_exit_with` alone is not enough: it waits while compiled code or imports hold the
+    interpreter.
+    """
     pipe = parent.sentinel
-    with suppress(OSError, AttributeError):  # systems that cannot have the thread
+    with suppress(OSError, AttributeError):  # other systems have only the thread
         fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())
         fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)
 
 
-def leave(status: int) -> NoReturn:
-    """End this process with an exit status, as Python does but for taking the interpreter down, which is a
-    twentieth of what a plan by search takes from start to end.
+def exit_process(status: int) -> NoReturn:
+    """Exit like Python does, but without tearing down the interpreter, which takes a twentieth of the whole
+    time of a `plan` command by search.
 
-    One of several that torchrun started ends at once: threads of PyTorch's process group that want the
-    interpreter meanwhile abort the process, rarely, and under load. What it had to do is done by then: files
-    are written, others have heard.
+    Under torchrun exit handlers are skipped too: under load, threads of PyTorch's process group that need the
+    interpreter at that moment rarely abort the process. All files are written by then.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         threading._shutdown()  # pyright: ignore[reportAttributeAccessIssue]
         atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError, AttributeError):  # full, closed, or none since the start
+        with suppress(OSError, ValueError, AttributeError):  # the stream is full, closed or None
             stream.flush()
     os._exit(status)
 
 
-def end(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -> None:
-    """Send the processes a signal, and kill those that have not ended after `patience` [s]."""
+def terminate(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -> None:
+    """Send the signal `by` to the processes, and kill those that still run after `patience` [s]."""
     processes = [process for process in processes if process.is_alive()]
     for process in processes:
-        with suppress(ProcessLookupError):  # a pool's own thread may have waited for it by now
+        with suppress(ProcessLookupError):  # a thread of the pool may have reaped it by now
             os.kill(process.pid or 0, by)
     until = time.monotonic() + patience
     for process in processes:
@@ -285,14 +372,15 @@ def end(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -
         process.join()
 
 
-class Companion:
-    """A program that reads lines and answers with lines. Whatever happens to it, this process lives on.
+class LineProcess:
+    """A subprocess that reads lines on stdin and answers with lines on stdout; its crash does not affect this
+    one.
 
-    It is for one thread at a time; `close` is for any.
+    Use it from one thread at a time, except `close`, which any thread may call.
     """
 
     def __init__(self, command: Sequence[str], log: Path) -> None:
-        """`log`: what it prints on standard error is added to this file."""
+        """`log`: its standard error is appended to this file."""
         self._command, self._log = command, log
         self._process: subprocess.Popen[bytes] | None = None
         self._unread = b""
@@ -300,10 +388,11 @@ class Companion:
 
     @property
     def runs(self) -> bool:
+        """Whether the subprocess is running."""
         return self._process is not None and self._process.poll() is None
 
     def start(self) -> None:
-        """Begin, or begin anew."""
+        """Start or restart the subprocess."""
         self._unread = b""
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with self._log.open("ab") as log:
@@ -313,13 +402,13 @@ class Companion:
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env=os.environ | {"OMP_NUM_THREADS": "1"},
-                start_new_session=True,  # Ctrl-C is for this process to act on
+                start_new_session=True,  # so that Ctrl-C reaches only this process
             )
-        if self._closed:  # by another thread, which did not see the new one
+        if self._closed:  # meanwhile, by another thread that saw only the old process
             self._process.kill()
 
     def tell(self, line: str) -> bool:
-        """Hand it a line; whether it took it."""
+        """Send a line; returns whether the subprocess was there to take it."""
         assert self._process is not None and self._process.stdin is not None
         try:
             self._process.stdin.write(line.encode() + b"\n")
@@ -329,7 +418,7 @@ class Companion:
         return True
 
     def answer(self, patience: float) -> bytes | None:
-        """Its next line; None if it ends or says nothing in this time [s]."""
+        """Its next line; None if it ends or writes nothing within `patience` [s]."""
         assert self._process is not None and self._process.stdout is not None
         out, until = self._process.stdout, time.monotonic() + patience
         while b"\n" not in self._unread:
@@ -338,11 +427,11 @@ class Companion:
             if not part:
                 return None
             self._unread += part
-        line, _, self._unread = self._unread.partition(b"\n")  # more than one line may be there
+        line, _, self._unread = self._unread.partition(b"\n")  # more than one line may have arrived
         return line
 
     def ended(self) -> str | None:
-        """How it has ended, and the last thing that it printed; None if it had to be killed."""
+        """How the subprocess ended, and its last line on standard error; None if it had to be killed."""
         assert self._process is not None
         try:
             code = self._process.wait(timeout=1.0)
@@ -355,7 +444,7 @@ class Companion:
         return f"{how}: {lines[-1][:300]}" if lines else how
 
     def close(self) -> None:
-        """Kill it, whatever another thread waits for."""
+        """Kill the subprocess, even while another thread waits for it."""
         self._closed = True
         if self._process is not None:
             self._process.kill()
@@ -364,12 +453,12 @@ class Companion:
 
 @contextmanager
 def ray_cluster() -> Iterator[Any]:
-    """The module ray, connected to the cluster that RAY_ADDRESS names, or to one started here with all cores.
+    """The module ray, connected to the cluster at RAY_ADDRESS, or to a new local one with all cores.
 
-    Raises InputError if Ray is not installed, its cluster cannot be reached or fails, and for an InputError
-    of a task or a node without this package.
+    Raises InputError if Ray is not installed, if its cluster cannot be reached or fails, if a task raises
+    InputError, and if a node lacks this package.
     """
-    # read when ray is imported: messages on a lost node are pages long, but for the one on the task
+    # Ray reads these on import. Its messages about a lost node are pages long, except the one about the task
     os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
@@ -377,12 +466,12 @@ def ray_cluster() -> Iterator[Any]:
         from ray.exceptions import RayError, RayTaskError
     except ImportError:
         raise InputError('a Ray cluster needs ray: pip install "robotdiffuse[cluster]"') from None
-    ours = not ray.is_initialized()
-    if ours:
+    started_here = not ray.is_initialized()
+    if started_here:
         _check_reachable(os.environ.get("RAY_ADDRESS", ""))
     connected = False
     try:
-        if ours:
+        if started_here:
             ray.init(log_to_driver=False, logging_level=logging.CRITICAL)
         connected = True
         yield ray
@@ -395,25 +484,25 @@ def ray_cluster() -> Iterator[Any]:
             ) from None
         raise
     except RayError as error:
-        raise InputError(f"the Ray cluster failed: {_line(error)}; {AGAIN}") from None
+        raise InputError(f"the Ray cluster failed: {_line(error)}; {RERUN_HINT}") from None
     except (ConnectionError, RuntimeError, ValueError) as error:
         if connected:
             raise
         raise InputError(f"no Ray cluster: {_line(error)}") from None
     finally:
-        if ours:
+        if started_here:
             ray.shutdown()
 
 
 def _check_reachable(address: str) -> None:
-    """Raises InputError if nobody listens where the address HOST:PORT or ray://HOST:PORT says."""
+    """Raises InputError if nothing listens at the address HOST:PORT or ray://HOST:PORT."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdecimal():
         return
     try:
-        socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT).close()
     except (OSError, OverflowError) as error:
-        raise InputError(f"no Ray cluster at {address}, where RAY_ADDRESS says: {error}") from None
+        raise InputError(f"no Ray cluster at {address}, the value of RAY_ADDRESS: {error}") from None
 
 
 def _line(error: Exception) -> str:

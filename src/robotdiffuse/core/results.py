@@ -1,4 +1,4 @@
-"""What a planner answers, and its files: the only place that knows how results are written."""
+"""PlanResult, the answer of a planner, and the result file format."""
 
 import json
 import math
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robotdiffuse.core.bounds import FASTEST, within
+from robotdiffuse.core.bounds import MAX_RATE, within
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
@@ -19,50 +19,51 @@ REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_tim
 
 @dataclass(frozen=True, eq=False)
 class PlanResult:
-    """The answer of a planner. `path` is set if and only if `status` is SOLVED; then it passed `verify`."""
+    """The answer of a planner. `path` is set if and only if `status` is SOLVED, and then it passed
+    `verify`."""
 
     status: Status
     reason: str
-    """A sentence that a person can act on; for SOLVED: what the solution came from."""
+    """A sentence to act on; for SOLVED, where the solution came from."""
     planner: str
     robot: str
     planning_time: float
-    """Wall time of plan() [s], with verification and without the timing of the trajectory."""
+    """Wall time of plan() [s], including verification, without time parameterization."""
     seed: int
     stage: str = ""
     """The part of the planner that produced the path, e.g. 'aorrtc', 'network', 'smooth_noise'."""
     path: Path | None = None
     trajectory: Trajectory | None = None
     min_clearance: float | None = None
-    """A lower bound of all distances along the motion [m], the smaller of ..."""
+    """Lower bound on all distances along the motion [m]: the smaller of the two below."""
     scene_clearance: float | None = None
-    """... that of the distances to obstacles, and ..."""
+    """Lower bound on the distance to obstacles [m]."""
     self_clearance: float | None = None
-    """... that of those between links. Results of earlier versions lack the two."""
+    """Lower bound on the distance between links [m]."""
     notes: tuple[str, ...] = field(default=())
-    """What was changed or ignored in the input, e.g. a start clamped to a limit."""
+    """Input that was changed or ignored, e.g. a start clamped to a limit."""
     progress: tuple[tuple[float, float], ...] = ()
-    """When each shorter path was found [s since the call], and its joint-space length [rad]; the last pair is
-    the returned path's."""
+    """Time [s since the call] and joint-space length [rad] of each shorter path; the last pair is the
+    returned path."""
     refused: str = ""
-    """What was wrong with the last path that the validator refused, a `verify.Violation.kind`; "" if none was."""
+    """`Violation.kind` of the last path that the validator rejected; "" if it rejected none."""
     assumption: str = ""
-    """For a scene that cameras saw: which obstacles in unknown space the motion keeps clear of, e.g. "points
-    padded by 9 cm"; "as seen": of none. "" where no view was given."""
+    """Problems with views: the assumption about unknown space that the motion was planned under, e.g. "points
+    padded by 9 cm"; "as seen" assumes no obstacles there. "" without views."""
     confidence: float | None = None
-    """For a scene that cameras saw: how likely the motion is free of what they did not see. `verified` says
-    that it is free of what they saw."""
+    """Problems with views: probability that the motion is free of obstacles in unknown space. `verified`
+    covers observed obstacles only."""
     swept_probability: float | None = None
-    """That the voxels it passes through are occupied, summed, where an prediction of unknown space was asked
-    for: what `confidence` is told from."""
+    """Sum of the predicted occupancy probabilities of all voxels that the motion sweeps, from which
+    `confidence` follows; None without the predicted policy for unknown space."""
     unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    """Least and greatest corner of a box, in the base frame, around the unknown space that the motion crosses
-    where that is likeliest to be occupied [m]; None where it crosses none."""
+    """Lower and upper corner, in the base frame [m], of a box around the crossed unknown space that is most
+    likely occupied; None if the motion crosses none."""
     trees: tuple[Tree, ...] = field(default=(), repr=False)
-    """Of the search: from the start and from the goals, as they found the shortest path of the search, or
-    stood when time ran out. Only where the planner's settings say `keep_trees`; files do not hold them."""
+    """Search trees from the start and from the goals, when the shortest path was found or time ran out. Only
+    if the planner's setting `keep_trees` is true; files do not hold them."""
     problem: Any = field(default=None, repr=False)
-    """The `Problem` that was asked, for `rd.show`; None in results that were read from files."""
+    """The `Problem`, for `rd.show`; None in results read from files."""
 
     @property
     def solved(self) -> bool:
@@ -86,23 +87,24 @@ class PlanResult:
             self.trajectory.save(path)
 
     def record(self, problem: dict[str, Any] | None = None) -> dict[str, Any]:
-        """What a result file holds, for JSON; `problem` as in a problem file."""
+        """The content of a result file as JSON values; `problem` as in a problem file."""
         return _record(self, problem)
 
 
 @dataclass(frozen=True, eq=False)
 class ResultFile:
-    """What a result file holds."""
+    """Content of a result file."""
 
     result: PlanResult
     problem: dict[str, Any] | None
-    """The problem as in a problem file, if it was saved along."""
+    """The problem as in a problem file, if it was saved too."""
 
 
 def load_result(file: str | FilePath) -> ResultFile:
     """Read and check a result file (.json).
 
-    Raises InputError for a file that cannot be read and for fields that are missing, misshapen or not finite.
+    Raises InputError for a file that cannot be read and for fields that are missing, of the wrong shape or
+    not finite.
     """
     record = read_json(file)
     if not isinstance(record, dict):
@@ -216,14 +218,14 @@ def _optional(record: dict[str, Any], name: str, kind: type) -> Any:
 
 def _text(record: dict[str, Any], name: str) -> str:
     if not isinstance(record[name], str):
-        raise InputError(f"{name} is {shown(record[name])}; it must be text")
+        raise InputError(f"{name} is {shown(record[name])}; it must be a string")
     return record[name]
 
 
 def _names(record: dict[str, Any], name: str) -> tuple[str, ...]:
     value = record[name]
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise InputError(f"{name} is {shown(value)}; it must be a list of texts")
+        raise InputError(f"{name} is {shown(value)}; it must be a list of strings")
     return tuple(value)
 
 
@@ -250,6 +252,6 @@ def _rows(record: dict[str, Any], name: str, rows: int | None, columns: int | No
         raise InputError(f"{name} has shape {shape or 'none'}; it must be {wanted}")
     if (rows is not None and len(array) != rows) or (columns is not None and array.shape[1] != columns):
         raise InputError(f"{name} has shape {shape}; it must be {wanted}")
-    if not within(array, FASTEST):
-        raise InputError(f"{name} holds numbers that are not finite, or not within ±{FASTEST:g}")
+    if not within(array, MAX_RATE):
+        raise InputError(f"{name} holds numbers that are not finite, or not within ±{MAX_RATE:g}")
     return array

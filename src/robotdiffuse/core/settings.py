@@ -1,4 +1,4 @@
-"""Settings: frozen dataclasses whose fields carry their bounds; as JSON and back, and from NAME=VALUE.
+"""Settings: frozen dataclasses with bounds in their field types, readable from JSON and from NAME=VALUE.
 
     @dataclass(frozen=True)
     class RRTConnectSettings(Settings, name="rrt_connect"):
@@ -6,8 +6,7 @@
         \"\"\"Longest extension of a tree [rad, joint-space L2].\"\"\"
         sampler: Annotated[str, OneOf(SAMPLERS)] = "uniform"
 
-Bounds stand once, in the type. An instance checks itself; messages name the field, its value and what would
-be right.
+Each instance checks itself on creation; error messages name the field, its value and what would be right.
 """
 
 import ast
@@ -19,6 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from numbers import Integral, Real
 from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -28,12 +28,12 @@ from robotdiffuse.core.registry import Registry
 
 Given = TypeVar("Given", bound="Settings")
 LONG = 40
-"""Longest value that is shown in lists of settings."""
+"""Longest value shown in lists of settings [characters]."""
 
 
 @dataclass(frozen=True)
 class Bound:
-    """Of a number. Infinite values are refused unless `infinite`."""
+    """Bounds of a number. Infinite values are rejected unless `infinite`."""
 
     above: float | None = None
     least: float | None = None
@@ -42,7 +42,7 @@ class Bound:
     infinite: bool = False
 
     def problem(self, value: Any) -> str | None:
-        """What a value must be that is not within the bounds; None for one that is."""
+        """The rule that the value breaks; None if it is within the bounds."""
         within = (
             (self.above is None or value > self.above)
             and (self.least is None or value >= self.least)
@@ -68,20 +68,22 @@ class Bound:
 
 @dataclass(frozen=True, eq=False)
 class OneOf:
-    """A name in a table or list."""
+    """The value must be one of these names."""
 
     names: Iterable[str]
 
 
 @dataclass(frozen=True)
 class Filled:
-    """A tuple that has entries."""
+    """The tuple must not be empty."""
 
 
 @dataclass(frozen=True)
 class SettingsOf:
-    """Settings of the entry that another field names: `denoiser_settings` of `denoiser`. Where that field
-    holds something else, a folder say, there are none."""
+    """Settings of the registry entry that another field names, such as `denoiser_settings` for `denoiser`.
+
+    None if that field holds no name of the registry, e.g. a folder.
+    """
 
     field: str
     table: Registry
@@ -93,22 +95,22 @@ Share = Annotated[float, Bound(least=0.0, most=1.0)]
 Count = Annotated[int, Bound(least=1.0)]
 Natural = Annotated[int, Bound(least=0.0)]
 Sizes = Annotated[tuple[Count, ...], Filled()]
-"""Of layers, one at least."""
+"""Layer sizes; at least one."""
 
 
 class Setting(NamedTuple):
-    """A field of a settings class, for people to read."""
+    """A field of a settings class, described for people."""
 
     name: str
     """Dotted for a field of settings within settings."""
     default: Any
     rule: str
-    """What values it takes."""
+    """Allowed values."""
     description: str
 
     @property
     def value(self) -> str:
-        """The default as `Settings.changed` takes it, "..." where that is long."""
+        """The default in the form that `Settings.changed` takes; "..." if that is long."""
         plain = self.default is None or isinstance(self.default, bool)
         text = str(self.default).lower() if plain else str(self.default)
         return text if len(text) <= LONG else "..."
@@ -120,10 +122,10 @@ class Setting(NamedTuple):
 
 
 class Settings:
-    """Base of settings classes; a subclass that overrides __post_init__ calls this one's."""
+    """Base of settings classes. A subclass that overrides __post_init__ must call this one."""
 
     settings_name: ClassVar[str] = ""
-    """What stands before the fields in messages."""
+    """Prefix of field names in messages."""
 
     def __init_subclass__(cls, name: str = "", **rest: Any) -> None:
         super().__init_subclass__(**rest)
@@ -131,9 +133,11 @@ class Settings:
             cls.settings_name = name
 
     def __post_init__(self) -> None:
-        """Raises InputError for the first field that is out of its bounds."""
+        """Raises InputError for the first field of the wrong type or out of bounds."""
         prefix = f"{self.settings_name}." if self.settings_name else ""
         for name, hint in _hints(type(self)).items():
+            if not _fits(hint, getattr(self, name)):
+                raise InputError(f"{prefix}{name} is {shown(getattr(self, name))}; it takes {_rule(hint)}")
             _check(prefix + name, hint, getattr(self, name), self)
 
     def to_json(self) -> dict[str, Any]:
@@ -159,7 +163,7 @@ class Settings:
         for name, field in fields.items():
             if name in values:
                 at = f"{where}.{name}"
-                # where there are none, what another field names need not be in a table
+                # no settings are given, so the name in the other field need not be in a registry
                 kind = None if values[name] is None else _settings_class(hints[name], values, fields)
                 if kind is not None:
                     found[name] = kind.from_json(values[name], at)
@@ -170,10 +174,10 @@ class Settings:
         return cls(**found)
 
     def changed(self: Given, assignments: Iterable[str]) -> Given:
-        """These settings with some replaced: "step=0.5", "guidance.margin=0.02"; values as in YAML.
+        """A copy with some settings replaced: "step=0.5", "guidance.margin=0.02"; values as in YAML.
 
-        Raises InputError for what is no NAME=VALUE, a name that is not there (all are listed, with what they
-        are) and a value of the wrong type or out of bounds.
+        Raises InputError for text that is not NAME=VALUE, an unknown name (the message lists all settings)
+        and a value of the wrong type or out of bounds.
         """
         where = self.settings_name or type(self).__name__
         changes: dict[str, Any] = {}
@@ -189,7 +193,7 @@ class Settings:
             except InputError:
                 parsed = value
             if isinstance(parsed, str):
-                # YAML 1.1 takes 1e-3 for text, and knows none as null
+                # YAML 1.1 reads 1e-3 as a string, and does not know none as null
                 parsed = None if parsed == "none" else _number(parsed)
             *outer, last = name.split(".")
             inner = changes
@@ -209,7 +213,7 @@ class Settings:
         return dataclasses.replace(self, **found)  # type: ignore[type-var]
 
     def describe(self) -> list[Setting]:
-        """All settings with their values, those of settings within them too."""
+        """All settings with their values, including nested ones."""
         hints, documents = _hints(type(self)), _documents(type(self))
         found: list[Setting] = []
         for name, hint in hints.items():
@@ -228,16 +232,34 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _options(hint: Any) -> tuple[Any, ...]:
-    """The members of a union; any other type alone."""
+    """The members of a union; a one-element tuple for any other type."""
     return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
 
 
 def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """A type and the marks on it."""
+    """A type and its Annotated metadata."""
     if get_origin(hint) is Annotated:
         bare, *marks = get_args(hint)
         return bare, tuple(marks)
     return hint, ()
+
+
+def _fits(hint: Any, value: Any) -> bool:
+    """Whether a value is of a type, whatever its entries are: NumPy's numbers are numbers."""
+    for option in _options(_split(hint)[0]):
+        bare = _split(option)[0]
+        kind = get_origin(bare) or bare
+        if kind in (Union, UnionType):
+            fits = _fits(bare, value)
+        elif kind in (int, float):
+            fits = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+        elif kind is tuple:
+            fits = isinstance(value, tuple | list)
+        else:
+            fits = kind is Any or not isinstance(kind, type) or isinstance(value, kind)
+        if fits:
+            return True
+    return False
 
 
 def _check(where: str, hint: Any, value: Any, owner: object) -> None:
@@ -276,7 +298,7 @@ def _check_mark(where: str, mark: Any, value: Any, owner: object) -> None:
 def _settings_class(
     hint: Any, values: Mapping[str, Any], fields: dict[str, dataclasses.Field]
 ) -> type[Settings] | None:
-    """The class of settings within settings; None for a field of another kind."""
+    """The class of a nested settings field; None for any other field."""
     bare, marks = _split(hint)
     for mark in marks:
         if isinstance(mark, SettingsOf):
@@ -288,9 +310,12 @@ def _settings_class(
 
 
 def _typed(hint: Any, value: Any, where: str) -> Any:
-    """The value as one of a type: lists become tuples, integers floats; InputError for others."""
+    """The value converted to the field's type: lists become tuples, integers floats. Raises InputError for
+    other types."""
     bare, _ = _split(hint)
     options = [_split(option)[0] for option in _options(bare)]
+    if Any in options:
+        return value
     for option in options:
         if get_origin(option) is tuple and isinstance(value, list | tuple):
             count = len(get_args(option))
@@ -309,7 +334,7 @@ def _typed(hint: Any, value: Any, where: str) -> Any:
 
 
 def _number(text: str) -> float | str:
-    """The number that it is, else the text."""
+    """The text as a number if it is one, else unchanged."""
     try:
         return float(text)
     except ValueError:
@@ -332,7 +357,7 @@ def _rule(hint: Any) -> str:
 
 
 def _documents(kind: type) -> dict[str, str]:
-    """What stands under each field of a class and of those that it inherits from."""
+    """Docstring below each field of a class and of its base classes."""
     found: dict[str, str] = {}
     for cls in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(cls):

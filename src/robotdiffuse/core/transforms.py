@@ -11,7 +11,7 @@ IDENTITY = np.eye(4)
 
 def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b 3 3"]:
     """Rotation matrix of a quaternion, normalised first."""
-    if wxyz.ndim == 1:  # plain numbers: NumPy would take several times as long for four
+    if wxyz.ndim == 1:  # plain floats: NumPy takes several times as long for four numbers
         return np.array(_rotation(*wxyz.tolist()))
     unit = wxyz / np.linalg.norm(wxyz, axis=-1, keepdims=True)
     w, x, y, z = unit[..., 0], unit[..., 1], unit[..., 2], unit[..., 3]
@@ -35,7 +35,7 @@ def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b
 
 
 def _rotation(w: float, x: float, y: float, z: float) -> list[list[float]]:
-    """`rotation_from_quaternion` of one."""
+    """`rotation_from_quaternion` of a single quaternion, as nested lists."""
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / norm, x / norm, y / norm, z / norm
     return [
@@ -74,8 +74,8 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Float[ndarray, "
 
 
 def rpy_from_rotation(rotation: Float[ndarray, "3 3"]) -> tuple[float, float, float]:
-    """URDF's roll, pitch, yaw of a rotation matrix, pitch within a quarter turn; in gimbal lock with roll
-    0."""
+    """URDF's roll, pitch, yaw [rad] of a rotation matrix, with pitch in [-pi/2, pi/2]; roll is 0 in gimbal
+    lock."""
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
     if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:
         return 0.0, float(pitch), float(np.arctan2(-rotation[0, 1], rotation[1, 1]))
@@ -111,7 +111,7 @@ def transform(
 
 
 def pose_entry(T: Float[ndarray, "4 4"]) -> dict[str, list[float]]:
-    """A pose as files have it: `xyz` [m] and `wxyz`."""
+    """The pose as files hold it: `xyz` [m] and `wxyz`."""
     return {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}
 
 

@@ -1,4 +1,4 @@
-"""What motions are: Path and Trajectory; and Status, why a planner ended."""
+"""Path, Trajectory, search Tree, and the Status of a planning call."""
 
 import csv
 import io
@@ -12,20 +12,21 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import Value
 from robotdiffuse.core.output_files import check_output, write_atomically
 
 ROWS = ("positions", "velocities", "accelerations")
-"""What a trajectory has for each time."""
+"""Arrays of a trajectory with a row for each time."""
 
 
 class Status(Enum):
-    """Why a call to a planner ended."""
+    """How a planning call ended."""
 
     SOLVED = "solved"
     TIMEOUT = "timeout"
     """No path was found within the time limit."""
     NO_PATH = "no_path"
-    """The search ended before that without a path."""
+    """The search ended before the time limit without a path."""
     INVALID_START = "invalid_start"
     """The start is out of limits, in collision or too close to it."""
     INVALID_GOAL = "invalid_goal"
@@ -33,16 +34,16 @@ class Status(Enum):
     UNREACHABLE_GOAL = "unreachable_goal"
     """Inverse kinematics found no configuration for the goal pose."""
     ERROR = "error"
-    """Of many problems: this one raised an error, or its process died of it."""
+    """`plan_many` only: planning this problem raised an error, or killed its process."""
 
 
-FIRST, SHORT, LIMIT = UNTIL = ("first", "short", "limit")
-"""When planning ends: with the first verified motion; when more time stops paying; when time runs out."""
+FIRST, CONVERGED, TIME_LIMIT = UNTIL = ("first", "converged", "time_limit")
+"""When planning ends: at the first verified motion, when paths stop getting shorter, or at the time limit."""
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
-    """Waypoints joined by straight lines in joint space."""
+class Path(Value):
+    """Waypoints joined by straight segments in joint space."""
 
     joint_names: tuple[str, ...]
     positions: Float[ndarray, "n dof"]
@@ -55,18 +56,20 @@ class Path:
 
 
 class Tree(NamedTuple):
-    """What a search has grown from one end; from a node to its parent the straight line in joint space is
-    free."""
+    """A search tree grown from the start or the goals.
+
+    The straight line in joint space from each node to its parent is free of collision.
+    """
 
     nodes: Float[ndarray, "n dof"]
-    """[rad], [m] for prismatic joints; the roots first."""
+    """[rad], [m] for prismatic joints; roots first."""
     parents: Int[ndarray, "n"]
-    """The row of each node's parent, before its own; -1 for roots."""
+    """Row of each node's parent, which precedes its own; -1 for roots."""
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
-    """A path with a time at each row."""
+class Trajectory(Value):
+    """Positions, velocities and accelerations over time."""
 
     joint_names: tuple[str, ...]
     times: Float[ndarray, "n"]
@@ -77,13 +80,14 @@ class Trajectory:
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Time of the last row [s]."""
         return float(self.times[-1])
 
     def save(self, file: str | FilePath) -> None:
-        """Write .json or .csv, by the ending; the CSV header is time, then <joint>_position and so on.
+        """Write .json or .csv, by the file's ending.
 
-        Raises InputError for another ending or a file that cannot be written.
+        The CSV header is time, then <joint>_position, <joint>_velocity and <joint>_acceleration. Raises
+        InputError for another ending or a file that cannot be written.
         """
         path = check_output(file, (".json", ".csv"))
         if path.suffix.lower() == ".json":
@@ -92,7 +96,7 @@ class Trajectory:
             write_atomically(path, self._csv())
 
     def record(self) -> dict[str, Any]:
-        """For JSON."""
+        """The trajectory as JSON values."""
         rows = {name: getattr(self, name).tolist() for name in ("times", *ROWS)}
         return {"joint_names": list(self.joint_names)} | rows
 

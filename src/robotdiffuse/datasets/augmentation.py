@@ -1,8 +1,8 @@
-"""Copies of motions turned about the vertical: more training data at no cost of planning.
+"""Augmentation: copies of motions turned about the vertical, which cost no planning.
 
-An arm whose first joint turns about the base's z axis, beside a scene turned by an angle, does the same
-motion with that angle added to the first joint. Only the base link does not turn along (nor the floor's
-corners, which are out of reach): copies that would touch it are left out.
+If the first joint turns about the base's z axis, a scene turned by an angle needs the same motion with that
+angle added to the first joint. Only the base link does not turn (nor do the floor's corners, which are out of
+reach): copies that would touch the base link are left out.
 """
 
 import numpy as np
@@ -28,10 +28,10 @@ def turned(
     scenes: PackedScenes,
     rng: np.random.Generator,
 ) -> tuple[Float32[ndarray, "n waypoints dof"], PackedScenes, Bool[ndarray, "n"]]:
-    """Each motion and its scene turned by an angle, uniform among those that the first joint's limits
-    allow; and which of the turned motions keep clear of the base.
+    """Turn each motion and its scene by a random angle, uniform within the limits of the first joint.
 
-    The robot must be one of `turns_about_vertical`.
+    Returns the motions, the scenes and which motions are free of collision with the base.
+    `turns_about_vertical` must hold for the robot.
     """
     first = q[:, :, 0]
     low = np.maximum(robot.lower[0] - first.min(1), -np.pi)

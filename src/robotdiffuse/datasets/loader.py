@@ -1,4 +1,4 @@
-"""The one loader of data sets: `read_rows`, and for PyTorch `rd.RopDataset("rop")`."""
+"""The PyTorch data set, `rd.RopDataset("rop")`: trajectories with their scenes and point clouds."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -18,9 +18,7 @@ from torch.utils.data import Dataset, get_worker_info
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.datasets.rows import read_rows
-from robotdiffuse.datasets.shards import (
-    SPLITS,
-)
+from robotdiffuse.datasets.shards import SPLITS
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
@@ -28,26 +26,26 @@ from robotdiffuse.scenes.surface_clouds import surface_clouds
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
 VIEWS = ("full", "partial")
-BLOCK = 16
-"""Shards that are shuffled together: 16 of the usual 500 rows map 57 MB."""
+SHARDS_PER_BLOCK = 16
+"""Shards that are shuffled together; 16 of 500 rows map 57 MB."""
 MAX_THREADS = 8
-"""Most threads that make batches ahead."""
+"""Most threads that prefetch batches."""
 CAMERA_CENTER = (0.0, 0.0, 0.4)
-"""What the cameras of partial views look at, in the base frame [m]."""
+"""Point that the cameras of partial views look at, in the base frame [m]."""
 CAMERA_DISTANCE = (1.5, 2.5)
-"""From the centre [m]; obstacles may come as near as that, and a camera within one sees nothing of it."""
+"""From the centre [m]; a camera inside an obstacle does not see it."""
 CAMERA_ELEVATION = (0.1, 1.2)
 """Above the horizontal [rad]."""
 ABOVE_FLOOR = VisibleRegion(floor=0.0, reach=10.0)
-"""What a camera can see: nothing below the plane that the robot stands on."""
+"""Cameras see nothing below the plane that the robot stands on."""
 
 
 @dataclass(frozen=True, eq=False)
 class RopBatch:
-    """Rows of the data set, on its device."""
+    """A batch of the data set, on its device."""
 
     trajectories: Float32[Tensor, "n waypoints dof"]
-    """In [-1, 1]: the robot's limits are -1 and 1."""
+    """Scaled so that the robot's limits are -1 and 1."""
     start: Float32[Tensor, "n dof"]
     """The first waypoint, scaled too."""
     goal: Float32[Tensor, "n dof"]
@@ -55,7 +53,7 @@ class RopBatch:
     target_pose: Float32[Tensor, "n 7"]
     """Of the robot's tip in the base frame, wxyz_xyz."""
     obstacle_kinds: Int8[Tensor, "n slots"]
-    """As `PackedScenes` has them."""
+    """As in `PackedScenes`."""
     obstacle_params: Float32[Tensor, "n slots 10"]
     points: Float32[Tensor, "n points 3"]
     """On the obstacles, in the base frame [m]."""
@@ -65,10 +63,10 @@ class RopBatch:
 
 
 class RopDataset(Dataset[dict[str, Tensor]]):
-    """Trajectories with their scenes and fresh point clouds; trajectories stay on the disk, mapped to memory.
+    """Trajectories with their scenes and newly drawn point clouds; trajectories are mapped from the disk.
 
-    The fast way is `batches`. For a standard DataLoader an item is a dict of the tensors in RopBatch; there,
-    clouds are made in the workers, so keep `device="cpu"` with `num_workers > 0`.
+    `batches` is the fast way. With a standard DataLoader an item is a dict of the tensors in RopBatch; its
+    workers make the clouds, so use `device="cpu"` with `num_workers > 0`.
     """
 
     def __init__(
@@ -83,10 +81,11 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         robot: Robot | None = None,
         waypoints: int | None = None,
     ) -> None:
-        """split: train, validation or test; scenes of one are in no other. points: of each cloud.
-        sort_points: by x, then y, then z. view: "full", all around the obstacles, or "partial", what a camera
-        sees from a random place. seed: of clouds and order. robot: the one that you will use the data for.
-        waypoints: so many, evenly spaced along each path, held in memory; None: those that are stored.
+        """split: train, validation or test; no scene is in two of them. points: of each cloud. sort_points:
+        whether points are sorted by x, then y, then z. view: "full" for points all around the obstacles,
+        "partial" for those that a camera at a random place sees. seed: of clouds and order. robot: the robot
+        that the data are used for. waypoints: resample to so many, evenly spaced along each path, in memory;
+        None: the stored ones.
 
         Raises InputError for unknown names, a folder without data or with damaged shards, and data of
         another robot.
@@ -109,7 +108,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         middle, half_range = (
             a.astype(np.float32) for a in (self.normalizer.middle, self.normalizer.half_range)
         )
-        # over whole trajectories: to broadcast along seven joints is slow
+        # tiled over whole trajectories, as broadcasting along seven joints is slow
         self._scale, self._shift = (
             torch.from_numpy(np.tile(a, self.waypoints)).to(self.device)
             for a in (1 / half_range, -middle / half_range)
@@ -127,7 +126,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         self._poses, self._scenes = np.concatenate(poses), PackedScenes.joined(scenes)
 
     def __reduce__(self) -> tuple:
-        return RopDataset, self._arguments  # pickled maps would be copies of the files
+        return RopDataset, self._arguments  # pickling memory maps would copy the files
 
     def __len__(self) -> int:
         return len(self._places)
@@ -138,11 +137,11 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         return self.__getitems__([index % len(self)])[0]
 
     def __getitems__(self, indices: list[int]) -> list[dict[str, Tensor]]:
-        """What a DataLoader asks for: clouds of all items at once."""
+        """Items for a DataLoader, whose clouds are made together."""
         worker = get_worker_info()
         number = -1 if worker is None else worker.id
         if number not in self._generators:
-            # each worker draws numbers of its own, and others in every epoch
+            # each worker has its own random numbers, and new ones in every epoch
             start = self.seed if worker is None else worker.seed % 2**63
             self._generators[number] = torch.Generator(self.device).manual_seed(start)
         batch = self._batch(np.array(indices), self._generators[number])
@@ -152,12 +151,11 @@ class RopDataset(Dataset[dict[str, Tensor]]):
     def batches(
         self, batch_size: int, shuffle: bool = True, generator: torch.Generator | None = None
     ) -> Iterator[RopBatch]:
-        """One epoch, made ahead by as many threads as PyTorch has; the last batch may be smaller.
+        """One epoch of batches, prefetched by as many threads as PyTorch uses; the last batch may be smaller.
 
-        Rows are shuffled within blocks of 16 shards, and shards among blocks, so that what is read lies
-        close together. The generator, on the CPU, draws order and clouds: from the same state come the same
-        batches, whatever the number of threads. None: one that is made from `seed`, so that every
-        call gives the same epoch.
+        Rows are shuffled within blocks of 16 shards, and shards among blocks, so that reads are local. The
+        generator, on the CPU, draws order and clouds: the same state gives the same batches for any number of
+        threads. None: a generator made from `seed`, so that every call gives the same epoch.
         """
         if batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; it must be at least 1")
@@ -173,7 +171,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
 
     def _run(self, jobs: Iterator) -> Iterator[RopBatch]:
         threads = min(MAX_THREADS, torch.get_num_threads()) if self.device.type == "cpu" else 1
-        # a batch is one thread's work: PyTorch's own threads wait for each other at every step
+        # one thread makes a batch: PyTorch's own threads would wait for each other at every step
         pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
         waiting: deque = deque()
         try:
@@ -191,8 +189,10 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         first = np.searchsorted(shard, np.arange(len(self._trajectories) + 1)).tolist()
         shards = torch.randperm(len(self._trajectories), generator=generator).tolist()
         blocks = [np.zeros(0, np.int64)]
-        for i in range(0, len(shards), BLOCK):
-            rows = np.concatenate([np.arange(first[s], first[s + 1]) for s in shards[i : i + BLOCK]])
+        for i in range(0, len(shards), SHARDS_PER_BLOCK):
+            rows = np.concatenate(
+                [np.arange(first[s], first[s + 1]) for s in shards[i : i + SHARDS_PER_BLOCK]]
+            )
             blocks.append(rows[torch.randperm(len(rows), generator=generator).numpy()])
         return np.concatenate(blocks)
 
@@ -220,7 +220,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
 
 
 def _cameras(n: int, generator: torch.Generator) -> Float32[Tensor, "n 3"]:
-    """Random places from which the scene is seen [m]."""
+    """Random positions of cameras [m]."""
     a, b, c = torch.rand(3, n, generator=generator, device=generator.device)
     turn = 2 * pi * a
     up = CAMERA_ELEVATION[0] + (CAMERA_ELEVATION[1] - CAMERA_ELEVATION[0]) * b

@@ -1,13 +1,14 @@
-"""What a data set is of: `manifest.json` in its folder."""
+"""The manifest of a data set: robot, scenes, settings and versions, in `manifest.json` in its folder."""
 
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.problems.families import load_family
+from robotdiffuse.core.settings import Count, Natural, Settings
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box
@@ -17,8 +18,8 @@ MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True)
-class Manifest:
-    """What a data set is of."""
+class Manifest(Settings):
+    """Robot, scenes, settings and versions of a data set."""
 
     robot: str
     """A bundled name, or the path of a URDF."""
@@ -27,26 +28,27 @@ class Manifest:
     lower: tuple[float, ...]
     """Limits [rad]."""
     upper: tuple[float, ...]
-    waypoints: int
+    waypoints: Count
     timing: str
     """How waypoints are spaced: "arc", evenly in joint-space length, or "time"."""
     families: dict[str, dict[str, Any]]
-    """Settings of the scenes by name, in the order of the numbers in `family`."""
+    """Settings of each family of scenes; their order gives the numbers of the array `family`."""
     floors: dict[str, dict[str, list[float]] | None]
-    """`center` and `size` of the box that the scenes of each family stand on [m]; None: of nothing."""
-    slots: int
+    """`center` and `size` of the box that the scenes of each family stand on [m]; None without one."""
+    slots: Natural
     """Most obstacles of a scene."""
-    goals: int
+    goals: Count
     """Most goal configurations of a problem."""
-    trajectories: int
-    """Planned in all."""
-    shard: int
+    trajectories: Natural
+    """Number of trajectories of the whole set."""
+    shard: Count
     """Rows per shard."""
     settings: dict[str, Any]
-    """All of the generation's."""
+    """Settings of the generation."""
     versions: dict[str, str]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not len(self.joint_names) == len(self.lower) == len(self.upper) > 0:
             raise InputError(
                 f"joint_names, lower and upper have {len(self.joint_names)}, {len(self.lower)} and "
@@ -64,12 +66,12 @@ class Manifest:
         return len(self.joint_names)
 
     def floor(self, family: int) -> Box | None:
-        """What the scenes of a family stand on."""
+        """The box that the scenes of a family stand on; None without one."""
         floor = list(self.floors.values())[family]
         return None if floor is None else Box(**floor, name="floor")
 
     def check_robot(self, robot: Robot) -> None:
-        """Raises InputError if the data were made with another robot."""
+        """Raise InputError if the data were made with another robot."""
         found = robot_fingerprint(robot)
         if found != self.robot_fingerprint:
             raise InputError(
@@ -79,19 +81,19 @@ class Manifest:
 
 
 def floor_record(floor: Box | None) -> dict[str, list[float]] | None:
-    """A floor as `Manifest.floors` keeps it."""
+    """A floor in the form of `Manifest.floors`."""
     return None if floor is None else {"center": floor.center.tolist(), "size": floor.size.tolist()}
 
 
 def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
-    """Write manifest.json, whole or not at all; makes the folder. Raises InputError if it cannot."""
+    """Write manifest.json atomically, making the folder. Raises InputError if it cannot be written."""
     data = {"format": FORMAT, "dof": manifest.dof} | asdict(manifest)
     write_atomically(FilePath(folder) / MANIFEST, json.dumps(data, indent=1) + "\n", make_folder=True)
 
 
 def read_manifest(folder: str | FilePath) -> Manifest:
-    """Raises InputError if there is none, or it is damaged or of another version of the format."""
-    file = FilePath(folder) / MANIFEST
+    """Read manifest.json. Raises InputError if it is missing, damaged or of another version of the format."""
+    file = file_name(folder, "folder") / MANIFEST
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -107,35 +109,12 @@ def read_manifest(folder: str | FilePath) -> Manifest:
     check_format(file, data.pop("format"))
     try:
         data.pop("dof")
-        for name in ("joint_names", "lower", "upper"):
-            data[name] = tuple(data[name])
-        if "frames" in data:  # as waypoints were called once
-            data["waypoints"] = data.pop("frames")
-            data["settings"] = {"waypoints": data["waypoints"]} | data["settings"]
-        return Manifest(**_with_floors(data))
-    except (KeyError, TypeError, ValueError) as error:
+        return Manifest.from_json(data, MANIFEST)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{file} is damaged: {error}") from None
 
 
-def _with_floors(data: dict[str, Any]) -> dict[str, Any]:
-    """Manifests once had no floors: they are those of the families in the table, unless settings say more."""
-    if "floors" in data:
-        return data
-    floors = {name: floor_record(_old_floor(name, of)) for name, of in data["families"].items()}
-    return data | {"floors": floors}
-
-
-def _old_floor(name: str, settings: dict[str, Any]) -> Box | None:
-    """ROP's floors had settings of their own once."""
-    if not settings.get("floor", True):
-        return None
-    if "floor_size" in settings:
-        size, thickness = settings["floor_size"], settings["floor_thickness"]
-        return Box((0.0, 0.0, -thickness / 2), (size, size, thickness))
-    return load_family(name).floor
-
-
 def check_format(file: FilePath, found: object) -> None:
-    """Raises InputError for another version of the format than this one's."""
+    """Raise InputError for another version of the format."""
     if found != FORMAT:
-        raise InputError(f"{file}: format is {found}; this version reads {FORMAT}")
+        raise InputError(f"{file}: format is {shown(found)}; this version reads {FORMAT}")

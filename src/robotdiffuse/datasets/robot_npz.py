@@ -1,8 +1,8 @@
-"""The layout of the paper's authors, robot.npz: data sets are written in it, and made of it.
+"""Export and import of robot.npz, the data layout of the paper's authors.
 
 `x_train` [n, 254, 7]: joint values [rad]. `y_train` [n, 23]: start 7, goal that was reached 7, centres of two
-spheres 6, position of the target 3 [m]. The first 20 are what the authors' viewer sends; that the last three
-are the target's position is our reading of the 23. float32.
+spheres 6, position of the target 3 [m]. The authors' viewer sends the first 20; that the last three are the
+target's position is our interpretation of the 23. float32.
 """
 
 import os
@@ -18,7 +18,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, shortened
-from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
 from robotdiffuse.datasets.shards import Row, check_shapes, read_shard, row_of, shard_indices, write_shard
 from robotdiffuse.problems.families import load_family
@@ -30,23 +30,22 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Sphere
 
-WAYPOINTS, DOF, NUMBERS = 254, 7, 23
-ROWS = 500
-"""Of a shard."""
-RADIUS = 0.25
-"""Of the spheres [m]: what the authors' planner sees; their loader and viewer show 0.2, a margin of 5 cm."""
-SAME = 1e-4
-"""Start and goal may differ by this from the first and last waypoint [rad]."""
+WAYPOINTS, DOF, CONDITION_NUMBERS = 254, 7, 23
+ROWS_PER_SHARD = 500
+SPHERE_RADIUS = 0.25
+"""[m]; that of the authors' planner. Their loader and viewer use 0.2, which leaves a margin of 5 cm."""
+END_TOLERANCE = 1e-4
+"""Largest difference of start and goal from the first and last waypoint [rad]."""
 RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of the straight line [m]."""
-NAMES = ("trajectories", "start", "target_pose", "obstacle_kinds", "obstacle_params")
+ARRAYS_READ = ("trajectories", "start", "target_pose", "obstacle_kinds", "obstacle_params")
 
 
 def export_npz(folder: str | FilePath, file: str | FilePath) -> int:
-    """Write the trajectories of all scenes of exactly two spheres, whole or not at all; returns their number.
+    """Write the trajectories of all scenes with exactly two spheres, atomically; returns their number.
 
-    Raises InputError if there is no data set, it has no such scene or other waypoints or joints, or the file
-    cannot be written.
+    Raises InputError if there is no data set, it has no such scene, other numbers of waypoints or joints, or
+    the file cannot be written.
     """
     manifest, file = read_manifest(folder), FilePath(file)
     if (manifest.waypoints, manifest.dof) != (WAYPOINTS, DOF):
@@ -54,9 +53,9 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> int:
             f"{folder} has {manifest.waypoints} waypoints of {manifest.dof} joints; "
             f"robot.npz holds {WAYPOINTS} waypoints of {DOF} joints"
         )
-    x, y = [np.zeros((0, WAYPOINTS, DOF), np.float32)], [np.zeros((0, NUMBERS), np.float32)]
+    x, y = [np.zeros((0, WAYPOINTS, DOF), np.float32)], [np.zeros((0, CONDITION_NUMBERS), np.float32)]
     for index in shard_indices(folder):
-        shard = read_shard(folder, index, NAMES)
+        shard = read_shard(folder, index, ARRAYS_READ)
         check_shapes(folder, shard, manifest)
         kinds = shard["obstacle_kinds"]
         rows = np.flatnonzero(((kinds == SPHERE).sum(1) == 2) & ((kinds != NONE).sum(1) == 2))
@@ -83,18 +82,18 @@ def import_npz(
     file: str | FilePath,
     folder: str | FilePath,
     robot: str = "panda",
-    radius: float = RADIUS,
+    radius: float = SPHERE_RADIUS,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
-    """Make a data set of a robot.npz in an empty folder; returns the number of its motions.
+    """Make a data set from a robot.npz in an empty folder; returns the number of its motions.
 
-    The scenes are two spheres of this radius [m] on ROP's floor. Nothing is validated: that is for
-    `robotdiffuse data check`. What the file does not say is measured (clearances, lengths, whether the
-    straight line is free) or follows from the motion: the target is where the last waypoint has the robot's
-    tip, for the target in the file is that of the authors' arm, which has no hand. The safety distance is
-    not known, and 0. `progress` is called with the numbers of motions that are done and of all.
+    Scenes are two spheres of this radius [m] on ROP's floor. Motions are not validated; `robotdiffuse data
+    check` does. Clearances, lengths and whether the straight line is free are measured. The target is the
+    pose of the robot's tip at the last waypoint: the target in the file is that of the authors' arm, which
+    has no hand. The safety distance is unknown and set to 0. `progress` is called with the numbers of motions
+    done and in all.
 
-    Raises InputError if the file is no such file, or the folder holds data or cannot be written.
+    Raises InputError if the file is no robot.npz, or the folder holds data or cannot be written.
     """
     arm, folder = load_robot(robot), FilePath(folder)
     if arm.dof != DOF:
@@ -115,15 +114,15 @@ def import_npz(
         slots=2,
         goals=1,
         trajectories=len(q),
-        shard=ROWS,
+        shard=ROWS_PER_SHARD,
         settings={"imported": FilePath(file).name, "radius": radius},
         versions={"robotdiffuse": __version__},
     )
-    with alone_in(folder):
+    with lock_folder(folder):
         if (folder / MANIFEST).exists() or shard_indices(folder):
             raise InputError(f"{folder} holds data already; import into another folder")
-        for index, first in enumerate(range(0, len(q), ROWS)):
-            rows = range(first, min(first + ROWS, len(q)))
+        for index, first in enumerate(range(0, len(q), ROWS_PER_SHARD)):
+            rows = range(first, min(first + ROWS_PER_SHARD, len(q)))
             made = [_row(arm, manifest, q[i], centers[i], radius, i) for i in rows]
             arrays = {name: np.stack([row[name] for row in made]) for name in made[0]}
             write_shard(folder, index, arrays, {"tried": len(made), "solved": len(made)})
@@ -164,14 +163,14 @@ def _row(
 
 
 def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[ndarray, "n 2 3"]]:
-    """Motions, and centres of the two spheres of each."""
-    wanted = {"x_train": (WAYPOINTS, DOF), "y_train": (NUMBERS,)}
+    """The motions, and the centres of the two spheres of each."""
+    wanted = {"x_train": (WAYPOINTS, DOF), "y_train": (CONDITION_NUMBERS,)}
     try:
         with np.load(file, allow_pickle=False) as stored:
             x, y = (np.asarray(stored[name], np.float32) for name in wanted)
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from None
-    except Exception as error:  # NumPy, zipfile and Python's tokenizer raise whatever they meet
+    except Exception as error:  # NumPy, zipfile and Python's tokenizer raise many types of exceptions
         raise InputError(f"{file} is no robot.npz: {shortened(str(error))}") from None
     for (name, row), array in zip(wanted.items(), (x, y), strict=True):
         if array.shape != (len(x), *row) or not len(x):
@@ -179,9 +178,9 @@ def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[nd
             raise InputError(f"{file}: {name} has shape {array.shape}; it must be {shape}, with n at least 1")
         if not np.isfinite(array).all():
             raise InputError(f"{file}: {name} holds numbers that are not finite")
-    for name, said, found in (("start", y[:, :DOF], x[:, 0]), ("goal", y[:, DOF : 2 * DOF], x[:, -1])):
-        off = np.abs(said - found).max(axis=1)
-        if off.max() > SAME:
+    for name, stated, found in (("start", y[:, :DOF], x[:, 0]), ("goal", y[:, DOF : 2 * DOF], x[:, -1])):
+        off = np.abs(stated - found).max(axis=1)
+        if off.max() > END_TOLERANCE:
             end = "first" if name == "start" else "last"
             raise InputError(
                 f"{file}: row {off.argmax()} has a {name} that differs from its {end} waypoint by "

@@ -1,4 +1,4 @@
-"""The rows of a data set, shard after shard, with copies of them turned; and even spacing of motions."""
+"""Reading the rows of a data set, with turned copies; and resampling motions evenly."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,43 +23,44 @@ from robotdiffuse.datasets.shards import (
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
-NAMES = ("trajectories", "target_pose", "obstacle_kinds", "obstacle_params", "family")
-"""Arrays that are read where shards are not checked throughout."""
+ARRAYS_READ = ("trajectories", "target_pose", "obstacle_kinds", "obstacle_params", "family")
+"""Arrays that are read from shards that are not fully checked."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """The rows of a shard, or copies of them turned about the vertical."""
+    """The rows of a shard, or copies turned about the vertical."""
 
     shard: Shard
-    """Where the other columns are; they are of the rows as they were before the turn."""
+    """The shard with the other arrays; these are not turned."""
     turn: int
-    """Number of the copy; 0: the rows themselves."""
+    """Number of the copy; 0 for the rows themselves."""
     q: Float32[ndarray, "n waypoints dof"]
     """[rad]"""
     scenes: PackedScenes
-    """With their floors."""
+    """The scenes with their floors."""
     split: Int8[ndarray, "n"]
-    """Index into SPLITS; -1 for a copy that must not be used."""
+    """Index into SPLITS; -1 for copies that must not be used."""
 
 
 def read_rows(
     folder: str | FilePath, robot: Robot | None = None, waypoints: int | None = None, turns: int = 0
 ) -> Iterator[Rows]:
-    """The rows of all shards, one shard after the other, each followed by its turned copies.
+    """Read the rows of all shards, each shard followed by its turned copies.
 
-    robot: the one that the data are used for. waypoints: so many, evenly spaced along each path, in memory,
-    of shards that are checked throughout; None: those that are stored, mapped, of which the shapes are
-    checked. turns: copies, see `turned`, of the rows for training; `waypoints` and a robot must be given.
+    robot: the robot that the data are used for. waypoints: resample to so many, evenly spaced along each
+    path, in memory; shards are then fully checked. None: the
+        stored ones, mapped to memory; only their shapes are checked.
+    turns: copies of the training rows, see `turned`; these need `waypoints` and a robot.
 
-    Raises InputError, naming the shard, if there are no data, they are damaged or of another robot.
+    Raises InputError, naming the shard, if data are missing, damaged or of another robot.
     """
     manifest = read_manifest(folder)
     if robot is not None:
         manifest.check_robot(robot)
     for index in existing_shards(folder):
         if waypoints is None:
-            shard = read_shard(folder, index, NAMES)
+            shard = read_shard(folder, index, ARRAYS_READ)
             check_shapes(folder, shard, manifest)
         else:
             shard = check_shard(folder, index, manifest)
@@ -79,16 +80,17 @@ def read_rows(
 def resample(
     q: Float[ndarray, "n stored dof"], waypoints: int, exact: bool = False
 ) -> Float[ndarray, "n {waypoints} dof"]:
-    """Each motion at `waypoints` places, evenly spaced in joint-space length; the ends are kept exactly.
+    """Resample each motion to `waypoints` places evenly spaced in joint-space length; the ends are kept
+    exactly.
 
-    exact: whether what lies between two stored waypoints is reckoned in double precision, as `numpy.interp`
-    has it, and then rounded: what is stored is made so; what is read is made faster.
+    exact: whether to interpolate in double precision, as `numpy.interp`, and round then. Stored data are made
+    so; reading uses the faster way.
     """
     n, stored = q.shape[:2]
     steps = np.linalg.norm(np.diff(q, axis=1), axis=2)
     at = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1, dtype=np.float64)], axis=1)
     wanted = np.linspace(0.0, at[:, -1], waypoints, axis=1)
-    # rows one after the other, far apart, are one rising list
+    # offsets make the rows one ascending list, for a single search
     row = 2.0 * at.max(initial=0.0) * np.arange(n)[:, None]
     after = np.searchsorted((at + row).reshape(-1), (wanted + row).reshape(-1), side="right")
     after = np.clip(after.reshape(n, waypoints) - np.arange(n)[:, None] * stored, 1, stored - 1)

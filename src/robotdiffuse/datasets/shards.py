@@ -1,10 +1,11 @@
-"""The rows of a data set: their schema, their shards on disk, and the way from a motion to a row and back.
+"""Shards of a data set: the schema of rows, files on disk, and conversion between motions and rows.
 
-    FOLDER/manifest.json             what the data are of, see `manifest.py`
+    FOLDER/manifest.json             robot, scenes and settings, see `manifest.py`
     FOLDER/shard_00000.zarr/         a Zarr v3 group, one chunk per array
 
-A shard is written beside its place and renamed, so what has its name is whole. The same arrays give the same
-files, byte for byte. `trajectories` is not compressed: its chunk is a file that can be mapped into memory.
+A shard is written under a temporary name and renamed, so that a shard with its final name is complete. The
+same arrays give the same files, byte for byte. `trajectories` is not compressed, so that its file can be
+mapped to memory.
 """
 
 import hashlib
@@ -31,8 +32,8 @@ from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes, floor_row
 
-COMPRESSION = 3
-"""Zstandard's level."""
+COMPRESSION_LEVEL = 3
+"""Of Zstandard."""
 
 SPLITS = ("train", "validation", "test")
 SPLIT_PERCENT = (90, 5, 5)
@@ -56,16 +57,16 @@ ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "detour": ("<f4", ()),
     "seed": ("<u8", ()),
 }
-"""By name: type, and shape of a row in fields of the manifest. `times` only where `timing` is "time".
+"""Type and row shape of each array; names are fields of the manifest. `times` exists only if `timing` is
+"time".
 
-Joint values [rad], times [s], lengths [m]. `trajectories` begin at `start` and end at `goals[goal_index]`,
-exactly. Rows of `goals` beyond those that a problem has are NaN, and so are their `goal_costs`; the cost of a
-goal that was not reached is inf. `target_pose` is wxyz_xyz of the tip in the base frame. Obstacles are as
-`PackedScenes` has them, without the floor. `cost` is the joint-space length of the path [rad], `clearance` a
-lower bound of its distance to obstacles [m], `end_clearance` that of start and reached goal alone,
-`safety_distance` the distance that the search kept but near ends that are closer themselves [m],
-`line_free` whether the straight line would have done, `detour` the cost in units of the straight line's,
-`seed` the number of the problem.
+Joint values [rad], times [s], lengths [m]. `trajectories` begin exactly at `start` and end at
+`goals[goal_index]`. Unused rows of `goals` and `goal_costs` are NaN; the cost of a goal that was not reached
+is inf. `target_pose` is wxyz_xyz of the tip in the base frame. Obstacles are packed as in `PackedScenes`,
+without the floor. `cost` is the joint-space length of the path [rad], `clearance` a lower bound of its
+distance to obstacles [m], `end_clearance` that of start and reached goal alone, `safety_distance` the
+distance that the search kept except near ends that are closer themselves [m], `line_free` whether the
+straight line is free, `detour` the cost over that of the straight line, `seed` the number of the problem.
 """
 UNBOUNDED = {"goals", "goal_costs"}
 """Arrays that may hold NaN or inf."""
@@ -75,14 +76,14 @@ _SHARD_NAME = re.compile(r"shard_(\d{5,})\.zarr")
 
 @dataclass(frozen=True, eq=False)
 class Shard:
-    """Arrays of one shard, or some of them."""
+    """One shard, with all arrays or some of them."""
 
     index: int
     fingerprint: str
     counts: dict[str, int]
-    """How many problems were tried, solved, unsolved, thinned, refused, ..."""
+    """Numbers of problems tried, solved, unsolved, thinned, refused, ..."""
     arrays: dict[str, ndarray]
-    """By the names in ARRAYS."""
+    """Arrays by their names in ARRAYS."""
 
     def __getitem__(self, name: str) -> ndarray:
         return self.arrays[name]
@@ -96,13 +97,13 @@ def shard_path(folder: str | FilePath, index: int) -> FilePath:
 
 
 def shard_indices(folder: str | FilePath) -> list[int]:
-    """Numbers of the shards that a folder has, rising."""
+    """Numbers of the shards in a folder, in ascending order."""
     matches = (_SHARD_NAME.fullmatch(path.name) for path in FilePath(folder).glob("shard_*.zarr"))
     return sorted(int(match[1]) for match in matches if match)
 
 
 def existing_shards(folder: str | FilePath) -> list[int]:
-    """`shard_indices`, of which there must be some. Raises InputError if there are none."""
+    """As `shard_indices`, but raises InputError if there are none."""
     indices = shard_indices(folder)
     if not indices:
         raise InputError(
@@ -112,7 +113,7 @@ def existing_shards(folder: str | FilePath) -> list[int]:
 
 
 def remove_leftovers(folder: str | FilePath) -> None:
-    """Remove what killed runs left half-written. Only while nobody writes to the folder."""
+    """Remove incomplete files of killed runs. Call it only while nobody writes to the folder."""
     for path in FilePath(folder).glob(".shard_*.zarr.*"):
         shutil.rmtree(path, ignore_errors=True)
     for path in FilePath(folder).glob(f".{MANIFEST}.*"):
@@ -132,10 +133,10 @@ def _zarr() -> ModuleType:
 def write_shard(
     folder: str | FilePath, index: int, arrays: dict[str, ndarray], counts: dict[str, int]
 ) -> None:
-    """Write a shard, whole or not at all, in the place of one of the same number.
+    """Write a shard atomically, replacing one of the same number.
 
-    `arrays` are all of ARRAYS, but for `times` where the timing is "arc". Raises InputError if the arrays do
-    not fit each other, or the shard cannot be written, as when the disk is full.
+    `arrays` are all of ARRAYS, without `times` if the timing is "arc". Raises InputError if the arrays do not
+    match, or the shard cannot be written, as on a full disk.
     """
     zarr, target = _zarr(), shard_path(folder, index)
     wrong = {*arrays, "times"} ^ ARRAYS.keys()
@@ -146,11 +147,11 @@ def write_shard(
         name: np.ascontiguousarray(arrays[name], ARRAYS[name][0]).reshape(arrays[name].shape)
         for name in sorted(arrays)
     }
-    prints = {name: _array_fingerprint(array) for name, array in ready.items()}
+    fingerprints = {name: _array_fingerprint(array) for name, array in ready.items()}
     attributes = {
         "format": FORMAT,
         "index": index,
-        "fingerprint": _shard_fingerprint(prints),
+        "fingerprint": _shard_fingerprint(fingerprints),
         "counts": {name: int(counts[name]) for name in sorted(counts)},
     }
     beside: str | None = None
@@ -164,10 +165,12 @@ def write_shard(
                 name,
                 data=array,
                 chunks=tuple(max(1, size) for size in array.shape),
-                compressors=None if name == "trajectories" else zarr.codecs.ZstdCodec(level=COMPRESSION),
+                compressors=None
+                if name == "trajectories"
+                else zarr.codecs.ZstdCodec(level=COMPRESSION_LEVEL),
                 filters=None,
-                attributes={"fingerprint": prints[name]},
-                # a chunk of zeros is a file too: a file that is not there is damage
+                attributes={"fingerprint": fingerprints[name]},
+                # write chunks of zeros too, so that a missing file means damage
                 config={"write_empty_chunks": True},
             )
         if target.exists():
@@ -186,17 +189,17 @@ def _array_fingerprint(array: ndarray) -> str:
     return digest.hexdigest()[:16]
 
 
-def _shard_fingerprint(prints: dict[str, str]) -> str:
-    """Of the fingerprints of all arrays, in the order of their names."""
-    text = json.dumps([(name, prints[name]) for name in sorted(prints)])
+def _shard_fingerprint(fingerprints: dict[str, str]) -> str:
+    """The fingerprint of the arrays' fingerprints, in the order of their names."""
+    text = json.dumps([(name, fingerprints[name]) for name in sorted(fingerprints)])
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def read_shard(folder: str | FilePath, index: int, names: tuple[str, ...] | None = None) -> Shard:
-    """The arrays of a shard, or those named; `trajectories` mapped from the disk, read-only.
+    """Read a shard, or the named arrays of it; `trajectories` is mapped from the disk, read-only.
 
-    Raises InputError, naming shard and array, where something is missing or cut short. Values are not
-    checked; see `check_shard`.
+    Raises InputError, naming shard and array, for missing or truncated data. Values are not checked; see
+    `check_shard`.
     """
     path = shard_path(folder, index)
     group = _open(path)
@@ -213,8 +216,11 @@ def read_shard(folder: str | FilePath, index: int, names: tuple[str, ...] | None
     return Shard(index, str(attributes.get("fingerprint")), attributes["counts"], arrays)
 
 
-_DAMAGE = (OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError)
-"""What zarr and its codecs raise for files that are not as they should be."""
+_DAMAGE_ERRORS = (
+    *(OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError),
+    *(OverflowError, MemoryError, RecursionError),
+)
+"""Exceptions of zarr and its codecs for damaged files."""
 
 
 def _open(path: FilePath) -> Any:
@@ -223,7 +229,7 @@ def _open(path: FilePath) -> Any:
         raise InputError(f"there is no shard {path}")
     try:
         return zarr.open_group(path, mode="r", zarr_format=3)
-    except _DAMAGE as error:
+    except _DAMAGE_ERRORS as error:
         raise InputError(f"shard {path} is damaged: {_line(error)}") from None
 
 
@@ -235,8 +241,10 @@ def _read_array(path: FilePath, group: Any, name: str) -> ndarray:
     try:
         array = group[name]
         found, ndim = array.dtype.str, len(array.shape)
-        whole = array.nchunks_initialized == array.nchunks
-    except _DAMAGE as error:
+        files = sum(file.is_file() for file in (path / name).rglob("*"))
+        # zarr counts through all chunks, however many there should be
+        whole = array.nchunks <= files and array.nchunks_initialized == array.nchunks
+    except _DAMAGE_ERRORS as error:
         raise InputError(f"{where} is damaged: {_line(error)}") from None
     if found != dtype or ndim != 1 + len(row):
         raise InputError(f"{where} is {found} with {ndim} axes; it must be {dtype} with {1 + len(row)}")
@@ -246,7 +254,7 @@ def _read_array(path: FilePath, group: Any, name: str) -> ndarray:
         if name == "trajectories" and _is_one_plain_chunk(array):
             return _map(path / name, array)
         return array[...]
-    except _DAMAGE as error:
+    except _DAMAGE_ERRORS as error:
         raise InputError(f"{where} is damaged: {_line(error)}") from None
 
 
@@ -255,7 +263,7 @@ def _line(error: BaseException) -> str:
 
 
 def _is_one_plain_chunk(array: Any) -> bool:
-    """Whether the array lies in one file as it would in memory."""
+    """Whether the array is one uncompressed file with the layout of memory."""
     codecs = [codec.to_dict() for codec in array.metadata.codecs]
     plain = len(codecs) == 1 and codecs[0]["name"] == "bytes"
     return plain and codecs[0]["configuration"] == {"endian": "little"} and array.chunks == array.shape
@@ -270,7 +278,7 @@ def _map(path: FilePath, array: Any) -> ndarray:
 
 
 def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> None:
-    """Raises InputError, naming shard and array, if rows are not of the shapes that the manifest says."""
+    """Raise InputError, naming shard and array, if rows do not have the shapes of the manifest."""
     for name, array in shard.arrays.items():
         row = tuple(getattr(manifest, s) if isinstance(s, str) else s for s in ARRAYS[name][1])
         if array.shape[1:] != row:
@@ -279,29 +287,31 @@ def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> No
 
 
 def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard:
-    """Read a shard and check everything that needs no robot: shapes, types, numbers and fingerprints.
+    """Read a shard and check all that needs no robot: shapes, types, finite numbers and fingerprints.
 
-    Raises InputError, naming shard and array, for the first thing that is wrong.
+    Raises InputError, naming shard and array, for the first defect.
     """
     shard, path = read_shard(folder, index), shard_path(folder, index)
     if ("times" in shard.arrays) != (manifest.timing == "time"):
         raise InputError(f"shard {path}, array times: it must be there only where timing is time")
     check_shapes(folder, shard, manifest)
-    group, prints = _open(path), {}
+    group, fingerprints = _open(path), {}
     for name, array in shard.arrays.items():
         where = f"shard {path}, array {name}"
-        prints[name] = _array_fingerprint(array)
-        if prints[name] != group[name].attrs.get("fingerprint"):
+        fingerprints[name] = _array_fingerprint(array)
+        attributes = group[name].metadata.attributes
+        if not isinstance(attributes, dict) or fingerprints[name] != attributes.get("fingerprint"):
             raise InputError(f"{where} is damaged: its fingerprint is not the one that was written")
         if name not in UNBOUNDED and not np.isfinite(array).all():
             raise InputError(f"{where} holds numbers that are not finite")
-    if _shard_fingerprint(prints) != shard.fingerprint:
+    if _shard_fingerprint(fingerprints) != shard.fingerprint:
         raise InputError(f"shard {path} is damaged: its fingerprint is not that of its arrays")
     return shard
 
 
 def split_of(scenes: PackedScenes) -> Int8[ndarray, "n"]:
-    """The split of each row, as an index into SPLITS: by a hash of its scene, so that no scene is in two."""
+    """The split of each row as an index into SPLITS, by a hash of its scene, so that no scene is in two
+    splits."""
     ends = np.cumsum(SPLIT_PERCENT)
     rows = zip(scenes.kinds, scenes.params, strict=True)
     hashes = [zlib.crc32(params.tobytes(), zlib.crc32(kinds.tobytes())) for kinds, params in rows]
@@ -309,7 +319,7 @@ def split_of(scenes: PackedScenes) -> Int8[ndarray, "n"]:
 
 
 Row = dict[str, ndarray | np.generic]
-"""A row of each of ARRAYS."""
+"""One row of each of ARRAYS."""
 
 
 def row_of(
@@ -328,9 +338,10 @@ def row_of(
     most_goals: int,
     times: Float[ndarray, "waypoints"] | None = None,
 ) -> Row:
-    """The row of a motion q in a packed scene of its own, with these `clearances` at its waypoints [m].
+    """The row of a motion q in a packed scene.
 
-    T_base_tip: the target. most_goals: rows for goals. The others are as the columns of their names, ARRAYS.
+    clearances: of the waypoints [m]. T_base_tip: the target. most_goals: rows for goals. The other arguments
+    are the values of the arrays of their names.
     """
     missing = [(0, most_goals - len(goals)), (0, 0)]
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
@@ -361,7 +372,7 @@ def row_of(
 def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> PackedScenes:
     """The scenes of some rows, with the floors of their families.
 
-    Raises InputError if the manifest has no such family.
+    Raises InputError for a family that the manifest does not have.
     """
     family, names = shard["family"][rows], list(manifest.families)
     if len(family) and not 0 <= family.min() <= family.max() < len(names):
@@ -374,7 +385,7 @@ def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> Pa
 def problem_of(manifest: Manifest, robot: Robot, shard: Shard, row: int) -> Problem:
     """The problem that a row solves, with all its goal configurations.
 
-    Raises InputError if the row makes no problem, such as a start out of limits.
+    Raises InputError if the row is no valid problem, as with a start outside the limits.
     """
     goals = np.asarray(shard["goals"][row], np.float64)
     goals = goals[~np.isnan(goals).any(axis=1)]
@@ -389,7 +400,8 @@ def path_of(robot: Robot, shard: Shard, row: int) -> Path:
 
 
 def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
-    """The waypoints of a row as they move: timed, with rates by differences, where the data have times."""
+    """The motion of a row: a trajectory, its rates by finite differences, if the data have times, else a
+    path."""
     path = path_of(robot, shard, row)
     times = np.asarray(shard.arrays.get("times", ()), np.float64)
     if not len(times) or not (np.diff(times[row]) > 0).all():
@@ -400,7 +412,7 @@ def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
 
 
 def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, Int[ndarray, "n"]]:
-    """Random rows without repetition, all where `count` is None, from shards of these sizes by number."""
+    """Random rows without repetition from shards of these sizes; all if `count` is None."""
     total, first, picked = sum(sizes.values()), 0, {}
     if count is None or count >= total:
         rows = np.arange(total)
@@ -413,7 +425,7 @@ def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, 
 
 
 def random_rows(folder: str | FilePath, count: int, seed: int) -> Iterator[tuple[Shard, Int[ndarray, "n"]]]:
-    """The shards that random rows are from, with these rows. Raises InputError for a damaged shard."""
+    """Shards and random rows of each. Raises InputError for a damaged shard."""
     sizes = {index: len(read_shard(folder, index, ("family",))) for index in shard_indices(folder)}
     for index, rows in pick_rows(sizes, count, seed).items():
         if len(rows):

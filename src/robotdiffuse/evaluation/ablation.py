@@ -1,7 +1,7 @@
-"""The paper's Table 2: every row trained at the same budget and tried on the same held-out problems.
+"""The paper's Table 2: every row is trained with the same budget and evaluated on the same held-out problems.
 
-Collision guidance alone, without a network, solves many problems. So what a row owes to its network is told
-by trying it without guidance, and by a control: guidance of trajectories that no network made.
+Collision guidance alone, without a network, solves many problems. What a row owes to its network is measured
+without guidance, and by a control: guidance of trajectories that do not come from a network.
 """
 
 import hashlib
@@ -16,14 +16,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.processes import Workers
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, without_network
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import tried
+from robotdiffuse.evaluation.runs import run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.tables import Column, Table
 from robotdiffuse.learning.checkpoint import load_model
@@ -38,26 +38,25 @@ from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"
 CONTROL = "no network"
-"""The line and random bumps in place of a network's samples."""
-CONTROL_FRAMES = 48
-"""As many as the rows' networks have."""
-PATIENCE = 20.0
-"""A training that is told to end stores a checkpoint first; after this it is killed [s]."""
+"""The straight line and random bumps in place of a network's samples."""
+CONTROL_WAYPOINTS = 48
+"""As many as those of the rows' networks."""
+STOP_TIMEOUT = 20.0
+"""A stopped training writes a checkpoint; it is killed after this time [s]."""
 
 
 class Row(NamedTuple):
     config: str
-    """By its name in `learning.training.configs`."""
+    """Name in `learning.training.configs`."""
     guided: bool
-    """Whether collision guidance is used in sampling."""
+    """Whether samples are drawn under collision guidance."""
     paper: tuple[float | None, ...]
-    """Success %, collision %, length, time s, as the paper has them; None where it has no such row."""
+    """The paper's success [%], collision [%], length and time [s]; None if it has no such row."""
 
 
 ROWS: dict[str, Row] = {
     "PointNet": Row("table2_pointnet", True, (69.4, 26.7, 17.154, 42)),
     "DGCNN": Row("table2_dgcnn", True, (73.4, 22.5, 16.864, 64)),
-    "Completing": Row("table2_completing", True, (None,) * 4),
     "U-Net": Row("table2_unet", True, (59.3, 29.7, 17.358, 27)),
     "Transformer": Row("table2_transformer", True, (69.0, 16.5, 17.137, 32)),
     "Decoder-only": Row("table2_decoder_only", True, (62.8, 23.8, 16.195, 23)),
@@ -74,15 +73,15 @@ class AblationSettings:
     data: str
     """Folder of a data set."""
     out: str
-    """Folder for the trained networks; what is there is kept, and what was interrupted goes on."""
+    """Folder for the trained networks; existing ones are kept, interrupted trainings continue."""
     samples: int = 300_000
-    """Training samples of each row: the equal budget."""
+    """Training samples of each row, the equal budget."""
     encoder_samples: int = 300_000
     """Clouds that the frozen encoder is trained on first."""
     problems: int = 500
     """Held-out problems that the straight line does not solve and search does."""
     family: str = "rop"
-    """What family they are of: a name in `problems.families`."""
+    """Family of the problems, a name in `problems.families`."""
     candidates: int = 16
     """Trajectories sampled for each problem."""
 
@@ -94,22 +93,22 @@ class AblationSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class Evaluation:
     """Figures of a network, one value for each problem."""
 
     single: Float[ndarray, "n"]
     """Share of the sampled trajectories that passed the validator."""
     best: Float[ndarray, "n"]
-    """1 where any of them did."""
+    """1 if any of them passed."""
     collided: Float[ndarray, "n"]
     """Share of the sampled trajectories in collision."""
     length: Float[ndarray, "n"]
-    """Link path length of the shortest that passed [m]; nan where none did."""
+    """Link path length of the shortest that passed [m]; NaN without one."""
     seconds: Float[ndarray, "n"]
-    """CPU time of encoding and sampling, on one thread."""
+    """CPU time of encoding and sampling on one thread [s]."""
 
     @classmethod
-    def of(cls, records: list[Record]) -> "Tried":
+    def of(cls, records: list[Record]) -> "Evaluation":
         single, collided = (np.array([getattr(r, name) for r in records]) for name in ("passed", "collided"))
         length = np.array([record.measures.get("link_length", np.nan) for record in records])
         return cls(single, (single > 0) * 1.0, collided, length, np.array([record.cpu for record in records]))
@@ -117,13 +116,13 @@ class Tried:
 
 class RowResult(NamedTuple):
     name: str
-    alone: Tried
+    alone: Evaluation
     """Without guidance."""
-    guided: Tried
+    guided: Evaluation
     """With it."""
 
     @property
-    def as_in_paper(self) -> Tried:
+    def as_in_paper(self) -> Evaluation:
         return self.guided if self.name not in ROWS or ROWS[self.name].guided else self.alone
 
 
@@ -133,9 +132,9 @@ def run_ablation(
     workers: int = 1,
     report: Callable[[str], None] = lambda text: None,
 ) -> list[RowResult]:
-    """Train what the rows need, and try every row. Killed, the same call goes on with what is missing.
+    """Train the networks of the rows and evaluate every row. After an interruption, the same call continues.
 
-    Raises InputError for an unknown row, listing the known, and for data that do not fit.
+    Raises InputError for an unknown row, listing the known ones, and for data of another robot.
     """
     for name in rows:
         if name not in ROWS:
@@ -143,7 +142,7 @@ def run_ablation(
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
     read_manifest(settings.data).check_robot(load_robot("panda"))
-    with alone_in(FilePath(settings.out)):
+    with lock_folder(FilePath(settings.out)):
         return _run(settings, rows, workers, report)
 
 
@@ -158,18 +157,20 @@ def _run(
         )
     _check_budget(encoder / "encoder.json", "encoder_samples", settings.encoder_samples)
     configs = list(dict.fromkeys(ROWS[name].config for name in rows))
-    found: dict[tuple[str | None, bool], Tried] = {}
-    with Workers(workers, PATIENCE) as pool:
+    found: dict[tuple[str | None, bool], Evaluation] = {}
+    with Workers(workers, STOP_TIMEOUT) as pool:
         for _, config in pool.each(_train, [(settings, config) for config in configs]):
             _check_budget(FilePath(settings.out) / config / "model.json", "samples", settings.samples)
             report(f"trained {config}")
         _check_same_data(settings, configs)
         cases = hard_cases(settings.family, settings.problems, FilePath(settings.out) / "problems", report)
         todo = [(settings, config, guided, cases) for config in (*configs, None) for guided in (False, True)]
-        for _, (config, guided, result) in pool.each(_try, todo):
+        for _, (config, guided, result) in pool.each(_evaluate, todo):
             found[config, guided] = result
             how = "with" if guided else "without"
-            report(f"tried {config or CONTROL} {how} guidance: {100 * result.single.mean():.1f} % of samples")
+            report(
+                f"evaluated {config or CONTROL} {how} guidance: {100 * result.single.mean():.1f} % of samples"
+            )
     results = [
         RowResult(name, *(found[ROWS[name].config, guided] for guided in (False, True))) for name in rows
     ]
@@ -181,7 +182,7 @@ def _training(file: FilePath) -> dict[str, Any]:
 
 
 def _check_budget(file: FilePath, name: str, wanted: int) -> None:
-    """Raises InputError if a network was trained longer or shorter."""
+    """Raise InputError if a network was trained with another budget."""
     found = _training(file)["settings"]["samples"]
     if found != wanted:
         raise InputError(
@@ -191,7 +192,7 @@ def _check_budget(file: FilePath, name: str, wanted: int) -> None:
 
 
 def _check_same_data(settings: AblationSettings, configs: list[str]) -> None:
-    """Raises InputError unless all networks saw the same data."""
+    """Raise InputError unless all networks were trained on the same data."""
     seen = {config: _training(FilePath(settings.out) / config / "model.json")["data"] for config in configs}
     if len(set(seen.values())) > 1:
         found = ", ".join(f"{config} {digest}" for config, digest in seen.items())
@@ -208,9 +209,9 @@ def _train(settings: AblationSettings, config: str) -> str:
     return config
 
 
-def _try(
+def _evaluate(
     settings: AblationSettings, config: str | None, guided: bool, cases: list[Case]
-) -> tuple[str | None, bool, Tried]:
+) -> tuple[str | None, bool, Evaluation]:
     robot = load_robot("panda")
     folder = FilePath(settings.out) / (config or CONTROL.replace(" ", "_"))
     weights = None if config is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
@@ -218,9 +219,13 @@ def _try(
     about = json.dumps(asdict(planner) | {"weights": weights}, sort_keys=True)
     name = f"{'guided' if guided else 'unguided'} {hashlib.sha256(about.encode()).hexdigest()[:12]}"
     alone = config is None
-    draw = without_network(planner, CONTROL_FRAMES) if alone else from_network(RobotDiffuse(planner))
+    draw = without_network(planner, CONTROL_WAYPOINTS) if alone else from_network(RobotDiffuse(planner))
     method = sampled(draw, Kinematics(robot).link_length)
-    return config, guided, Tried.of(tried(cases, {name: method}, seeds=(1,), folder=folder, bar=False)[name])
+    return (
+        config,
+        guided,
+        Evaluation.of(run_all(cases, {name: method}, seeds=(1,), folder=folder, bar=False)[name]),
+    )
 
 
 def _planner_settings(settings: AblationSettings, config: str | None, guided: bool) -> RobotDiffuseSettings:
@@ -243,7 +248,7 @@ NOTES = (
 
 
 def table(settings: AblationSettings, results: list[RowResult]) -> Table:
-    """Table 2, the paper's figures beside."""
+    """Table 2, with the paper's figures beside ours."""
     known = asdict(settings)
     budget = ("samples", "encoder_samples", "problems", "candidates")
     title = f"Table 2 on {settings.family}: {', '.join(f'{name} {known[name]:,}' for name in budget)}"
@@ -264,17 +269,17 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
     )
     first, rows = results[0].as_in_paper, []
     for result in results:
-        tried, of = result.as_in_paper, ROWS.get(result.name)
+        evaluation, of = result.as_in_paper, ROWS.get(result.name)
         rows.append(
             (
                 result.name,
-                "yes" if tried is result.guided else "no",
-                *_share(tried.single),
-                float(tried.best.mean()),
-                *_share(tried.collided),
-                _mean(tried.length),
-                _mean(tried.length / first.length),
-                float(np.median(tried.seconds)),
+                "yes" if evaluation is result.guided else "no",
+                *_share(evaluation.single),
+                float(evaluation.best.mean()),
+                *_share(evaluation.collided),
+                _mean(evaluation.length),
+                _mean(evaluation.length / first.length),
+                float(np.median(evaluation.seconds)),
                 *_share(result.alone.single),
                 *((None,) * 4 if of is None else of.paper),
             )
@@ -283,12 +288,12 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
 
 
 def _share(values: Float[ndarray, "n"]) -> tuple[float, str]:
-    """Mean of shares and its interval, in per cent."""
+    """Mean of shares, and its 95 % interval in per cent."""
     low, high = (100 * x for x in bootstrap_interval(values))
     return float(values.mean()), f"{low:.1f} to {high:.1f}"
 
 
 def _mean(values: Float[ndarray, "n"]) -> float | None:
-    """Of those that are not nan."""
+    """Mean of the values that are not NaN; None without any."""
     known = values[values == values]
     return float(known.mean()) if len(known) else None

@@ -10,11 +10,11 @@ By the paper's own formulas, the figures of its Table 1 give these scores instea
 | MPD          | 0.454   | 0.133     | 1      | 1     | 0.6467   | 0.645   | +0.002     |
 | RobotDiffuse | 0.823   | 0.315     | 0.983  | 0.990 | 0.7774   | 0.765   | +0.012     |
 
-The order of the rows is the printed one, but for RRT* and MPiNets, which are level in print. Where the
-differences come from is not known. What was tried:
+The order of the rows is the printed one, except for RRT* and MPiNets, which are equal in print. The cause of
+the differences is unknown. These explanations were tried:
 
 - Rounding: four times each printed score has no more than two decimals (1.67, 0.76, 1.67, 2.58, 3.06), so
-  normalised values were probably rounded to two first. Then MPD is 0.645 exactly; MPiNets is 0.4150, and
+  normalised values were probably first rounded to two. Then MPD is 0.645 exactly; MPiNets is 0.4150, and
   MPNet 0.1975, of which 0.19 is the first two decimals; RRT* (0.4475) and RobotDiffuse (0.7750) are one
   digit away from print. So slips of the pen in three rows, and one score cut short, would explain it all.
 - Columns normalised otherwise (shares of the maximum, logarithms, ranks; all combinations): the largest
@@ -39,21 +39,21 @@ from robotdiffuse.core.errors import InputError
 
 @dataclass(frozen=True)
 class Indicators:
-    """The four figures of a planner that ComScore weighs. NaN for one that is not known."""
+    """The four figures of a planner that ComScore weighs; NaN if unknown."""
 
     success: float
     """Share of problems solved, in any unit that all rows share (the paper: per cent)."""
     collision: float
     """Share of motions in collision."""
     length: float
-    """Path length; of the links' ways in the paper, which names no unit."""
+    """Path length; in the paper that of all links, without a unit."""
     time: float
     """Time per problem [s]."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """The weights w_i of ComScore, which sum to 1; the paper's are equal."""
+    """The weights w_i of ComScore, which sum to 1; equal in the paper."""
 
     success: float = 0.25
     collision: float = 0.25
@@ -67,15 +67,15 @@ class Weights:
 
 
 HIGHER_IS_BETTER = np.array([True, False, False, False])
-"""In the order of the fields of Indicators."""
+"""For the fields of Indicators, in their order."""
 
 
 def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
-    """V_norm of every row and indicator: 1 for the best of these rows, 0 for the worst, linear between.
+    """V_norm of every row and indicator: 1 for the best of these rows, 0 for the worst, linear in between.
 
-    An indicator in which all rows are equal, where the paper's formulas are 0 / 0, is 1 for all of them:
-    each is as good as the best, and a row that is nowhere behind keeps the full score. One that is not known
-    (NaN, e.g. the length where nothing was solved) is 0, as bad as the worst.
+    If all rows have the same indicator, where the paper's formulas give 0 / 0, it is 1 for all: each row is
+    as good as the best. An unknown indicator (NaN, such as the length if nothing was solved) is 0, as for the
+    worst.
     """
     values = np.array([astuple(row) for row in rows], dtype=np.float64).reshape(len(rows), 4)
     if not len(rows):
@@ -89,7 +89,7 @@ def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
 
 
 def comscores(rows: Sequence[Indicators], weights: Weights | None = None) -> Float[ndarray, "n"]:
-    """The ComScore of each of the compared rows, in [0, 1]. It depends on which rows are compared."""
+    """The ComScore of each row, in [0, 1]. It depends on which rows are compared."""
     return normalized(rows) @ np.array(astuple(weights or Weights()))
 
 

@@ -1,4 +1,4 @@
-"""What figures were measured with: the machine and the versions of packages."""
+"""The machine and the versions of packages that figures were measured with."""
 
 import os
 import platform
@@ -8,7 +8,7 @@ from pathlib import Path as FilePath
 
 
 def processor() -> str:
-    """Its name."""
+    """The name of the processor."""
     info = FilePath("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     names = (line.split(": ")[1] for line in lines if line.startswith("model name"))
@@ -16,7 +16,7 @@ def processor() -> str:
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
-    """Of packages; `none` of one that is not installed."""
+    """Versions of packages; `none` for one that is not installed."""
     found = {}
     for name in packages:
         try:
@@ -27,7 +27,7 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
 
 
 def about(packages: Iterable[str]) -> str:
-    """Processor, load and versions: a line for the head of a report."""
+    """Processor, load and versions, as one line for the head of a report."""
     names = ", ".join(f"{name} {number}" for name, number in versions(packages).items())
     return (
         f"{processor()}, {os.cpu_count()} cores, load average {os.getloadavg()[0]:.1f} before; "

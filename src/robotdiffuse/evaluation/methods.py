@@ -1,9 +1,12 @@
-"""What can be tried: planners, networks that sample, and searches that go on. Each gives its trials'
-records, with the verdict of the validator, whose time is not counted unless it is part of a planner's call."""
+"""Methods that can be run: planners, and networks that sample. Each yields its records with the validator's
+verdict.
+
+The validator's time counts only where it is part of a planner's call.
+"""
 
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from math import ceil
@@ -18,8 +21,8 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status
 from robotdiffuse.evaluation.metrics import Measure
-from robotdiffuse.evaluation.records import ENDED, RAISED, RESTARTABLE, SOLVED
-from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial
+from robotdiffuse.evaluation.records import ENDED_EARLY, RAISED, RESTARTABLE, SOLVED
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planning.diffusion.diffusion import ModelSampler, encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuseSettings, unlearned_starts
@@ -31,24 +34,25 @@ from robotdiffuse.validation.validator import Report, VerifySettings, verifier
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
 
-NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4)
-"""How networks are sampled where they are looked at alone: without guidance, the planner's steps are few."""
+NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4, guidance_scale=1.0)
+"""Settings of networks that are measured alone; the planner's own number of steps is too small without
+guidance."""
 UNSOLVED = Status.NO_PATH.value
-SHORTEST = 1 + 1e-6
-"""A path is the shortest that there is if it is at most so many times as long as the straight line."""
+SHORTEST_FACTOR = 1 + 1e-6
+"""A path counts as the shortest possible if it is at most so many times as long as the straight line."""
 
 measure_of = lru_cache(maxsize=8)(Measure)
-"""That of a robot, made once."""
+"""The Measure of a robot; made once."""
 
 
 # Planners
 
 
 def planned(planner: Planner, **request: Any) -> Method:
-    """A planner in this process; `request` are further arguments of its `plan`."""
+    """A planner in this process, as a method; `request` holds further arguments of its `plan`."""
 
-    def call(trial: Trial) -> Iterator[Fields]:
-        yield from planner_calls(planner, trial.problem, trial.seed, trial.limit, False, request)
+    def call(run: Run) -> Iterator[Fields]:
+        yield from planner_calls(planner, run.problem, run.seed, run.limit, False, request)
 
     return call
 
@@ -61,14 +65,14 @@ def planner_calls(
     restarts: bool,
     request: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[Fields]:
-    """The record of a call, with further arguments; if there are to be restarts and it ended by itself, that
-    of `restarted` too. An exception is a record."""
+    """Yield the fields of a call's record; with `restarts`, if the call ended early, also those of
+    `restarted`. An exception is a record too."""
     measure, began = measure_of(problem.robot), time.perf_counter()
     try:
         with Clock() as clock:
             result = planner.plan(problem, time_limit=limit, seed=seed, **request)
         yield {"cpu": round(clock.cpu, 6), **fields_of(result, measure)}
-        if restarts and result.status.value in RESTARTABLE and result.planning_time < ENDED * limit:
+        if restarts and result.status.value in RESTARTABLE and result.planning_time < ENDED_EARLY * limit:
             again, result = restarted(planner, problem, seed, limit, result, request)
             yield {"restarts": again, **fields_of(result, measure)}
     except Exception as error:
@@ -85,15 +89,15 @@ def restarted(
     first: PlanResult,
     request: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[int, PlanResult]:
-    """How often a planner is called again, with fresh seeds, until its calls have used up the time limit
-    together; and the shortest path of all of them, with the times at which paths were found.
+    """Call a planner again with fresh seeds until its calls have used up the time limit together.
 
-    Not any more when there is no shorter path. As in single calls, only the answer needs a trajectory: the
-    time that it takes to time the others is not counted.
+    Returns the number of calls and the shortest path of all, with the times at which paths were found. Stops
+    early if no shorter path exists. The time for timing the other paths does not count: a single call times
+    its answer only.
     """
     best, spent, least, again = first, first.planning_time, first.planning_time, 0
     progress, straight = list(first.progress), _straight_length(problem)
-    while limit - spent > least and (best.path_length or np.inf) > SHORTEST * straight:
+    while limit - spent > least and (best.path_length or np.inf) > SHORTEST_FACTOR * straight:
         again += 1
         fresh = int(np.random.SeedSequence([seed, again]).generate_state(1)[0])
         result = planner.plan(problem, time_limit=limit - spent, seed=fresh, **request)
@@ -107,14 +111,14 @@ def restarted(
 
 
 def _straight_length(problem: Problem) -> float:
-    """From the start to the nearest goal configuration [rad]; 0 where goals are poses."""
+    """Distance from the start to the nearest goal configuration [rad]; 0 if goals are poses."""
     if not isinstance(problem.goal, JointGoal):
         return 0.0
     return float(np.linalg.norm(problem.goal.positions - problem.start, axis=1).min())
 
 
 def fields_of(result: PlanResult, measure: Measure) -> Fields:
-    """What a record keeps of a result."""
+    """The fields of a result's record."""
     found: dict[str, Any] = {
         "status": result.status.value,
         "reason": result.reason,
@@ -132,21 +136,21 @@ def fields_of(result: PlanResult, measure: Measure) -> Fields:
 # Sampled trajectories
 
 
-Draw = Callable[[Trial, CollisionChecker], ndarray]
-"""A batch of trajectories [count, waypoints, dof] for a trial."""
+Draw = Callable[[Run, CollisionChecker], ndarray]
+"""A batch of trajectories [count, waypoints, dof] for a run."""
 
 
 class Validated(NamedTuple):
-    """The validator's opinion of a batch."""
+    """The validator's verdict on a batch."""
 
     passed: Bool[ndarray, "n"]
     hit: Bool[ndarray, "n"]
-    """Which are in collision."""
+    """Which trajectories are in collision."""
     reports: list[Report]
 
 
 def validated(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Validated:
-    """Of trajectories as they are, but for their ends, which are made exact."""
+    """Validate trajectories as they are, except that their ends are made exact."""
     validator, reports = verifier(problem, VerifySettings()), []
     for waypoints in q.astype(np.float64):
         waypoints[0], waypoints[-1] = problem.start, goal_of(problem)
@@ -157,18 +161,18 @@ def validated(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Validat
 
 
 def path_lengths(q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
-    """In joint space [rad]."""
+    """Joint-space lengths [rad]."""
     return np.linalg.norm(np.diff(q, axis=1), axis=2).sum(axis=1)
 
 
 def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) -> Method:
-    """A batch of trajectories, all validated as they are; measured is the shortest of those that passed."""
+    """A method that validates a batch of trajectories as they are and measures the shortest that passes."""
 
-    def call(trial: Trial) -> Iterator[Fields]:
-        problem = trial.problem
+    def call(run: Run) -> Iterator[Fields]:
+        problem = run.problem
         checker = CollisionChecker(problem.robot, problem.scene)
         with Clock() as clock:
-            q = draw(trial, checker)
+            q = draw(run, checker)
         verdict, found = validated(problem, q), {}
         if verdict.passed.any():
             best = int(np.where(verdict.passed, lengths(q), np.inf).argmin())
@@ -187,101 +191,52 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
 
 def from_network(
     sampler: ModelSampler,
-    seen: Callable[[Trial], Problem] | None = None,
+    seen: Callable[[Run], Problem] | None = None,
     hidden: bool = False,
-    guidance_scale: float = 1.0,
 ) -> Draw:
-    """Straight from the network: no refinement, no search, no shortcuts.
+    """Samples of the network: no refinement, no search, no shortcuts.
 
-    seen: whose obstacles are encoded, in place of the problem's own. hidden: the denoiser is told that no
-    link is anywhere near an obstacle. Guidance knows the obstacles in any case. guidance_scale: see
-    `MotionModel.denoise_guided`; 0 hides the condition, the code with it.
+    seen: the problem whose obstacles are encoded, in place of the run's own. hidden: whether the clearances
+    given to the denoiser are those without obstacles. Guidance knows the obstacles in
+        any case.
     """
 
-    def draw(trial: Trial, checker: CollisionChecker) -> ndarray:
-        problem, rng = trial.problem, trial.rng()
+    def draw(run: Run, checker: CollisionChecker) -> ndarray:
+        problem, rng = run.problem, run.rng()
         model = sampler.model(problem.robot)
         assert model is not None
-        other = checker if seen is None else CollisionChecker(problem.robot, seen(trial).scene)
+        other = checker if seen is None else CollisionChecker(problem.robot, seen(run).scene)
         code = encode(model, other, sampler.settings.points, rng)
         ends = problem.start, goal_of(problem)[None]
-        told = nothing_near(model) if hidden else None
-        return sampler.draw(model, checker, code, *ends, rng, told, guidance_scale=guidance_scale)
+        clearances = clearances_without_obstacles(model) if hidden else None
+        return sampler.draw(model, checker, code, *ends, rng, clearances)
 
     return draw
 
 
-def nothing_near(model: "MotionModel") -> "ClearanceFn":
-    """What a model is told of the obstacles where there are none."""
-    links, width = len(model.robot.links), model.dof if model.settings.sees_gradients else 0
+def clearances_without_obstacles(model: "MotionModel") -> "ClearanceFn":
+    """The clearance inputs of a model in a scene without obstacles."""
+    links, width = len(model.robot.links), model.dof if model.settings.clearance_gradients else 0
 
     def clearances(q: ndarray) -> ndarray:
-        told = np.zeros((*q.shape[:2], links + width), np.float32)
-        told[..., :links] = model.settings.clearance_high
-        return told
+        inputs = np.zeros((*q.shape[:2], links + width), np.float32)
+        inputs[..., :links] = model.settings.clearance_high
+        return inputs
 
     return clearances
 
 
 def without_network(settings: RobotDiffuseSettings, waypoints: int) -> Draw:
-    """The control: the line and random bumps, and as many gradient steps as a network's samples take, all of
-    them one after the other."""
+    """The control without a network: the straight line and random bumps, after as many gradient steps as
+    guidance takes on a network's samples."""
     sampling_steps = settings.sampling_steps
-    assert sampling_steps is not None  # as many as a network's would be
+    assert sampling_steps is not None  # networks are sampled in a given number of steps
     steps = settings.guidance_steps * ceil(settings.guided_share * sampling_steps)
 
-    def draw(trial: Trial, checker: CollisionChecker) -> ndarray:
-        problem = trial.problem
+    def draw(run: Run, checker: CollisionChecker) -> ndarray:
+        problem = run.problem
         ends = problem.start, goal_of(problem)
-        q = unlearned_starts(*ends, settings.samples, waypoints, problem.robot, trial.rng())
+        q = unlearned_starts(*ends, settings.samples, waypoints, problem.robot, run.rng())
         return CollisionGuidance(checker, settings.guidance)(q, steps)[0] if steps else q
 
     return draw
-
-
-# Searches that go on
-
-
-Search = Callable[[Trial], Iterator[ndarray | None]]
-"""Yields waypoints as it finds them; None where it only wants to be asked whether there is time left. What it
-does before it returns the iterator is not counted."""
-
-
-def searched(
-    search: Search, marks: Sequence[float], whole: Callable[[Trial], Problem] = lambda trial: trial.problem
-) -> Method:
-    """A record for each mark, a CPU time [s]: of what a search has by then, the shortest path that passes the
-    validator is its answer, and that is solved if it passes for the whole problem too.
-
-    whole: what is true, where the trial's problem is what a planner sees of it. `passed` is 1 with an answer.
-    """
-
-    def call(trial: Trial) -> Iterator[Fields]:
-        found: list[tuple[float, ndarray]] = []
-        paths, began = search(trial), time.process_time()
-        for path in paths:
-            spent = time.process_time() - began
-            if spent > marks[-1]:
-                break
-            if path is not None:
-                found.append((spent, np.asarray(path, np.float64)))
-        found.sort(key=lambda one: path_lengths(one[1][None])[0])
-        names, verdicts = trial.problem.robot.joint_names, dict[int, Report]()
-
-        def passes(i: int) -> bool:
-            if i not in verdicts:
-                verdicts[i] = verifier(trial.problem, VerifySettings()).path(Path(names, found[i][1]))
-            return verdicts[i].valid
-
-        for mark in marks:
-            answer = next((i for i, (at, _) in enumerate(found) if at <= mark and passes(i)), None)
-            fields: Fields = {"status": UNSOLVED, "time": mark, "time_limit": mark, "passed": 0.0}
-            if answer is not None:
-                at, path = found[answer][0], Path(names, found[answer][1])
-                report = verifier(whole(trial), VerifySettings()).path(path)
-                fields |= {"passed": 1.0, "time": at, "cpu": at}
-                if report.valid:
-                    fields |= {"status": SOLVED, **measure_of(trial.problem.robot)(path, None, report)}
-            yield fields
-
-    return call

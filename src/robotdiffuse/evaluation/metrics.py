@@ -1,4 +1,4 @@
-"""What is measured of a motion: METRICS. A new line there is in records, tables, plots and pages."""
+"""Metrics of motions. A new line in METRICS appears in records, tables, plots and pages."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,26 +17,26 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.validation.validator import Report
 
 STEP = 0.02
-"""Longest step [rad, joint-space L2] of a path whose links are followed; an arc is then 2e-5 too short."""
+"""Longest step for link paths [rad, joint-space L2]; arcs are then measured 2e-5 too short."""
 SAMPLE_TIME = 0.01
-"""Time between the rows from which smoothness is measured [s]."""
-STILL = 1e-6
-"""What moves less than this in all [rad] or [m] stands still."""
+"""Time between the rows that smoothness is measured at [s]."""
+STANDSTILL = 1e-6
+"""A motion shorter than this [rad] or [m] stands still."""
 CUTOFF, THRESHOLD, PADDING = 10.0, 0.05, 4
-"""Of the spectral arc length, from its paper: highest frequency [Hz]; least amplitude, as a share of that at
-frequency 0; zeros are appended up to 2 to this power times the length, or up to twice as many."""
-EVEN_PLACES = 129
-"""Along a path, from which bending is measured."""
+"""Of the spectral arc length, from its paper: highest frequency [Hz]; least amplitude as a share of that at
+frequency 0; zeros are appended up to 2 to the power PADDING times the length, or up to twice as many."""
+BENDING_SAMPLES = 129
+"""Evenly spaced places of a path that bending is measured at."""
 DIGITS = 7
-"""Of a value in records."""
+"""Significant digits of values in records."""
 
 
 Verdict = Report | PlanResult
-"""What says how near a motion that passed comes to things."""
+"""Holds the clearances of a motion that passed the validator."""
 
 
 class Kinematics:
-    """Of one robot: the ways of its links."""
+    """Path lengths of the links of one robot."""
 
     def __init__(self, robot: Robot) -> None:
         moving = [link for link in robot.link_names if robot.link_frame(link) > 0]
@@ -45,19 +45,19 @@ class Kinematics:
         self._origins = np.stack([robot.T_frame_link(link)[:, 3] for link in moving])
 
     def link_length(self, q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
-        """The paper's path length: the sum over all moving links of the way that the origin travels [m]."""
+        """The paper's path length: the sum over all moving links of the path lengths of their origins [m]."""
         T = forward_frames(self._robot, np.asarray(q, np.float64).reshape(-1, q.shape[-1]))
         at = np.einsum("nlij,lj->nli", T[:, self._frames, :3], self._origins)
         at = at.reshape(*q.shape[:2], *at.shape[1:])
         return np.linalg.norm(np.diff(at, axis=1), axis=-1).sum(axis=(1, 2))
 
     def tip_length(self, q: Float[ndarray, "waypoints dof"]) -> float:
-        """The way of the origin of the robot's tip [m]."""
+        """Path length of the origin of the robot's tip [m]."""
         tip = link_origins(self._robot, q, self._robot.tip)
         return float(np.linalg.norm(np.diff(tip, axis=0), axis=1).sum())
 
     def tip_speed(self, motion: Trajectory) -> Float[ndarray, "n"]:
-        """Of the origin of the robot's tip at each row [m/s]."""
+        """Speed of the origin of the robot's tip at each row [m/s]."""
         robot, q = self._robot, motion.positions
         joints = list(robot.chain(robot.tip))
         T = forward_frames(robot, q)[:, [j + 1 for j in joints]]
@@ -70,12 +70,12 @@ class Kinematics:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What metrics are taken of; what several of them need is made once."""
+    """A motion to be measured; values that several metrics need are computed once."""
 
     kinematics: Kinematics
     path: Path
     trajectory: Trajectory | None
-    """The same motion with times; None of a path alone, which has no metrics of time."""
+    """The timed motion; None for a path alone, which has no metrics of time."""
     verdict: Verdict | None
 
     @cached_property
@@ -89,19 +89,19 @@ class Motion:
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of a motion."""
+    """A figure of motions."""
 
     name: str
-    """In records; with spaces, in tables."""
+    """Its name in records; in tables with spaces."""
     unit: str
-    """That it is shown in."""
+    """Unit in tables."""
     better: Literal["more", "less", ""]
     format: str
-    """Of a number, as `.2f`."""
+    """Format of numbers, such as `.2f`."""
     of: Callable[[Motion], float | None]
-    """Its value in SI units, which records keep; None where the motion has none."""
+    """Returns the value in SI units, as in records; None if the motion has none."""
     scale: float = 1.0
-    """Shown units in an SI unit."""
+    """Units of tables per SI unit."""
 
     @property
     def heading(self) -> str:
@@ -109,7 +109,7 @@ class Metric:
 
 
 def _clearance(name: str) -> Callable[[Motion], float | None]:
-    """A field of the verdict: lower bounds of distances along the motion [m]."""
+    """A metric that reads a field of the verdict: a lower bound of distances along the motion [m]."""
     return lambda motion: getattr(motion.verdict, name, None)
 
 
@@ -136,14 +136,14 @@ def _sparc_tip(motion: Motion) -> float | None:
 
 
 _METRICS = (
-    # Euclidean, in joint space; the paper's: the ways of the origins of all moving links together
+    # Euclidean in joint space; the paper's: path lengths of the origins of all moving links together
     Metric("joint_length", "rad", "less", ".3f", lambda m: m.path.length),
     Metric("link_length", "m", "less", ".2f", lambda m: m.kinematics.link_length(m.fine[None])[0]),
     Metric("tip_length", "m", "less", ".2f", lambda m: m.kinematics.tip_length(m.fine)),
-    # angles between successive segments in joint space together; 0 for a straight line
+    # sum of the angles between successive segments in joint space; 0 for a straight line
     Metric("turning", "rad", "less", ".2f", lambda m: turning(m.path.positions)),
     Metric("bending", "", "less", ".0f", lambda m: bending(m.path.positions)),
-    # the lesser of the two that follow: to obstacles, and of the arm to itself
+    # the smaller of the two that follow: to obstacles, and of the arm to itself
     Metric("min_clearance", "mm", "more", ".1f", _clearance("min_clearance"), 1000.0),
     Metric("scene_clearance", "mm", "more", ".1f", _clearance("scene_clearance"), 1000.0),
     Metric("self_clearance", "mm", "more", ".1f", _clearance("self_clearance"), 1000.0),
@@ -153,11 +153,11 @@ _METRICS = (
     Metric("sparc_tip", "", "more", ".2f", _sparc_tip),
 )
 METRICS = {metric.name: metric for metric in _METRICS}
-"""In the order of tables."""
+"""Metrics by name, in the order of tables."""
 
 
 class Measure:
-    """Measures motions of one robot by all of METRICS."""
+    """Measures motions of one robot by all METRICS."""
 
     def __init__(self, robot: Robot) -> None:
         self.kinematics = Kinematics(robot)
@@ -165,31 +165,32 @@ class Measure:
     def __call__(
         self, path: Path, trajectory: Trajectory | None = None, verdict: Verdict | None = None
     ) -> dict[str, float]:
-        """By their names; those that the motion has. One that stands still has 0 in all but the duration."""
+        """Values of the metrics that the motion has, by name; all but the duration are 0 for one that stands
+        still."""
         motion = Motion(self.kinematics, path, trajectory, verdict)
         values = {name: metric.of(motion) for name, metric in METRICS.items()}
         return {name: float(f"{x:.{DIGITS}g}") for name, x in values.items() if x is not None}
 
 
 def bending(positions: Float[ndarray, "n dof"]) -> float:
-    """The integral of |q''(u)|^2 du over u in [0, 1], over the squared length, of a path at EVEN_PLACES;
+    """The integral of |q''(u)|^2 du over u in [0, 1], over the squared length, of a path at BENDING_SAMPLES;
     0 for a straight line."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     length = float(steps.sum())
-    if length < STILL:
+    if length < STANDSTILL:
         return 0.0
-    at, u = np.concatenate([[0.0], np.cumsum(steps) / length]), np.linspace(0.0, 1.0, EVEN_PLACES)
+    at, u = np.concatenate([[0.0], np.cumsum(steps) / length]), np.linspace(0.0, 1.0, BENDING_SAMPLES)
     even = np.stack([np.interp(u, at, column) for column in positions.T], axis=1)
-    second = np.diff(even, 2, axis=0) * (EVEN_PLACES - 1) ** 2
-    return float((second**2).sum() / (EVEN_PLACES - 1) / length**2)
+    second = np.diff(even, 2, axis=0) * (BENDING_SAMPLES - 1) ** 2
+    return float((second**2).sum() / (BENDING_SAMPLES - 1) / length**2)
 
 
 def turning(positions: Float[ndarray, "n dof"]) -> float:
     """Sum of the angles between successive segments that have a length [rad]."""
     steps = np.diff(positions, axis=0)
-    steps = steps[np.linalg.norm(steps, axis=1) > STILL]
+    steps = steps[np.linalg.norm(steps, axis=1) > STANDSTILL]
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
-    # Unlike the arc cosine of their product, this keeps the digits of nearly straight turns.
+    # Unlike the arc cosine of their product, this is accurate for small angles.
     half = np.linalg.norm(np.diff(steps, axis=0), axis=1) / 2
     return float(2 * np.arcsin(np.minimum(half, 1.0)).sum())
 
@@ -199,11 +200,12 @@ def log_dimensionless_jerk(trajectory: Trajectory) -> float:
     Sternad, "Sensitivity of smoothness measures to movement duration, amplitude, and arrests", 2009).
 
     6.579 = ln 720 for a straight minimum-jerk motion, 0 for one that stands still. Jerk is the difference of
-    accelerations over SAMPLE_TIME; before and after the motion they are zero. Where an acceleration jumps, as
-    in time-optimal motions, the integral is inverse to that time: only figures of equal one can be compared.
+    accelerations over SAMPLE_TIME; before and after the motion they are zero. If accelerations jump, as in
+    time-optimal motions, the integral is inversely proportional to that time: compare only figures with the
+    same one.
     """
     length = float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum())
-    if length < STILL:
+    if length < STANDSTILL:
         return 0.0
     even, step = _evenly(trajectory)
     accelerations = np.pad(even.accelerations, ((1, 1), (0, 0)))
@@ -219,19 +221,19 @@ def spectral_arc_length(speed: Float[ndarray, "n"], step: float) -> float:
     frequency as a share of the last one up to CUTOFF whose amplitude is at least THRESHOLD. -1.4 for a
     minimum-jerk motion, less for less smooth ones; 0 for one that stands still.
     """
-    if speed.sum() * step < STILL:
+    if speed.sum() * step < STANDSTILL:
         return 0.0
     count = 2 ** (int(np.ceil(np.log2(len(speed)))) + PADDING)
     amplitude = np.abs(np.fft.rfft(speed, count)) / speed.sum()
     frequency = np.arange(len(amplitude)) / (count * step)
-    # In motions of a few milliseconds the first frequency above 0 is past the cut-off.
+    # For motions of a few milliseconds the first frequency above 0 exceeds the cut-off.
     last = max(int(np.flatnonzero((amplitude >= THRESHOLD) & (frequency <= CUTOFF))[-1]), 1)
     return -float(np.hypot(1 / last, np.diff(amplitude[: last + 1])).sum())
 
 
 def _evenly(trajectory: Trajectory) -> tuple[Trajectory, float]:
-    """With rows at even times, from the first to the last, as near to SAMPLE_TIME apart as fits; and that
-    time [s]."""
+    """Resample with rows at even times about SAMPLE_TIME apart; the trajectory and the time between its rows
+    [s]."""
     count = max(round(trajectory.duration / SAMPLE_TIME), 1)
     times = np.linspace(0.0, trajectory.duration, count + 1)
 
@@ -243,7 +245,7 @@ def _evenly(trajectory: Trajectory) -> tuple[Trajectory, float]:
 
 
 def _fine(positions: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
-    """Configurations along a path at most STEP apart, its waypoints among them."""
+    """Configurations along a path at most STEP apart, including its waypoints."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     counts = np.maximum(np.ceil(steps / STEP).astype(int), 1)
     starts = np.repeat(np.arange(len(counts)), counts)

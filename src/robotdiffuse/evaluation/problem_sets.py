@@ -1,4 +1,5 @@
-"""Problems by name: held-out ones of the families, and those of files and folders; validated once and kept."""
+"""Problem sets by name: held-out problems of the families, and those of files and folders, checked once and
+kept."""
 
 import itertools
 from dataclasses import replace
@@ -14,11 +15,11 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.validation.validator import VerifySettings, verifier
 
 NONTRIVIAL = "_nontrivial"
-"""Suffix of a family's name: only problems that the straight line does not solve and search does."""
+"""Suffix of a family: only problems that search solves and the straight line does not."""
 SEARCH_TIME = 10.0
-"""Problems that this much search does not solve count as unsolvable [s]."""
-PATIENCE = 20_000
-"""Iterations that the search for the reference length takes at least."""
+"""Problems that search does not solve in this time count as unsolvable [s]."""
+REFERENCE_ITERATIONS = 20_000
+"""Least iterations of the search for the reference length."""
 
 
 def validator(problem: Problem, path: Path) -> bool:
@@ -27,25 +28,26 @@ def validator(problem: Problem, path: Path) -> bool:
 
 
 def search(problem: Problem) -> float | None:
-    """Length of a short path, the reference of a problem [rad]; None: not solved in time."""
-    planner = AORRTC(AORRTCSettings(gain=0.001, patience=PATIENCE))
+    """The reference length of a problem, that of a short path [rad]; None if search does not solve it in
+    time."""
+    planner = AORRTC(AORRTCSettings(gain=0.001, patience=REFERENCE_ITERATIONS))
     return planner.plan(problem, SEARCH_TIME, seed=1, clearance=0.0).path_length
 
 
 def case_file(folder: FilePath | None, name: str) -> CaseFile:
-    """What a folder keeps of a family's problems, or of another set's; nothing without a folder."""
+    """The file that keeps the cases of a set in a folder; without a folder, in memory."""
     return CaseFile(None if folder is None else folder / f"{name}.jsonl")
 
 
 def hard_cases(
     family: str, count: int, folder: FilePath | None = None, report: Report = lambda text: None
 ) -> list[Case]:
-    """The first held-out problems of a family that are hard; the folder keeps what is known of them."""
+    """The first hard held-out problems of a family; the folder keeps what is known of them."""
     return case_file(folder, family).held_out(family, count, validator, search, report)
 
 
 def problem_set_name(text: str) -> str:
-    """The name of a set as it stands in results. Raises InputError for what is no family, file or folder."""
+    """The name of a set in results. Raises InputError for a text that is no family, file or folder."""
     family = text.removesuffix(NONTRIVIAL)
     if family in FAMILIES:
         return text
@@ -61,9 +63,9 @@ def problem_set_name(text: str) -> str:
 def gather_cases(names: list[str], count: int | None, out: FilePath, report: Report) -> list[Case]:
     """The first `count` problems of each set (None: all of a file or folder, 100 of a family).
 
-    They are kept in `out`/problems, one file for each family, file or folder, and read from there the next
-    time; a larger count adds to them. `report` is told how far it is. Raises InputError for unknown names and
-    empty sets.
+    They are kept in `out`/problems, one file for each set, and read from there next time; a larger count adds
+    to them. `report` is called with lines on the progress. Raises InputError for unknown names and empty
+    sets.
     """
     sets = [problem_set_name(text) for text in names]
     twice = {name for name in sets if sets.count(name) > 1}
@@ -73,7 +75,7 @@ def gather_cases(names: list[str], count: int | None, out: FilePath, report: Rep
 
 
 def read_cases(out: FilePath, problem_set: str) -> list[Case]:
-    """All problems of a set that a folder keeps. Raises InputError if their file is damaged."""
+    """All cases of a set in a folder. Raises InputError if their file is damaged."""
     family = problem_set.removesuffix(NONTRIVIAL)
     name = family if family in FAMILIES else problem_set
     return _of_set(case_file(out / "problems", name).cases(hard=name != problem_set), problem_set)
@@ -87,7 +89,7 @@ def _set(text: str, count: int | None, folder: FilePath, report: Report) -> list
         return _of_set(case_file(folder, family).held_out(family, wanted, validator, finder, report), name)
     kept = case_file(folder, name)
     if not len(kept):
-        kept.fill(_from_place(FilePath(text), name, report))
+        kept.fill(_read_place(FilePath(text), name, report))
     return _of_set(kept.cases()[:count], name)
 
 
@@ -95,8 +97,8 @@ def _of_set(cases: list[Case], problem_set: str) -> list[Case]:
     return [replace(case, problem_set=problem_set) for case in cases]
 
 
-def _from_place(place: FilePath, name: str, report: Report) -> list[Case]:
-    """Those of a file, of a MotionBenchMaker folder, or of the files and such folders in a folder."""
+def _read_place(place: FilePath, name: str, report: Report) -> list[Case]:
+    """The cases of a file, of a MotionBenchMaker folder, or of all files and such folders in a folder."""
     cases = []
     for part in _parts(place):
         family = part.resolve().stem
@@ -124,7 +126,7 @@ def _parts(place: FilePath) -> list[FilePath]:
 
 
 def _interleaved(cases: list[Case]) -> list[Case]:
-    """One of each family in turn, so that the first so many are of all."""
+    """Cases of all families in turn, so that the first few are of all."""
     families: dict[str, list[Case]] = {}
     for case in cases:
         families.setdefault(case.family, []).append(case)

@@ -1,4 +1,4 @@
-"""What is kept of each call of a planner, or of another method that is measured: a line of JSON."""
+"""Records: one line of JSON for each call of a planner, or of another method that is measured."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -15,13 +15,14 @@ from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.types import Status
 
 SOLVED, CRASHED, OVERRAN, RAISED = "solved", "crashed", "overran", "exception"
-"""Statuses of records beside those of `types.Status`: the process died, hung, or the planner raised."""
-ENDED = 0.9
-"""A call that took less than this share of its time limit ended by itself: more time changes nothing."""
+"""Statuses of records. Beside those of `types.Status`: the process died, did not answer, or the planner
+raised."""
+ENDED_EARLY = 0.9
+"""A call that took less than this share of its time limit ended by itself: a longer limit changes nothing."""
 RESTARTABLE = {SOLVED, Status.TIMEOUT.value, Status.NO_PATH.value}
-"""Statuses that another seed may change."""
+"""Statuses that another seed can change."""
 RESTARTED = "+restarts"
-"""What is added to a planner's name where it was called again and again until the time limit."""
+"""Suffix of a planner's name whose calls were repeated until the time limit."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Record:
     """One call on one problem."""
 
     planner: str
-    """Or another method."""
+    """Name of the planner or other method."""
     problem_set: str
     name: str
     """Of the problem, in its set."""
@@ -42,44 +43,43 @@ class Record:
     """Of `types.Status`, or crashed, overran, exception."""
     reason: str
     time: float
-    """Planning time, with the validator and without timing the trajectory [s]."""
+    """Planning time, with validation and without timing the trajectory [s]."""
     cpu: float | None = None
     """CPU time [s], where it was measured."""
     restarts: int | None = None
-    """How often the planner was called again; None: it was not to be."""
+    """How often the planner was called again; None if it was not to be."""
     refused: str = ""
-    """What was wrong with the last path that the validator refused, see PlanResult."""
+    """Why the validator refused the last path, see PlanResult."""
     stage: str = ""
     progress: tuple[tuple[float, float], ...] = ()
-    """When each shorter path was found [s], and its joint-space length [rad]."""
+    """Time of each shorter path [s] and its joint-space length [rad]."""
     passed: float | None = None
     """Share of the samples of a batch that passed the validator."""
     collided: float | None = None
-    """Share of them in collision."""
+    """Share of the samples in collision."""
     reference: float | None = None
-    """Length of the shortest path that is known [rad], see `held_out.Case`."""
+    """Length of the shortest known path [rad], see `held_out.Case`."""
     measures: dict[str, float] = field(default_factory=dict)
-    """Of the returned motion, by the names of `metrics.METRICS`; in files they stand beside the fields."""
+    """Of the returned motion, by the names of `metrics.METRICS`; in files they are fields of the line."""
     memory: float | None = None
-    """Most memory that the planner's process had so far [MB]."""
+    """Peak memory of the planner's process so far [MB]."""
     run: str = ""
-    """When the run began that the call is of; empty where it was not noted."""
+    """Start of the session that made the call; empty if it was not noted."""
     workers: int | str = ""
-    """Calls that were made at once, or the cluster."""
+    """Number of calls at a time, or the cluster."""
     load: float | None = None
-    """Load average of the machine at the end of the call."""
+    """Load average of the machine after the call."""
     positions: tuple[tuple[float, ...], ...] = ()
     """Waypoints of the returned path [rad]."""
 
     @property
     def key(self) -> tuple[str, str, int, float]:
-        """What of a planner's calls this is."""
+        """Identifies the record among those of its planner."""
         return self.problem_set, self.name, self.seed, self.time_limit
 
     @property
     def case(self) -> tuple[str, str, int]:
-        """Problem set, problem and seed. What stands behind a # in the name says what part of the answer it
-        is."""
+        """Problem set, problem and seed. A name may end with # and the part of the answer."""
         return self.problem_set, self.name.partition("#")[0], self.seed
 
     @property
@@ -93,18 +93,18 @@ class Record:
 
     @property
     def ended_by_itself(self) -> bool:
-        """Whether a longer time limit would have given the same."""
+        """Whether a longer time limit would give the same."""
         cut_off = self.status in (CRASHED, OVERRAN) or bool(self.restarts)
-        return not cut_off and self.time < ENDED * self.time_limit
+        return not cut_off and self.time < ENDED_EARLY * self.time_limit
 
     @property
     def restartable(self) -> bool:
-        """Whether there was time left for a call with another seed."""
+        """Whether time was left for a call with another seed."""
         return self.ended_by_itself and self.status in RESTARTABLE
 
     @property
     def in_collision(self) -> bool:
-        """Whether the planner's last answer was one that collides: the validator refused it."""
+        """Whether the validator refused the planner's last path because it collides."""
         return not self.solved and self.refused.endswith("collision")
 
     @property
@@ -112,7 +112,7 @@ class Record:
         return np.array(self.positions, np.float64)
 
     def row(self) -> dict[str, Any]:
-        """For JSON, without the fields that have their defaults, which are most of a failure's."""
+        """The record as JSON data, without fields that have their defaults."""
         defaults = {f.name: f.default for f in fields(self)}
         values = asdict(self)
         kept = {name: x for name, x in values.items() if name != "measures" and x != defaults[name]}
@@ -120,7 +120,7 @@ class Record:
 
 
 def record_of_row(row: dict[str, Any]) -> Record:
-    """The record of a row. Numbers that are no fields are measures. Raises TypeError for other fields."""
+    """The record of JSON data. Unknown numbers are measures; raises TypeError for other unknown fields."""
     of = {f.name for f in fields(Record)}
     found: dict[str, Any] = {name: value for name, value in row.items() if name in of}
     measures = {name: value for name, value in row.items() if name not in of}
@@ -134,11 +134,11 @@ def record_of_row(row: dict[str, Any]) -> Record:
 
 
 class RecordFile:
-    """The records of one method in the order that they were made in; without a file, in memory."""
+    """The records of one method in the order of their making, in a file or in memory."""
 
     def __init__(self, file: FilePath | None) -> None:
-        """Reads what is there; a last line that was cut off is left out. Raises InputError, naming file and
-        line, for any other line that is no record."""
+        """Read the file without a last line that was cut off. Raises InputError, naming file and line, for
+        any other line that is no record."""
         self._lines = JsonLines(file)
         self.records: list[Record] = []
         for number, row in enumerate(self._lines.rows, start=1):
@@ -149,7 +149,7 @@ class RecordFile:
         self._keys = {record.key for record in self.records}
 
     def append(self, record: Record) -> None:
-        """It is on the disk when this returns. One that is there already stays as it is."""
+        """Write a record, which is on the disk when this returns, unless one with its key exists."""
         if record.key not in self._keys:
             self._lines.append(record.row())
             self.records.append(record)
@@ -157,19 +157,19 @@ class RecordFile:
 
 
 def record_path(folder: FilePath, method: str) -> FilePath:
-    """Where the records of a method are."""
+    """The file of a method's records."""
     return folder / "records" / f"{quote(method, safe='@:=,+ ')}.jsonl"
 
 
 def recorded(folder: FilePath) -> dict[str, FilePath]:
-    """The files of all methods that a folder has records of, by their names."""
+    """The record files of a folder, by method."""
     return {unquote(file.stem): file for file in sorted((folder / "records").glob("*.jsonl"))}
 
 
 def read_records(folder: FilePath, methods: Sequence[str] | None = None) -> dict[str, list[Record]]:
-    """The records of all methods, or of some, by name.
+    """Read the records of all methods, or of some, by name.
 
-    Raises InputError for a folder without records, for methods of which it has none, and for damaged files.
+    Raises InputError for a folder without records, for methods without any, and for damaged files.
     """
     files = recorded(folder)
     if not files:

@@ -1,8 +1,8 @@
-"""The one loop of all that is measured: every case by every method with every seed, validated, and kept.
+"""Runs: every case by every method with every seed, each validated and kept as a record.
 
-A method is called with a trial and gives the fields of a record, with the validator's verdict; `methods` has
-those for planners, networks and searches. An executor calls them: in this process, one after the other
-(`in_turn`), or in the processes of a bench. What is kept is not made again.
+A method takes a run and yields the fields of its records, with the validator's verdict; `methods` has those
+of planners and networks. An executor calls methods: in this process, one after the other (`in_this_process`),
+or in the processes of a bench. Runs whose records are kept are not made again.
 """
 
 import os
@@ -23,14 +23,14 @@ from robotdiffuse.problems.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
-    """A call that is to be made."""
+class Run:
+    """One call of a method, to be made."""
 
     case: Case
-    place: int
+    index: int
     """Of the case among all."""
     method: str
-    """What it is called in records."""
+    """Its name in records."""
     seed: int
     limit: float = np.inf
     """Time limit [s]."""
@@ -40,10 +40,11 @@ class Trial:
         return self.case.problem
 
     def rng(self) -> np.random.Generator:
-        """The same for all methods."""
-        return np.random.default_rng([SEED, self.seed, self.place])
+        """Random numbers, the same ones for all methods."""
+        return np.random.default_rng([SEED, self.seed, self.index])
 
     def record(self, found: "Fields") -> Record:
+        """The record of this run with these fields."""
         about = {
             "planner": self.method,
             "problem_set": self.case.problem_set,
@@ -59,17 +60,17 @@ class Trial:
 
 
 Fields = dict[str, Any]
-"""Of a record; what they do not say, the trial does."""
-Method = Callable[[Trial], Iterable[Fields]]
-"""Mostly gives one record; more where one call answers for several time limits, say."""
-Made = Generator[tuple[Trial, list[Record]], None, None]
-Execute = Callable[[Sequence[Trial]], Made]
-Done = Callable[[str, int], None]
-"""Told a method, and how many of its trials are left."""
+"""Fields of a record; the run provides the others."""
+Method = Callable[[Run], Iterable[Fields]]
+"""Yields the fields of one record, or of several if one call answers for several time limits."""
+Results = Generator[tuple[Run, list[Record]], None, None]
+Executor = Callable[[Sequence[Run]], Results]
+OnProgress = Callable[[str, int], None]
+"""Called with a method and the number of its runs that are left."""
 
 
 class Clock:
-    """Wall time, and CPU time of this process, of a `with` block [s]."""
+    """Measures wall time and CPU time of this process in a `with` block [s]."""
 
     wall = cpu = 0.0
 
@@ -85,70 +86,70 @@ class Clock:
         return {"time": round(self.wall, 6), "cpu": round(self.cpu, 6)}
 
 
-def trials_of(
+def runs_of(
     cases: Sequence[Case], methods: Iterable[str], seeds: Iterable[int] = (0,), limit: float = np.inf
-) -> list[Trial]:
-    """All, in the order that they are made in: methods take turns on each case, so that what else the machine
-    does hits them alike."""
-    names, places = list(methods), list(enumerate(cases))
-    return [Trial(case, i, name, seed, limit) for seed in seeds for i, case in places for name in names]
+) -> list[Run]:
+    """All runs in their order: methods take turns on each case, so that other work on the machine affects
+    them alike."""
+    names, numbered = list(methods), list(enumerate(cases))
+    return [Run(case, i, name, seed, limit) for seed in seeds for i, case in numbered for name in names]
 
 
-def run_trials(
-    trials: Sequence[Trial],
-    execute: Execute,
+def execute_runs(
+    runs: Sequence[Run],
+    execute: Executor,
     files: Mapping[str, RecordFile],
-    done: Done = lambda method, left: None,
+    on_progress: OnProgress = lambda method, left: None,
 ) -> int:
-    """Make the trials and keep their records, each as soon as it is there; returns how many were made."""
-    left = {trial.method: 0 for trial in trials}
-    for trial in trials:
-        left[trial.method] += 1
+    """Make the runs, keeping each record at once; returns how many were made."""
+    left = {run.method: 0 for run in runs}
+    for run in runs:
+        left[run.method] += 1
     made = 0
-    with closing(execute(trials)) as found:  # a Ctrl-C here ends what makes them too
-        for trial, records in found:
+    with closing(execute(runs)) as found:  # Ctrl-C ends the executor's processes too
+        for run, records in found:
             for record in records:
                 files[record.planner].append(record)
             made += 1
-            left[trial.method] -= 1
-            done(trial.method, left[trial.method])
+            left[run.method] -= 1
+            on_progress(run.method, left[run.method])
     return made
 
 
-def in_turn(methods: Mapping[str, Method]) -> Execute:
-    """Calls in this process, one after the other."""
+def in_this_process(methods: Mapping[str, Method]) -> Executor:
+    """An executor that calls methods in this process, one after the other."""
 
-    def execute(trials: Sequence[Trial]) -> Made:
-        for trial in trials:
-            found = list(methods[trial.method](trial))
+    def execute(runs: Sequence[Run]) -> Results:
+        for run in runs:
+            found = list(methods[run.method](run))
             load = {"workers": 1, "load": round(os.getloadavg()[0], 2)}
-            yield trial, [trial.record(load | fields) for fields in found]
+            yield run, [run.record(load | fields) for fields in found]
 
     return execute
 
 
-def tried(
+def run_all(
     cases: Sequence[Case],
     methods: Mapping[str, Method],
     seeds: Iterable[int] = (0,),
     limit: float = np.inf,
     folder: FilePath | None = None,
-    title: str = "trials",
+    title: str = "runs",
     bar: bool = True,
 ) -> dict[str, list[Record]]:
-    """The records of each method in the order of the cases, made in this process.
+    """Make all runs in this process; the records of each method in the order of the cases.
 
-    folder: keeps them; the names of methods must say all that they depend on. title: of a bar on the
-        terminal, unless there is to be none.
+    folder: keeps the records; the names of methods must then say all that these depend on.
+    title: of the progress bar, which `bar` switches off.
     """
     files = {name: RecordFile(None if folder is None else record_path(folder, name)) for name in methods}
     there = {(name, record.case) for name, file in files.items() for record in file.records}
-    trials = trials_of(cases, methods, seeds, limit)
-    todo = [t for t in trials if (t.method, (t.case.problem_set, t.case.name, t.seed)) not in there]
+    runs = runs_of(cases, methods, seeds, limit)
+    todo = [t for t in runs if (t.method, (t.case.problem_set, t.case.name, t.seed)) not in there]
     with Progress(transient=True, console=Console(stderr=True), disable=not bar) as shown:
-        task = shown.add_task(title, total=len(trials), completed=len(trials) - len(todo))
-        run_trials(todo, in_turn(methods), files, lambda *_: shown.advance(task))
-    order = {(t.case.problem_set, t.case.name, t.seed): i for i, t in enumerate(trials)}
+        task = shown.add_task(title, total=len(runs), completed=len(runs) - len(todo))
+        execute_runs(todo, in_this_process(methods), files, lambda *_: shown.advance(task))
+    order = {(t.case.problem_set, t.case.name, t.seed): i for i, t in enumerate(runs)}
     return {
         name: sorted((r for r in file.records if r.case in order), key=lambda record: order[record.case])
         for name, file in files.items()

@@ -1,4 +1,4 @@
-"""How sure a figure is: intervals, and comparisons of two planners on the same problems."""
+"""Confidence intervals, and paired comparisons of two planners on the same problems."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from robotdiffuse.core.errors import InputError
 
 RESAMPLES = 2000
 TIE = 1e-6
-"""Lengths [rad] or [m] below this count as this, and logarithms of ratios within this of 0 as ties."""
+"""Lengths below this [rad] or [m] count as this; logarithms of ratios within this of 0 are ties."""
 
 
 def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The interval of a share by its score test (E. B. Wilson 1927); (0, 1) of no trials.
+    """The interval of a share by its score test (E. B. Wilson 1927); (0, 1) without trials.
 
-    Unlike that by the standard error it stays within 0 and 1 and has a width at shares of 0 and 1.
+    Unlike the interval by the standard error it stays within 0 and 1 and has a width at shares of 0 and 1.
     """
     from scipy.stats import norm
 
@@ -55,23 +55,23 @@ class Paired:
     both: int
     neither: int
     p_success: float
-    """Of a split of `a_only` and `b_only` this uneven or more, were both planners equally good: the exact
-    test of Q. McNemar 1947, two-sided. 1.0 where they solve the same problems."""
+    """Probability of a split of `a_only` and `b_only` this uneven or more if both planners were equally good:
+    exact test of Q. McNemar 1947, two-sided; 1.0 if they solve the same problems."""
     ratio: float | None
-    """Median of length of A / length of B over the problems that both solve; None if there are none."""
+    """Median of length of A / length of B over the problems that both solve; None without any."""
     ratio_interval: tuple[float, float] | None
-    """Its 95 % interval, by resampling the problems."""
+    """The 95 % interval of the ratio, by resampling the problems."""
     p_length: float
-    """Of the logarithms of these ratios lying this much to one side or more, were neither planner's motions
-    longer: signed ranks (F. Wilcoxon 1945), two-sided, without ties. 1.0 where all are ties."""
+    """Probability that the logarithms of these ratios lie this much to one side or more if neither planner's
+    motions were longer: signed ranks (F. Wilcoxon 1945), two-sided, without ties; 1.0 if all are ties."""
 
 
 def compare(a: Float[ndarray, "n"], b: Float[ndarray, "n"]) -> Paired:
-    """Compare two planners by the lengths of their motions [rad] or [m], of the same problems in the same
-    order; NaN where one has no solution.
+    """Compare two planners by the lengths of their motions [rad] or [m] on the same problems in the same
+    order; NaN without a solution.
 
-    The tests take problems as independent: several seeds of one problem have to be made one row before,
-    or the p-values are too small. Raises InputError if the arrays differ in length.
+    The tests assume that problems are independent: merge several seeds of one problem into one row first, or
+    the p-values are too small. Raises InputError if the arrays differ in length.
     """
     from scipy.stats import binomtest, wilcoxon
 

@@ -1,6 +1,6 @@
-"""What the pages on data sets and benches share: their frame and style sheet, and plots as SVG.
+"""The frame and style sheet of pages on data sets and benches, and plots as SVG.
 
-Plots need matplotlib, which the core install lacks.
+Plots need matplotlib, which is not part of the core install.
 """
 
 import html
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 INK, SOFT, LINE, FAINT = "#222b38", "#6b7684", "#d9dde2", "#eef0f3"
 WIDTHS = {4: 4.1, 6: 6.25, 12: 12.7}
-"""Of a plot by the columns of the page that it spans [inch]; so text is of one size everywhere."""
+"""Width of plots by the number of columns that they span [inch], so that text has one size everywhere."""
 STYLE = """
 :root { --ink: #222b38; --soft: #6b7684; --line: rgba(34, 43, 56, .09); }
 * { box-sizing: border-box; }
@@ -73,9 +73,10 @@ def page(
     own: str = "",
     end: str = "",
 ) -> str:
-    """A page: its name, lines on what it is about, figures and what they are, and what follows.
+    """The HTML of a page.
 
-    own: style sheet; end: of the body, as scripts.
+    about: lines below the name. facts: figures and their captions. own: further style sheet. end: further
+    elements of the body, such as scripts.
     """
     tiles = "".join(
         f'<div class="tile"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'
@@ -102,14 +103,14 @@ def card(title: str, width: int, text: str, content: str) -> str:
 
 @contextmanager
 def style() -> Iterator[None]:
-    """One look for all plots. Raises InputError if matplotlib is missing."""
+    """Apply the style of all plots. Raises InputError if matplotlib is missing."""
     try:
         import matplotlib
     except ImportError:
         raise InputError(
             'the page needs matplotlib, which is not installed: pip install "robotdiffuse[data]"'
         ) from None
-    look: dict[Any, Any] = {
+    settings: dict[Any, Any] = {
         "svg.fonttype": "none",
         "svg.hashsalt": "robotdiffuse",
         "font.size": 8.0,
@@ -137,19 +138,19 @@ def style() -> Iterator[None]:
         "legend.handleheight": 0.9,
         "figure.constrained_layout.use": True,
     }
-    with matplotlib.rc_context(look):
+    with matplotlib.rc_context(settings):
         yield
 
 
 def make_figure(width: int, height: float) -> "Figure":
-    """As wide as so many columns of the page, and so high [inch]."""
+    """A figure as wide as so many columns of the page, with this height [inch]."""
     from matplotlib.figure import Figure
 
     return Figure((WIDTHS[width], height))
 
 
 def as_svg(figure: "Figure") -> str:
-    """The text of an element."""
+    """The figure as an SVG element."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, dpi=220, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
@@ -157,7 +158,7 @@ def as_svg(figure: "Figure") -> str:
 
 
 def percent_axis(axes: "Axes") -> None:
-    """Of the values, which are percentages."""
+    """Format the value axis in per cent."""
     from matplotlib.ticker import FuncFormatter
 
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} %"))

@@ -1,4 +1,4 @@
-"""Tables of what methods made of the same cases: a row for each method, a column for each figure."""
+"""Tables of methods on the same cases: a row for each method, a column for each figure."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from robotdiffuse.evaluation.tables import Cell, Column, Figure, Table
 
 
 class Summary(NamedTuple):
-    """A figure of some records."""
+    """A column, and its figure of some records."""
 
     column: Column
     of: Callable[[Sequence[Record]], Cell]
@@ -22,14 +22,14 @@ def _solved(records: Sequence[Record]) -> Cell:
 
 
 def share(passed: Sequence[bool]) -> Cell:
-    """In per cent, with its 95 % interval."""
+    """A share in per cent with its 95 % interval."""
     low, high = wilson_interval(int(np.sum(passed)), len(passed))
     text = f"{100 * np.mean(passed):.1f} % ({100 * low:.1f} to {100 * high:.1f})"
     return Figure(text, float(np.mean(passed)))
 
 
 def half_width(values: Sequence[float]) -> float:
-    """Half of the 95 % interval of a mean."""
+    """Half the width of the 95 % interval of a mean."""
     return 1.96 * float(np.std(values)) / len(values) ** 0.5
 
 
@@ -50,16 +50,16 @@ def _cpu(records: Sequence[Record]) -> Cell:
 
 
 SINGLE = Summary(Column("single", better="more"), _single)
-"""Share of samples that pass the validator."""
+"""Share of the samples that pass the validator."""
 BEST = Summary(Column("best", better="more"), _solved)
-"""Share of problems with a sample that does."""
+"""Share of problems with such a sample."""
 SOLVED = Summary(Column("solved", better="more"), _solved)
 LENGTH = Summary(Column("length*", "", ".3f", "less"), _ratio)
-"""Mean of the ratios to the cases' reference lengths."""
+"""Mean ratio to the cases' reference lengths."""
 CPU = Summary(Column("CPU ms median / p95", better="less"), _cpu)
 
 
 def summary(title: str, of: Mapping[str, Sequence[Record]], figures: Sequence[Summary]) -> Table:
-    """Of each method's records."""
+    """The table of each method's records."""
     rows = [(name, *(figure.of(records) for figure in figures)) for name, records in of.items()]
     return Table.of(title, [Column(""), *(figure.column for figure in figures)], rows)

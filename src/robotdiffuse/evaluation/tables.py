@@ -1,4 +1,4 @@
-"""Tables, for the terminal, Markdown, LaTeX and HTML."""
+"""Tables for the terminal, Markdown, LaTeX and HTML."""
 
 import html as markup
 import re
@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
-NONE = "–"
-"""Where there is no value."""
+NO_VALUE = "–"
 WIDTH = 150
-"""Of tables where there is no terminal."""
-LEAST_WIDTH = 20
-"""Of the texts of pairs, however narrow the terminal is."""
+"""Of tables without a terminal [characters]."""
+MIN_TEXT_WIDTH = 20
+"""Of the texts of pairs in narrow terminals [characters]."""
 
 
 @dataclass(frozen=True)
@@ -26,17 +25,17 @@ class Column:
     heading: str
     unit: str = ""
     format: str = ""
-    """Of numbers, as `.2f`; without one, as many digits as they have."""
+    """Format of numbers, such as `.2f`; empty: all digits."""
     better: Literal["more", "less", ""] = ""
-    """Which values are the best and are marked."""
+    """Which values are best and so marked."""
     left: bool = False
-    """Whether texts stand at the left, as in the first column."""
+    """Whether texts are aligned left, as in the first column."""
     scale: float = 1.0
-    """Shown units in that of the values."""
+    """Shown units per unit of the values."""
     bar: bool = False
-    """Whether pages draw a bar beside the figure, which is a percentage."""
+    """Whether pages draw a bar beside the figure, a percentage."""
     dim: bool = False
-    """Whether pages print it faintly, as what is said of the column before."""
+    """Whether pages print it faintly, as an addition to the column before."""
 
     @property
     def title(self) -> str:
@@ -44,7 +43,7 @@ class Column:
 
 
 class Figure(NamedTuple):
-    """A text, and the number that it stands for, which says which figure is the best."""
+    """A text and the number behind it, by which the best figure is found."""
 
     text: str
     value: float
@@ -56,25 +55,25 @@ Rows = Sequence[Sequence[Cell]]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of texts and numbers. The first column has their names."""
+    """Rows of texts and numbers; the first column holds the names of the rows."""
 
     title: str
     columns: tuple[Column, ...]
     rows: tuple[tuple[Cell, ...], ...]
     notes: tuple[str, ...] = ()
-    """Lines below."""
+    """Lines below the table."""
 
     @classmethod
     def of(
         cls, title: str, columns: Sequence[Column | str], rows: Rows, notes: Sequence[str] = ()
     ) -> "Table":
-        """A column can be named by its heading alone."""
+        """Make a table; a column can be given by its heading."""
         of_columns = (Column(column) if isinstance(column, str) else column for column in columns)
         return cls(title, tuple(of_columns), tuple(tuple(row) for row in rows), tuple(notes))
 
     @classmethod
     def pairs(cls, title: str, rows: Sequence[tuple[str, str]]) -> "Table":
-        """Names and what is said of them, without headings."""
+        """A table of names and texts without headings."""
         return cls.of(title, ("", Column("", left=True)), rows)
 
     @property
@@ -83,20 +82,20 @@ class Table:
 
     @property
     def paired(self) -> bool:
-        """Whether it is one of `pairs`."""
+        """Whether the table is one of `pairs`."""
         return len(self.columns) == 2 and not self.headed
 
     @property
     def texts(self) -> list[list[str]]:
-        """All cells, finished."""
+        """All cells as texts."""
         return [
             [_text(cell, column) for cell, column in zip(row, self.columns, strict=True)] for row in self.rows
         ]
 
     @property
     def best(self) -> set[tuple[int, int]]:
-        """Row and column of the best figures of each column, as they are shown; none where more than half of
-        the rows have it."""
+        """Row and column of the best figures of each column, compared as shown; none if more than half of the
+        rows have it."""
         found: set[tuple[int, int]] = set()
         for j, column in enumerate(self.columns):
             values = {i: _value(row[j]) for i, row in enumerate(self.rows)}
@@ -113,7 +112,7 @@ class Table:
 
 
 def _value(cell: Cell) -> float:
-    """NaN for a text."""
+    """The number of a cell; NaN for a text."""
     if isinstance(cell, Figure):
         return cell.value
     return float("nan") if cell is None or isinstance(cell, str) else float(cell)
@@ -125,13 +124,13 @@ def _text(cell: Cell, column: Column) -> str:
     if isinstance(cell, Figure):
         return cell.text
     if cell is None or cell != cell:
-        return NONE
+        return NO_VALUE
     text = f"{cell:,}" if isinstance(cell, int) else format(column.scale * cell, column.format or "g")
     return text.replace("-", "−") if text.strip("-0.") else text.removeprefix("-")
 
 
 def terminal(table: Table) -> "RichTable":
-    """For rich's console."""
+    """The table for rich's console."""
     from rich.markup import escape
     from rich.table import Table as RichTable
 
@@ -156,8 +155,8 @@ def terminal(table: Table) -> "RichTable":
 
 
 def show(*tables: Table, width: int | None = None) -> None:
-    """Print tables; as wide as the terminal, or as WIDTH where there is none."""
-    if all(table.paired for table in tables):  # without rich, which takes longer to import than a plan takes
+    """Print tables as wide as the terminal, or as WIDTH without one."""
+    if all(table.paired for table in tables):  # without rich, whose import takes longer than a plan
         wide = width or (shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH)
         print("\n\n".join("\n".join(pair_lines(table, wide)) for table in tables))
         return
@@ -169,14 +168,15 @@ def show(*tables: Table, width: int | None = None) -> None:
 
 
 def pair_lines(table: Table, width: int) -> list[str]:
-    """A table of pairs with its title, in lines of at most so many characters."""
+    """Lines of a table of pairs with its title, of at most `width` characters."""
     margin = max((len(name) for name, _ in table.texts), default=0) + 2
     lines = [table.title] if table.title else []
     for name, text in table.texts:
         parts = [
             part
             for line in text.splitlines() or [""]
-            for part in textwrap.wrap(line, max(width - margin, LEAST_WIDTH), break_on_hyphens=False) or [""]
+            for part in textwrap.wrap(line, max(width - margin, MIN_TEXT_WIDTH), break_on_hyphens=False)
+            or [""]
         ]
         lines += [
             f"{start:<{margin}}{part}".rstrip() for start, part in zip_longest([name], parts, fillvalue="")
@@ -185,7 +185,7 @@ def pair_lines(table: Table, width: int) -> list[str]:
 
 
 def markdown(table: Table) -> list[str]:
-    """Lines, without the title."""
+    """Lines of Markdown, without the title."""
     best = table.best
     texts = [
         [f"**{plain(text)}**" if (i, j) in best else plain(text) for j, text in enumerate(row)]
@@ -209,12 +209,13 @@ def markdown(table: Table) -> list[str]:
 
 
 def plain(text: str) -> str:
-    """For Markdown: what would be formatting or a column. An underscore within a word is neither."""
+    """Escape a text for Markdown: characters of formatting and columns; an underscore within a word is
+    neither."""
     return re.sub(r"[\\|*<`]|(?<!\w)_|_(?!\w)", r"\\\g<0>", text)
 
 
 def latex(table: Table) -> list[str]:
-    """Lines of a tabular, without the title; it needs booktabs."""
+    """Lines of a LaTeX tabular, without the title; it needs booktabs."""
     best = table.best
 
     def line(cells: Sequence[str]) -> str:
@@ -261,14 +262,14 @@ TEX = str.maketrans(
 
 
 def tex(text: str) -> str:
-    """For LaTeX."""
+    """Escape a text for LaTeX."""
     return text.translate(TEX)
 
 
 def html(table: Table, colors: Mapping[str, str] | None = None, ours: str = "") -> str:
-    """A table element, without the title; its look is in `look.STYLE`.
+    """An HTML table element, without the title; `style.STYLE` is its style sheet.
 
-    colors: of rows, by the text of their first cell; `ours`: that of a row that stands out.
+    colors: of rows, by the text of their first cell. ours: the text of the row that is emphasized.
     """
     head = "".join(f"<th>{markup.escape(column.title)}</th>" for column in table.columns)
     body, best = [], table.best

@@ -1,4 +1,5 @@
-"""The data factory: random problems, solved by Shared-Tree Informed RRT*, validated, and kept in shards."""
+"""Data generation: random problems solved by Shared-Tree Informed RRT* or AORRTC, validated, and kept in
+shards."""
 
 from robotdiffuse.generation.factory import generate
 from robotdiffuse.generation.settings import GenerationSettings

@@ -1,4 +1,4 @@
-"""From settings to a folder of shards: what is there is kept, what is missing is made, here or on Ray."""
+"""Data generation into a folder of shards: makes the missing ones on this machine or on Ray."""
 
 import json
 import platform
@@ -11,8 +11,8 @@ from typing import Any
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.core.output_files import alone_in
-from robotdiffuse.core.processes import CLUSTERS, interrupts_afterwards, on_this_machine
+from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.processes import CLUSTERS, delay_interrupts, on_this_machine
 from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
 from robotdiffuse.datasets.shards import remove_leftovers, shard_indices, write_shard
 from robotdiffuse.generation.settings import GenerationSettings
@@ -20,8 +20,6 @@ from robotdiffuse.generation.shard_maker import Arrays, Counts, make_shard
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 
-FIRST_PLANNER = "shared_tree_rrt_star"
-"""Of data sets that do not say which: there was one."""
 PACKAGES = ("numpy", "numba", "zarr")
 
 
@@ -34,20 +32,20 @@ def generate(
 ) -> int:
     """Make the shards that the folder lacks; returns the number of trajectories in all.
 
-    Killed at any moment, a second call goes on, and the finished folder is the same, bit for bit, as that of
-    a call that nothing disturbed, whatever the number of workers. With `cluster` "ray" shards are made by the
-    Ray cluster that RAY_ADDRESS names, or by one started here. `progress` is called with the numbers of
-    trajectories that are there and of all.
+    After an interruption at any moment, another call continues, and the finished folder is the same, bit for
+    bit, as that of an uninterrupted call with any number of workers. With `cluster` "ray" the Ray cluster
+    that RAY_ADDRESS names, or one started here, makes the shards. `progress` is called with the numbers of
+    trajectories done and in all.
 
-    Raises InputError for a folder of other settings, of another version or robot, one that cannot be
-    written, or one that another process is filling.
+    Raises InputError for a folder of other settings, of another version or robot, for one that cannot be
+    written, and for one that another process is filling.
     """
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
     if cluster is not None and cluster not in CLUSTERS:
         raise unknown_name("cluster", cluster, CLUSTERS)
     wanted = manifest_of(settings)
-    with alone_in(out):
+    with lock_folder(out):
         try:
             remove_leftovers(out)
             _claim(wanted, out)
@@ -57,7 +55,7 @@ def generate(
 
 
 def _silent(_done: int, _total: int) -> None:
-    """No progress is shown."""
+    """Ignore progress."""
 
 
 def _fill(
@@ -76,15 +74,15 @@ def _fill(
     if cluster is None:
         made = on_this_machine(make_shard, [(settings, index) for index in missing], workers)
     else:
-        there_too = _as_absolute(settings)
-        here = _bearings(there_too)
-        made = CLUSTERS[cluster](_make_on_node, [(there_too, index, here) for index in missing])
-    # closed at once, so that nobody works on when this is interrupted
+        absolute = _as_absolute(settings)
+        here = _reproducibility_record(absolute)
+        made = CLUSTERS[cluster](_make_on_node, [(absolute, index, here) for index in missing])
+    # close it at once, so that workers stop when this is interrupted
     with closing(made):
         for number, (arrays, counts) in made:
             index = missing[number]
-            # zarr's threads would go on writing what was tidied up
-            with interrupts_afterwards():
+            # else zarr's threads would write files after the clean-up
+            with delay_interrupts():
                 write_shard(out, index, arrays, counts)
             done += settings.rows(index)
             progress(done, settings.trajectories)
@@ -92,13 +90,13 @@ def _fill(
 
 
 def _as_absolute(settings: GenerationSettings) -> GenerationSettings:
-    """The same on nodes, which have other working folders."""
+    """The settings with an absolute path of the robot, for nodes with other working folders."""
     file = Path(settings.robot)
     return replace(settings, robot=str(file.resolve())) if file.exists() else settings
 
 
 def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, str]) -> tuple[Arrays, Counts]:
-    for name, found in _bearings(settings).items():
+    for name, found in _reproducibility_record(settings).items():
         if found != wanted[name]:
             raise InputError(
                 f"a node of the Ray cluster has {name} {found}, this machine {wanted[name]}; their data may "
@@ -107,20 +105,20 @@ def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, st
     return make_shard(settings, index)
 
 
-def _bearings(settings: GenerationSettings) -> dict[str, str]:
-    """What two machines must have in common to make the same data."""
+def _reproducibility_record(settings: GenerationSettings) -> dict[str, str]:
+    """Versions and robot that two machines must share to make the same data."""
     return versions() | {f"robot {settings.robot}": robot_fingerprint(load_robot(settings.robot))}
 
 
 def versions() -> dict[str, str]:
-    """What the data may differ by, besides the settings and the robot."""
+    """Versions of the software that the data depend on."""
     return {"robotdiffuse": __version__, "python": platform.python_version()} | {
         name: version(name) for name in PACKAGES
     }
 
 
 def manifest_of(settings: GenerationSettings) -> Manifest:
-    """The manifest of the data that the settings make."""
+    """The manifest of a data set with these settings."""
     robot = load_robot(settings.robot)
     return Manifest(
         robot=settings.robot,
@@ -142,7 +140,7 @@ def manifest_of(settings: GenerationSettings) -> Manifest:
 
 
 def _claim(wanted: Manifest, out: Path) -> None:
-    """Write the manifest, or see to it that the one that is there is of the same data."""
+    """Write the manifest, or raise InputError if the folder's manifest is of other data."""
     if not (out / MANIFEST).exists():
         if shard_indices(out):
             raise InputError(f"{out} holds shards but no {MANIFEST}; use another folder")
@@ -150,7 +148,7 @@ def _claim(wanted: Manifest, out: Path) -> None:
         return
     found = read_manifest(out)
     found.check_robot(load_robot(wanted.robot))
-    begun = _by_name({"planner": FIRST_PLANNER} | found.settings)
+    begun = _by_name(found.settings)
     for name, value in _by_name(wanted.settings).items():
         if begun.get(name) != value:
             raise InputError(
@@ -166,7 +164,7 @@ def _claim(wanted: Manifest, out: Path) -> None:
 
 
 def _by_name(settings: dict[str, Any]) -> dict[str, str]:
-    """As JSON, in which the order of a mix counts; those of the search as search.NAME."""
+    """Settings as JSON texts, in which the order of a mix counts; those of the search as search.NAME."""
     search = settings.get("search")
     inner = search if isinstance(search, dict) else {}
     named = settings | {f"search.{name}": value for name, value in inner.items()}

@@ -1,4 +1,4 @@
-"""What a data set is made of."""
+"""Settings of data generation."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -19,7 +19,8 @@ TIMINGS = ("arc", "time")
 
 @dataclass(frozen=True)
 class GenerationSettings(Settings):
-    """The same settings give the same data, whatever the number of workers and of interruptions."""
+    """Settings of a data set. The same settings give the same data, for any number of workers and
+    interruptions."""
 
     robot: str = "panda"
     """Bundled name, or path to a URDF."""
@@ -27,29 +28,30 @@ class GenerationSettings(Settings):
     """Solved and verified motions to make, each in a scene of its own (the paper: 0.14 million)."""
     seed: Natural = 0
     mix: dict[str, float] = field(default_factory=lambda: {"rop": 1.0})
-    """Shares of problems by family of scenes, in any unit; the default is the paper's. Rows of the data hold
-    the number of their family in this order."""
+    """Relative shares of problems by family of scenes; the default is the paper's. Rows of the data hold the
+    number of their family in this order."""
     trivial_share: Share = 1.0
-    """Share that is kept of the problems that the straight line solves; 1 is the paper's distribution."""
+    """Share of the problems solved by the straight line that is kept; 1 is the paper's distribution."""
     target: Annotated[str, OneOf(TARGETS)] = POSITION
-    """What is given of the tip's goal: its position alone, as in the paper, or the whole pose. Among
-    furniture it is always the pose, with the fingers in a compartment, say."""
+    """Goal of the tip: its position alone, as in the paper, or its pose. Among furniture it is always the
+    pose, such as with the fingers in a compartment."""
     goals: Annotated[int, Bound(least=1.0, most=127.0)] = 10
     """Most goal configurations of a target, found by inverse kinematics (the paper's k)."""
     waypoints: Annotated[int, Bound(least=2.0)] = 254
     """Waypoints of a trajectory (the authors' number)."""
     timing: Annotated[str, OneOf(TIMINGS)] = "arc"
-    """How waypoints are spaced: evenly in joint-space length (arc), or in time by toppra (time)."""
+    """Spacing of waypoints: evenly in joint-space length (arc), or in time by time parameterization
+    (time)."""
     shard: Count = 500
-    """Trajectories in a shard: what an interruption may lose."""
+    """Trajectories in a shard, the most that an interruption loses."""
     planner: Annotated[str, OneOf(SEARCHES)] = "shared_tree_rrt_star"
-    """What solves the problems; the default is the paper's."""
+    """Planner that solves the problems; the default is the paper's."""
     search: Annotated[SharedTreeSettings | AORRTCSearchSettings, SettingsOf("planner", SEARCHES)] = field(
         default=SharedTreeSettings(
             resolution=0.02, improvement=0.01, patience=6, step_rounds=5, connect_iterations=800
         )
     )
-    """Its settings: for the paper's planner quicker than a user's default, at 1 % more length."""
+    """Settings of that planner; for the paper's planner faster than its defaults, at 1 % more length."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,13 +65,13 @@ class GenerationSettings(Settings):
 
     @property
     def families(self) -> dict[str, Family]:
-        """Those of the mix, in its order and in the robot's size."""
+        """The families of the mix, in its order and scaled to the robot."""
         robot = load_robot(self.robot)
         return {name: family_for(name, robot) for name in self.mix}
 
     @property
     def slots(self) -> int:
-        """Most obstacles of a scene, the floor left out."""
+        """Most obstacles of a scene, without the floor."""
         return max(family.most_obstacles for family in self.families.values())
 
     @property
@@ -77,5 +79,5 @@ class GenerationSettings(Settings):
         return -(-self.trajectories // self.shard)
 
     def rows(self, index: int) -> int:
-        """Trajectories of a shard: all have as many, but the last may have fewer."""
+        """Trajectories of a shard; the last shard may have fewer."""
         return min(self.shard, self.trajectories - index * self.shard)

@@ -1,4 +1,5 @@
-"""One shard of the data: problems drawn and solved until it is full; it depends on settings and number."""
+"""Making one shard: draws and solves problems until it is full. It depends on the settings and its number
+alone."""
 
 from dataclasses import replace
 
@@ -25,33 +26,32 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import Verifier, VerifySettings
 
-TRIES = 50
-"""Problems drawn for each row, and GRACE more, before the settings are called hopeless."""
-GRACE = 1_000
-NUMBERS = 2**32
-"""Problem numbers of a shard; shards do not share any."""
+MAX_PROBLEMS_PER_ROW, EXTRA_PROBLEMS = 50, 1_000
+"""A shard is given up after so many problems for each row, and as many extra ones."""
+PROBLEMS_PER_SHARD = 2**32
+"""Problem numbers reserved for each shard, so that shards share none."""
 
 Arrays = dict[str, ndarray]
 Counts = dict[str, int]
 
 
 def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts]:
-    """Arrays and counts of a shard, as `datasets.shards` keeps them.
+    """Arrays and counts of a shard in the form of `datasets.shards`.
 
-    Counts: `tried` problems; of those `solved` ones are in the shard, `thinned` ones are trivial and left
-    out, of `unsolved` ones the search found no path, and `refused` ones did not pass the validator. Raises
-    InputError if hardly any problem can be solved.
+    Counts are of problems: `tried` of all; `solved` are in the shard; `thinned` are trivial and left out; for
+    `unsolved` the search found no path; the validator rejected the motions of `refused`. Raises InputError if
+    hardly any problem can be solved.
     """
     robot, rows = load_robot(settings.robot), settings.rows(index)
     kept: list[Row] = []
     counts: Counts = dict.fromkeys(("tried", "solved", "thinned", "unsolved", "refused"), 0)
     while len(kept) < rows:
-        if counts["tried"] >= TRIES * rows + GRACE:
+        if counts["tried"] >= MAX_PROBLEMS_PER_ROW * rows + EXTRA_PROBLEMS:
             raise InputError(
                 f"only {len(kept)} of {counts['tried']} problems were solved for {robot.name}; a smaller "
                 f"safety_distance than {settings.search.safety_distance} m or other scenes may help"
             )
-        number = index * NUMBERS + counts["tried"]
+        number = index * PROBLEMS_PER_SHARD + counts["tried"]
         counts["tried"] += 1
         row = solve(settings, robot, number)
         if isinstance(row, str):
@@ -63,7 +63,7 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
 
 
 def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
-    """The row of a problem by its number, or why there is none: thinned, unsolved or refused."""
+    """Solve the problem of a number: its row, or thinned, unsolved or refused."""
     rng = np.random.default_rng([settings.seed, number])
     family, drawn = draw(settings, robot, rng)
     drawn = with_near_goals(robot, drawn)
@@ -71,7 +71,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     lines_free = [_line_is_free(settings, checker, drawn.start, goal) for goal in drawn.goals]
     thinned = rng.random() >= settings.trivial_share
     if thinned and all(lines_free):
-        return "thinned"  # whichever goal a search would choose
+        return "thinned"  # for whichever goal a search chooses
     search: SharedTreeSearch | AORRTCSearch = SEARCHES.load(settings.planner)(
         checker, drawn.start, drawn.goals, settings.search, random_state(settings.seed, number)
     )
@@ -83,7 +83,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     if thinned and line_free:
         return "thinned"
     validator = Verifier(drawn.problem(robot), VerifySettings())
-    motion = _frames(settings, robot, path, validator)
+    motion = _resampled(settings, robot, path, validator)
     if motion is None:
         return "refused"
     times, q = motion
@@ -110,7 +110,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
 
 
 def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -> tuple[int, Drawn]:
-    """A random problem, and the number of its family in the mix; the same state of `rng` gives the same."""
+    """A random problem and the number of its family in the mix; it depends on the state of `rng` alone."""
     shares = np.array(list(settings.mix.values()))
     number = int(rng.choice(len(shares), p=shares / shares.sum()))
     family = list(settings.families.values())[number]
@@ -118,7 +118,8 @@ def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -
 
 
 def with_near_goals(robot: Robot, drawn: Drawn) -> Drawn:
-    """The problem with goals of joints that turn more than once as near to the start as whole turns allow."""
+    """The problem with the goals of continuous joints moved by whole turns as near to the start as
+    possible."""
     return replace(drawn, goals=np.stack([robot.same_stance(q, drawn.start)[0] for q in drawn.goals]))
 
 
@@ -129,10 +130,10 @@ def _line_is_free(
     return bool(motions_free(space, np.stack([start, goal]))[0])
 
 
-def _frames(
+def _resampled(
     settings: GenerationSettings, robot: Robot, path: Float32[ndarray, "n dof"], validator: Verifier
 ) -> tuple[ndarray, Float32[ndarray, "waypoints dof"]] | None:
-    """Times and joint values of the waypoints; None if the timed motion does not pass the validator."""
+    """Times and joint values of the waypoints; None if the validator rejects the timed motion."""
     if settings.timing == "arc":
         return np.zeros(0), resample(path[None], settings.waypoints, exact=True)[0]
     waypoints = Path(robot.joint_names, path.astype(np.float64))

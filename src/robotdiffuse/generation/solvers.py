@@ -1,4 +1,4 @@
-"""What solves the problems of a data set, by name."""
+"""Searches that solve the problems of data sets, by name."""
 
 from robotdiffuse.core.registry import Entry, Registry
 
@@ -7,12 +7,12 @@ SEARCHES = Registry(
     {
         "shared_tree_rrt_star": Entry(
             "robotdiffuse.planning.search.shared_tree.planner:SharedTreeSearch",
-            "the paper's: one tree towards all goals of a target; the cost of each",
+            "the paper's: one tree towards all goals of a target, with the cost of each",
             "SharedTreeSettings",
         ),
         "aorrtc": Entry(
             "robotdiffuse.generation.aorrtc_solver:AORRTCSearch",
-            "shorter paths in less time, as far from obstacles; the cost of one goal",
+            "shorter paths in less time at the same safety distance, with the cost of one goal",
             "AORRTCSearchSettings",
         ),
     },

@@ -1,19 +1,19 @@
-"""CSV: a column for each joint, and time."""
+"""Reads motions from CSV: a column for time and for each joint."""
 
 import csv
 from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_text
-from robotdiffuse.interop.recorded_motion import Recorded, recorded
+from robotdiffuse.interop.recorded_motion import RecordedMotion, checked_motion
 
 TIMES = ("time", "t", "time_from_start", "timestamp")
 KINDS = {"position": "positions", "velocity": "velocities", "acceleration": "accelerations"}
 
 
-def read(file: Path, topic: str | None = None) -> Recorded:
-    """Columns time (if not: waypoints), NAME or NAME_position for each joint, and if they are known
-    NAME_velocity and NAME_acceleration; as `Trajectory.save` writes them."""
+def read(file: Path, topic: str | None = None) -> RecordedMotion:
+    """Read a motion in the columns of `Trajectory.save`: time, then NAME or NAME_position for each joint, and
+    optionally NAME_velocity and NAME_acceleration. Without time, the rows are waypoints."""
     try:
         return _read(read_text(file))
     except InputError as error:
@@ -21,7 +21,7 @@ def read(file: Path, topic: str | None = None) -> Recorded:
         raise InputError(text if text.startswith(str(file)) else f"{file}: {text}") from None
 
 
-def _read(text: str) -> Recorded:
+def _read(text: str) -> RecordedMotion:
     try:
         rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     except csv.Error as error:
@@ -55,9 +55,9 @@ def _read(text: str) -> Recorded:
     names = list(found["positions"])
     for what in ("velocities", "accelerations"):
         if found[what] and sorted(found[what]) != sorted(names):
-            raise InputError(f"the header has {what} of other joints than it has positions of")
+            raise InputError(f"the header has {what} of other joints than positions")
     table = {
         what: [list(r) for r in zip(*(c[n] for n in names), strict=True)] if c else None
         for what, c in found.items()
     }
-    return recorded(names, table["positions"], times, table["velocities"], table["accelerations"])
+    return checked_motion(names, table["positions"], times, table["velocities"], table["accelerations"])

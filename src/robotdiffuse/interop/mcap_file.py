@@ -1,8 +1,8 @@
-"""MCAP: a file that Foxglove opens as a scene, with the motion as ROS 2 messages; and those of others.
+"""Reads and writes MCAP files: a scene for Foxglove, and the motion as ROS 2 messages.
 
-/scene and /tf are Foxglove's own messages: the obstacles, the arm as triangles fixed to its links, and where
-the links are. /robot_description is the URDF, if the robot was read from one, beside it as an attachment with
-the problem; /joint_trajectory and /joint_states are ROS 2's.
+/scene and /tf hold Foxglove messages: the obstacles, the arm as triangles fixed to its links, and the poses
+of the links. /joint_trajectory, /joint_states and /robot_description hold ROS 2 messages; the last is the
+URDF, if the robot was read from one. The URDF and the problem are attachments, too.
 """
 
 import io
@@ -19,28 +19,28 @@ from robotdiffuse.core.input_files import input_file, parse_json
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.interop import missing
+from robotdiffuse.interop import missing_package
 from robotdiffuse.interop.plain_messages import joint_trajectory
-from robotdiffuse.interop.recorded_motion import Recorded
-from robotdiffuse.interop.ros_messages import motion_in
+from robotdiffuse.interop.recorded_motion import RecordedMotion
+from robotdiffuse.interop.ros_messages import motion_from_messages
 from robotdiffuse.interop.ros_types import (
     DISPLAY_TRAJECTORY,
     JOINT_STATE,
     JOINT_TRAJECTORY,
-    TEXT,
-    chosen,
+    STRING,
+    choose_topic,
     display_trajectory,
-    message,
+    to_message,
     typestore,
 )
 from robotdiffuse.interop.scene_primitives import (
-    OBSTACLE,
-    Ball,
-    Brick,
-    Can,
-    Drawn,
-    Points,
-    Triangles,
+    OBSTACLE_COLOR,
+    BoxPrimitive,
+    CylinderPrimitive,
+    MeshPrimitive,
+    PointsPrimitive,
+    Primitive,
+    SpherePrimitive,
     arm,
     obstacles,
 )
@@ -57,16 +57,18 @@ try:
     from mcap_protobuf.schema import register_schema
     from rosbags.typesys import get_types_from_msg
 except ImportError:
-    raise missing("mcap, mcap-protobuf-support, foxglove-schemas-protobuf and rosbags", "ros") from None
+    raise missing_package(
+        "mcap, mcap-protobuf-support, foxglove-schemas-protobuf and rosbags", "ros"
+    ) from None
 
 FLOAT32 = 7
 """foxglove.PackedElementField.FLOAT32"""
-PROBLEM = "problem.json"
-"""Name of the attachment."""
+PROBLEM_ATTACHMENT = "problem.json"
+"""Name of the attachment that holds the problem."""
 
 
-class _File:
-    """Messages of both encodings in one MCAP file."""
+class _McapWriter:
+    """Writes Protobuf and ROS 2 messages to one MCAP file."""
 
     def __init__(self, stream: io.BytesIO) -> None:
         self.writer = Writer(stream)
@@ -84,16 +86,16 @@ class _File:
             text, _ = typestore().generate_msgdef(kind, ros_version=2)
             schema = self.writer.register_schema(kind, "ros2msg", text.encode())
             self._channels[topic] = self.writer.register_channel(topic, "cdr", schema)
-        self._add(topic, bytes(typestore().serialize_cdr(message(kind, content), kind)), at)
+        self._add(topic, bytes(typestore().serialize_cdr(to_message(kind, content), kind)), at)
 
     def _add(self, topic: str, data: bytes, at: int) -> None:
         self.writer.add_message(self._channels[topic], log_time=at, data=data, publish_time=at)
 
 
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
-    """See the head of this file, and `interop.write_motion`."""
+    """Write the scene and the motion; see `interop.write_motion` and this module's description."""
     robot, stream = problem.robot, io.BytesIO()
-    out = _File(stream)
+    out = _McapWriter(stream)
     out.protobuf("/scene", _scene(problem), 0)
     for cloud in _clouds(problem):
         out.protobuf(f"/points/{cloud[0]}", cloud[1], 0)
@@ -102,13 +104,13 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     out.ros("/display_planned_path", DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record), 0)
     urdf = _urdf(robot.source)
     if urdf is not None:
-        out.ros("/robot_description", TEXT, {"data": urdf.decode("utf-8", "replace")}, 0)
+        out.ros("/robot_description", STRING, {"data": urdf.decode("utf-8", "replace")}, 0)
         out.writer.add_attachment(0, 0, "robot.urdf", "application/xml", urdf)
     try:
         content = json.dumps(problem_record(problem)).encode()
-        out.writer.add_attachment(0, 0, PROBLEM, "application/json", content)
+        out.writer.add_attachment(0, 0, PROBLEM_ATTACHMENT, "application/json", content)
     except InputError:
-        pass  # a robot that only this program has
+        pass  # a robot that was made in Python has no problem file
     names = [*trajectory.joint_names, *robot.locked]
     for i, t in enumerate(trajectory.times.tolist()):
         at = round(1e9 * t)
@@ -123,7 +125,7 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
 
 
 def _urdf(source: str | None) -> bytes | None:
-    """The robot's URDF, if it was read from one that is still there."""
+    """The URDF that the robot was read from; None if there is none any more."""
     if source is None or not source.endswith(".urdf"):
         return None
     try:
@@ -132,7 +134,7 @@ def _urdf(source: str | None) -> bytes | None:
         return None
 
 
-def _place(pose: Any, T: Float[ndarray, "4 4"]) -> None:
+def _set_pose(pose: Any, T: Float[ndarray, "4 4"]) -> None:
     pose.position.x, pose.position.y, pose.position.z = T[:3, 3].tolist()
     w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
     pose.orientation.w, pose.orientation.x, pose.orientation.y, pose.orientation.z = w, x, y, z
@@ -141,7 +143,7 @@ def _place(pose: Any, T: Float[ndarray, "4 4"]) -> None:
 def _scene(problem: Problem) -> SceneUpdate:
     update = SceneUpdate()
     for name, frame, drawn in (*obstacles(problem), *arm(problem.robot)):
-        if isinstance(drawn, Points):
+        if isinstance(drawn, PointsPrimitive):
             continue
         entity = update.entities.add()
         entity.id, entity.frame_id, entity.frame_locked = name, frame, True
@@ -149,34 +151,34 @@ def _scene(problem: Problem) -> SceneUpdate:
     return update
 
 
-def _add(entity: Any, drawn: Drawn) -> None:
+def _add(entity: Any, drawn: Primitive) -> None:
     match drawn:
-        case Brick(T, size, color):
+        case BoxPrimitive(T, size, color):
             primitive = entity.cubes.add()
             primitive.size.x, primitive.size.y, primitive.size.z = size.tolist()
-        case Ball(T, radius, color):
+        case SpherePrimitive(T, radius, color):
             primitive = entity.spheres.add()
             primitive.size.x = primitive.size.y = primitive.size.z = 2 * radius
-        case Can(T, radius, height, color):
+        case CylinderPrimitive(T, radius, height, color):
             primitive = entity.cylinders.add()
             primitive.size.x = primitive.size.y = 2 * radius
             primitive.size.z = height
             primitive.bottom_scale = primitive.top_scale = 1.0
-        case Triangles(T, vertices, faces, color):
+        case MeshPrimitive(T, vertices, faces, color):
             primitive = entity.triangles.add()
             for x, y, z in vertices.tolist():
                 primitive.points.add(x=x, y=y, z=z)
             primitive.indices.extend(faces.ravel().tolist())
         case _:
             raise TypeError(f"no primitive for {type(drawn).__name__}")
-    _place(primitive.pose, T)
+    _set_pose(primitive.pose, T)
     primitive.color.r, primitive.color.g, primitive.color.b = (part / 255 for part in color)
-    primitive.color.a = 0.8 if color == OBSTACLE else 1.0
+    primitive.color.a = 0.8 if color == OBSTACLE_COLOR else 1.0
 
 
 def _clouds(problem: Problem) -> Iterator[tuple[str, PointCloud]]:
     for name, frame, drawn in obstacles(problem):
-        if isinstance(drawn, Points):
+        if isinstance(drawn, PointsPrimitive):
             cloud = PointCloud(frame_id=frame, point_stride=12)
             cloud.pose.orientation.w = 1.0
             for k, axis in enumerate("xyz"):
@@ -203,23 +205,23 @@ def _transforms(problem: Problem, q: Float[ndarray, "dof"], at: int) -> FrameTra
 
 
 def problem_in(file: Path) -> Problem | None:
-    """The problem that `write` put along; None if there is none."""
+    """The problem that `write` attached; None if there is none."""
     path = input_file(file)
     try:
         with path.open("rb") as stream:
             attached = {found.name: found.data for found in make_reader(stream).iter_attachments()}
-        if PROBLEM not in attached:
+        if PROBLEM_ATTACHMENT not in attached:
             return None
-        record = parse_json(attached[PROBLEM].decode(), f"{file}, {PROBLEM}")
+        record = parse_json(attached[PROBLEM_ATTACHMENT].decode(), f"{file}, {PROBLEM_ATTACHMENT}")
     except InputError:
         raise
-    except Exception as error:  # mcap and zstandard raise whatever they meet in a damaged file
+    except Exception as error:  # mcap and zstandard raise many kinds of errors for a damaged file
         raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
     return problem_from_record(record)
 
 
-def read(file: Path, topic: str | None = None) -> Recorded:
-    """The motion on a topic with ROS 2 messages; see `ros_types.chosen`."""
+def read(file: Path, topic: str | None = None) -> RecordedMotion:
+    """Read the motion from the ROS 2 messages of a topic; see `ros_types.choose_topic`."""
     path = input_file(file)
     try:
         with path.open("rb") as stream:
@@ -232,21 +234,21 @@ def read(file: Path, topic: str | None = None) -> Recorded:
                 for channel in summary.channels.values()
                 if channel.message_encoding == "cdr" and channel.schema_id in summary.schemas
             }
-            name = chosen({topic: schema.name for topic, schema in ros.items()}, topic, str(file))
+            name = choose_topic({topic: schema.name for topic, schema in ros.items()}, topic, str(file))
             store = _typestore(ros[name])
             messages = [
                 (found.log_time, store.deserialize_cdr(found.data, ros[name].name))
                 for _, _, found in reader.iter_messages(topics=[name])
             ]
-        return motion_in(ros[name].name, messages, f"{file}, {name}")
+        return motion_from_messages(ros[name].name, messages, f"{file}, {name}")
     except InputError:
         raise
-    except Exception as error:  # mcap, zstandard and rosbags raise whatever they meet in a damaged file
+    except Exception as error:  # mcap, zstandard and rosbags raise many kinds of errors for a damaged file
         raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
 
 
 def _typestore(schema: Any) -> Any:
-    """With the types as the file defines them."""
+    """A store with the message types that the file defines."""
     from rosbags.typesys import Stores, get_typestore
 
     if schema.encoding != "ros2msg":

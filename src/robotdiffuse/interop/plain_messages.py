@@ -1,4 +1,4 @@
-"""Messages of ROS and MoveIt, and our own records, as plain data: what JSON, YAML and bags have in common."""
+"""Motions in ROS and MoveIt messages and in RobotDiffuse's own records, as plain Python data."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,27 +6,27 @@ from typing import Any
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_json
-from robotdiffuse.interop.recorded_motion import Recorded, recorded
+from robotdiffuse.interop.recorded_motion import RecordedMotion, checked_motion
 
-HOLDS = "it must hold a result or trajectory of ours, a JointTrajectory, RobotTrajectory or DisplayTrajectory"
-
-
-def read_json_file(file: Path, topic: str | None = None) -> Recorded:
-    """A result, a trajectory, or a message of ROS or MoveIt as rosbridge writes them."""
-    return motion_of(read_json(file), str(file))
+SUPPORTED = "it must hold a RobotDiffuse result, a JointTrajectory, RobotTrajectory or DisplayTrajectory"
 
 
-def motion_of(record: Any, where: str) -> Recorded:
-    """The motion in a record; InputError, one line that names the place, where there is none."""
+def read_json_file(file: Path, topic: str | None = None) -> RecordedMotion:
+    """Read a result, a trajectory, or a ROS or MoveIt message in the JSON form of rosbridge."""
+    return motion_from_record(read_json(file), str(file))
+
+
+def motion_from_record(record: Any, where: str) -> RecordedMotion:
+    """The motion in a record. Raises InputError, naming `where`, if there is none."""
     try:
         return _motion(record)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
 
-def _motion(record: Any) -> Recorded:
+def _motion(record: Any) -> RecordedMotion:
     if not isinstance(record, Mapping):
-        raise InputError(f"it is {shown(record)}; {HOLDS}")
+        raise InputError(f"it is {shown(record)}; {SUPPORTED}")
     if "status" in record and record.get("status") != "solved":
         raise InputError(f"it holds no motion: its status is {shown(record['status'])}")
     if "trajectory" in record:
@@ -42,15 +42,15 @@ def _motion(record: Any) -> Recorded:
         return _joint_trajectory(record)
     if record.get("times"):
         q, t, v, a = (record.get(name) for name in ("positions", "times", "velocities", "accelerations"))
-        return recorded(record.get("joint_names"), q, t, v, a)
+        return checked_motion(record.get("joint_names"), q, t, v, a)
     for name in ("waypoints", "positions"):
         if record.get(name):
-            return recorded(record.get("joint_names"), record[name])
-    raise InputError(f"it holds no motion: {HOLDS}")
+            return checked_motion(record.get("joint_names"), record[name])
+    raise InputError(f"it holds no motion: {SUPPORTED}")
 
 
-def _only(trajectories: Any) -> Recorded:
-    """Of a DisplayTrajectory, or of a MoveIt response, which has one."""
+def _only(trajectories: Any) -> RecordedMotion:
+    """The motion in the `trajectory` field of a DisplayTrajectory (a list) or a MoveIt response (one)."""
     if isinstance(trajectories, Mapping):
         return _motion(trajectories)
     if not isinstance(trajectories, list) or len(trajectories) != 1:
@@ -59,7 +59,7 @@ def _only(trajectories: Any) -> Recorded:
     return _motion(trajectories[0])
 
 
-def _joint_trajectory(record: Mapping[str, Any]) -> Recorded:
+def _joint_trajectory(record: Mapping[str, Any]) -> RecordedMotion:
     points = record["points"]
     if not isinstance(points, list) or not points:
         raise InputError("points is empty: a motion has at least one row")
@@ -75,8 +75,8 @@ def _joint_trajectory(record: Mapping[str, Any]) -> Recorded:
     for name in ("velocities", "accelerations"):
         given = [len(row) > 0 for row in rows[name]]
         if any(given) and not all(given):
-            raise InputError(f"points[{given.index(False)}] has no {name}, others have")
-    return recorded(
+            raise InputError(f"points[{given.index(False)}] has no {name}, but others do")
+    return checked_motion(
         _list(record.get("joint_names")), rows["positions"], times, rows["velocities"], rows["accelerations"]
     )
 
@@ -86,7 +86,7 @@ def _list(value: Any) -> list[Any]:
 
 
 def _seconds(where: str, value: Any) -> float:
-    """A duration of ROS 2 (sec, nanosec), of ROS 1 (secs, nsecs), or plain seconds."""
+    """Seconds of a ROS 2 (sec, nanosec) or ROS 1 (secs, nsecs) duration, or of a plain number."""
     parts: tuple[Any, Any] = (value, 0)
     if isinstance(value, Mapping):
         for whole, rest in (("sec", "nanosec"), ("secs", "nsecs")):

@@ -1,4 +1,4 @@
-"""Recorded: a motion as somebody else wrote it, and what of it a robot is to do."""
+"""Motions read from files of other programs, and their conversion to motions of a robot."""
 
 from dataclasses import dataclass, replace
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import FASTEST, LARGEST, numbers, within
+from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, numbers, within
 from robotdiffuse.core.errors import InputError, joined, shown
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.goals import JointGoal
@@ -14,61 +14,62 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
 
-STANDS_STILL = 1e-6
-"""A joint that moves less than this does not move [rad] or [m]."""
-HELD = 1e-4
-"""How far from where the problem holds it a joint may stand [rad] or [m]."""
-MOST_NAMED = 6
+STATIONARY_TOLERANCE = 1e-6
+"""A joint that moves less than this counts as stationary [rad] or [m]."""
+LOCKED_TOLERANCE = 1e-4
+"""Largest distance of a joint from the value that the problem locks it at [rad] or [m]."""
+MAX_NAMES = 6
+"""Most joint names in a message."""
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
-    """Rows of joint values, in any order, of any joints. Rates that are not there are None."""
+class RecordedMotion:
+    """A checked_motion motion of any joints, in any order; absent rates are None."""
 
     joint_names: tuple[str, ...]
     positions: Float[ndarray, "n joints"]
     times: Float[ndarray, "n"] | None = None
-    """[s]; None: waypoints."""
+    """[s]; None if the rows are waypoints."""
     velocities: Float[ndarray, "n joints"] | None = None
     accelerations: Float[ndarray, "n joints"] | None = None
     notes: tuple[str, ...] = ()
 
 
-def recorded(
+def checked_motion(
     names: object,
     positions: object,
     times: object = None,
     velocities: object = None,
     accelerations: object = None,
     notes: tuple[str, ...] = (),
-) -> Recorded:
-    """The motion, if it is one: InputError for names that are none or twice there, no rows, rows of different
-    lengths, numbers that are not finite, and times that do not increase.
+) -> RecordedMotion:
+    """Check the parts of a motion and return it.
 
-    Rates that are empty count as not there; times that begin later begin at 0, those that are all 0 count as
-    none.
+    Empty rates count as absent. Times are shifted to begin at 0; times that are all 0 count as absent. Raises
+    InputError for missing or repeated names, no rows, rows of different lengths, numbers that are not finite,
+    and times that do not increase.
     """
     if not isinstance(names, list | tuple) or not names or not all(isinstance(n, str) and n for n in names):
         raise InputError(f"joint_names is {shown(names)}; it must be a list of names, not empty")
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f"joint_names has {', '.join(twice)} more than once")
-    q = _rows("positions", positions, len(names), LARGEST)
+    q = _rows("positions", positions, len(names), MAX_COORDINATE)
     v, a = (
-        None if _empty(rates) else _rows(what, rates, len(names), FASTEST)
+        None if _empty(rates) else _rows(what, rates, len(names), MAX_RATE)
         for what, rates in (("velocities", velocities), ("accelerations", accelerations))
     )
     for what, rates in (("velocities", v), ("accelerations", a)):
         if rates is not None and len(rates) != len(q):
             raise InputError(f"{what} has {len(rates)} rows; positions has {len(q)}")
     t, more = _times(times, len(q))
-    return Recorded(
+    return RecordedMotion(
         tuple(names), q, t, v if t is not None else None, a if t is not None else None, notes + more
     )
 
 
 def _empty(rates: object) -> bool:
-    """Whether there is nothing, or a list of nothing."""
+    """Whether the value is None, or a list of empty rows."""
     if rates is None:
         return True
     try:
@@ -109,25 +110,25 @@ def _times(value: object, count: int) -> tuple[Float[ndarray, "n"] | None, tuple
         raise InputError(
             f"times do not increase: {times[i]:g} s in row {i}, {times[i + 1]:g} s in row {i + 1}"
         )
-    note = () if times[0] == 0 else (f"times begin at {times[0]:.9g} s, counted from there",)
+    note = () if times[0] == 0 else (f"times begin at {times[0]:.9g} s; they were shifted to 0",)
     return times - times[0], note
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
-    """What a robot is to do."""
+class RobotMotion:
+    """A motion of a robot's planned joints, and notes on the conversion."""
 
     motion: Path | Trajectory
     notes: tuple[str, ...]
 
 
-def fitted(motion: Recorded, robot: Robot) -> Fitted:
-    """The motion of a robot's planned joints, by their names.
+def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
+    """The motion of a robot's planned joints, matched by name.
 
-    Other joints of the robot may be there where they stand still where the robot holds them. Velocities that
-    are not there are those of the smoothest curve from rest to rest through the rows, accelerations the means
-    of the changes of velocity around each row. Raises InputError for joints that are missing, unknown, or
-    held elsewhere.
+    The recording may contain other joints of the robot, if they stay at their locked values. Absent
+    velocities become those of the cubic spline from rest to rest through the rows, absent accelerations the
+    mean rates of change of velocity around each row. Raises InputError for missing or unknown joints, and for
+    other joints that leave their locked values.
     """
     notes = list(motion.notes)
     given = {name: j for j, name in enumerate(motion.joint_names)}
@@ -135,49 +136,49 @@ def fitted(motion: Recorded, robot: Robot) -> Fitted:
     unknown = [name for name in given if name not in known]
     absent = [name for name in robot.joint_names if name not in given]
     if absent or unknown:
-        parts = [f"lacks {joined(absent, MOST_NAMED)}"] if absent else []
-        parts += [f"has {joined(unknown, MOST_NAMED)}, which {robot.name} has not"] if unknown else []
-        right = joined(robot.joint_names, MOST_NAMED)
+        parts = [f"lacks {joined(absent, MAX_NAMES)}"] if absent else []
+        parts += [f"has {joined(unknown, MAX_NAMES)}, which {robot.name} lacks"] if unknown else []
+        right = joined(robot.joint_names, MAX_NAMES)
         raise InputError(f"the motion {' and '.join(parts)}; the robot's joints are {right}")
     for name in given:
         if name not in robot.joint_names:
-            _check_held(motion.positions[:, given[name]], name, robot)
+            _check_locked(motion.positions[:, given[name]], name, robot)
     extra = [name for name in given if name not in robot.joint_names]
     if extra:
-        notes.append(f"{joined(extra, MOST_NAMED)} stand still where the robot holds them")
+        notes.append(f"{joined(extra, MAX_NAMES)} stay at their locked values")
     order = [given[name] for name in robot.joint_names]
     if order != sorted(order):
-        notes.append("joints were put into the robot's order by their names")
+        notes.append("joints were reordered by name")
     q = motion.positions[:, order]
     if motion.times is None:
-        return Fitted(Path(robot.joint_names, q), tuple(notes))
+        return RobotMotion(Path(robot.joint_names, q), tuple(notes))
     v = None if motion.velocities is None else motion.velocities[:, order]
     a = None if motion.accelerations is None else motion.accelerations[:, order]
     if v is None:
-        v = _smoothest(motion.times, q)
-        notes.append("no velocities are given: those of the smoothest curve from rest to rest are validated")
+        v = _spline_velocities(motion.times, q)
+        notes.append("no velocities are given: those of a cubic spline from rest to rest are validated")
     if a is None:
-        a = _changes(motion.times, v)
-        notes.append("no accelerations are given: those of the velocities are validated")
-    return Fitted(Trajectory(robot.joint_names, motion.times, q, v, a), tuple(notes))
+        a = _mean_accelerations(motion.times, v)
+        notes.append("no accelerations are given: the rates of change of velocity are validated")
+    return RobotMotion(Trajectory(robot.joint_names, motion.times, q, v, a), tuple(notes))
 
 
-def _check_held(values: Float[ndarray, "n"], name: str, robot: Robot) -> None:
+def _check_locked(values: Float[ndarray, "n"], name: str, robot: Robot) -> None:
     held = robot.locked.get(name, 0.0)
     low, high = float(values.min()), float(values.max())
-    if high - low > STANDS_STILL + HELD:
+    if high - low > STATIONARY_TOLERANCE + LOCKED_TOLERANCE:
         raise InputError(
-            f"the motion moves {name} from {low:.6g} to {high:.6g}, which the problem holds at {held:.6g}"
+            f"the motion moves {name} from {low:.6g} to {high:.6g}, which the problem locks at {held:.6g}"
         )
-    if max(abs(low - held), abs(high - held)) > HELD:
+    if max(abs(low - held), abs(high - held)) > LOCKED_TOLERANCE:
         raise InputError(
-            f"the motion has {name} at {low:.6g}, the problem holds it at {held:.6g}: "
+            f"the motion has {name} at {low:.6g}, the problem locks it at {held:.6g}: "
             f"write `locked: {{{name}: {low:.6g}}}` in the problem if that is right"
         )
 
 
-def _smoothest(times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
-    """Velocities of the cubic spline through the rows that begins and ends at rest."""
+def _spline_velocities(times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+    """Velocities of the cubic spline through the rows that starts and ends at rest."""
     if len(times) < 2:
         return np.zeros_like(q)
     from scipy.interpolate import CubicSpline
@@ -185,20 +186,21 @@ def _smoothest(times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> Float[
     return CubicSpline(times, q, bc_type="clamped")(times, 1)
 
 
-def _changes(times: Float[ndarray, "n"], v: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+def _mean_accelerations(times: Float[ndarray, "n"], v: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+    """Mean rate of change of velocity around each row."""
     if len(times) < 2:
         return np.zeros_like(v)
     change = np.diff(v, axis=0) / np.diff(times)[:, None]
     return (np.concatenate([change[:1], change]) + np.concatenate([change, change[-1:]])) / 2
 
 
-def own_problem(motion: Recorded, robot: Robot, scene: Scene) -> Problem:
-    """The problem that a motion solves in a scene: from where it begins to where it ends. Joints that it has
-    beside the planned ones are held where they stand."""
+def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Problem:
+    """The problem in a scene whose start and goal are those of a motion; its other joints are locked at their
+    first values."""
     held = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     held -= set(robot.joint_names)
     at = {name: float(motion.positions[0, j]) for j, name in enumerate(motion.joint_names) if name in held}
     robot = robot.with_locked(at)
     motion = replace(motion, notes=())
-    q = fitted(motion, robot).motion.positions
+    q = motion_of_robot(motion, robot).motion.positions
     return Problem(robot, scene, q[0], JointGoal(q[-1:]))

@@ -1,48 +1,49 @@
-"""Rerun: a recording (.rrd) of the scene, the arm and its joints, for the Rerun viewer."""
+"""Writes Rerun recordings (.rrd) of the scene, the arm and its joints."""
 
 from pathlib import Path
 
 import numpy as np
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.interop import missing
-from robotdiffuse.interop.scene_primitives import Ball, Brick, Can, Drawn, Points, Triangles, arm, obstacles
+from robotdiffuse.interop import missing_package
+from robotdiffuse.interop.scene_primitives import (
+    BoxPrimitive,
+    CylinderPrimitive,
+    MeshPrimitive,
+    PointsPrimitive,
+    Primitive,
+    SpherePrimitive,
+    arm,
+    obstacles,
+)
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose
 
 try:
     import rerun as rr
 except ImportError:
-    raise missing("rerun-sdk", "rerun") from None
+    raise missing_package("rerun-sdk", "rerun") from None
 
 TIMELINE = "time"
 FPS = 60.0
-"""Most poses of a link a second: what can be seen."""
+"""Most poses of each link per second."""
 
 
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
-    """Entities: scene/NAME, robot/LINK with its meshes, joints/NAME/position and velocity over time; see
-    `interop.write_motion`."""
-    part = file.with_name(f".{file.name}.part")
+    """Write the entities scene/NAME, robot/LINK with its meshes, and joints/NAME/positions and velocities
+    over time; see `interop.write_motion`."""
     robot, recording = problem.robot, rr.RecordingStream("robotdiffuse", recording_id=file.stem)
-    try:
-        part.touch()
-        recording.save(part)
-        recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for name, _, drawn in obstacles(problem):
-            recording.log(f"scene/{rr.escape_entity_path_part(name)}", *_archetypes(drawn), static=True)
-        for name, link, drawn in arm(robot):
-            recording.log(f"robot/{link}/{name.partition('/')[2]}", *_archetypes(drawn), static=True)
-        _motion(recording, problem, trajectory)
-        recording.flush()
-        recording.disconnect()
-        part.replace(file)
-    except OSError as error:
-        raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
-    finally:
-        part.unlink(missing_ok=True)
+    # in memory: what Rerun cannot write to a disk ends a thread of its own, with messages of several lines
+    content = recording.memory_recording()
+    recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for name, _, drawn in obstacles(problem):
+        recording.log(f"scene/{rr.escape_entity_path_part(name)}", *_archetypes(drawn), static=True)
+    for name, link, drawn in arm(robot):
+        recording.log(f"robot/{link}/{name.partition('/')[2]}", *_archetypes(drawn), static=True)
+    _motion(recording, problem, trajectory)
+    write_atomically(file, content.drain_as_bytes())
 
 
 def _motion(recording: rr.RecordingStream, problem: Problem, trajectory: Trajectory) -> None:
@@ -62,21 +63,21 @@ def _motion(recording: rr.RecordingStream, problem: Problem, trajectory: Traject
             recording.send_columns(f"joints/{name}/{what}", [every], columns)
 
 
-def _archetypes(drawn: Drawn) -> tuple[rr.AsComponents, ...]:
-    if isinstance(drawn, Points):
+def _archetypes(drawn: Primitive) -> tuple[rr.AsComponents, ...]:
+    if isinstance(drawn, PointsPrimitive):
         return (rr.Points3D(drawn.points, radii=drawn.radius, colors=[drawn.color]),)
     x, y, z = drawn.T[:3, 3].tolist()
     turn = rr.Quaternion(xyzw=quaternion_from_rotation(drawn.T[:3, :3])[[1, 2, 3, 0]])
     placed = {"centers": [[x, y, z]], "quaternions": [turn], "colors": [drawn.color]}
     solid = rr.components.FillMode.Solid
     match drawn:
-        case Brick(_, size, _):
+        case BoxPrimitive(_, size, _):
             return (rr.Boxes3D(half_sizes=[size / 2], fill_mode=solid, **placed),)
-        case Ball(_, radius, _):
+        case SpherePrimitive(_, radius, _):
             return (rr.Ellipsoids3D(half_sizes=[[radius] * 3], fill_mode=solid, **placed),)
-        case Can(_, radius, height, _):
+        case CylinderPrimitive(_, radius, height, _):
             return (rr.Cylinders3D(radii=[radius], lengths=[height], fill_mode=solid, **placed),)
-        case Triangles(T, vertices, faces, color):
+        case MeshPrimitive(T, vertices, faces, color):
             points = vertices @ T[:3, :3].T + T[:3, 3]
             return (rr.Mesh3D(vertex_positions=points, triangle_indices=faces, albedo_factor=color),)
     raise TypeError(f"no archetype for {type(drawn).__name__}")

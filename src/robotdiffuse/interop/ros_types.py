@@ -1,4 +1,4 @@
-"""ROS 2 messages without ROS: a store of types, MoveIt's among them, to and from plain data."""
+"""ROS 2 messages without ROS: message types including MoveIt's, and conversion to and from plain data."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -9,22 +9,22 @@ import numpy as np
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.interop import missing
+from robotdiffuse.interop import missing_package
 from robotdiffuse.problems.problem import Problem
 
 try:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     from rosbags.typesys.store import Typestore
 except ImportError:
-    raise missing("rosbags", "ros") from None
+    raise missing_package("rosbags", "ros") from None
 
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 ROBOT_TRAJECTORY = "moveit_msgs/msg/RobotTrajectory"
 DISPLAY_TRAJECTORY = "moveit_msgs/msg/DisplayTrajectory"
 JOINT_STATE = "sensor_msgs/msg/JointState"
-TEXT = "std_msgs/msg/String"
+STRING = "std_msgs/msg/String"
 
-# Interfaces of moveit_msgs and object_recognition_msgs (ROS 2), by name.
+# Message definitions of moveit_msgs and object_recognition_msgs (ROS 2), by name.
 MOVEIT = {
     "object_recognition_msgs/msg/ObjectType": "string key\nstring db",
     "moveit_msgs/msg/CollisionObject": (
@@ -54,7 +54,7 @@ MOVEIT = {
 
 @cache
 def typestore() -> Typestore:
-    """Types of ROS 2 Humble and of MoveIt."""
+    """The message types of ROS 2 Humble and MoveIt."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     types: dict[str, Any] = {}
     for name, definition in MOVEIT.items():
@@ -63,8 +63,8 @@ def typestore() -> Typestore:
     return store
 
 
-def message(kind: str, record: Mapping[str, Any]) -> Any:
-    """The message of plain data; what is not there is empty or zero."""
+def to_message(kind: str, record: Mapping[str, Any]) -> Any:
+    """A message from plain data; missing fields are empty or zero."""
     store = typestore()
     known = store.fielddefs[kind][1]
     return store.types[kind](**{name: _value(of, record.get(name)) for name, of in known})
@@ -78,7 +78,7 @@ def _value(definition: Any, value: Any) -> Any:
             return "" if value is None else str(value)
         return bool(value) if kind == "bool" else (value or 0.0 if kind.startswith("float") else value or 0)
     if node == 2:  # a message
-        return message(of, value or {})
+        return to_message(of, value or {})
     element = of[0]
     items = [] if value is None else value
     if int(element[0]) == 1 and element[1][0] not in ("string", "bool"):
@@ -86,17 +86,19 @@ def _value(definition: Any, value: Any) -> Any:
     return [_value(element, item) for item in items]
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """A message as plain data."""
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("__")}
+        return {
+            f.name: to_plain(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("__")
+        }
     if isinstance(value, np.ndarray):
         return value.tolist()
-    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+    return [to_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def display_trajectory(problem: Problem, trajectory: Trajectory, record: Mapping[str, Any]) -> dict[str, Any]:
-    """A DisplayTrajectory in plain data around a JointTrajectory: where the arm and its fingers begin."""
+    """A DisplayTrajectory in plain data: a JointTrajectory, and the state in which the arm starts."""
     robot = problem.robot
     names = [*trajectory.joint_names, *robot.locked]
     values = [*trajectory.positions[0].tolist(), *robot.locked.values()]
@@ -109,12 +111,16 @@ def display_trajectory(problem: Problem, trajectory: Trajectory, record: Mapping
 
 
 def header_seconds(stamp: Mapping[str, Any]) -> float:
+    """The time stamp of a message header [s]."""
     return float(stamp.get("sec", 0)) + 1e-9 * float(stamp.get("nanosec", 0))
 
 
-def chosen(topics: Mapping[str, str], asked: str | None, where: str) -> str:
-    """The topic that holds the motion, of topics and their types: the one that is asked for, or the only one
-    of the first type that there is; InputError otherwise."""
+def choose_topic(topics: Mapping[str, str], asked: str | None, where: str) -> str:
+    """The topic to read a motion from, given all topics and their types.
+
+    This is `asked`, or else the only topic of the first type of JointTrajectory, RobotTrajectory,
+    DisplayTrajectory and JointState that occurs. Raises InputError if there is no such topic or several.
+    """
     kinds = (JOINT_TRAJECTORY, ROBOT_TRAJECTORY, DISPLAY_TRAJECTORY, JOINT_STATE)
     motions = {topic: kind for topic, kind in topics.items() if kind in kinds}
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
@@ -125,7 +131,9 @@ def chosen(topics: Mapping[str, str], asked: str | None, where: str) -> str:
     for kind in kinds:
         found = [topic for topic, of in motions.items() if of == kind]
         if len(found) > 1:
-            raise InputError(f"{where}: motions are on the topics {', '.join(found)}; choose one by --topic")
+            raise InputError(
+                f"{where}: several topics hold motions: {', '.join(found)}; choose one with --topic"
+            )
         if found:
             return found[0]
     raise InputError(f"{where} holds no motion; topics: {listed}; known types: {', '.join(kinds)}")

@@ -1,19 +1,22 @@
-"""ROS 2 bags, without ROS: folders with metadata.yaml and a database."""
+"""Reads and writes ROS 2 bags (folders with metadata.yaml and a database) without ROS."""
 
 import shutil
+import sqlite3
+import sys
 from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop.plain_messages import joint_trajectory
-from robotdiffuse.interop.recorded_motion import Recorded
-from robotdiffuse.interop.ros_messages import motion_in
+from robotdiffuse.interop.recorded_motion import RecordedMotion
+from robotdiffuse.interop.ros_messages import motion_from_messages
 from robotdiffuse.interop.ros_types import (
     DISPLAY_TRAJECTORY,
     JOINT_TRAJECTORY,
-    chosen,
+    choose_topic,
     display_trajectory,
-    message,
+    to_message,
     typestore,
 )
 from robotdiffuse.problems.problem import Problem
@@ -22,19 +25,19 @@ try:
     from rosbags.highlevel import AnyReader
     from rosbags.rosbag2 import Writer
 except ImportError:
-    from robotdiffuse.interop import missing
+    from robotdiffuse.interop import missing_package
 
-    raise missing("rosbags", "ros") from None
+    raise missing_package("rosbags", "ros") from None
 
 VERSION = 9
-"""Of the bag's metadata; ROS 2 Humble reads what it knows of it."""
+"""Version of the bag's metadata; ROS 2 Humble reads the fields that it knows."""
 
 
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
-    """A JointTrajectory on /joint_trajectory and a DisplayTrajectory on /display_planned_path, which RViz's
-    MoveIt plugin shows. A bag that is there is replaced; see `interop.write_motion`."""
+    """Write a JointTrajectory on /joint_trajectory and a DisplayTrajectory on /display_planned_path, which
+    RViz's MoveIt plugin shows. An existing bag is replaced; see `interop.write_motion`."""
     if file.exists() and not (file / "metadata.yaml").is_file():
-        raise InputError(f"{file} cannot be written: it exists and is no ROS 2 bag")
+        raise InputError(f"{file} cannot be written: it exists and is not a ROS 2 bag")
     record = joint_trajectory(trajectory.joint_names, trajectory)
     topics = {
         "/joint_trajectory": (JOINT_TRAJECTORY, record),
@@ -44,34 +47,38 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
-        with Writer(part / file.name, version=VERSION) as writer:  # which names the database after the folder
+        with Writer(part / file.name, version=VERSION) as writer:  # it names the database after the folder
             for topic, (kind, content) in topics.items():
                 connection = writer.add_connection(topic, kind, typestore=typestore())
-                writer.write(connection, 0, typestore().serialize_cdr(message(kind, content), kind))
+                writer.write(connection, 0, typestore().serialize_cdr(to_message(kind, content), kind))
         shutil.rmtree(file, ignore_errors=True)
         (part / file.name).replace(file)
-    except OSError as error:
-        raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
+    except (OSError, sqlite3.Error) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"{file} cannot be written: {why}") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def read(file: Path, topic: str | None = None) -> Recorded:
-    """The motion on a topic; see `ros_types.chosen`."""
+def read(file: Path, topic: str | None = None) -> RecordedMotion:
+    """Read the motion on a topic; see `ros_types.choose_topic`."""
     if not (file / "metadata.yaml").is_file():
-        raise InputError(f"{file} is no ROS 2 bag: it has no metadata.yaml")
+        raise InputError(f"{file} is not a ROS 2 bag: it has no metadata.yaml")
+    for part in file.iterdir():
+        if not part.is_dir():
+            input_file(part, largest=sys.maxsize)
     try:
         with AnyReader([file], default_typestore=typestore()) as reader:
             topics = {connection.topic: connection.msgtype for connection in reader.connections}
-            name = chosen(topics, topic, str(file))
+            name = choose_topic(topics, topic, str(file))
             messages = [
                 (at, reader.deserialize(raw, connection.msgtype))
                 for connection, at, raw in reader.messages(
                     [connection for connection in reader.connections if connection.topic == name]
                 )
             ]
-            return motion_in(topics[name], messages, f"{file}, {name}")
+            return motion_from_messages(topics[name], messages, f"{file}, {name}")
     except InputError:
         raise
-    except Exception as error:  # rosbags, SQLite and YAML raise whatever they meet in a damaged bag
+    except Exception as error:  # rosbags, SQLite and YAML raise many kinds of errors for a damaged bag
         raise InputError(f"{file} is damaged: {shortened(str(error))}") from None

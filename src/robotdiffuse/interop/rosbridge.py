@@ -1,16 +1,14 @@
-"""A motion published to ROS by a rosbridge, live."""
-
-from typing import Any
+"""Publishes motions to ROS through rosbridge."""
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.interop import missing
+from robotdiffuse.interop import missing_package
 from robotdiffuse.interop.plain_messages import joint_trajectory
 
 try:
     import roslibpy
 except ImportError:
-    raise missing("roslibpy", "ros") from None
+    raise missing_package("roslibpy", "ros") from None
 
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PORT = 9090
@@ -23,9 +21,9 @@ def publish(
     topic: str = "/joint_trajectory",
     timeout: float = 5.0,
 ) -> None:
-    """Send a trajectory once, as a JointTrajectory. The caller has validated it.
+    """Publish a trajectory once, as a JointTrajectory; the caller must have validated it.
 
-    Raises InputError where no rosbridge answers within `timeout` [s].
+    Raises InputError if no rosbridge answers within `timeout` [s].
     """
     ros = roslibpy.Ros(host, port)
     try:
@@ -36,11 +34,7 @@ def publish(
     try:
         publisher = roslibpy.Topic(ros, topic, JOINT_TRAJECTORY, latch=True)
         publisher.advertise()
-        publisher.publish(roslibpy.Message(_record(trajectory)))
+        publisher.publish(roslibpy.Message(joint_trajectory(trajectory.joint_names, trajectory)))
         publisher.unadvertise()
     finally:
         ros.close()
-
-
-def _record(trajectory: Trajectory) -> dict[str, Any]:
-    return joint_trajectory(trajectory.joint_names, trajectory)

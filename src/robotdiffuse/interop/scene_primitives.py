@@ -1,4 +1,4 @@
-"""What programs that show scenes are given: obstacles and links as primitives, each in its frame."""
+"""Obstacles and links as primitives in their frames, for programs that display scenes."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,70 +14,70 @@ from robotdiffuse.robots.visual_meshes import load_visual
 from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
 
 Color = tuple[int, int, int]
-OBSTACLE: Color = (0xD9, 0x7B, 0x5C)
+OBSTACLE_COLOR: Color = (0xD9, 0x7B, 0x5C)
 
 
-class Brick(NamedTuple):
+class BoxPrimitive(NamedTuple):
     T: Float[ndarray, "4 4"]
-    """In the frame that it is given in, as of all of them."""
+    """Pose in the frame that it is listed with."""
     size: Float[ndarray, "3"]
     color: Color
 
 
-class Ball(NamedTuple):
+class SpherePrimitive(NamedTuple):
     T: Float[ndarray, "4 4"]
     radius: float
     color: Color
 
 
-class Can(NamedTuple):
+class CylinderPrimitive(NamedTuple):
     T: Float[ndarray, "4 4"]
     radius: float
     height: float
     color: Color
 
 
-class Triangles(NamedTuple):
+class MeshPrimitive(NamedTuple):
     T: Float[ndarray, "4 4"]
     vertices: Float[ndarray, "v 3"]
     faces: Int[ndarray, "f 3"]
     color: Color
 
 
-class Points(NamedTuple):
+class PointsPrimitive(NamedTuple):
     points: Float[ndarray, "n 3"]
     radius: float
     color: Color
 
 
-Drawn = Brick | Ball | Can | Triangles | Points
+Primitive = BoxPrimitive | SpherePrimitive | CylinderPrimitive | MeshPrimitive | PointsPrimitive
 
 
-def obstacles(problem: Problem) -> Iterator[tuple[str, str, Drawn]]:
-    """Each obstacle's name, the frame that it is in, and what it is drawn as."""
+def obstacles(problem: Problem) -> Iterator[tuple[str, str, Primitive]]:
+    """Name, frame and primitive of each obstacle."""
     for shape in problem.scene.shapes:
-        yield shape.name, problem.robot.base, _drawn(shape)
+        yield shape.name, problem.robot.base, _primitive(shape)
 
 
-def _drawn(shape: Shape) -> Drawn:
+def _primitive(shape: Shape) -> Primitive:
     match shape:
         case Sphere():
-            return Ball(transform(shape.center), shape.radius, OBSTACLE)
+            return SpherePrimitive(transform(shape.center), shape.radius, OBSTACLE_COLOR)
         case Box():
-            return Brick(pose(shape), shape.size, OBSTACLE)
+            return BoxPrimitive(pose(shape), shape.size, OBSTACLE_COLOR)
         case Cylinder():
-            return Can(pose(shape), shape.radius, shape.height, OBSTACLE)
+            return CylinderPrimitive(pose(shape), shape.radius, shape.height, OBSTACLE_COLOR)
         case PointCloud():
-            return Points(shape.points, shape.point_radius, OBSTACLE)
+            return PointsPrimitive(shape.points, shape.point_radius, OBSTACLE_COLOR)
         case Triangulated():
-            return Triangles(np.eye(4), shape.mesh.world_vertices, shape.mesh.faces, OBSTACLE)
+            return MeshPrimitive(np.eye(4), shape.mesh.world_vertices, shape.mesh.faces, OBSTACLE_COLOR)
         case _:
             T, [mesh] = shape.solid()
-            return Triangles(T, mesh.vertices, mesh.faces, OBSTACLE)
+            return MeshPrimitive(T, mesh.vertices, mesh.faces, OBSTACLE_COLOR)
 
 
-def arm(robot: Robot) -> Iterator[tuple[str, str, Drawn]]:
-    """The same of the meshes of links, by colour, each in the frame of its link."""
+def arm(robot: Robot) -> Iterator[tuple[str, str, Primitive]]:
+    """Name, frame and primitive of the link meshes, one for each colour, in the frames of their links."""
     for link, meshes in load_visual(robot).items():
         for k, mesh in enumerate(meshes):
             for color in np.unique(mesh.colors, axis=0):
@@ -85,4 +85,8 @@ def arm(robot: Robot) -> Iterator[tuple[str, str, Drawn]]:
                 used, faces = np.unique(faces, return_inverse=True)
                 r, g, b = color.tolist()
                 name = f"{link}/{k}/{r:02x}{g:02x}{b:02x}"
-                yield name, link, Triangles(np.eye(4), mesh.vertices[used], faces.reshape(-1, 3), (r, g, b))
+                yield (
+                    name,
+                    link,
+                    MeshPrimitive(np.eye(4), mesh.vertices[used], faces.reshape(-1, 3), (r, g, b)),
+                )

@@ -1,7 +1,8 @@
-"""Trained networks in files: NAME.safetensors and NAME.json, all that planning needs; whole or not at all.
+"""Trained networks in files: NAME.safetensors and NAME.json hold all that planning needs.
 
-Every network is written and read the same way: the diffusion model, those of the baselines, and the encoder
-that is trained alone, which is of no robot.
+All networks are written and read in the same way: the diffusion model, the baselines' networks, the encoder
+that is trained alone and the completion network; the last two belong to no robot. A file is written whole or
+not at all.
 """
 
 import hashlib
@@ -22,25 +23,20 @@ from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning.completion.network import CompletionNetwork, CompletionSettings
-from robotdiffuse.learning.encoders import COMPLETES, ENCODERS, encoder_name, make_encoder
+from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Encoder
-from robotdiffuse.learning.encoders.completing_autoencoder import (
-    CompletingAutoencoder,
-    CompletingAutoencoderSettings,
-)
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.network import Network
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.weights_registry import BUNDLED, check_weights, untrained, weights_for
-from robotdiffuse.robots import load_robot
+from robotdiffuse.learning.weights_registry import BUNDLED, check_weights, no_weights_error, weights_for
 from robotdiffuse.robots.robot import Robot
 
 FORMAT = 2
 
 
 def versions() -> dict[str, str]:
-    """What a checkpoint was made with: versions of this package and of PyTorch, and the day."""
+    """Versions of this package and of PyTorch, and the date, for the description of a checkpoint."""
     try:
         own = version("robotdiffuse")
     except PackageNotFoundError:
@@ -57,7 +53,7 @@ def write_tensors(file: FilePath, tensors: dict[str, Tensor], notes: dict[str, A
 
 
 def read_tensors(file: FilePath) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and notes of `write_tensors`. Raises InputError if it is missing or damaged."""
+    """Tensors and notes of a file of `write_tensors`. Raises InputError if it is missing or damaged."""
     try:
         with safe_open(str(file), framework="pt") as opened:
             notes = json.loads((opened.metadata() or {}).get("notes", "{}"))
@@ -69,7 +65,7 @@ def read_tensors(file: FilePath) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def fingerprint(module: nn.Module) -> str:
-    """SHA-256 of the weights and buffers, the first 16 digits."""
+    """The first 16 digits of the SHA-256 of weights and buffers."""
     digest = hashlib.sha256()
     for name, tensor in sorted(module.state_dict().items()):
         data = tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8)
@@ -78,21 +74,22 @@ def fingerprint(module: nn.Module) -> str:
 
 
 def _pack(module: nn.Module) -> dict[str, Tensor]:
-    """Matrices of layers in fp16, which is finer than the bf16 that they are used in; the rest as it is."""
+    """The weights to store: matrices of layers in fp16, finer than the bf16 they are used in; others
+    unchanged."""
     kinds = (nn.Linear, nn.Conv3d)
     half = {f"{name}.weight" for name, part in module.named_modules() if isinstance(part, kinds)}
     return {name: t.half() if name in half else t for name, t in module.state_dict().items()}
 
 
 def _save(module: nn.Module, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
-    """Write STEM.safetensors and, with the SHA-256 of it, STEM.json."""
+    """Write STEM.safetensors, and STEM.json with its SHA-256."""
     digest = write_tensors(folder / f"{stem}.safetensors", _pack(module), {})
     about = {"format": FORMAT, **about, "weights_sha256": digest}
     write_atomically(folder / f"{stem}.json", json.dumps(about, indent=1) + "\n", make_folder=True)
 
 
 def _read(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Weights and description of `_save`. Raises InputError if they are missing or damaged."""
+    """Weights and description from files of `_save`. Raises InputError if they are missing or damaged."""
     file = folder / f"{stem}.json"
     try:
         about = json.loads(file.read_text(encoding="utf-8"))
@@ -100,10 +97,6 @@ def _read(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any
         raise InputError(f"{folder} holds no trained model: {file.name} is missing") from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{file} is damaged: {error}") from None
-    if isinstance(about, dict) and about.get("format") == 1:
-        about = _of_format_1(about)
-    if isinstance(about, dict) and isinstance(about.get("settings"), dict):
-        about["settings"] = _of_prior(renamed(about["settings"]))
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise InputError(f"{file} is not a model description of format {FORMAT}")
     weights = folder / f"{stem}.safetensors"
@@ -116,42 +109,8 @@ def _read(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any
     return read_tensors(weights)[0], about
 
 
-def renamed(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings in which waypoints were called frames, as they are called now."""
-    found = {"waypoints" if name == "frames" else name: value for name, value in settings.items()}
-    return found | ({"parametrization": "waypoints"} if found.get("parametrization") == "frames" else {})
-
-
-def _of_prior(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings of a trajectory prior that was a class of its own, as those of the model that it is."""
-    if "unet" not in settings:
-        return settings
-    same = {name: settings[name] for name in ("waypoints", "schedule")}
-    parts = {"denoiser": "unet", "denoiser_settings": settings["unet"], "objective": "noise"}
-    parts |= {"encoder": None, "encoder_settings": None, "target": "limits", "sees_clearances": False}
-    return same | parts | {"sampler": "ddpm", "sampling_steps": 25}
-
-
-def _of_format_1(about: dict[str, Any]) -> dict[str, Any]:
-    """A description in which models had their robot among their settings, and baselines its limits alone."""
-    found: dict[str, Any] = about | {"format": FORMAT}
-    if "encoder" in about:
-        found["network"] = found.pop("encoder")
-    elif "model" in about:
-        settings = dict(found.pop("model"))
-        robot = {name: settings.pop(name, None) for name in ("joint_names", "lower", "upper")}
-        robot |= {name: settings.pop(name, None) for name in ("frame_offsets", "links")}
-        found |= {"network": "model", "robot": robot | {"source": settings.pop("robot", None)}}
-        found["settings"] = settings
-    else:
-        robot = dict(about.get("robot") or {})
-        source = str(robot.pop("robot", ""))
-        found["robot"] = RobotIdentity.of(load_robot(source)).to_json() | robot
-    return found
-
-
 def _fill(module: nn.Module, tensors: dict[str, Tensor], file: FilePath) -> None:
-    """Give a module its weights. Raises InputError, naming the file, if they are another's."""
+    """Load weights into a module. Raises InputError, naming the file, if they do not fit."""
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:
@@ -160,7 +119,7 @@ def _fill(module: nn.Module, tensors: dict[str, Tensor], file: FilePath) -> None
 
 
 def save_encoder(encoder: Encoder, folder: str | FilePath, training: dict[str, Any]) -> None:
-    """Write encoder.safetensors and encoder.json. `training`: how it was trained, for the reader."""
+    """Write encoder.safetensors and encoder.json. training: a record of the training, for readers."""
     about = {
         "network": encoder_name(encoder),
         "settings": encoder.settings.to_json(),
@@ -170,14 +129,7 @@ def save_encoder(encoder: Encoder, folder: str | FilePath, training: dict[str, A
 
 
 def load_encoder(folder: str | FilePath) -> Encoder:
-    """The trained encoder of a folder, frozen; also that of a folder of `train completion`, and
-    "completing_autoencoder" for the one that comes with the package. Raises InputError if it is missing or
-    damaged.
-    """
-    if folder in ENCODERS and ENCODERS.entry(folder).kind == COMPLETES:
-        return _load_code(BUNDLED / "completion")
-    if (FilePath(folder) / "code.json").is_file():
-        return _load_code(FilePath(folder))
+    """The trained encoder of a folder, frozen. Raises InputError if it is missing or damaged."""
     tensors, about = _read(FilePath(folder), "encoder")
     where = str(FilePath(folder) / "encoder.json")
     kind: Any = ENCODERS.settings(about.get("network", ""))
@@ -186,44 +138,21 @@ def load_encoder(folder: str | FilePath) -> Encoder:
     return encoder.requires_grad_(False).eval()
 
 
-def save_code(encoder: CompletingAutoencoder, folder: str | FilePath) -> None:
-    """Write code.safetensors and code.json: what makes an encoder of the completing network in the folder."""
-    completion = _read(FilePath(folder), "completion")[1]["weights_sha256"]
-    about = {
-        "network": encoder_name(encoder),
-        "settings": encoder.settings.to_json(),
-        "completion": completion,
-    }
-    _save(encoder.components, FilePath(folder), "code", about)
-
-
-def _load_code(folder: FilePath) -> Encoder:
-    network, (tensors, about) = load_completion(folder), _read(folder, "code")
-    file = folder / "code.json"
-    if about.get("completion") != _read(folder, "completion")[1]["weights_sha256"]:
-        raise InputError(f"{file} was made for other weights of the completing network than those beside it")
-    kind = CompletingAutoencoderSettings
-    encoder = CompletingAutoencoder(kind.from_json(about.get("settings"), f"{file}: settings"))
-    encoder.network = network
-    _fill(encoder.components, tensors, folder / "code.safetensors")
-    return encoder.requires_grad_(False).eval()
-
-
 def save_completion(network: CompletionNetwork, folder: str | FilePath, training: dict[str, Any]) -> None:
-    """Write completion.safetensors and completion.json. `training`: how it was trained, for the reader."""
+    """Write completion.safetensors and completion.json. training: a record of the training, for readers."""
     about = {"network": "completion", "settings": network.settings.to_json(), "training": training}
     _save(network, FilePath(folder), "completion", about)
 
 
 def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
-    """The completing network of a folder, or the one that comes with the package, ready to use.
+    """The occupancy completion network of a folder, frozen; None: the one that comes with the package.
 
-    Raises InputError if there is none, naming the command that trains it, and for damaged files.
+    Raises InputError for damaged files, and if there is none, naming the command that trains it.
     """
     place = BUNDLED / "completion" if folder is None else FilePath(folder)
     if not (place / "completion.json").is_file():
         raise InputError(
-            f"{place} holds no weights of the completing network; train them: robotdiffuse train completion "
+            f"{place} holds no weights of the completion network; train them: robotdiffuse train completion "
             "--out FOLDER"
         )
     tensors, about = _read(place, "completion")
@@ -236,7 +165,7 @@ def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
 def save_network(name: str, network: Network, folder: str | FilePath, training: dict[str, Any]) -> None:
     """Write NAME.safetensors and NAME.json; `name` as in NETWORKS.
 
-    `training`: the data's fingerprint, the number of samples and so on, for the reader.
+    training: the data's fingerprint, the number of samples and so on, for readers.
     """
     about = {
         "network": name,
@@ -248,7 +177,7 @@ def save_network(name: str, network: Network, folder: str | FilePath, training: 
 
 
 def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
-    """The trained network of a folder, or the one that comes with the package for the robot, ready to use.
+    """The trained network of a folder, ready to use; None: the weights found for the robot by `weights_for`.
 
     Raises InputError if there is none, naming the command that trains it, and for files that are damaged or
     made for another robot.
@@ -256,7 +185,9 @@ def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
     check_weights(name, folder)
     place = (weights_for(name, robot) or BUNDLED / robot.name) if folder is None else FilePath(folder)
     if not (place / f"{name}.json").is_file():
-        raise untrained(name, f"no weights of the network {name} come with the package for {robot.name}")
+        raise no_weights_error(
+            name, f"no weights of the network {name} come with the package for {robot.name}"
+        )
     network = _loaded(name, place)
     network.robot.check(robot, str(place / f"{name}.json"))
     return network
@@ -275,14 +206,21 @@ def _load(name: str, folder: FilePath) -> Network:
     made = settings.from_json(about.get("settings"), f"{where}: settings")
     try:
         network: Network = NETWORKS.load(name)(robot, made)
-    except (RuntimeError, TypeError, MemoryError, OverflowError) as error:  # as PyTorch has it of sizes
-        raise InputError(f"{where}: no network can be of such settings: {shortened(str(error))}") from None
+    except (
+        RuntimeError,
+        TypeError,
+        MemoryError,
+        OverflowError,
+    ) as error:  # PyTorch's errors for impossible sizes
+        raise InputError(
+            f"{where}: no network can be made from these settings: {shortened(str(error))}"
+        ) from None
     _fill(network, tensors, folder / f"{name}.safetensors")
     return network.for_inference()
 
 
 def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionModel:
-    """The diffusion model of a folder, or of a bundled robot's name, ready for sampling.
+    """The diffusion model of a folder, or the bundled one of a robot with this name, ready for sampling.
 
     Raises InputError, naming the file, if it is missing, damaged, or made for another robot than `robot`.
     """

@@ -1,4 +1,5 @@
-"""What a model is told of the obstacles along a noisy trajectory: in planning, and in training."""
+"""Network inputs about the obstacles along a noisy trajectory: clearances of the links and their
+gradients."""
 
 from collections.abc import Callable
 
@@ -13,28 +14,32 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 PackedClearanceFn = Callable[[PackedScenes, ndarray], ndarray]
-"""A scene for each trajectory and joint values [n, rows, dof] to what `ClearanceFn` gives."""
+"""From one scene for each trajectory and joint values [n, waypoints, dof] to the output of a
+`ClearanceFn`."""
 
 
 def link_clearances(checker: CollisionChecker, settings: MotionModelSettings) -> ClearanceFn:
-    """What a model of these settings is told of the obstacles."""
+    """The inputs for a model with these settings, in planning: all trajectories in the checker's scene."""
     limit = settings.clearance_high
-    arm, carriers = _carriers(checker)
+    arm_links, carriers = _carriers(checker)
 
     def clearances(q: ndarray) -> ndarray:
-        rows = q.reshape(-1, q.shape[-1])
-        if settings.sees_gradients:
-            links, gradients = checker.clearances_and_gradients(rows, limit, settings.gradient_margin)
-            told = np.concatenate([_of_arm(links, arm, carriers), gradients], axis=-1)
-            return told.reshape(*q.shape[:2], -1)
-        return _of_arm(checker.link_clearances(rows, limit), arm, carriers).reshape(*q.shape[:2], -1)
+        configurations = q.reshape(-1, q.shape[-1])
+        if settings.clearance_gradients:
+            margin = settings.gradient_margin
+            links, gradients = checker.clearances_and_gradients(configurations, limit, margin)
+            inputs = np.concatenate([_of_bare_arm(links, arm_links, carriers), gradients], axis=-1)
+        else:
+            inputs = _of_bare_arm(checker.link_clearances(configurations, limit), arm_links, carriers)
+        return inputs.reshape(*q.shape[:2], -1)
 
     return clearances
 
 
 def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
-    """How many of the checker's links are the bare arm's, and for each body after them, the one of these that
-    carries it: the link that it is fixed to, or the last one that moves as that does or before."""
+    """The number of the checker's links that belong to the bare arm; and for each body after them, the index
+    of the arm's link that carries it: the link that it is fixed to, or the last one that moves no later than
+    it."""
     robot = checker.robot
     arm = [link for link in checker.links if link in robot.arm.link_names]
     fixed_to = {body.name: body.link for body in robot.attached}
@@ -49,24 +54,25 @@ def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
     return len(arm), [carrier(link) for link in checker.links[len(arm) :]]
 
 
-def _of_arm(links: ndarray, arm: int, carriers: list[int]) -> ndarray:
-    """Clearances [n, links] of the bare arm's links, which are all that a network knows: what it holds counts
-    as a part of the link that carries it."""
-    told = links[:, :arm].copy() if carriers else links
-    for held, carrier in enumerate(carriers, start=arm):
-        told[:, carrier] = np.minimum(told[:, carrier], links[:, held])
-    return told
+def _of_bare_arm(links: ndarray, arm_links: int, carriers: list[int]) -> ndarray:
+    """Clearances [n, links] of the bare arm's links, the only ones that a network has inputs for: an attached
+    body counts as a part of the link that carries it."""
+    of_arm = links[:, :arm_links].copy() if carriers else links
+    for body, carrier in enumerate(carriers, start=arm_links):
+        of_arm[:, carrier] = np.minimum(of_arm[:, carrier], links[:, body])
+    return of_arm
 
 
 def packed_clearances(robot: Robot, settings: MotionModelSettings) -> PackedClearanceFn:
-    """The same for training, each trajectory in a scene of its own."""
+    """The inputs for a model with these settings, in training: each trajectory in a scene of its own."""
     arrays = compile_robot(robot)
 
     def clearances(scenes: PackedScenes, q: ndarray) -> ndarray:
-        given = arrays, scenes, q, settings.clearance_high
-        if settings.sees_gradients:
-            told = packed_clearances_and_gradients(*given, settings.gradient_margin)
-            return np.concatenate(told, axis=-1)
-        return packed_link_clearances(*given)
+        arguments = arrays, scenes, q, settings.clearance_high
+        if settings.clearance_gradients:
+            return np.concatenate(
+                packed_clearances_and_gradients(*arguments, settings.gradient_margin), axis=-1
+            )
+        return packed_link_clearances(*arguments)
 
     return clearances

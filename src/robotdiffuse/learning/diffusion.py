@@ -1,17 +1,15 @@
 """The forward process: x_t = signal_t x_0 + noise_t n, with n a Gaussian trajectory.
 
-A schedule gives signal and noise of the levels t = 0 .. T. For `cosine` and `linear` they are
-sqrt(alpha_bar_t) and sqrt(1 - alpha_bar_t), so that unit variance stays; `flow` is the straight line from the
-data to the noise.
+Signal and noise of the levels t = 0 .. T are sqrt(alpha_bar_t) and sqrt(1 - alpha_bar_t), so that unit
+variance is kept; alpha_bar follows the cosine schedule.
 
-The noise may be white over the waypoints (the paper's identity covariance) or have the covariance of the
-training trajectories over the waypoints. A trajectory is smooth, so white noise hides its low frequencies
-only at the very end of the schedule, and noisy trajectories look like none that a robot follows; with the
-data's covariance every frequency is hidden at the same rate, and clearances of noisy trajectories mean
-something.
+The noise is white over the waypoints (the paper's identity covariance), or has the covariance of the training
+trajectories over the waypoints. Trajectories are smooth, so white noise hides their low frequencies only at
+the very end of the schedule, and noisy trajectories look like none that a robot follows. With the data's
+covariance every frequency is hidden at the same rate, and clearances along noisy trajectories carry
+information.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -20,62 +18,19 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, NotNegative, OneOf, Settings
-
-Levels = tuple[Float[ndarray, "levels"], Float[ndarray, "levels"]]
-"""Signal and noise of the levels 0 .. T."""
-
-LINEAR_BETAS = (1e-4, 0.02)
-"""Variance that the first and last of LINEAR_STEPS steps add (Ho et al. 2020)."""
-LINEAR_STEPS = 1000
-
-
-def cosine(settings: "ScheduleSettings") -> Levels:
-    """Nichol and Dhariwal 2021, eq. 17."""
-    t = np.arange(settings.steps + 1) / settings.steps
-    curve = np.cos((t + settings.offset) / (1 + settings.offset) * np.pi / 2) ** 2
-    alpha_bar = np.maximum(curve / curve[0], settings.floor)
-    return np.sqrt(alpha_bar), np.sqrt(1 - alpha_bar)
-
-
-def linear(settings: "ScheduleSettings") -> Levels:
-    """Betas that grow evenly (Ho et al. 2020), scaled by 1000 / T so that any T ends at as little signal."""
-    betas = np.linspace(*LINEAR_BETAS, settings.steps) * (LINEAR_STEPS / settings.steps)
-    alpha_bar = np.concatenate([[1.0], np.cumprod(1 - betas)])
-    return np.sqrt(alpha_bar), np.sqrt(1 - alpha_bar)
-
-
-def flow(settings: "ScheduleSettings") -> Levels:
-    """x_t = (1 - t/T) x_0 + t/T n: rectified flow, flow matching (Lipman et al. 2023; Liu et al. 2023)."""
-    t = np.arange(settings.steps + 1) / settings.steps
-    return 1 - t, t
-
-
-SCHEDULES: dict[str, Callable[["ScheduleSettings"], Levels]] = {
-    "cosine": cosine,
-    "linear": linear,
-    "flow": flow,
-}
-"""Name in ScheduleSettings.kind: function."""
+from robotdiffuse.core.settings import Bound, NotNegative, Settings
 
 
 @dataclass(frozen=True)
 class ScheduleSettings(Settings, name="schedule"):
+    """The cosine schedule (Nichol and Dhariwal 2021, eq. 17)."""
+
     steps: Annotated[int, Bound(least=2.0, most=100_000.0)] = 200
     """T, the number of noise levels (paper: 200)."""
     offset: NotNegative = 0.008
-    """s of the cosine schedule (Nichol and Dhariwal 2021, eq. 17): the first levels are not too small."""
+    """The equation's s: it keeps the noise of the first levels from being too small."""
     floor: Annotated[float, Bound(above=0.0, below=1.0)] = 1e-4
-    """Least alpha_bar of the cosine schedule: the last level is noise but for this share of the variance."""
-    kind: Annotated[str, OneOf(SCHEDULES)] = "cosine"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.kind == "linear" and self.steps <= LINEAR_STEPS * LINEAR_BETAS[1]:
-            raise InputError(
-                f"schedule.steps is {self.steps}; the linear schedule needs more than "
-                f"{LINEAR_STEPS * LINEAR_BETAS[1]:.0f}, or its last step would leave no signal"
-            )
+    """Smallest alpha_bar: the share of the variance that is still signal at the last level."""
 
 
 class NoiseSchedule:
@@ -83,31 +38,36 @@ class NoiseSchedule:
 
     def __init__(self, settings: ScheduleSettings) -> None:
         self.settings = settings
-        signal, noise = SCHEDULES[settings.kind](settings)
-        self.signal: Float[ndarray, "levels"] = signal
+        t = np.arange(settings.steps + 1) / settings.steps
+        curve = np.cos((t + settings.offset) / (1 + settings.offset) * np.pi / 2) ** 2
+        alpha_bar = np.maximum(curve / curve[0], settings.floor)
+        self.signal: Float[ndarray, "levels"] = np.sqrt(alpha_bar)
         """Factor of the clean trajectory in x_t."""
-        self.noise: Float[ndarray, "levels"] = noise
+        self.noise: Float[ndarray, "levels"] = np.sqrt(1 - alpha_bar)
         """Factor of the unit noise in x_t."""
         with np.errstate(divide="ignore"):
-            self.half_log_snr: Float[ndarray, "levels"] = np.log(signal) - np.log(noise)
-            """lambda_t = log(signal / noise); inf at level 0, and -inf where a flow ends."""
+            self.half_log_snr: Float[ndarray, "levels"] = np.log(self.signal) - np.log(self.noise)
+            """Half the logarithm of the signal-to-noise ratio; inf at level 0."""
 
     @property
     def steps(self) -> int:
+        """T."""
         return self.settings.steps
 
     def weight(self, t: Int[ndarray, "n"], limit: float) -> Float[ndarray, "n"]:
         """Weight of the loss on x_0 at level t: 1 + SNR, at most `limit`.
 
-        1 + SNR is the weight that keeps the network's effective target at unit variance on every level
-        (Karras et al. 2022, table 1, for unit data variance); the limit is that of min-SNR weighting
-        (Hang et al. 2023).
+        With 1 + SNR the network's effective target has unit variance on every level (Karras et al. 2022,
+        table 1, for unit data variance); the limit is that of min-SNR weighting (Hang et al. 2023).
         """
         power = self.signal[t] ** 2 + self.noise[t] ** 2
         return power / np.maximum(self.noise[t] ** 2, power / limit)
 
     def sampling_levels(self, steps: int) -> Int[ndarray, "steps_and_1"]:
-        """The levels that a sampler of so many steps visits: from T to 0, evenly."""
+        """The levels that a sampler with this many steps visits, evenly spaced from T to 0.
+
+        Raises InputError unless steps is between 1 and T.
+        """
         if not 1 <= steps <= self.steps:
             raise InputError(f"sampling steps is {steps}; it must be between 1 and {self.steps}")
         return np.linspace(self.steps, 0, steps + 1).round().astype(np.int64)
@@ -116,18 +76,17 @@ class NoiseSchedule:
 def noise_factor(
     residuals: Float[ndarray, "n waypoints dof"], smooth: bool
 ) -> Float[ndarray, "waypoints waypoints"]:
-    """L such that noise L e, with e white, is zero on the first and last waypoint, of mean variance 1
-    between.
+    """The matrix L that makes noise L e of white noise e: zero at both ends, of mean variance 1 between them.
 
-    `residuals` are scaled to unit variance; for `smooth`, L Lᵀ is their covariance over the waypoints, with a
-    little white noise so that no direction is left without noise.
+    smooth: L Lᵀ is the covariance of the residuals over the waypoints, plus a little white noise so that
+    every direction has some; else L is `white_noise_factor`. residuals: scaled to unit variance.
     """
     waypoints = residuals.shape[1]
-    white = white_factor(waypoints)
+    white = white_noise_factor(waypoints)
     if not smooth:
         return white
-    rows = np.moveaxis(residuals, 1, 2).reshape(-1, waypoints).astype(np.float64)
-    covariance = rows.T @ rows / len(rows)
+    by_waypoint = np.moveaxis(residuals, 1, 2).reshape(-1, waypoints).astype(np.float64)
+    covariance = by_waypoint.T @ by_waypoint / len(by_waypoint)
     mean_variance = np.trace(covariance) / white.sum()
     covariance = covariance / mean_variance + 1e-4 * np.eye(waypoints)
     values, vectors = np.linalg.eigh(covariance)
@@ -135,6 +94,6 @@ def noise_factor(
     return white @ root
 
 
-def white_factor(waypoints: int) -> Float[ndarray, "waypoints waypoints"]:
-    """The same for noise that is white over the waypoints between the first and the last."""
+def white_noise_factor(waypoints: int) -> Float[ndarray, "waypoints waypoints"]:
+    """L of noise that is white between the first and the last waypoint, and zero at these."""
     return np.diag(np.r_[0.0, np.ones(waypoints - 2), 0.0])

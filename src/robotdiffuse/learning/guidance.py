@@ -4,37 +4,32 @@ The same steps serve in two places: a few of them inside the sampler, on the pre
 (guidance), and more of them on its output (refinement). The costs of waypoints q_i, with the paper's hinge
 h = max(S - D, 0) of a safe distance S and a distance D:
 
-| cost           | formula                                                        | switched on by |
-|----------------|----------------------------------------------------------------|----------------|
-| collision      | sum of h^2 / 2 over covering spheres; D is theirs to the scene | margin (S)     |
-| self_collision | sum of h^2 / 2 over their pairs; D is between two links        | self_margin    |
-| limits         | sum of h^2 / 2 over joints; D is theirs to the nearer limit    | limit_margin   |
-| smoothness     | sum of |q_(i-1) - 2 q_i + q_(i+1)|^2 / 2: accelerations        | smoothness     |
-| length         | sum of |q_(i+1) - q_i|^2 / 2: velocities                       | length         |
+| cost           | formula                                                             | enabled by  |
+|----------------|---------------------------------------------------------------------|-------------|
+| collision      | sum of h^2 / 2 over covering spheres; D: from sphere to scene       | margin (S)  |
+| self_collision | sum of h^2 / 2 over pairs of links; D: between the two links        | self_margin |
+| limits         | sum of h^2 / 2 over joints; D: from joint value to the nearer limit | limit_margin|
+| smoothness     | sum of |q_(i-1) - 2 q_i + q_(i+1)|^2 / 2: accelerations             | smoothness  |
+| length         | sum of |q_(i+1) - q_i|^2 / 2: velocities                            | length      |
 
-The first three are of single waypoints, which are pushed by the least motion that clears a contact (a
-Gauss-Newton step); a kernel spreads the pushes over the neighbouring waypoints, as the metric of CHOMP does
-(Zucker et al., IJRR 2013), whose smoothness is our length. Our smoothness is that of STOMP (Kalakrishnan et
-al., ICRA 2011). These two move one waypoint after the other towards its optimum between its neighbours.
+The first three concern single waypoints. Each waypoint is pushed by the smallest motion that clears a contact
+(a Gauss-Newton step), and a kernel spreads the pushes over the neighbouring waypoints, as the metric of CHOMP
+does (Zucker et al., IJRR 2013). Length is the smoothness of CHOMP, and smoothness that of STOMP (Kalakrishnan
+et al., ICRA 2011); these two move one waypoint after the other towards its optimum between its neighbours.
 
-Each is a file in `learning.costs` and a line in its table. A new one says its step down itself, and acts
-where `further` gives it a strength; the steps of these five are compiled, in `guidance_kernel.descend`. The
-cost of a problem's path constraints, `learning.costs.path_constraints`, comes with the problem.
+The steps of these five are compiled, in `guidance_kernel.descend`. Further costs are in `learning.costs`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import NotNegative, Positive, Settings, Share
-from robotdiffuse.learning.costs import COSTS
-from robotdiffuse.learning.costs.cost import Cost
+from robotdiffuse.learning.costs import COSTS, CostStep
 from robotdiffuse.learning.guidance_kernel import OFF, Steps, descend
 
 
@@ -42,29 +37,27 @@ from robotdiffuse.learning.guidance_kernel import OFF, Steps, descend
 class GuidanceSettings(Settings, name="guidance"):
     margin: NotNegative | None = 0.04
     """Distance to obstacles below which waypoints are pushed away [m]: the paper's safe distance S. It also
-    covers what lies between two waypoints. None: obstacles have no cost."""
+    covers the motion between two waypoints. None: obstacles have no cost."""
     self_margin: NotNegative | None = 0.01
-    """The same between links [m]."""
+    """Distance between links below which they are pushed apart [m]; None: no cost."""
     limit_margin: NotNegative | None = None
-    """The same of joint values to their limits [rad]. The limits themselves are always kept."""
+    """Distance of joint values to their limits below which they are pushed back [rad]; None: no cost. The
+    limits themselves are always kept."""
     push: Positive = 0.15
     """Longest push of a waypoint in one step [rad]."""
     width: Positive = 4.0
     """Waypoints over which a push spreads: the standard deviation of the kernel."""
     smoothness: Share = 0.0
-    """Share by which waypoints move towards the least accelerations after the pushes; 0: it has no cost."""
+    """After the pushes, waypoints move by this fraction towards the smallest accelerations; 0: no cost."""
     length: Share = 0.2
-    """Share by which waypoints move towards the middle of their neighbours after that; 0: it has no cost."""
-    further: dict[str, float] = field(default_factory=dict)
-    """Strengths of costs that are not of these, by name in `learning.costs.COSTS`."""
+    """Then waypoints move by this fraction towards the middle of their neighbours; 0: no cost."""
+    extra_costs: dict[str, float] = field(default_factory=dict)
+    """Strengths of further costs, by name in `learning.costs.COSTS`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in self.further:
-            if COSTS.load(name).step is None:
-                raise InputError(
-                    f"guidance.further names {name}; it has a setting, {COSTS.load(name).setting}"
-                )
+        for name in self.extra_costs:
+            COSTS.entry(name)
 
 
 class CollisionGuidance:
@@ -74,30 +67,25 @@ class CollisionGuidance:
         self,
         checker: CollisionChecker,
         settings: GuidanceSettings | None = None,
-        of_problem: Mapping[str, Cost] = MappingProxyType({}),
+        problem_costs: Sequence[CostStep] = (),
     ) -> None:
-        """`of_problem`: costs that the problem brings along, by name; their strength is the longest push."""
+        """problem_costs: costs of this problem alone; their strength is the setting `push`."""
         self.checker, self.settings = checker, settings or GuidanceSettings()
-        each = {name: (COSTS.load(name), strength) for name, strength in self.settings.further.items()}
-        self._further: dict[str, tuple[Cost, float]] = {
-            **each,
-            **{name: (cost, self.settings.push) for name, cost in of_problem.items()},
-        }
+        extra = [(COSTS.load(name), strength) for name, strength in self.settings.extra_costs.items()]
+        self._extra_costs: list[tuple[CostStep, float]] = extra + [
+            (step, self.settings.push) for step in problem_costs
+        ]
 
     def __call__(
-        self, q: Float[ndarray, "count waypoints dof"], steps: int, prefix: int = 1, suffix: int = 1
+        self, q: Float[ndarray, "count waypoints dof"], steps: int
     ) -> tuple[Float[ndarray, "count waypoints dof"], Float[ndarray, "count"]]:
-        """The trajectories after some steps, and the cost of their margins that the last step met.
+        """The trajectories [rad] after some steps, and the costs of the margins that the last step found.
 
-        The first `prefix` and the last `suffix` waypoints stay where they are, and have no cost. Cost zero:
-        no waypoint between is within the margins, or it was so before the last step. Such a trajectory is
-        left as it is; only where no margin is on do smoothness and length act on all.
+        The first and the last waypoint stay where they are, and have no cost. A cost of zero: no waypoint
+        between them is within a margin, or none was before the last step. Such a trajectory is left as it is;
+        smoothness and length act on every trajectory only where no margin is enabled.
         """
         settings, checker = self.settings, self.checker
-        if min(prefix, suffix) < 1:
-            raise InputError(
-                f"prefix and suffix of guidance are {prefix} and {suffix}; both must be at least 1"
-            )
         index = np.arange(q.shape[1])
         kernel = np.exp(-0.5 * ((index[:, None] - index) / settings.width) ** 2).astype(np.float32)
         moved = np.array(q, np.float32)
@@ -111,28 +99,11 @@ class CollisionGuidance:
             smoothness=np.float32(settings.smoothness),
             length=np.float32(settings.length),
         )
-        further = self._further.values()
-        costs, free = np.zeros(len(q), np.float32), slice(prefix, q.shape[1] - suffix)
-        # one round at a time only where not all of it is compiled
-        for count in [1] * steps if further else [steps]:
+        costs = np.zeros(len(q), np.float32)
+        # one round at a time only if some of the steps are not compiled
+        for rounds in [1] * steps if self._extra_costs else [steps]:
             arrays = checker.robot_arrays, checker.scene_arrays
-            costs = descend(*arrays, moved, lower, upper, compiled, prefix, suffix, count)
-            for cost, strength in further:
-                assert cost.step is not None  # by GuidanceSettings
-                moved[:, free] = np.clip(cost.step(checker, moved, strength)[:, free], lower, upper)
+            costs = descend(*arrays, moved, lower, upper, compiled, rounds)
+            for step, strength in self._extra_costs:
+                moved[:, 1:-1] = np.clip(step(checker, moved, strength)[:, 1:-1], lower, upper)
         return moved, costs
-
-    def costs(self, q: Float[ndarray, "count waypoints dof"]) -> dict[str, Float[ndarray, "count"]]:
-        """The cost functions by name, all waypoints counted; those whose margin is None are left out.
-
-        In rad² but for the collision costs, in m². Not what the steps compute with: the formulas as they
-        are, to look at and to test against.
-        """
-        compiled = {name: cost for name in COSTS if (cost := COSTS.load(name)).setting}
-        every = {name: (cost, getattr(self.settings, cost.setting)) for name, cost in compiled.items()}
-        every.update(self._further)
-        return {
-            name: cost.value(self.checker, q, strength)
-            for name, (cost, strength) in every.items()
-            if strength is not None
-        }

@@ -1,4 +1,4 @@
-"""Compiled descent of whole trajectories down their costs; `guidance` has the costs' formulas and sources."""
+"""Compiled steps of whole trajectories down their costs; `guidance` states the formulas and their sources."""
 
 from typing import NamedTuple
 
@@ -15,11 +15,11 @@ from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspa
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 OFF = -CAP
-"""A margin that nothing is ever within: the cost does not act."""
+"""The margin of a cost that is not enabled: nothing is ever within it."""
 
 
 class Steps(NamedTuple):
-    """What one round of steps does: `GuidanceSettings` as compiled code takes them."""
+    """Parameters of one round of steps: `GuidanceSettings` in the types that compiled code takes."""
 
     margin: np.float32
     """[m] here and below, or OFF."""
@@ -34,17 +34,16 @@ class Steps(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def descend(robot, scene, q, lower, upper, steps, prefix, suffix, count):
-    """Moves trajectories q[batch, waypoints, dof] by `count` rounds, in place; the first `prefix` and the
-    last `suffix` waypoints, at least one each, stay. Returns the margins' costs [batch] that the last round
-    met.
+def descend(robot, scene, q, lower, upper, steps, rounds):
+    """Moves trajectories q [batch, waypoints, dof] by some rounds, in place; the first and the last waypoint
+    stay. Returns the costs of the margins [batch] that the last round found.
 
     Each waypoint within a margin is pushed out of it, the pushes are spread over its neighbours, then the
-    steps of smoothness and length follow. A trajectory of which no waypoint is within a margin is left as it
-    is, unless no margin is on.
+    steps of smoothness and length follow. A trajectory without a waypoint within a margin is left as it is,
+    unless no margin is enabled.
     """
     batch, n, dof = q.shape
-    first, last = prefix, n - suffix
+    first, last = 1, n - 1
     scratch = make_cost_workspace(dof)
     pushes, active = np.empty((n, dof), np.float32), np.empty(n, np.float32)
     gradient = np.empty(dof, np.float32)
@@ -53,7 +52,7 @@ def descend(robot, scene, q, lower, upper, steps, prefix, suffix, count):
     pairs = np.full((n, len(robot.pairs)), CAP)
     pushed = max(steps.margin, steps.self_margin, steps.limit_margin) > OFF
     for b in range(batch):
-        for _ in range(count):
+        for _ in range(rounds):
             total = _ZERO
             if steps.self_margin > OFF:
                 pair_clearances_into(robot, q[b], steps.self_margin, work, pairs)
@@ -83,7 +82,8 @@ def descend(robot, scene, q, lower, upper, steps, prefix, suffix, count):
 def _push_away(cost, gradient, push, pushed):
     """The Gauss-Newton step -g 2c / (g.g) of the collision costs, at most `push` [rad], into pushed[dof].
 
-    For one contact it is just what clears it, whatever the scale. Returns 1 if there is one, else 0.
+    For a single contact this step just clears it, whatever the scale of the cost. Returns 1 if there is a
+    contact, else 0.
     """
     pushed[:] = _ZERO
     square = _ZERO
@@ -100,9 +100,10 @@ def _push_away(cost, gradient, push, pushed):
 
 @njit(cache=True)
 def _push_inside(q, lower, upper, margin, push, pushed):
-    """Adds to pushed[dof] the Newton step of the limits' cost, each at most `push` [rad]. Returns the cost.
+    """Adds the Newton step of the limits' cost, at most `push` [rad] per joint, to pushed[dof]. Returns the
+    cost.
 
-    Where a joint's range is narrower than two margins, its middle is far enough from both limits.
+    If a joint's range is narrower than two margins, the middle of the range has no cost.
     """
     cost = _ZERO
     for j in range(len(q)):
@@ -115,8 +116,7 @@ def _push_inside(q, lower, upper, margin, push, pushed):
 
 @allocation_free(fastmath=True)
 def _spread(q, first, last, pushes, active, kernel, lower, upper):
-    """Each waypoint takes a weighted mean of the pushes of its neighbours, falling off where none is
-    pushed."""
+    """Moves each waypoint by a weighted mean of its neighbours' pushes, less where no neighbour is pushed."""
     dof = q.shape[1]
     for i in range(first, last):
         weight = _ZERO
@@ -136,8 +136,8 @@ def _spread(q, first, last, pushes, active, kernel, lower, upper):
 
 @allocation_free(fastmath=True)
 def _smooth(q, first, last, share, lower, upper):
-    """Each waypoint by a share of the way to where the accelerations that it is part of are smallest:
-    Newton's step in that waypoint alone. Every third waypoint at a time, for these do not meet."""
+    """Moves each waypoint by a share of Newton's step in that waypoint alone, towards the smallest
+    accelerations that it is part of. Every third waypoint at a time: these share no acceleration."""
     n, dof = q.shape
     for offset in range(3):
         for i in range(first + offset, last, 3):
@@ -156,8 +156,8 @@ def _smooth(q, first, last, share, lower, upper):
 
 @allocation_free(fastmath=True)
 def _shorten(q, first, last, share):
-    """Each waypoint by a share of the way to the middle of its neighbours, where the two steps that it is
-    part of are shortest: Newton's step in that waypoint alone. Every second waypoint at a time."""
+    """Moves each waypoint by a share of the way to the middle of its neighbours, which is Newton's step in
+    that waypoint alone. Every second waypoint at a time: these share no segment."""
     dof = q.shape[1]
     for parity in range(2):
         for i in range(first + parity, last, 2):

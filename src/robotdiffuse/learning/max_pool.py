@@ -1,7 +1,7 @@
-"""The maximum over the points of a cloud, or of a group of them, that training on a CPU waits for the least.
+"""Max pooling over the points of a cloud, or of a group of points, with a fast gradient on CPUs.
 
-The gradient of PyTorch's takes longer than the layers before it; without a gradient PyTorch's is the faster
-one, and planning need not load compiled code for it.
+The gradient of PyTorch's `amax` takes longer than the layers before it. Without a gradient `amax` is faster,
+and planning need not load compiled code.
 """
 
 from typing import Any
@@ -14,16 +14,16 @@ from numpy import ndarray
 from torch import Tensor
 
 
-def greatest(x: Float[Tensor, "groups rows width"]) -> Float[Tensor, "groups width"]:
-    """The maximum over the rows; of equal ones the first has the gradient. At most 32,767 rows."""
-    return _Greatest.apply(x.contiguous()) if x.requires_grad and not x.is_cuda else x.amax(1)
+def max_pool(x: Float[Tensor, "groups rows width"]) -> Float[Tensor, "groups width"]:
+    """The maximum over the rows; among equal rows the first gets the gradient. At most 32,767 rows."""
+    return _MaxPool.apply(x.contiguous()) if x.requires_grad and not x.is_cuda else x.amax(1)
 
 
-class _Greatest(torch.autograd.Function):
+class _MaxPool(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         best, which = x.new_empty(len(x), x.shape[2]), x.new_empty(len(x), x.shape[2], dtype=torch.int16)
-        _take(_bits(x), _bits(best), which.numpy())
+        _forward(_bits(x), _bits(best), which.numpy())
         ctx.save_for_backward(which)
         ctx.rows = x.shape[1]
         return best
@@ -32,21 +32,22 @@ class _Greatest(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         (which,) = ctx.saved_tensors
         out = gradients[0].new_empty(len(which), ctx.rows, which.shape[1])
-        _put_back(_bits(gradients[0].contiguous()), which.numpy(), _bits(out))
+        _backward(_bits(gradients[0].contiguous()), which.numpy(), _bits(out))
         return out
 
 
 def _bits(x: Tensor) -> ndarray:
-    """The same memory as integers."""
+    """The memory of a tensor, viewed as integers."""
     return x.detach().view(torch.int16 if x.dtype == torch.bfloat16 else torch.int32).numpy()
 
 
 @njit(cache=True, nogil=True)
-def _take(values, best, which):
-    """The greatest of each group's rows: values [groups, rows, width] to best and which [groups, width].
+def _forward(values, best, which):
+    """Writes the maximum over each group's rows of values [groups, rows, width] to best, its row to which.
 
     `values` are the bits of floating-point numbers as signed integers of the same size, int16 of bfloat16 or
-    int32 of float32, and so is `best`; `which` is int16. Of equal ones the first counts.
+    int32 of float32, and so is best [groups, width]; which [groups, width] is int16. Of equal rows the first
+    counts.
     """
     groups, rows, width = values.shape
     sign = values.dtype.type(8 * values.itemsize - 1)
@@ -70,9 +71,9 @@ def _take(values, best, which):
 
 
 @njit(cache=True, nogil=True)
-def _put_back(gradients, which, out):
-    """The gradient of `_take`: out [groups, rows, width] is `gradients` [groups, width] where the greatest
-    were and 0 elsewhere, as bits too."""
+def _backward(gradients, which, out):
+    """Writes the gradient of `_forward` to out [groups, rows, width]: `gradients` [groups, width] at the
+    maxima, 0 elsewhere, all as bits."""
     groups, rows, width = out.shape
     for i in range(groups):
         for r in range(rows):

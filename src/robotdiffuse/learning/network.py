@@ -1,4 +1,4 @@
-"""What every trained network has, so that one checkpoint format keeps them all."""
+"""The base class of all trained networks of a robot, so that one checkpoint format holds them all."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from robotdiffuse.learning.robot_identity import RobotIdentity
 
 
 class Network(nn.Module):
-    """A network for one robot; made from a `RobotIdentity` and settings of the class that NETWORKS names."""
+    """A network for one robot, made from a `RobotIdentity` and settings of the class that NETWORKS names."""
 
     robot: RobotIdentity
     settings: Any

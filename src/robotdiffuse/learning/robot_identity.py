@@ -1,4 +1,4 @@
-"""Which robot a network's weights are for."""
+"""Identifies the robot that a network's weights were trained for."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,25 +13,25 @@ from robotdiffuse.robots.robot import Robot, once_per_robot
 if TYPE_CHECKING:
     from robotdiffuse.robots.normalizer import JointNormalizer
 
-CLOSE = 1e-3
-"""Dimensions are the same within this [m], and entries of rotations."""
+DIMENSION_TOLERANCE = 1e-3
+"""Robots are the same if their dimensions [m] and entries of rotations differ by less than this."""
 
 
 @dataclass(frozen=True)
 class RobotIdentity(Settings):
-    """What weights keep of the robot that they are trained for."""
+    """The robot that weights were trained for, as checkpoints describe it."""
 
     source: str
-    """Bundled name, or path to the URDF that it was read from."""
+    """Bundled name, or path to its URDF."""
     joint_names: tuple[str, ...]
     lower: tuple[float, ...]
-    """Limits that joint values are normalised by [rad], [m] for prismatic joints. A robot with others will
-    do: the validator knows its own."""
+    """Limits that joint values are normalised by [rad], [m] for prismatic joints. The weights serve robots
+    with other limits too: validation uses the limits of the robot itself."""
     upper: tuple[float, ...]
     frame_offsets: tuple[tuple[tuple[float, ...], ...], ...]
-    """`Robot.frame_offsets`, to tell robots of the same joints but other measures."""
+    """`Robot.frame_offsets`, to distinguish robots with the same joint names but other dimensions."""
     links: tuple[str, ...]
-    """Links with collision spheres that some planned joint moves, in the order of link clearances."""
+    """Moving links with collision spheres, in the order of link clearances."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -45,7 +45,8 @@ class RobotIdentity(Settings):
     @staticmethod
     @once_per_robot
     def of(robot: Robot) -> "RobotIdentity":
-        """Of the bare arm: what it holds changes nothing about its joints."""
+        """The identity of a robot: that of its bare arm, since attached bodies change nothing about its
+        joints."""
         robot = robot.arm
         return RobotIdentity(
             source=robot.source or robot.name,
@@ -61,23 +62,24 @@ class RobotIdentity(Settings):
         return len(self.joint_names)
 
     def normalizer(self) -> "JointNormalizer":
-        from robotdiffuse.robots.normalizer import JointNormalizer  # which loads PyTorch
+        from robotdiffuse.robots.normalizer import JointNormalizer  # loads PyTorch
 
         return JointNormalizer(np.array(self.lower), np.array(self.upper))
 
     def difference(self, robot: Robot) -> str:
-        """What the robot has that this one has not, "" if it is the same."""
+        """How the robot differs from this one; "" if it is the same."""
         its = RobotIdentity.of(robot)
         if its.joint_names != self.joint_names:
             return f"joints {joined(its.joint_names)}"
-        if not np.allclose(its.frame_offsets, self.frame_offsets, atol=CLOSE):
+        if not np.allclose(its.frame_offsets, self.frame_offsets, atol=DIMENSION_TOLERANCE):
             return "other dimensions"
         if its.links != self.links:
             return f"spheres on the links {joined(its.links)}, not {joined(self.links)}"
         return ""
 
     def check(self, robot: Robot, where: str) -> None:
-        """Raises InputError unless the weights are for this robot. `where` names them."""
+        """Raises InputError unless the weights are for this robot. where: names the weights in the
+        message."""
         other = self.difference(robot)
         if other:
             raise InputError(

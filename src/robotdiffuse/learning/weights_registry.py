@@ -1,29 +1,32 @@
-"""Which weights there are, told without loading them or PyTorch."""
+"""Finds trained weights for a robot without loading them or PyTorch."""
 
 import json
+import os
 from functools import lru_cache
 from pathlib import Path as FilePath
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.input_files import is_file
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.user_data_dir import user_robots
 
 BUNDLED = FilePath(__file__).parent / "weights"
-"""Weights that come with the package, one folder per robot."""
+"""Folder of the weights that come with the package; those for a robot are in a folder of its name."""
 
 
 def user_weights(robot: Robot) -> FilePath:
-    """The folder for weights that were trained here for a robot: beside the user's robots, by its name."""
+    """The folder of weights that the user trained for a robot, in the user's data folder."""
     return user_robots() / robot.name / "weights"
 
 
 def weights_for(name: str, robot: Robot) -> FilePath | None:
-    """The folder with weights of a network, as NETWORKS names it, for this very robot; None if there is none.
+    """The folder with weights of a network (a name in NETWORKS) for exactly this robot; None if there is
+    none.
 
-    Those that were trained here come before those of the package. Raises InputError, naming the file, for a
-    description that is damaged.
+    The user's weights take precedence over those of the package. Raises InputError, naming the file, for a
+    damaged description.
     """
     for place in (user_weights(robot), BUNDLED / robot.name):
         file = place / f"{name}.json"
@@ -48,11 +51,12 @@ def _identity(file: FilePath, _changed: int) -> RobotIdentity:
 def check_weights(name: str, folder: str | FilePath | None) -> None:
     """Raises InputError if a folder is given that holds no weights of this network."""
     NETWORKS.entry(name)
-    if folder is not None and not (FilePath(folder) / f"{name}.json").is_file():
-        raise untrained(name, f"{folder} holds no {name}")
+    if folder is not None and not is_file(FilePath(folder) / f"{name}.json"):
+        what = f"{folder} holds no {name}" if os.path.isdir(folder) else f"there are no weights {folder}"
+        raise no_weights_error(name, what)
 
 
-def untrained(name: str, what: str) -> InputError:
-    """What to do where there are no weights."""
+def no_weights_error(name: str, what: str) -> InputError:
+    """The error for missing weights: `what` is missing, and the command that trains it."""
     how = NETWORKS[name].kind or f"baseline {name} --data FOLDER --out FOLDER"
     return InputError(f"{what}; train them: robotdiffuse train {how}")

@@ -1,7 +1,7 @@
 """How likely a motion is free of what no camera saw: fitted on the calibration half of the problems of
-`benchmarks/unseen.py`.
+`benchmarks/cameras.py`.
 
-python benchmarks/unseen.py --fit
+python benchmarks/cameras.py --fit
 """
 
 import math

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import FASTEST, numbers, rigid_transform, vector
+from robotdiffuse.core.bounds import MAX_RATE, Value, numbers, rigid_transform, vector
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.scenes.shapes import PointCloud
 
@@ -23,7 +23,7 @@ CLOUD_WIDTH, CLOUD_HEIGHT = 320, 240
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class DepthView:
+class DepthView(Value):
     """A depth image of a pinhole camera, in the frame of the robot's base.
 
     A pixel without a return, 0, negative or not a number, says nothing: neither that space is free nor that
@@ -49,7 +49,7 @@ class DepthView:
         if depth is None or depth.ndim != 2 or depth.size == 0:
             form = "not numbers" if depth is None else f"an array of {' x '.join(map(str, depth.shape))}"
             raise InputError(f"view.depth is {form}; it must be an image of height x width")
-        intrinsics = vector("view", "intrinsics", self.intrinsics, 4, FASTEST)
+        intrinsics = vector("view", "intrinsics", self.intrinsics, 4, MAX_RATE)
         if min(intrinsics[:2]) < LEAST_FOCAL:
             least = f"fx and fy must be at least {LEAST_FOCAL:g} [pixels]"
             raise InputError(f"view.intrinsics is {shown(intrinsics)}; {least}")
@@ -66,6 +66,7 @@ class DepthView:
             "configuration": configuration,
         }.items():
             object.__setattr__(self, key, value)
+        super().__post_init__()
 
     if TYPE_CHECKING:
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.free_space_kernel import BEHIND, FREE, OUT, SHADOW, carve
@@ -68,7 +69,7 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof
         spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
         spheres[:, 3] += ARM_MARGIN
         carve(
-            view.depth,
+            for_kernels(view.depth, np.float32),
             np.array(view.intrinsics, np.float32),
             T.astype(np.float32),
             spheres.astype(np.float32),

@@ -7,6 +7,7 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.perception.seen_points_kernel import (
     gather_cloud,
@@ -64,10 +65,11 @@ def seen_points(
                 count,
             )
             if view.cloud is not None:
-                count = gather_cloud(view.cloud, *rest)
+                count = gather_cloud(for_kernels(view.cloud), *rest)
             else:
+                image = for_kernels(view.depth, np.float32)
                 intrinsics = tuple(map(np.float32, view.intrinsics))
-                count = gather_image(view.depth, intrinsics, view.T_base_camera.astype(np.float32), *rest)
+                count = gather_image(image, intrinsics, view.T_base_camera.astype(np.float32), *rest)
             if count < 0:
                 break
         if count >= 0:

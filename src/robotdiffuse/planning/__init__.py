@@ -5,9 +5,10 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import SHORT
+from robotdiffuse.core.types import CONVERGED
 
 if TYPE_CHECKING:
     from robotdiffuse.core.results import PlanResult
@@ -120,7 +121,7 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
         if PLANNERS.entry(name).kind == SEARCH:
             learned = ", ".join(other for other, its in PLANNERS.items() if its.kind != SEARCH)
             raise InputError(f"planner {name} has no weights; those that have: {learned}")
-        settings = PLANNERS.settings(name)(weights=weights)  # type: ignore[misc]
+        settings = PLANNERS.settings(name)(weights=str(file_name(weights, "weights")))  # type: ignore[misc]
     return PLANNERS.make(name, settings)
 
 
@@ -144,7 +145,7 @@ def plan(
     problem: "Problem",
     time_limit: float = 1.0,
     seed: int = 0,
-    until: str = SHORT,
+    until: str = CONVERGED,
     clearance: float | None = None,
     velocity_scaling: float = 1.0,
     acceleration_scaling: float = 1.0,

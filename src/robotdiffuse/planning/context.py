@@ -2,8 +2,10 @@
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from numbers import Integral, Real
 from typing import Annotated
 
 import numpy as np
@@ -11,14 +13,22 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import compile_seconds
-from robotdiffuse.core.bounds import LARGEST
-from robotdiffuse.core.deadline import OutOfTimeError, check_left
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.bounds import MAX_COORDINATE
+from robotdiffuse.core.deadline import OutOfTimeError, check_left, deadline
+from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Bound, OneOf, Positive, Settings
-from robotdiffuse.core.types import SHORT, UNTIL, Path, Status, Trajectory
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.trajectories.speed_limits import DEFAULT, NOTHING, Beside, Pace, TimingSettings
+from robotdiffuse.core.settings import Bound, OneOf, Settings
+from robotdiffuse.core.types import CONVERGED, UNTIL, Path, Status, Trajectory
+from robotdiffuse.problems.problem import Problem, check_problem
+from robotdiffuse.trajectories.speed_limits import (
+    DEFAULT,
+    NOTHING,
+    Beside,
+    Jerk,
+    Pace,
+    Scaling,
+    TimingSettings,
+)
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import Report, Verifier, Violation, verifier
 
@@ -40,11 +50,11 @@ _finishing: dict[str, float] = {}
 class Request(Settings):
     """What a call may ask for beyond its time limit and seed; see `planning.planner.Planner.plan`."""
 
-    until: Annotated[str, OneOf(UNTIL)] = SHORT
-    clearance: Annotated[float, Bound(least=0.0, most=LARGEST)] | None = None
-    velocity_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
-    acceleration_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
-    jerk: Positive | None = None
+    until: Annotated[str, OneOf(UNTIL)] = CONVERGED
+    clearance: Annotated[float, Bound(least=0.0, most=MAX_COORDINATE)] | None = None
+    velocity_scaling: Scaling = 1.0
+    acceleration_scaling: Scaling = 1.0
+    jerk: Jerk | None = None
 
 
 @lru_cache
@@ -58,6 +68,16 @@ def _timing(request: Request, constrained: bool) -> TimingSettings:
     )
 
 
+def check_asked(problem: object, time_limit: object, seed: object) -> None:
+    """Raises InputError for what is no problem, a time limit that is not positive and a seed that is no
+    whole number from 0 on."""
+    check_problem(problem)
+    if not isinstance(time_limit, Real) or not 0 < float(time_limit) < float("inf"):
+        raise InputError(f"time_limit is {shown(time_limit)}; it must be a positive number of seconds")
+    if not isinstance(seed, Integral) or seed < 0:
+        raise InputError(f"seed is {shown(seed)}; it must be a whole number, at least 0")
+
+
 class PlanningContext:
     """One call of plan(); see the head of this file."""
 
@@ -69,12 +89,9 @@ class PlanningContext:
         seed: int,
         request: Request = Request(),
     ) -> None:
-        """Starts the clock. Raises InputError for a time limit that is not positive or a negative seed."""
+        """Starts the clock. Raises InputError as `check_asked`."""
         self.started, self._compiled = time.perf_counter(), compile_seconds()
-        if not 0 < time_limit < float("inf"):
-            raise InputError(f"time_limit is {time_limit}; it must be a positive number of seconds")
-        if seed < 0:
-            raise InputError(f"seed is {seed}; it must be at least 0")
+        check_asked(problem, time_limit, seed)
         self.planner, self.problem, self.time_limit, self.seed = planner, problem, time_limit, seed
         self.until = request.until
         wanted = (request.clearance, problem.clearance, CLEARANCE)
@@ -86,7 +103,8 @@ class PlanningContext:
         self.notes = list(problem.notes)
         """What the result will say was changed or ignored; planners may add to it."""
         self._progress: list[tuple[float, float]] = []
-        self._refused = self._no_time_for = ""
+        self._refused = ""
+        self._ended: tuple[Status, str] | None = None
 
     @cached_property
     def rng(self) -> np.random.Generator:
@@ -129,7 +147,7 @@ class PlanningContext:
     @property
     def remaining(self) -> float:
         """Wall time left for searching [s]; negative when it has run out, or is too short for the validator."""
-        return -1.0 if self._no_time_for else self.search_until - self.elapsed
+        return -1.0 if self._ended else self.search_until - self.elapsed
 
     def fail(self, status: Status, reason: str) -> PlanResult:
         """A result without a motion."""
@@ -146,8 +164,8 @@ class PlanningContext:
 
     def unsolved(self, reason: str = "") -> PlanResult:
         """A result without a path: TIMEOUT if time has run out, else NO_PATH, for a search that ended."""
-        if self._no_time_for:
-            return self.out_of_time(self._no_time_for)
+        if self._ended:
+            return self.fail(*self._ended)
         if self.remaining <= 0:
             tried = (
                 f"no path was found in {self.elapsed:.2f} s; a longer time limit or another seed may find one"
@@ -156,10 +174,22 @@ class PlanningContext:
         ended = f"the search ended after {self.elapsed:.2f} s without a path; another seed may find one"
         return self.fail(Status.NO_PATH, reason or ended)
 
-    def out_of_time(self, step: str) -> PlanResult:
-        """A result for a scene whose preparation takes longer than the call may."""
-        limit = f"the time limit of {self.time_limit:g} s is too short to prepare the scene"
-        return self.fail(Status.TIMEOUT, f"{limit}: there was no time for {step}")
+    def deadline(self) -> AbstractContextManager[None]:
+        """The call's time holds for steps far below while this lasts: they raise OutOfTimeError."""
+        return deadline(lambda: self.time_limit - self.elapsed)
+
+    def out_of_time(self, error: OutOfTimeError) -> PlanResult:
+        """A result for a scene whose preparation, or a motion whose timing, takes longer than it may."""
+        return self.fail(Status.TIMEOUT, self._too_short(error))
+
+    def _too_short(self, error: OutOfTimeError) -> str:
+        limit = f"the time limit of {self.time_limit:g} s is too short {error.what}"
+        return f"{limit}: there was no time for {error}"
+
+    @property
+    def ended(self) -> bool:
+        """Whether no path can be finished any more; `unsolved` says why."""
+        return self._ended is not None
 
     def finish(
         self,
@@ -177,9 +207,10 @@ class PlanningContext:
         """
         began = self.elapsed
         try:
-            result = self._finished(waypoints, stage, reason, notes, keeps, deviations)
+            with self.deadline():
+                result = self._finished(waypoints, stage, reason, notes, keeps, deviations)
         except OutOfTimeError as error:
-            self._no_time_for = str(error)
+            self._ended = Status.TIMEOUT, self._too_short(error)
             return None
         took = self.elapsed - began
         before = _finishing.get(self.problem.robot.name, took)
@@ -216,6 +247,8 @@ class PlanningContext:
         )
         timed = motion.report(trajectory)
         if timed.violation is not None:
+            if timed.violation.kind == "time":  # too long to be validated, as any other motion here would be
+                self._ended = Status.NO_PATH, timed.violation.message
             return self._refuse(timed.violation)
         scene = _least(report.scene_clearance, timed.scene_clearance)
         itself = _least(report.self_clearance, timed.self_clearance)

@@ -7,15 +7,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import rigid_transform
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.bounds import Value, rigid_transform
+from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.assumptions import FINE, fine, voxels_in
 from robotdiffuse.perception.observed_volume import LOW, observe
 from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.perception.unknown_space import UnknownSpace
 from robotdiffuse.perception.visibility_kernel import seen_weights
-from robotdiffuse.problems.problem import PREDICTED, Problem
+from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
 RING = 1.6
@@ -31,7 +31,7 @@ LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class NextView:
+class NextView(Value):
     """A camera pose, and what it is worth."""
 
     T_base_camera: Float[ndarray, "4 4"]
@@ -57,6 +57,8 @@ def next_view(
     the problem's start. With another policy than `predicted`, each unknown voxel that is swept counts the same.
     Raises InputError without views, without a motion and without poses.
     """
+    check_problem(problem)
+    check_type("result", result, PlanResult, "a PlanResult, as of rd.plan")
     if not problem.views:
         raise InputError("next_view: the problem has no views; it is for scenes that cameras saw")
     if result.path is None:

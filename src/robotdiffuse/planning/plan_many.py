@@ -6,17 +6,18 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields, replace
+from numbers import Integral
 from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.processes import LoneWorker
+from robotdiffuse.core.processes import SingleWorker, NotStartedError, check_not_importing
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
 from robotdiffuse.planning.context import PlanningContext, Request
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.robot import Robot
 
 
@@ -35,14 +36,21 @@ def plan_many(
     request: arguments of `Planner.plan`, the same for all problems: time_limit, seed, until, ...
 
     A problem that raises an error, or whose process dies of it, has a result with status ERROR; the others go
-    on. A process compiles or loads its code before its first problem, outside the time limit.
+    on. Processes import the main script: without the line `if __name__ == "__main__":` above what it does,
+    all results have status ERROR. A process compiles or loads its code before its first problem, outside the
+    time limit.
 
     Raises InputError for an unknown planner, settings or weights that it cannot have, arguments that are
     wrong, and a number of workers below 1.
     """
+    check_not_importing()
+    if isinstance(problems, str) or not isinstance(problems, Iterable):
+        raise InputError(f"problems is {shown(problems)}; it must be a list of Problems")
     problems = list(problems)
-    if workers is not None and workers < 1:
-        raise InputError(f"workers is {workers}; it must be at least 1")
+    for i, problem in enumerate(problems):
+        check_problem(problem, f"problems[{i}]")
+    if workers is not None and not (isinstance(workers, Integral) and workers >= 1):
+        raise InputError(f"workers is {shown(workers)}; it must be a whole number, at least 1")
     unknown = set(request) - ARGUMENTS
     if unknown:
         raise InputError(f"unknown argument {shown(min(unknown))}; known: {', '.join(sorted(ARGUMENTS))}")
@@ -68,16 +76,23 @@ def _planned(
     robots = list(dict.fromkeys(problem.robot for problem in problems))
     number = {robot: i for i, robot in enumerate(robots)}
     bare = [replace(robot) for robot in robots]
-    pool = [LoneWorker(_prepare, (loaded, bare, request)) for _ in range(workers)]
-    idle: queue.SimpleQueue[LoneWorker] = queue.SimpleQueue()
+    pool = [SingleWorker(_prepare, (loaded, bare, request)) for _ in range(workers)]
+    idle: queue.SimpleQueue[SingleWorker] = queue.SimpleQueue()
     for worker in pool:
         idle.put(worker)
 
+    not_started: list[NotStartedError] = []
+
     def one(problem: Problem) -> PlanResult:
+        if not_started:  # nor would the next process
+            return _error(loaded[0], problem, str(not_started[0]), request)
         asked = tuple(getattr(problem, field.name) for field in fields(problem) if field.name != "robot")
         worker = idle.get()
         try:
             return replace(worker.call(_plan, number[problem.robot], asked), problem=problem)
+        except NotStartedError as error:
+            not_started.append(error)
+            return _error(loaded[0], problem, str(error), request)
         except BrokenProcessPool:
             return _error(loaded[0], problem, "the process of the planner died of this problem", request)
         except Exception as error:

@@ -6,12 +6,12 @@ from dataclasses import replace
 from typing import ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motions import finer
-from robotdiffuse.core.deadline import OutOfTimeError, deadline
+from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import FIRST, SHORT
-from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.core.types import FIRST, CONVERGED
+from robotdiffuse.planning.context import PlanningContext, Request, check_asked
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
@@ -50,7 +50,7 @@ class Planner(ABC, Generic[Own]):
         problem: Problem,
         time_limit: float = 1.0,
         seed: int = 0,
-        until: str = SHORT,
+        until: str = CONVERGED,
         clearance: float | None = None,
         velocity_scaling: float = 1.0,
         acceleration_scaling: float = 1.0,
@@ -61,14 +61,16 @@ class Planner(ABC, Generic[Own]):
         The same seed gives the same path, as long as time does not run out. A result with status SOLVED holds
         a path and a trajectory that passed `verify`; any other status comes with a reason.
 
-        until: "first" ends with the first verified motion, "short" when more time stops paying, "limit" when
-            time runs out; planners that cannot improve a path always end with their first.
+        until: "first" ends with the first verified motion, "converged" when more time stops paying,
+            "time_limit" when time runs out; planners that cannot improve a path always end with their first.
         clearance: distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
             and passages allow it [m]; where they do not, less, and a note says so. None: what the problem
             says, or 1 cm. The other planners have settings of their own, or keep what their motions have;
             they refuse one that is asked for.
-        velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses.
-        jerk: most jerk of any joint of the timed motion [rad/s³]. None: no limit, the fastest motion.
+        velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses, from
+            0.001 to 1.
+        jerk: most jerk of any joint of the timed motion [rad/s³], at least 0.01. None: no limit, the fastest
+            motion.
 
         Where the problem has waypoints, the motion stops at each or passes within its blend:
         `planning/pipeline/waypoints.py`. Where obstacles move, it waits, goes slower or draws back on its path:
@@ -80,6 +82,7 @@ class Planner(ABC, Generic[Own]):
         Raises InputError for arguments that are none of these, for what the planner cannot keep, and where
         `prepare` does.
         """
+        check_asked(problem, time_limit, seed)
         request = Request(until, clearance, velocity_scaling, acceleration_scaling, jerk)
         self._check_keeps(problem, request)
         self.prepare(problem.robot)
@@ -114,12 +117,12 @@ class Planner(ABC, Generic[Own]):
     def attempt(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
         """`plan` in the problem's scene as it is."""
         context = PlanningContext(self.name, problem, time_limit, seed, request)
-        with deadline(lambda: context.time_limit - context.elapsed):
+        with context.deadline():
             try:
                 start_goal = usable_start_goal(context)
                 return start_goal if isinstance(start_goal, PlanResult) else self.solve(context, start_goal)
             except OutOfTimeError as error:
-                return context.out_of_time(str(error))
+                return context.out_of_time(error)
 
     def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
         """Load the compiled code that calls on such a problem need, or compile it on a new machine, which

@@ -203,7 +203,7 @@ def _usable_goals(
         return goals
     held = [q for q in goals if _too_heavy(context, q) is None]
     if not held:
-        reason = f"the payload cannot be held at the goal: {_too_heavy(call, goals[0])}"
+        reason = f"the payload cannot be held at the goal: {_too_heavy(context, goals[0])}"
         return context.fail(Status.INVALID_GOAL, reason)
     return goals if len(held) == len(goals) else np.stack(held)
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import inverse, rotation_angle, rotation_z_to, transform
 from robotdiffuse.problems import constraint_kernel as kernel
@@ -105,7 +106,7 @@ class PathConstraints:
 
     def values(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n rows"]:
         """Of each row [m] or [rad]."""
-        return kernel.values(self.rows, np.ascontiguousarray(q, np.float64))
+        return kernel.values(self.rows, for_kernels(q))
 
     def limits(self, share: float) -> Float[ndarray, "rows"]:
         """Of the values, with a share of the tolerances [m] or [rad]."""
@@ -135,7 +136,7 @@ class PathConstraints:
         chord: what the motion may leave them by, each joint [rad] or [m], is taken from the limits.
         share: of their tolerances, which are taken whole.
         """
-        q, rows = np.ascontiguousarray(q, np.float64), self.rows
+        q, rows = for_kernels(q), self.rows
         around = np.where(rows.what == DISTANCE, rows.reach.sum(axis=1), rows.last)
         turning = (rows.what == TURN) * np.linalg.norm(rows.a, axis=1) * np.linalg.norm(rows.b, axis=1)
         slack = chord * (around + turning * rows.reach.sum(axis=1))
@@ -147,7 +148,7 @@ class PathConstraints:
 
     def speeds(self, q: Float[ndarray, "n dof"], rates: Float[ndarray, "n dof"]) -> Float[ndarray, "n paced"]:
         """Speeds of the frames that have a greatest one [m/s], one column each, for rates of the joints."""
-        columns = [kernel.speeds(self.rows, m, q, rates) for m, _ in self._paced]
+        columns = [kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates)) for m, _ in self._paced]
         return np.stack(columns, axis=1) if columns else np.zeros((len(q), 0))
 
     @property
@@ -271,9 +272,9 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
         joints=joints,
         offsets=robot.frame_offsets[joints],
         kinds=kinds[joints],
-        endless=robot.continuous,
-        lower=robot.lower,
-        upper=robot.upper,
+        endless=for_kernels(robot.continuous, np.bool_),
+        lower=for_kernels(robot.lower),
+        upper=for_kernels(robot.upper),
         what=np.array([row.what for row in rows]),
         last=np.array([len(chain) for chain in chains]),
         again=np.array([False, *(a == b for a, b in pairwise(frames))]),

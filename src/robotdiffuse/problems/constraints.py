@@ -13,25 +13,25 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import LARGEST, numbers, rigid_transform, vector
+from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, rigid_transform, vector
 from robotdiffuse.core.errors import InputError, shown
 
 LEAST_TOLERANCE, LEAST_ANGLE = 1e-4, 1e-3
 """The tightest constraints [m], [rad]."""
 SIZES = {
     "angle": (LEAST_ANGLE, np.pi, "rad"),
-    "tolerance": (LEAST_TOLERANCE, LARGEST, "m"),
-    "speed": (1e-4, LARGEST, "m/s"),
+    "tolerance": (LEAST_TOLERANCE, MAX_COORDINATE, "m"),
+    "speed": (1e-4, MAX_COORDINATE, "m/s"),
 }
 """Fields that are sizes: least, greatest, unit."""
 DIRECTIONS = ("axis", "direction", "normal")
 """Fields whose length does not matter."""
-AROUND = np.eye(4)
+AROUND = read_only(np.eye(4))
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class AxisCone:
+class AxisCone(Value):
     """An axis of a frame stays within an angle of a direction: a cup upright."""
 
     kind: ClassVar[str] = "axis_cone"
@@ -58,7 +58,7 @@ class AxisCone:
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class PositionBox:
+class PositionBox(Value):
     """The origin of a frame stays in a box."""
 
     kind: ClassVar[str] = "position_box"
@@ -79,7 +79,7 @@ class PositionBox:
                 f"above its low by at least {2 * LEAST_TOLERANCE:g} m"
             )
         T = AROUND if self.T_base_box is None else rigid_transform(f"{self.kind}.T_base_box", self.T_base_box)
-        object.__setattr__(self, "T_base_box", T)
+        object.__setattr__(self, "T_base_box", read_only(T))
 
     if TYPE_CHECKING:
 
@@ -94,7 +94,7 @@ class PositionBox:
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class OnPlane:
+class OnPlane(Value):
     """The origin of a frame stays on a plane."""
 
     kind: ClassVar[str] = "on_plane"
@@ -121,7 +121,7 @@ class OnPlane:
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class OnLine:
+class OnLine(Value):
     """The origin of a frame stays on a line without ends."""
 
     kind: ClassVar[str] = "on_line"
@@ -148,7 +148,7 @@ class OnLine:
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class CartesianLine:
+class CartesianLine(Value):
     """The origin of a frame moves on the straight segment from where it starts to where the goal has it.
 
     So the goal must say one pose of the frame: one configuration, or a pose without tolerances of a link that
@@ -212,4 +212,4 @@ def _check(constraint: Constraint) -> None:
                     f"{where} is {shown(given)}; it must be a number from {least:g} to {most:.6g} [{unit}]"
                 )
             given = float(value)
-        object.__setattr__(constraint, name, given)
+        object.__setattr__(constraint, name, read_only(given))

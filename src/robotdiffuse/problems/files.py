@@ -1,16 +1,17 @@
 """Problem files: one problem in YAML or JSON, many in JSON lines or a MotionBenchMaker folder."""
 
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from numbers import Integral
 from pathlib import Path
 
 import yaml
 
 from robotdiffuse.core.bounds import numbers
-from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.input_files import no_files, parse_json, parse_yaml, read_text, read_yaml
+from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
+from robotdiffuse.core.input_files import file_name, no_files, parse_json, parse_yaml, read_text, read_yaml
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
@@ -20,8 +21,11 @@ from robotdiffuse.problems.moveit import (
     MoveItRequest,
     holding_at,
     moveit_frames,
+    moveit_model,
     moveit_request,
     moveit_scene,
+    request_robot_notes,
+    scene_robot_notes,
 )
 from robotdiffuse.problems.moving_obstacle_files import moving_entry, read_moving
 from robotdiffuse.problems.problem import (
@@ -41,7 +45,7 @@ from robotdiffuse.problems.robot_setup_files import (
     rounded,
 )
 from robotdiffuse.robots import ROBOTS, load_robot
-from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
 
@@ -67,14 +71,17 @@ class ProblemEntry:
         return self.problem
 
 
-def load_problem(file: str | Path, index: int = 0) -> Problem:
+def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) -> Problem:
     """The problem in a .yaml, .yml or .json file, or the one at `index` (from 0) in a .jsonl file.
 
     Files named in it are looked up from its folder. `scene` may name a MoveIt planning scene, and `request` a
     MoveIt motion plan request in place of start and goal. Raises InputError, one line that names the file
     and the field: unknown or missing fields and shapes, wrong kinds of values, all that `Problem` refuses.
+
+    ignore_joints: joints of MoveIt files that the robot lacks are a note rather than an error.
     """
-    file = Path(file)
+    file = file_name(file, "problem file")
+    check_type("index", index, Integral, "a whole number from 0 on")
     if file.suffix.lower() not in WRITERS:
         raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
     text = read_text(file)
@@ -83,28 +90,30 @@ def load_problem(file: str | Path, index: int = 0) -> Problem:
         if not 0 <= index < len(lines):
             raise InputError(f"index is {index}; {file} holds {len(lines)} problems, counted from 0")
         number, line = lines[index]
-        return _problem(f"{file}, line {number}", parse_json(line, f"{file}, line {number}"), file.parent)
+        where = f"{file}, line {number}"
+        return _problem(where, parse_json(line, where), file.parent, ignore_joints=ignore_joints)
     if index != 0:
         raise InputError(f"index is {index}; {file} holds one problem, and only .jsonl files hold more")
     data = parse_json(text, str(file)) if file.suffix.lower() == ".json" else parse_yaml(text, str(file))
-    return _problem(str(file), data, file.parent)
+    return _problem(str(file), data, file.parent, ignore_joints=ignore_joints)
 
 
-def load_problems(file: str | Path) -> list[ProblemEntry]:
+def load_problems(file: str | Path, ignore_joints: bool = False) -> list[ProblemEntry]:
     """All problems of a .jsonl file, of a MotionBenchMaker folder, or the one of any other problem file.
 
     In a .jsonl file, each line is a problem as in `load_problem`, named after the file and its line; the
-    first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`.
+    first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`;
+    `ignore_joints` as in `load_problem`.
     """
-    file = Path(file)
+    file = file_name(file, "problem file")
     if file.is_dir():
-        return load_motion_bench_maker(file)
+        return load_motion_bench_maker(file, ignore_joints=ignore_joints)
     if file.suffix.lower() != ".jsonl":
-        return [ProblemEntry(file.stem, load_problem(file))]
+        return [ProblemEntry(file.stem, load_problem(file, ignore_joints=ignore_joints))]
     entries = []
     for number, line in _lines(read_text(file)):
         where = f"{file}, line {number}"
-        problem = _problem(where, parse_json(line, where), file.parent)
+        problem = _problem(where, parse_json(line, where), file.parent, ignore_joints=ignore_joints)
         entries.append(ProblemEntry(f"{file.stem}:{number}", problem))
     return entries
 
@@ -184,19 +193,17 @@ def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -
 
     `robot` as in `problem_record`. Raises InputError for a place that cannot be written to.
     """
-    file = Path(file)
+    file = file_name(file, "problem file")
     ending = file.suffix.lower()
     if ending not in WRITERS:
         raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
     text = WRITERS[ending](problem_record(problem, file.parent, robot))
+    if ending != ".jsonl":
+        write_atomically(file, text)
+        return
     try:
-        if ending == ".jsonl":
-            with file.open("a", encoding="utf-8") as stream:
-                stream.write(text + "\n")
-        else:
-            part = file.with_name(f".{file.name}.{os.getpid()}.part")
-            part.write_text(text, encoding="utf-8")
-            part.replace(file)
+        with file.open("a", encoding="utf-8") as stream:
+            stream.write(text + "\n")
     except OSError as error:
         raise InputError(f"{file} cannot be written: {error.strerror}") from None
 
@@ -213,12 +220,15 @@ WRITERS: dict[str, Callable[[dict[str, object]], str]] = {
 }
 
 
-def load_motion_bench_maker(folder: str | Path, robot: Robot | None = None) -> list[ProblemEntry]:
+def load_motion_bench_maker(
+    folder: str | Path, robot: Robot | None = None, ignore_joints: bool = False
+) -> list[ProblemEntry]:
     """The problems of a folder with pairs of files sceneNNNN.yaml and requestNNNN.yaml, in their order.
 
     The robot is the bundled one named by the scenes' robot_model_name, unless one is given. Its joints that
     are not planned (fingers) are held at the values of the request's start state. A problem that is wrong,
-    e.g. its goal is out of limits, becomes an entry with an error. Raises InputError if there is no pair.
+    e.g. its goal is out of limits or it has joints that the robot lacks (unless `ignore_joints`), becomes an
+    entry with an error. Raises InputError if there is no pair.
     """
     folder = Path(folder)
     scenes = sorted(folder.glob("scene*.yaml"))
@@ -230,7 +240,7 @@ def load_motion_bench_maker(folder: str | Path, robot: Robot | None = None) -> l
     for scene_file in scenes:
         name = f"{folder.resolve().name}/{scene_file.stem.removeprefix('scene')}"
         try:
-            problem = _moveit_problem(scene_file, robot)
+            problem = _moveit_problem(scene_file, robot, ignore_joints)
         except InputError as error:
             entries.append(ProblemEntry(name, None, str(error)))
         else:
@@ -238,7 +248,7 @@ def load_motion_bench_maker(folder: str | Path, robot: Robot | None = None) -> l
     return entries
 
 
-def _moveit_problem(scene_file: Path, robot: Robot | None) -> Problem:
+def _moveit_problem(scene_file: Path, robot: Robot | None, ignore_joints: bool) -> Problem:
     request_file = scene_file.with_name(scene_file.name.replace("scene", "request", 1))
     where = scene_file
     try:
@@ -246,10 +256,13 @@ def _moveit_problem(scene_file: Path, robot: Robot | None) -> Problem:
         if robot is None:
             robot_name = data.get("robot_model_name") if isinstance(data, dict) else None
             robot = _robot(robot_name, {}, scene_file.parent)
+        notes = scene_robot_notes(data, robot, ignore_joints)
         frames = moveit_frames(data, robot)
         scene = moveit_scene(data, frames, scene_file.parent)
         where = request_file
-        return _requested(robot, scene, moveit_request(read_yaml(request_file), frames, scene_file.parent))
+        request = moveit_request(read_yaml(request_file), frames, scene_file.parent)
+        notes += request_robot_notes(request, robot, moveit_model(data), ignore_joints)
+        return _requested(robot, scene, replace(request, notes=(*request.notes, *notes)))
     except InputError as error:
         prefix = "" if str(error).startswith(str(where)) else f"{where}: "
         raise InputError(f"{prefix}{error}") from None
@@ -267,6 +280,7 @@ def _requested(
     held -= {*robot.joint_names}
     locked = {name: value for name, value in request.start.items() if name in held}
     robot = robot.with_locked(locked)
+    notes = (*request.notes, *_follower_notes(robot, request.start))
 
     def values(where: str, positions: dict[str, float]) -> list[float]:
         missing = [name for name in robot.joint_names if name not in positions]
@@ -279,12 +293,28 @@ def _requested(
         robot = holding_at(robot, held, start)
     if request.pose_goal is not None:
         goal = PoseGoal(*request.pose_goal)
-        return Problem(robot, scene, start, goal, request.notes, clearance, views, unknown)
+        return Problem(robot, scene, start, goal, notes, clearance, views, unknown)
     goals = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
-    return Problem(robot, scene, start, JointGoal(goals), request.notes, clearance, views, unknown)
+    return Problem(robot, scene, start, JointGoal(goals), notes, clearance, views, unknown)
 
 
-def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot] | None = None) -> Problem:
+def _follower_notes(robot: Robot, start: dict[str, float]) -> tuple[str, ...]:
+    """Notes on mimic joints that a start state does not put where the joints that they follow do."""
+    mimics = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
+    return tuple(
+        f"start_state: {name} is {start[name]:g}; planned at {robot.locked[name]:g}, where {master} puts it"
+        for name, master in mimics.items()
+        if name in start and name in robot.locked and abs(robot.locked[name] - start[name]) > MIMIC_SLACK
+    )
+
+
+def _problem(
+    where: str,
+    data: object,
+    folder: Path,
+    robots: Mapping[str, Robot] | None = None,
+    ignore_joints: bool = False,
+) -> Problem:
     try:
         requested = isinstance(data, dict) and "request" in data
         values = check_fields(
@@ -298,11 +328,12 @@ def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot]
                 "base is for scenes in the file itself: MoveIt scenes say where their robot stands"
             )
         clearance = check_clearance("clearance", values["clearance"]) if "clearance" in values else None
-        frames = moveit_frames({}, robot)
+        frames, model = moveit_frames({}, robot), ""
         if isinstance(values["scene"], str):
             file = folder / values["scene"]
             content = read_yaml(file)
-            frames = moveit_frames(content, robot)
+            notes += scene_robot_notes(content, robot, ignore_joints)
+            frames, model = moveit_frames(content, robot), moveit_model(content)
             scene = moveit_scene(content, frames, file.parent)
         else:
             scene, more = read_scene(values["scene"], folder)
@@ -316,6 +347,8 @@ def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot]
         payload = read_payload(values["payload"]) if "payload" in values else None
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
+            notes += request_robot_notes(request, robot, model, ignore_joints)
+            request = replace(request, notes=(*request.notes, *notes, *more))
             asked = _requested(robot, scene, request, clearance, views, unknown)
             return replace(asked, constraints=kept, payload=payload) if kept or payload else asked
         goal, notes = read_goal("goal", values["goal"], scene), (*notes, *more)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import numbers, rigid_transform
+from robotdiffuse.core.bounds import Value, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.transforms import rotation_from_rpy, transform
 
@@ -23,7 +23,7 @@ INWARDS = 1e-3
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class JointGoal:
+class JointGoal(Value):
     """Any of these configurations (one row each)."""
 
     positions: Float[ndarray, "n dof"]
@@ -35,6 +35,7 @@ class JointGoal:
                 f"goal is {shown(self.positions)}; it must be a configuration or a list of them of one length"
             )
         object.__setattr__(self, "positions", np.atleast_2d(positions))
+        super().__post_init__()
 
     if TYPE_CHECKING:
 
@@ -43,7 +44,7 @@ class JointGoal:
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class PoseGoal:
+class PoseGoal(Value):
     """A pose of a link. Without tolerances, the path must end within 1 cm and 15 degrees of it (the paper's).
 
     With them, the pose where the link ends, seen from the goal, has xyz and rpy within plus and minus these:
@@ -72,6 +73,7 @@ class PoseGoal:
                         f"goal.{name} is {shown(value)}; it must be 3 finite numbers of at least 0 [{unit}]"
                     )
                 object.__setattr__(self, name, array)
+        super().__post_init__()
 
     if TYPE_CHECKING:
 
@@ -100,7 +102,7 @@ class PoseGoal:
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class PosesGoal:
+class PosesGoal(Value):
     """A pose for each of several links at once, for each hand of two arms say, each with its tolerances."""
 
     poses: tuple[PoseGoal, ...]
@@ -127,7 +129,7 @@ class PosesGoal:
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class AnyGoal:
+class AnyGoal(Value):
     """Any of several goals."""
 
     goals: "tuple[OneGoal, ...]"

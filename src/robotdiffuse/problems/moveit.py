@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import unit_quaternion, vector
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, joined, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import read_triangles, read_yaml
 from robotdiffuse.core.transforms import (
     inverse,
@@ -24,7 +24,7 @@ from robotdiffuse.core.transforms import (
 )
 from robotdiffuse.robots.bodies import Attached
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Shape, Sphere
 
@@ -67,20 +67,86 @@ class MoveItRequest:
     """What is not taken over."""
 
 
-def read_moveit_scene(file: str | Path, robot: Robot | None = None) -> Scene:
+def read_moveit_scene(file: str | Path, robot: Robot | None = None, ignore_joints: bool = False) -> Scene:
     """The collision objects of a planning scene, in the frame of the robot's base.
 
     Where the root of the robot's URDF stands is taken from robot_state.multi_dof_joint_state, where its base
     is from there from the robot (None: base and root are one), frames from fixed_frame_transforms and from
     the links that stand still with the base. The allowed collision matrix is not used: the robot brings its
-    own. Raises InputError, naming file and object, for a missing or damaged file, unknown frames, and shapes
-    without a counterpart (cone, plane, octomap).
+    own. Raises InputError, naming file and object, for a missing or damaged file, unknown frames, shapes
+    without a counterpart (cone, plane, octomap), and, unless `ignore_joints`, joints that the robot lacks.
     """
+    return read_noted_moveit_scene(file, robot, ignore_joints)[0]
+
+
+def read_noted_moveit_scene(
+    file: str | Path, robot: Robot | None = None, ignore_joints: bool = False
+) -> tuple[Scene, tuple[str, ...]]:
+    """`read_moveit_scene`, and notes on differences between its robot and the one given."""
     data = read_yaml(file)
     try:
-        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent)
+        notes = () if robot is None else scene_robot_notes(data, robot, ignore_joints)
+        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent), notes
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
+
+
+def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -> tuple[str, ...]:
+    """Notes on differences between a robot and the one of a parsed planning scene.
+
+    Raises InputError for joints that the robot lacks, unless they are to be ignored. Another model name alone
+    is a note: copies of one arm have many names, and all joints are known. Names of multi-dof joints are not
+    looked at: they are virtual joints of an SRDF, and their transforms place the robot's root.
+    """
+    data = _mapping("a planning scene", data)
+    state = _mapping("robot_state", data.get("robot_state"))
+    values = _joint_state("robot_state.joint_state", state.get("joint_state"))
+    model = moveit_model(data)
+    notes = joint_notes("robot_state.joint_state", values, robot, model, ignore_joints)
+    if model not in ("", robot.name):
+        notes = (f"the scene's robot_model_name is {shortened(model)}; planned for {robot.name}", *notes)
+    return notes
+
+
+def moveit_model(data: object) -> str:
+    """The robot_model_name of a parsed planning scene; empty if it has none."""
+    return str((data.get("robot_model_name") if isinstance(data, dict) else None) or "")
+
+
+def request_robot_notes(
+    request: "MoveItRequest", robot: Robot, model: str = "", ignore_joints: bool = False
+) -> tuple[str, ...]:
+    """`scene_robot_notes` for a request; `model` is its scene's robot_model_name."""
+    notes = joint_notes("start_state.joint_state", request.start, robot, model, ignore_joints)
+    for i, goal in enumerate(request.joint_goals):
+        notes += joint_notes(f"goal_constraints[{i}]", goal, robot, model, ignore_joints)
+    return notes
+
+
+def joint_notes(
+    where: str, values: dict[str, float], robot: Robot, model: str, ignore_joints: bool
+) -> tuple[str, ...]:
+    """A note on joints that a robot lacks, if they are to be ignored; else InputError.
+
+    A fixed joint of the robot counts as known at zero, where it stands.
+    """
+    kinds = {joint.name: joint.kind for joint in robot.joints}
+    lacking = [
+        name
+        for name, value in values.items()
+        if kinds.get(name) not in MOVING_KINDS and (name not in kinds or abs(value) > MIMIC_SLACK)
+    ]
+    if not lacking:
+        return ()
+    if ignore_joints:
+        return (f"{where}: ignored {joined(lacking)}, which {robot.name} lacks",)
+    of_model = f" (robot_model_name is {shortened(model)})" if model not in ("", robot.name) else ""
+    own = joined(name for name, kind in kinds.items() if kind in MOVING_KINDS)
+    raise InputError(
+        f"{where} has values of {joined(lacking)}, movable joints that {robot.name} lacks{of_model}; its own "
+        f"are {own}: give the robot that is meant, or ignore these joints (--ignore-joints, "
+        f"ignore_joints=True)"
+    )
 
 
 class MoveItFrames(dict[str, ndarray]):
@@ -239,18 +305,22 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     state = _mapping("start_state", data.get("start_state"))
     held = _list("attached_collision_objects", state.get("attached_collision_objects"))
     attached = tuple(_attached(i, entry, frames, folder) for i, entry in enumerate(held))
-    joints = _mapping("start_state.joint_state", state.get("joint_state"))
-    names = _list("start_state.joint_state.name", joints.get("name"))
-    positions = _list("start_state.joint_state.position", joints.get("position"))
-    values = vector("start_state.joint_state", "position", positions, len(names)).tolist()
+    start = _joint_state("start_state.joint_state", state.get("joint_state"))
     goals = _list("goal_constraints", data.get("goal_constraints"))
     if not goals:
         raise InputError("goal_constraints is empty; it must hold at least one goal")
-    start = dict(zip(map(str, names), values, strict=True))
     if len(goals) == 1 and _mapping("goal_constraints[0]", goals[0]).get("position_constraints"):
         return MoveItRequest(start, pose_goal=_pose_goal(goals[0], frames), attached=attached, notes=notes)
     each = tuple(_joint_goal(f"goal_constraints[{i}]", goal) for i, goal in enumerate(goals))
     return MoveItRequest(start, each, attached=attached, notes=notes)
+
+
+def _joint_state(where: str, value: object) -> dict[str, float]:
+    """Joint values by name."""
+    state = _mapping(where, value)
+    names = _list(f"{where}.name", state.get("name"))
+    positions = vector(where, "position", _list(f"{where}.position", state.get("position")), len(names))
+    return dict(zip(map(str, names), positions.tolist(), strict=True))
 
 
 def _scaling_notes(data: dict[str, Any]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
+from pathlib import PurePath
 from typing import TYPE_CHECKING, ClassVar, no_type_check
 
 import numpy as np
@@ -13,8 +14,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import LARGEST, numbers, rigid_transform
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, Value, numbers, rigid_transform
+from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
@@ -41,7 +42,7 @@ predicts it; occupied. See `planning/pipeline/unknown_space.py`."""
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Value):
     """`goal` may be given as a configuration, a list of them, a JointGoal, a PoseGoal or a PosesGoal, or a
     list of those, of which any is to be reached; so may each of the waypoints.
 
@@ -76,7 +77,7 @@ class Problem:
     moving: tuple[MovingObstacle, ...] = ()
     """Obstacles that move, from time 0 of the motion on; `scene` holds those that stand still."""
     start_velocity: Float[ndarray, "dof"] | None = None
-    """Of the joints when the motion begins [rad/s] or [m/s]; None: it begins at rest."""
+    """Of the joints when the motion begins [rad/s] or [m/s]; None, and all below 1e-6: it begins at rest."""
     blend: tuple[float, ...] = ()
     """For each waypoint, within what distance of it the motion may pass without stopping: of configurations
     in joint space [rad, L2], of the position of a pose, or the box that it may be in [m]; 0: it stops there.
@@ -151,6 +152,7 @@ class Problem:
             "blend": blend,
         }.items():
             object.__setattr__(self, key, value)
+        super().__post_init__()
 
     if TYPE_CHECKING:
 
@@ -226,11 +228,19 @@ class Problem:
     """`problems.files.load_problem`, put here by the package: files know problems, not the reverse."""
 
 
+def check_problem(problem: object, field: str = "problem") -> None:
+    """InputError for anything but a Problem, with what to call for the name of a file."""
+    how = "e.g. rd.Problem(robot, scene, start, goal)"
+    if isinstance(problem, str | PurePath):
+        how = f"rd.load_problem({shown(str(problem))}) reads one from a file"
+    check_type(field, problem, Problem, f"a Problem: {how}")
+
+
 def check_clearance(field: str, value: object) -> float:
     """The value as a distance [m]; InputError unless it is a finite number from 0 on."""
     clearance = numbers(value)
-    if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= LARGEST:
-        raise InputError(f"{field} is {shown(value)}; it must be a distance from 0 to {LARGEST:g} m")
+    if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= MAX_COORDINATE:
+        raise InputError(f"{field} is {shown(value)}; it must be a distance from 0 to {MAX_COORDINATE:g} m")
     return float(clearance)
 
 
@@ -311,7 +321,7 @@ def _moving(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]:
 
 
 def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
-    """A velocity within limits, None for rest."""
+    """A velocity within limits; None for rest, and what is nearly that."""
     if value is None:
         return None
     velocity = numbers(value)
@@ -327,7 +337,7 @@ def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
             f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; its velocity limit is "
             f"{robot.velocity[j]:g}"
         )
-    return velocity if velocity.any() else None
+    return velocity if (np.abs(velocity) >= MIN_RATE).any() else None
 
 
 def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
@@ -374,9 +384,9 @@ def _configuration(robot: Robot, field: str, value: object, notes: list[str]) ->
 
 def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float:
     unit = "m" if joint.kind == "prismatic" else "rad"
-    if not abs(value) <= LARGEST:
+    if not abs(value) <= MAX_COORDINATE:
         raise InputError(
-            f"{field}: {joint.name} is {value}; it must be a finite number within ±{LARGEST:g} [{unit}]"
+            f"{field}: {joint.name} is {value}; it must be a finite number within ±{MAX_COORDINATE:g} [{unit}]"
         )
     if joint.kind == "continuous":
         return float(value)

@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from os import PathLike
 from pathlib import Path
 
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, check_type, unknown_name
 from robotdiffuse.core.input_files import is_file
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, read_bundle, read_source
@@ -25,7 +26,10 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
     Robot.with_locked). The same robot is the same object, as long as its files stay as they are. Raises
     InputError for an unknown name or bad input.
     """
+    check_type("robot", name, (str, PathLike), "its name, or the path of its folder or URDF")
     text = str(name)
+    if locked is not None:
+        check_type("locked", locked, dict, "a mapping of joints to values")
     if is_file(Path(name) / ROBOT_FILE):
         robot = _read(Path(name), str(Path(name).resolve()))
     elif isinstance(name, Path) or text.endswith((".urdf", ".xacro", ".xml")) or "/" in text or "\\" in text:

@@ -6,12 +6,14 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import Value
+
 TOOL = "tool"
 """Name of a tool that is given none."""
 
 
 @dataclass(frozen=True, eq=False)
-class ConvexMesh:
+class ConvexMesh(Value):
     """A convex polyhedron in the frame of its link [m]."""
 
     vertices: Float[ndarray, "v 3"]
@@ -31,7 +33,7 @@ class Rigid(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Attached:
+class Attached(Value):
     """A body that is fixed to a link of a robot, itself a link of the name."""
 
     name: str

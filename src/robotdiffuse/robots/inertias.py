@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import LARGEST, numbers, within
+from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, within
 from robotdiffuse.core.errors import InputError, shown
 
 SLACK = 1e-6
@@ -42,12 +42,12 @@ def inertia_of(values: ArrayLike) -> Inertia:
     least = float(np.linalg.eigvalsh(moments)[0])
     if not row[0] > 0 or least < -SLACK * np.abs(moments).max():
         raise ValueError("a mass above 0 and moments of inertia of at least 0 expected")
-    return Inertia(float(row[0]), row[1:4], moments)
+    return read_only(Inertia(float(row[0]), row[1:4], moments))
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Payload:
+class Payload(Value):
     """A mass that a link carries, whose torques joints must bear beside those of the arm.
 
     Raises InputError for numbers that are not finite, a negative mass or negative moments of inertia.
@@ -64,21 +64,26 @@ class Payload:
 
     def __post_init__(self) -> None:
         mass = numbers(self.mass)
-        if mass is None or mass.ndim != 0 or not 0 <= mass <= LARGEST:
+        if mass is None or mass.ndim != 0 or not 0 <= mass <= MAX_COORDINATE:
             raise InputError(
-                f"payload.mass is {shown(self.mass)}; it must be a number from 0 to {LARGEST:g} kg"
+                f"payload.mass is {shown(self.mass)}; it must be a number from 0 to {MAX_COORDINATE:g} kg"
             )
         object.__setattr__(self, "mass", float(mass))
-        for name, least in (("com", -LARGEST), ("moments", 0.0)):
+        for name, least in (("com", -MAX_COORDINATE), ("moments", 0.0)):
             value = numbers(getattr(self, name))
-            if value is None or value.shape != (3,) or not ((value >= least) & (value <= LARGEST)).all():
+            if (
+                value is None
+                or value.shape != (3,)
+                or not ((value >= least) & (value <= MAX_COORDINATE)).all()
+            ):
                 raise InputError(
                     f"payload.{name} is {shown(getattr(self, name))}; it must be 3 numbers from {least:g} to "
-                    f"{LARGEST:g}"
+                    f"{MAX_COORDINATE:g}"
                 )
             object.__setattr__(self, name, value)
         if self.link is not None and not isinstance(self.link, str):
             raise InputError(f"payload.link is {shown(self.link)}; it must be the name of a link")
+        super().__post_init__()
 
     if TYPE_CHECKING:
 

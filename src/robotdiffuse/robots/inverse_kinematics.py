@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import rigid_transform
+from robotdiffuse.core.bounds import for_kernels, rigid_transform
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, solve_seeds
 from robotdiffuse.robots.robot import Robot
@@ -87,7 +87,7 @@ def inverse_kinematics(
         raise InputError(f"inverse kinematics: count is {count}; it must be at least 1")
     T_base_frame = rigid_transform("inverse kinematics: T_base_frame", T_base_frame)
     lower, upper = robot.lower + settings.limit_margin, robot.upper - settings.limit_margin
-    tool = np.ascontiguousarray(robot.T_frame_link(frame))
+    tool = for_kernels(robot.T_frame_link(frame))
     accepted = np.zeros((0, robot.dof))
     chain = list(robot.chain(frame))
     distance = np.linalg.norm(T_base_frame[:3, 3] - robot.frame_offsets[chain[0], :3, 3])

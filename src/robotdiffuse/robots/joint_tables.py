@@ -6,13 +6,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import Value
+
 TURN = 2 * np.pi
 ROUNDING = 1e-5
 """More than what rounding does to a joint's value [rad] or [m]."""
 
 
 @dataclass(frozen=True, eq=False)
-class JointTable:
+class JointTable(Value):
     """Where the convex parts of two links are apart, by the one or two joints between them."""
 
     links: tuple[str, str]

@@ -4,14 +4,15 @@ share."""
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache, wraps
+from numbers import Real
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import LARGEST
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.bounds import MAX_COORDINATE, Value, read_only
+from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
 from robotdiffuse.robots.inertias import Inertia
@@ -38,7 +39,7 @@ class Mimic(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Joint:
+class Joint(Value):
     """One joint of the URDF tree. Limits are meaningless for a fixed joint."""
 
     name: str
@@ -71,7 +72,7 @@ class Joint:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot:
+class Robot(Value):
     """A serial arm: the joints between base and tip that are not locked are planned. Or a tree of them: those
     between the base and any of several tips, as of two arms on one torso.
 
@@ -133,7 +134,7 @@ class Robot:
         for joint in self.joints:
             if joint.kind == "fixed" and joint.parent in found:
                 found[joint.child] = found[joint.parent] @ joint.T_parent_joint
-        return found
+        return read_only(found)
 
     @property
     def tips(self) -> tuple[str, ...]:
@@ -167,7 +168,7 @@ class Robot:
         return len(self.planned_joints)
 
     def _limit(self, what: str) -> Float[ndarray, "dof"]:
-        return np.array([getattr(joint, what) for joint in self.planned_joints])
+        return read_only(np.array([getattr(joint, what) for joint in self.planned_joints]))
 
     @cached_property
     def lower(self) -> Float[ndarray, "dof"]:
@@ -201,7 +202,7 @@ class Robot:
     @cached_property
     def continuous(self) -> Bool[ndarray, "dof"]:
         """Which joints turn without limits, so that values a turn apart are the same."""
-        return np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool)
+        return read_only(np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool))
 
     def turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
         """The whole turns of continuous joints in configurations [rad]: less these, they are within half a
@@ -238,7 +239,7 @@ class Robot:
 
     @cached_property
     def _turns_twice(self) -> Bool[ndarray, "dof"]:
-        return (self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool)
+        return read_only((self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool))
 
     @cached_property
     def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], ndarray, ndarray]:
@@ -256,7 +257,7 @@ class Robot:
             else:
                 T_joint_child = joint.motion(self.locked.get(joint.name, 0.0))
                 links[joint.child] = (frame, T_frame_parent @ joint.T_parent_joint @ T_joint_child)
-        return links, offsets, parents
+        return read_only((links, offsets, parents))
 
     @cached_property
     def frame_offsets(self) -> Float[ndarray, "dof 4 4"]:
@@ -269,8 +270,9 @@ class Robot:
 
     @cached_property
     def branching(self) -> Int[ndarray, "dof"] | None:
-        """The same for compiled code: None of a chain, where each planned joint moves all that come after."""
-        return None if (self.parents == np.arange(self.dof)).all() else self.parents
+        """The same for compiled code, which is compiled for arrays that can be written to: None of a chain,
+        where each planned joint moves all that come after."""
+        return None if (self.parents == np.arange(self.dof)).all() else self.parents.copy()
 
     @cached_property
     def moved_by(self) -> Bool[ndarray, "frames dof"]:
@@ -279,7 +281,7 @@ class Robot:
         for j, parent in enumerate(self.parents):
             rows[j + 1] = rows[parent]
             rows[j + 1, j] = True
-        return rows
+        return read_only(rows)
 
     def at_end(self, link: str) -> bool:
         """Whether planned joints move a link and none comes behind it."""
@@ -338,8 +340,8 @@ class Robot:
         for name, value in locked.items():
             if name not in movable:
                 raise unknown_name("joint in locked", name, movable)
-            if not abs(value) <= LARGEST:
-                raise InputError(f"locked: {name} is {value}; it must be a number within ±{LARGEST:g}")
+            if not isinstance(value, Real) or not abs(value) <= MAX_COORDINATE:
+                raise InputError(f"locked: {name} is {shown(value)}; it must be a number within ±{MAX_COORDINATE:g}")
         held = following(self.joints, self.locked | {name: float(value) for name, value in locked.items()})
         for name, value in locked.items():
             mimic = movable[name].mimic

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import LARGEST, unit_quaternion, within
+from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, unit_quaternion, within
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import read_arrays, read_json
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
@@ -143,7 +143,7 @@ def _table_from_json(data: dict) -> JointTable:
     apart = np.unpackbits(apart, axis=1).astype(bool)
     lower, upper = (tuple(map(float, data[end])) for end in ("lower", "upper"))
     ends = (len(lower), len(upper), 1 if len(apart) == 1 else 2)
-    spans = [0 < high - low <= LARGEST for low, high in zip(lower, upper, strict=False)]
+    spans = [0 < high - low <= MAX_COORDINATE for low, high in zip(lower, upper, strict=False)]
     if ends != (len(joints),) * 3 or not all(spans):
         raise ValueError("a table over one or two joints expected, lower below upper")
     a, b = map(str, data["links"])
@@ -234,7 +234,7 @@ def _joint_from_json(data: dict) -> Joint:
     axis = _array([data["axis"]], 3, f"joint {name}: axis")[0]
     lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
     rates = (velocity, acceleration, jerk)
-    if not -LARGEST <= lower <= upper <= LARGEST or not min(rates) > 0 or not max(rates) < np.inf:
+    if not -MAX_COORDINATE <= lower <= upper <= MAX_COORDINATE or not min(rates) >= MIN_RATE or not max(rates) < np.inf:
         raise ValueError(f"joint {name}: limits")
     if not abs(np.linalg.norm(axis) - 1) < AXIS_SLACK:
         raise ValueError(f"joint {name}: an axis of length 1 expected")
@@ -247,7 +247,7 @@ def _joint_from_json(data: dict) -> Joint:
         master, multiplier, offset = data["mimic"]
         mimic = Mimic(str(master), float(multiplier), float(offset))
     effort = float(data.get("effort", 0.0))
-    if not 0 <= effort <= LARGEST:
+    if not 0 <= effort <= MAX_COORDINATE:
         raise ValueError(f"joint {name}: effort")
     ends, limits = (str(data["parent"]), str(data["child"])), (lower, upper, velocity, acceleration, jerk)
     return Joint(name, kind, *ends, T, axis, *limits, mimic, effort)
@@ -262,7 +262,7 @@ def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:
 def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
     array = np.asarray(rows, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != width or not within(array):
-        raise ValueError(f"{what}: {width} finite numbers within ±{LARGEST:g} in each row expected")
+        raise ValueError(f"{what}: {width} finite numbers within ±{MAX_COORDINATE:g} in each row expected")
     return array
 
 

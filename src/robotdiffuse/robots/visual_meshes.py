@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import Value
 from robotdiffuse.robots.robot import Robot
 
 UNIT = 5e-5
@@ -19,7 +20,7 @@ HELD, TOOL = (0xD9, 0x7B, 0x5C), (176, 182, 190)
 
 
 @dataclass(frozen=True, eq=False)
-class VisualMesh:
+class VisualMesh(Value):
     """A triangle mesh in the frame of its link [m], with one sRGB colour per face."""
 
     vertices: Float[ndarray, "v 3"]

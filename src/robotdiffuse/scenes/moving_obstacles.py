@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import form, numbers, vector, within
+from robotdiffuse.core.bounds import Value, form, numbers, read_only, vector, within
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.transforms import (
     inverse,
@@ -35,7 +35,7 @@ SAME = 1e-6
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class MovingObstacle:
+class MovingObstacle(Value):
     """A shape in the frame of the robot's base, standing at time 0 as it says, and one of three ways to move.
 
     `velocity`: it keeps its orientation and moves on for ever. `times` and `poses`: its frame is there then,
@@ -91,6 +91,7 @@ class MovingObstacle:
             poses = _poses(self.name, self.poses, len(times))
             self._set(times=times, poses=poses)
             self._check_track(times, poses)
+        super().__post_init__()
 
     if TYPE_CHECKING:
 
@@ -145,10 +146,11 @@ class MovingObstacle:
         known, where it stands at time 0."""
         T = placed(self.shape)
         if self.velocity is not None:
-            return np.array([0.0, FOREVER]), np.stack([T, transform(self.velocity * FOREVER) @ T])
+            poses = np.stack([T, transform(self.velocity * FOREVER) @ T])
+            return read_only((np.array([0.0, FOREVER]), poses))
         if self.times is not None and self.poses is not None:
             return self.times, self.poses
-        return np.zeros(1), T[None]
+        return read_only((np.zeros(1), T[None]))
 
     @property
     def greatest_speed(self) -> float:

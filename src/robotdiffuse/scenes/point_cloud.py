@@ -10,6 +10,9 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_arrays
 
+MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+"""Odd numbers with many bits, by which coordinates are mixed into a hash."""
+
 
 def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m 3"]:
     """The first point of every occupied cell of a grid with cells `voxel` wide [m], in the old order.
@@ -30,6 +33,20 @@ def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m
         kept = packed[first] & ((1 << bits) - 1)
     else:
         kept = np.unique(cells, axis=0, return_index=True)[1]
+    return points[np.sort(kept)]
+
+
+def distinct(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+    """The points without repetitions, in the old order; the same array if there are none."""
+    if len(points) == 0:
+        return points
+    # To sort one number for each point is ten times faster than to sort points.
+    hashes = (np.ascontiguousarray(points, np.float64) + 0.0).view(np.uint64) @ MIXERS
+    if len(np.unique(hashes)) == len(points):
+        return points
+    kept, which = np.unique(hashes, return_index=True, return_inverse=True)[1:]
+    if not np.array_equal(points[kept][which], points):  # two points have one hash
+        kept = np.unique(points, axis=0, return_index=True)[1]
     return points[np.sort(kept)]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import Value
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.kinematics import link_pose
@@ -18,7 +19,7 @@ from robotdiffuse.scenes.shapes import Shape
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(Value):
     """Obstacles in the frame of the robot's base. Names are made unique by a number at the end."""
 
     shapes: tuple[Shape, ...] = ()

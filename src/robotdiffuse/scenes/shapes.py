@@ -14,16 +14,26 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import SMALLEST, form, numbers, points, positive, unit_quaternion, vector
+from robotdiffuse.core.bounds import (
+    MIN_SIZE,
+    Value,
+    form,
+    numbers,
+    points,
+    positive,
+    read_only,
+    unit_quaternion,
+    vector,
+)
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.scenes.point_cloud import voxel_thin
+from robotdiffuse.scenes.point_cloud import distinct, voxel_thin
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
-class Shape(ABC):
+class Shape(Value, ABC):
     """Base of all obstacles. `kind` is its name in problem files.
 
     The constructors take anything that NumPy reads as numbers and raise InputError for the rest.
@@ -76,7 +86,7 @@ def _set(shape: Shape, **values: object) -> None:
     if not isinstance(shape.name, str) or not shape.name:
         raise InputError(f"{shape.kind}.name is {shown(shape.name)}; it must be a text, not empty")
     for key, value in values.items():
-        object.__setattr__(shape, key, value)
+        object.__setattr__(shape, key, read_only(value))
 
 
 @no_type_check
@@ -119,9 +129,9 @@ class Box(Shape):
 
     def __post_init__(self) -> None:
         size = vector("box", "size", self.size, 3)
-        if (size < SMALLEST).any():
+        if (size < MIN_SIZE).any():
             raise InputError(
-                f"box.size is {shown(self.size)}; edge lengths must be positive, at least {SMALLEST:g} m"
+                f"box.size is {shown(self.size)}; edge lengths must be positive, at least {MIN_SIZE:g} m"
             )
         center = vector("box", "center", self.center, 3)
         _set(self, center=center, size=size, wxyz=unit_quaternion("box", self.wxyz))
@@ -134,7 +144,7 @@ class Box(Shape):
 
     @cached_property
     def rotation(self) -> Float[ndarray, "3 3"]:
-        return rotation_from_quaternion(self.wxyz)
+        return read_only(rotation_from_quaternion(self.wxyz))
 
     @property
     def area(self) -> float:
@@ -166,7 +176,7 @@ class _Axial(Shape):
 
     @cached_property
     def rotation(self) -> Float[ndarray, "3 3"]:
-        return rotation_from_quaternion(self.wxyz)
+        return read_only(rotation_from_quaternion(self.wxyz))
 
 
 @no_type_check
@@ -278,12 +288,12 @@ class Mesh(Triangulated):
 
     @cached_property
     def world_vertices(self) -> Float[ndarray, "v 3"]:
-        return self.vertices @ rotation_from_quaternion(self.wxyz).T + self.xyz
+        return read_only(self.vertices @ rotation_from_quaternion(self.wxyz).T + self.xyz)
 
     @cached_property
     def face_areas(self) -> Float[ndarray, "f"]:
         a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
-        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        return read_only(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
     @property
     def area(self) -> float:
@@ -324,6 +334,11 @@ class PointCloud(Shape):
         ) -> None: ...
 
     @cached_property
+    def distinct_points(self) -> Float[ndarray, "m 3"]:
+        """Without repetitions, each of which takes as long as a point of its own in Coal's tree."""
+        return distinct(self.points)
+
+    @cached_property
     def area(self) -> float:
         """An estimate: one face of each cell, as wide as a point, that holds a point [m^2]."""
         width = 2 * self.point_radius
@@ -332,9 +347,9 @@ class PointCloud(Shape):
     @cached_property
     def bounds(self) -> Float[ndarray, "2 3"]:
         if len(self.points) == 0:
-            return np.zeros((2, 3))
+            return read_only(np.zeros((2, 3)))
         low, high = self.points.min(axis=0), self.points.max(axis=0)
-        return np.stack([low - self.point_radius, high + self.point_radius])
+        return read_only(np.stack([low - self.point_radius, high + self.point_radius]))
 
 
 def pose(shape: Box | Cylinder | Capsule) -> Float[ndarray, "4 4"]:

@@ -1,1 +1,1 @@
-"""Planning over HTTP: `robotdiffuse serve`. Worker processes plan, one process listens."""
+"""Planning over HTTP (`robotdiffuse serve`): one process listens, worker processes plan."""

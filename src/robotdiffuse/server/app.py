@@ -1,4 +1,4 @@
-"""What a server answers: the paths, their bounds and their errors, each of one line."""
+"""The HTTP application: endpoints, limits of requests, and errors as one line of JSON."""
 
 import asyncio
 import secrets
@@ -6,11 +6,15 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from ipaddress import ip_address
 from math import ceil
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import urlsplit
 
-from fastapi import FastAPI, Request, Response
-from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse
+from fastapi import FastAPI, Header, Request, Response
+from fastapi.openapi.constants import REF_TEMPLATE
+from fastapi.responses import JSONResponse, PlainTextResponse
+from prometheus_client import CONTENT_TYPE_LATEST
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -19,39 +23,76 @@ from robotdiffuse import __version__
 from robotdiffuse.core.errors import shown
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.server import openapi
-from robotdiffuse.server.settings import SENDING, ServeSettings
+from robotdiffuse.server.schemas import (
+    Cancelled,
+    Error,
+    Health,
+    JointInfo,
+    PlanAnswer,
+    PlannerInfo,
+    PlanRequest,
+    RobotInfo,
+    VerifyAnswer,
+    VerifyRequest,
+)
+from robotdiffuse.server.settings import READ_TIMEOUT, ServeSettings
 from robotdiffuse.server.worker import PLAN, VERIFY, Answer, failed
-from robotdiffuse.server.worker_pool import Pool, QueueFullError
+from robotdiffuse.server.worker_pool import QueueFullError, WorkerPool
 
+ABOUT = (
+    "Motion planning for redundant robot arms; every motion in an answer passed the validator.\n\n"
+    "Units: metres, radians, seconds; quaternions wxyz. Problems are those of problem files in JSON. They "
+    "name a robot of /robots and contain all other data, because the server reads no files.\n\n"
+    'An error is one line of JSON: {"error": "..."}. The header X-Request-ID names a request, so that '
+    "DELETE /requests/{name} can cancel it; closing the connection cancels it too."
+)
 JSON, LINES = "application/json", "application/x-ndjson"
 REQUEST_ID = "X-Request-ID"
-LONGEST_ID = 100
-GONE = 499
-"""The client has gone, and nobody reads the answer; the code is for the metrics."""
+MAX_REQUEST_ID = 100
+"""Longest request ID [characters]."""
+CLIENT_GONE = 499
+"""Status code, for the metrics only, of a request whose client closed the connection."""
+ERRORS = {
+    400: "the request is wrong",
+    401: "the token is missing or wrong",
+    404: "no such request is running",
+    408: "the request did not arrive in time",
+    409: "the request was cancelled, or its X-Request-ID is in use",
+    413: "the request is too large",
+    415: "wrong Content-Type",
+    421: "wrong Host",
+    429: "the queue is full; Retry-After says when to try again",
+    500: "the worker failed on this request",
+    503: "the server is stopping, or the request took too long",
+}
+REQUEST_ERRORS = (400, 401, 408, 409, 413, 415, 421, 429, 500, 503)
+RequestID = Annotated[str, Header(alias=REQUEST_ID, description="names the request, to cancel it")]
 
 
 class RequestError(Exception):
-    """A request that is answered without a worker."""
+    """A request that is answered with an error before any worker sees it."""
 
     def __init__(self, code: int, message: str, **headers: str) -> None:
         super().__init__(message)
         self.code, self.headers = code, headers
 
 
-class Door:
-    """What every request passes: the token, and that a browser was not led here by another page's address."""
+class AccessControl:
+    """Middleware: checks the bearer token and, on loopback, that the Host header names this machine.
+
+    The Host check stops DNS rebinding: a page of another site whose name was made to resolve to 127.0.0.1.
+    """
 
     def __init__(self, app: ASGIApp, settings: ServeSettings) -> None:
         self.app, self.settings = app, settings
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        refused = self._refused(Request(scope)) if scope["type"] == "http" else None
-        await (refused or self.app)(scope, receive, send)
+        refusal = self._refusal(Request(scope)) if scope["type"] == "http" else None
+        await (refusal or self.app)(scope, receive, send)
 
-    def _refused(self, request: Request) -> Response | None:
+    def _refusal(self, request: Request) -> Response | None:
         host = request.headers.get("host", "")
-        if self.settings.on_loopback and not _local(host):
+        if self.settings.on_loopback and not _is_local(host):
             return _error(421, f"the host is {shown(host)}; this server is known as localhost")
         given, token = request.headers.get("authorization", ""), self.settings.token
         if token and not secrets.compare_digest(given.encode(), f"Bearer {token}".encode()):
@@ -61,8 +102,8 @@ class Door:
         return None
 
 
-def _local(host: str) -> bool:
-    """Of what a header says, with or without a port."""
+def _is_local(host: str) -> bool:
+    """Whether a Host header, with or without a port, names this machine."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
         return name == "localhost" or ip_address(name).is_loopback
@@ -70,135 +111,193 @@ def _local(host: str) -> bool:
         return False
 
 
-def make_app(pool: Pool, robots: dict[str, Robot]) -> FastAPI:
-    """The application; the pool is started by others."""
+def make_app(pool: WorkerPool, robots: dict[str, Robot]) -> FastAPI:
+    """The application; the caller starts the pool."""
     app = FastAPI(
         title="RobotDiffuse",
         version=__version__,
-        description=openapi.ABOUT,
-        docs_url=None,
+        description=ABOUT,
+        docs_url=None,  # FastAPI's pages load scripts from a CDN; this server also works offline
         redoc_url=None,
         redirect_slashes=False,
     )
-    app.add_middleware(Door, settings=pool.settings)
-    app.exception_handler(RequestError)(_refused)
-    app.exception_handler(QueueFullError)(_full)
+    app.add_middleware(AccessControl, settings=pool.settings)
+    app.exception_handler(RequestError)(_request_error)
+    app.exception_handler(QueueFullError)(_queue_full)
     app.exception_handler(HTTPException)(_http_error)
     app.exception_handler(Exception)(_unexpected)
     _add_requests(app, pool, pool.settings)
     _add_lists(app, pool, robots)
+    _describe_bodies(app)
     return app
 
 
-def _add_requests(app: FastAPI, pool: Pool, settings: ServeSettings) -> None:
+def _describe_bodies(app: FastAPI) -> None:
+    """Complete the OpenAPI description: add the models of bodies that endpoints read themselves, and remove
+    the answer 422 of FastAPI's own validation, which they do not use."""
+    _, models = models_json_schema(
+        [(PlanRequest, "validation"), (VerifyRequest, "validation")], ref_template=REF_TEMPLATE
+    )
+    description = app.openapi()
+    schemas = description["components"]["schemas"]
+    schemas |= models["$defs"]
+    for name in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(name, None)
+    for methods in description["paths"].values():
+        for operation in methods.values():
+            operation["responses"].pop("422", None)
+
+
+def _errors(*codes: int) -> dict[int | str, dict[str, Any]]:
+    return {code: {"model": Error, "description": ERRORS[code]} for code in codes}
+
+
+def _body(model: type[BaseModel] | None, description: str) -> dict[str, Any]:
+    """`openapi_extra` of an endpoint that reads its body itself; None: one PlanRequest a line."""
+    schema = {"type": "string"} if model is None else {"$ref": REF_TEMPLATE.format(model=model.__name__)}
+    content = {LINES if model is None else JSON: {"schema": schema}}
+    return {"requestBody": {"required": True, "description": description, "content": content}}
+
+
+def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> None:
     running: dict[str, Callable[[], None]] = {}
 
-    async def single(request: Request, what: str) -> Response:
-        with pool.places(1):
-            body = await _body(request, settings.largest, JSON)
-            task = asyncio.ensure_future(pool.run(what, body))
-            with _under_way(request, running, [task]):
-                answer = await _answered(task, asyncio.ensure_future(_gone(request)))
+    async def single(request: Request, endpoint: str, name: str) -> Response:
+        with pool.admit(1):
+            body = await _read(request, settings.max_request_size, JSON)
+            task = asyncio.ensure_future(pool.run(endpoint, body))
+            with _cancellable(name, running, [task]):
+                answer = await _wait(task, asyncio.ensure_future(_disconnected(request)))
                 return Response(answer.body, answer.code, media_type=JSON)
 
-    @app.post("/plan", **openapi.PLAN)
-    async def plan(request: Request) -> Response:
-        """Plan a motion. Every status of a result has code 200: that there is no plan is an answer."""
-        return await single(request, PLAN)
+    @app.post(
+        "/plan",
+        summary="Plan a motion",
+        response_model=PlanAnswer,
+        responses=_errors(*REQUEST_ERRORS),
+        openapi_extra=_body(PlanRequest, "a problem, and arguments of plan"),
+    )
+    async def plan(request: Request, name: RequestID = "") -> Response:
+        """Any status of a result is answered with code 200, also if there is no plan."""
+        return await single(request, PLAN, name)
 
-    @app.post("/verify", **openapi.VERIFY)
-    async def verify(request: Request) -> Response:
-        """Validate a path or a trajectory, whoever made it."""
-        return await single(request, VERIFY)
+    @app.post(
+        "/verify",
+        summary="Validate a path or a trajectory",
+        response_model=VerifyAnswer,
+        responses=_errors(*REQUEST_ERRORS),
+        openapi_extra=_body(VerifyRequest, "a problem, and a path, a trajectory or both"),
+    )
+    async def verify(request: Request, name: RequestID = "") -> Response:
+        """The motion may come from any planner."""
+        return await single(request, VERIFY, name)
 
-    @app.post("/batch", **openapi.BATCH)
-    async def batch(request: Request) -> Response:
-        """Plan many: a request of /plan in each line, and in each line of the answer what /plan answers, in
-        the same order, as soon as those before it are there."""
+    @app.post(
+        "/batch",
+        summary="Plan many motions",
+        response_description="a result or an error in each line",
+        responses=_errors(*REQUEST_ERRORS) | {200: {"content": {LINES: {"schema": {"type": "string"}}}}},
+        openapi_extra=_body(None, "a request of /plan in each line"),
+        response_class=Response,
+    )
+    async def batch(request: Request, name: RequestID = "") -> Response:
+        """Each line of the answer is what /plan answers to that line, in the same order; a line is sent as
+        soon as it and all before it are done."""
 
         async def write(send: Send) -> None:
-            with pool.places(1):
-                body = await _body(request, settings.largest, LINES)
+            with pool.admit(1):
+                body = await _read(request, settings.max_request_size, LINES)
                 lines = [line for line in body.split(b"\n") if line.strip()]
-                if not 1 <= len(lines) <= settings.batch:
+                if not 1 <= len(lines) <= settings.max_batch:
                     raise RequestError(
-                        400, f"the batch has {len(lines)} lines; it must have 1 to {settings.batch}"
+                        400, f"the batch has {len(lines)} lines; it must have 1 to {settings.max_batch}"
                     )
                 at_once = min(len(lines), settings.workers)
-                with pool.places(at_once - 1):
+                with pool.admit(at_once - 1):
                     tasks = _tasks(pool, lines, at_once)
-                    with _under_way(request, running, tasks):
-                        await _write(send, tasks, asyncio.ensure_future(_gone(request)))
+                    with _cancellable(name, running, tasks):
+                        await _write(send, tasks, asyncio.ensure_future(_disconnected(request)))
 
-        return _Written(write)
+        return _StreamedResponse(write)
 
-    @app.delete("/requests/{name}", **openapi.DELETE)
+    @app.delete(
+        "/requests/{name}",
+        summary="Cancel a running request",
+        response_model=Cancelled,
+        responses=_errors(401, 404, 421),
+    )
     async def cancel(name: str) -> Response:
-        """End the request that came with this name in its header X-Request-ID."""
+        """Cancels the request that was sent with this name in its header X-Request-ID."""
         if name not in running:
-            raise RequestError(404, f"no request {shown(name)} is under way")
+            raise RequestError(404, f"no request {shown(name)} is running")
         running[name]()
         return JSONResponse({"cancelled": name})
 
 
-def _add_lists(app: FastAPI, pool: Pool, robots: dict[str, Robot]) -> None:
-    known = [_about(name, robot) for name, robot in robots.items()]
+def _add_lists(app: FastAPI, pool: WorkerPool, robots: dict[str, Robot]) -> None:
+    known = [robot_info(name, robot) for name, robot in robots.items()]
+    errors = _errors(401, 421)
 
-    @app.get("/robots", **openapi.ROBOTS)
-    async def list_robots() -> Response:
-        """The robots that problems may name."""
-        return JSONResponse(known)
+    @app.get("/robots", summary="List the robots that problems may name", responses=errors)
+    async def list_robots() -> list[RobotInfo]:
+        return known
 
-    @app.get("/planners", **openapi.PLANNERS)
-    async def list_planners() -> Response:
-        """The planners that requests may name."""
-        return JSONResponse(
-            [
-                {
-                    "name": name,
-                    "kind": of.kind,
-                    "description": of.description,
-                    "default": name == DEFAULT_PLANNER,
-                }
-                for name, of in PLANNERS.items()
-            ]
-        )
+    @app.get("/planners", summary="List the planners that requests may name", responses=errors)
+    async def list_planners() -> list[PlannerInfo]:
+        return [
+            PlannerInfo(name=name, kind=of.kind, description=of.description, default=name == DEFAULT_PLANNER)
+            for name, of in PLANNERS.items()
+        ]
 
-    @app.get("/health", **openapi.HEALTH)
+    @app.get(
+        "/health",
+        summary="Whether the server accepts requests",
+        response_model=Health,
+        responses=errors | {503: {"model": Health, "description": "no worker is ready, or it is stopping"}},
+    )
     async def health() -> Response:
-        """Whether requests are taken: 503 while no worker is ready, and when the server stops."""
         status = "stopping" if pool.stopping else "ok" if pool.ready else "starting"
-        state = {name: value for name, (_, value) in pool.gauges().items()}
-        return JSONResponse({"status": status} | state, 200 if status == "ok" else 503)
+        return JSONResponse({"status": status} | pool.state(), 200 if status == "ok" else 503)
 
-    @app.get("/metrics", **openapi.METRICS)
+    @app.get("/metrics", summary="Metrics for Prometheus", responses=errors, response_class=PlainTextResponse)
     async def metrics() -> Response:
-        """Counts for Prometheus."""
-        text = pool.metrics.text(pool.gauges())
-        return PlainTextResponse(text, media_type="text/plain; version=0.0.4")
+        return Response(pool.metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
     @app.get("/", include_in_schema=False)
     @app.get("/docs", include_in_schema=False)
     async def docs() -> Response:
-        return HTMLResponse(openapi.html(app.openapi()))
+        return PlainTextResponse(endpoint_list(app))
+
+
+def endpoint_list(app: FastAPI) -> str:
+    """A plain list of all endpoints, from the OpenAPI description."""
+    description = app.openapi()
+    lines = [
+        f"{method.upper():7}{path:18}{operation['summary']}"
+        for path, methods in description["paths"].items()
+        for method, operation in methods.items()
+    ]
+    info = description["info"]
+    fields = "Fields, limits and errors: /openapi.json"
+    return "\n".join([f"{info['title']} {info['version']}", info["description"], "", *lines, "", fields, ""])
 
 
 @contextmanager
-def _under_way(
-    request: Request, running: dict[str, Callable[[], None]], tasks: list[asyncio.Task[Answer]]
+def _cancellable(
+    name: str, running: dict[str, Callable[[], None]], tasks: list[asyncio.Task[Answer]]
 ) -> Iterator[None]:
-    """While this lasts, the tasks of a request can be cancelled by its name; they end with it."""
-    name = request.headers.get(REQUEST_ID, "")
+    """Within the block, the tasks of a request can be cancelled by its name; at the end they are
+    cancelled."""
 
     def cancel() -> None:
         for task in tasks:
             task.cancel()
 
     try:
-        if len(name) > LONGEST_ID:
-            raise RequestError(400, f"{REQUEST_ID} has {len(name)} characters; it may have {LONGEST_ID}")
+        if len(name) > MAX_REQUEST_ID:
+            raise RequestError(400, f"{REQUEST_ID} has {len(name)} characters; it may have {MAX_REQUEST_ID}")
         if name in running:
-            raise RequestError(409, f"another request {shown(name)} is under way")
+            raise RequestError(409, f"another request {shown(name)} is running")
         if name:
             running[name] = cancel
         yield
@@ -208,25 +307,25 @@ def _under_way(
         cancel()
 
 
-async def _gone(request: Request) -> None:
-    """Until the client has gone."""
+async def _disconnected(request: Request) -> None:
+    """Returns when the client has closed the connection."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
 
 
-async def _answered(task: asyncio.Task[Answer], gone: asyncio.Future[None]) -> Answer:
-    """What the task ends with, if nobody cancels it and the client stays."""
+async def _wait(task: asyncio.Task[Answer], disconnected: asyncio.Future[None]) -> Answer:
+    """The answer of the task, or an error if it is cancelled or the client disconnects first."""
     try:
-        await asyncio.wait({task, gone}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        gone.cancel()
+        disconnected.cancel()
     if not task.done():
-        return failed(GONE, "the client has gone")
+        return failed(CLIENT_GONE, "the client closed the connection")
     return failed(409, "the request was cancelled") if task.cancelled() else task.result()
 
 
-def _tasks(pool: Pool, lines: list[bytes], at_once: int) -> list[asyncio.Task[Answer]]:
-    """Of which so many are with workers or wait for them at once."""
+def _tasks(pool: WorkerPool, lines: list[bytes], at_once: int) -> list[asyncio.Task[Answer]]:
+    """A task for each line; at most `at_once` of them are in the pool at a time."""
     limit = asyncio.Semaphore(at_once)
 
     async def one(line: bytes) -> Answer:
@@ -236,24 +335,24 @@ def _tasks(pool: Pool, lines: list[bytes], at_once: int) -> list[asyncio.Task[An
     return [asyncio.ensure_future(one(line)) for line in lines]
 
 
-async def _write(send: Send, tasks: list[asyncio.Task[Answer]], gone: asyncio.Future[None]) -> None:
-    """The answers in the order of the tasks."""
+async def _write(send: Send, tasks: list[asyncio.Task[Answer]], disconnected: asyncio.Future[None]) -> None:
+    """Send the answers in the order of the tasks."""
     try:
-        kind = [(b"content-type", LINES.encode())]
-        await send({"type": "http.response.start", "status": 200, "headers": kind})
+        headers = [(b"content-type", LINES.encode())]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
         for task in tasks:
-            await asyncio.wait({task, gone}, return_when=asyncio.FIRST_COMPLETED)
-            if gone.done():
+            await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
+            if disconnected.done():
                 return
             answer = failed(409, "the request was cancelled") if task.cancelled() else task.result()
             await send({"type": "http.response.body", "body": answer.body, "more_body": True})
         await send({"type": "http.response.body", "body": b""})
     finally:
-        gone.cancel()
+        disconnected.cancel()
 
 
-class _Written(Response):
-    """A response that is written bit by bit."""
+class _StreamedResponse(Response):
+    """A response that `write` sends piece by piece; errors before the first piece still get a status code."""
 
     def __init__(self, write: Callable[[Send], Awaitable[None]]) -> None:
         self.write, self.background = write, None
@@ -262,48 +361,48 @@ class _Written(Response):
         await self.write(send)
 
 
-async def _body(request: Request, largest: int, kind: str) -> bytes:
-    """The bytes of a request, within bounds of size and time, and of the right kind."""
+async def _read(request: Request, max_size: int, kind: str) -> bytes:
+    """The body of a request. Raises RequestError if it is too large, too slow or not of Content-Type
+    `kind`."""
     given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if given != kind:
         raise RequestError(415, f"Content-Type is {shown(given)}; it must be {kind}")
     too_large = RequestError(
-        413, f"the request is too large: it may have {largest} bytes", Connection="close"
+        413, f"the request is too large: it may have {max_size} bytes", Connection="close"
     )
     length = request.headers.get("content-length", "0")
-    if not length.isdecimal() or int(length) > largest:
+    if not length.isdecimal() or int(length) > max_size:
         raise too_large
     parts: list[bytes] = []
     try:
-        async with asyncio.timeout(SENDING):
+        async with asyncio.timeout(READ_TIMEOUT):
             async for part in request.stream():
                 parts.append(part)
-                if sum(map(len, parts)) > largest:
+                if sum(map(len, parts)) > max_size:
                     raise too_large
     except TimeoutError:
         raise RequestError(
-            408, f"the request took more than {SENDING:g} s to arrive", Connection="close"
+            408, f"the request took more than {READ_TIMEOUT:g} s to arrive", Connection="close"
         ) from None
     except ClientDisconnect:
-        raise RequestError(GONE, "the client has gone") from None
+        raise RequestError(CLIENT_GONE, "the client closed the connection") from None
     return b"".join(parts)
 
 
-def _about(name: str, robot: Robot) -> dict[str, Any]:
-    """For the list of robots."""
+def robot_info(name: str, robot: Robot) -> RobotInfo:
+    """The entry of a robot in /robots."""
     joints = [
-        {
-            "name": joint.name,
-            "kind": joint.kind,
-            "lower": None if joint.kind == "continuous" else joint.lower,
-            "upper": None if joint.kind == "continuous" else joint.upper,
-            "velocity": joint.velocity,
-            "acceleration": joint.acceleration,
-        }
+        JointInfo(
+            name=joint.name,
+            kind=joint.kind,
+            lower=None if joint.kind == "continuous" else joint.lower,
+            upper=None if joint.kind == "continuous" else joint.upper,
+            velocity=joint.velocity,
+            acceleration=joint.acceleration,
+        )
         for joint in robot.planned_joints
     ]
-    links = list(robot.link_names)
-    return {"name": name, "base": robot.base, "tip": robot.tip, "joints": joints, "links": links}
+    return RobotInfo(name=name, base=robot.base, tip=robot.tip, joints=joints, links=list(robot.link_names))
 
 
 def _error(code: int, message: str, **headers: str) -> Response:
@@ -311,7 +410,7 @@ def _error(code: int, message: str, **headers: str) -> Response:
     return Response(answer.body, code, headers, JSON)
 
 
-def _refused(_: Request, error: Exception) -> Response:
+def _request_error(_: Request, error: Exception) -> Response:
     assert isinstance(error, RequestError)
     return _error(error.code, str(error), **error.headers)
 
@@ -320,14 +419,14 @@ def _unexpected(_: Request, error: Exception) -> Response:
     return _error(500, f"{type(error).__name__}: {error}")
 
 
-def _full(_: Request, error: Exception) -> Response:
+def _queue_full(_: Request, error: Exception) -> Response:
     assert isinstance(error, QueueFullError)
     seconds = ceil(error.seconds)
-    return _error(429, f"the queue is full; come again in {seconds} s", **{"Retry-After": str(seconds)})
+    return _error(429, f"the queue is full; try again in {seconds} s", **{"Retry-After": str(seconds)})
 
 
 def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     if error.status_code == 404:
-        return _error(404, f"there is no {shown(request.url.path)}; /docs says what there is")
+        return _error(404, f"there is no {shown(request.url.path)}; see /docs")
     return _error(error.status_code, str(error.detail), **(error.headers or {}))

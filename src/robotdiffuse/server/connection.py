@@ -1,4 +1,4 @@
-"""Connections of a server: uvicorn's HTTP/1.1, with errors of one line and bounds of time for clients."""
+"""Uvicorn's HTTP/1.1 connection, with errors as one line of JSON and timeouts for slow clients."""
 
 import asyncio
 from typing import Any
@@ -6,17 +6,17 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from robotdiffuse.server.settings import SENDING, TAKING
+from robotdiffuse.server.settings import READ_TIMEOUT, WRITE_TIMEOUT
 from robotdiffuse.server.worker import failed
 
 
 class Connection(H11Protocol):
-    """Closed where a client does not go on with a request, or does not take its answer."""
+    """Closes itself when the client stops sending a request or stops reading its answer."""
 
-    _late: asyncio.TimerHandle | None = None
-    """Runs while no request is with the application."""
-    _stuck: asyncio.TimerHandle | None = None
-    """Runs while too much waits to be taken."""
+    _read_timer: asyncio.TimerHandle | None = None
+    """Runs while the application has no request."""
+    _write_timer: asyncio.TimerHandle | None = None
+    """Runs while the write buffer is full."""
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
@@ -24,49 +24,49 @@ class Connection(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         if self.conn.their_state is h11.MUST_CLOSE:
-            return  # after a client's last request it has nothing to say, and still gets its answer
+            return  # ignore bytes after the client's last request, which still gets its answer
         super().data_received(data)
         self._watch()
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
-        for timer in (self._late, self._stuck):
+        for timer in (self._read_timer, self._write_timer):
             if timer is not None:
                 timer.cancel()
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._stuck = self.loop.call_later(TAKING, self.transport.abort)
+        self._write_timer = self.loop.call_later(WRITE_TIMEOUT, self.transport.abort)
 
     def resume_writing(self) -> None:
         super().resume_writing()
-        if self._stuck is not None:
-            self._stuck.cancel()
+        if self._write_timer is not None:
+            self._write_timer.cancel()
 
     def send_400_response(self, msg: str) -> None:
-        """Which uvicorn calls for what is not HTTP."""
-        self._refuse(400, "this is no request of HTTP/1.1, or its head is too large")
+        """Called by uvicorn for bytes that are not HTTP."""
+        self._refuse(400, "not an HTTP/1.1 request, or its head is too large")
 
     def _watch(self) -> None:
         if self.cycle is None or self.cycle.response_complete:
-            self._late = self._late or self.loop.call_later(SENDING, self._give_up)
-        elif self._late is not None:
-            self._late.cancel()
-            self._late = None
+            self._read_timer = self._read_timer or self.loop.call_later(READ_TIMEOUT, self._give_up)
+        elif self._read_timer is not None:
+            self._read_timer.cancel()
+            self._read_timer = None
 
     def _give_up(self) -> None:
         if self.conn.trailing_data[0]:
-            self._refuse(408, f"the request took more than {SENDING:g} s to arrive")
+            self._refuse(408, f"the request took more than {READ_TIMEOUT:g} s to arrive")
         else:
             self.transport.close()
 
     def _refuse(self, code: int, message: str) -> None:
-        """Close the connection, with an error if the answer has not begun."""
+        """Close the connection; send an error first if the answer has not begun."""
         if self.transport.is_closing():
             return
         begun = self.cycle is not None and not self.cycle.response_complete
         if begun:
-            self.cycle.disconnected = True  # for the application, which has nothing to say any more
+            self.cycle.disconnected = True  # tells the application to stop
             self.cycle.message_event.set()
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
             answer = failed(code, message).body

@@ -1,11 +1,11 @@
-"""Motions in requests, and what the validator says of them."""
+"""Paths and trajectories in requests, and validation reports in answers."""
 
 from dataclasses import asdict
 from typing import Any
 
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import FASTEST, LARGEST, form, numbers, within
+from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, form, numbers, within
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.scenes.files import check_fields
@@ -15,9 +15,10 @@ MOTIONS = ("path", "trajectory")
 
 
 def read_motion(name: str, data: object) -> Path | Trajectory:
-    """{joint_names, positions}, of a path; for a trajectory times, velocities and accelerations too.
+    """The motion in a request: `name` is path (joint_names, positions) or trajectory (also times, velocities
+    and accelerations).
 
-    Raises InputError, which names the field, for anything else; whether times increase is for the validator.
+    Raises InputError, naming the field, for anything else. The validator checks that times increase.
     """
     rows = ROWS if name == "trajectory" else ("positions",)
     timed = ("times",) if name == "trajectory" else ()
@@ -28,14 +29,14 @@ def read_motion(name: str, data: object) -> Path | Trajectory:
     arrays = [_rows(f"{name}.{what}", values[what], len(names)) for what in rows]
     if name == "path":
         return Path(tuple(names), arrays[0])
-    times = _array("trajectory.times", values["times"], 1, FASTEST)
+    times = _array("trajectory.times", values["times"], 1, MAX_RATE)
     if len(times) != len(arrays[0]):
         raise InputError(f"trajectory.times has {len(times)} values; positions has {len(arrays[0])} rows")
     return Trajectory(tuple(names), times, *arrays)
 
 
 def _rows(where: str, value: object, columns: int) -> ndarray:
-    array = _array(where, value, 2, LARGEST if where.endswith("positions") else FASTEST)
+    array = _array(where, value, 2, MAX_COORDINATE if where.endswith("positions") else MAX_RATE)
     if array.shape[1] != columns:
         raise InputError(f"{where} is {form(array)}; it must have a column for each of {columns} joints")
     return array
@@ -52,7 +53,7 @@ def _array(where: str, value: object, dimensions: int, most: float) -> ndarray:
 
 
 def report_record(report: Report) -> dict[str, Any]:
-    """For JSON."""
+    """A validation report as JSON values."""
     return {
         "valid": report.valid,
         "min_clearance": report.min_clearance,

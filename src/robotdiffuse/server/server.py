@@ -1,4 +1,4 @@
-"""A server from start to stop."""
+"""Starts, runs and stops the server."""
 
 import asyncio
 import signal
@@ -12,19 +12,19 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.app import make_app
 from robotdiffuse.server.connection import Connection
-from robotdiffuse.server.settings import GRACE, KEPT, ServeSettings
-from robotdiffuse.server.worker_pool import Pool
+from robotdiffuse.server.settings import GRACE_TIME, KEEP_ALIVE_TIMEOUT, ServeSettings
+from robotdiffuse.server.worker_pool import WorkerPool
 
 BACKLOG = 128
-"""Connections that wait to be taken."""
+"""Connections that may wait to be accepted."""
 SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
 class _Server(uvicorn.Server):
-    """Stops when it is told: requests that wait are refused, those with a worker finished. Told twice, it
-    stops at once."""
+    """Stops at the first signal after running requests have finished, and refuses waiting ones; the second
+    signal stops it at once."""
 
-    def __init__(self, config: uvicorn.Config, pool: Pool) -> None:
+    def __init__(self, config: uvicorn.Config, pool: WorkerPool) -> None:
         super().__init__(config)
         self.pool = pool
 
@@ -32,26 +32,26 @@ class _Server(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         loop = asyncio.get_running_loop()
         for number in SIGNALS:
-            loop.add_signal_handler(number, self._told, number)
+            loop.add_signal_handler(number, self._on_signal, number)
         try:
             yield
         finally:
             for number in SIGNALS:
                 loop.remove_signal_handler(number)
 
-    def _told(self, number: int) -> None:
+    def _on_signal(self, number: int) -> None:
         self.pool.stop()
         self.force_exit = self.should_exit
         self.should_exit = True
 
 
 def serve(robots: dict[str, Robot], settings: ServeSettings, say: Callable[[str], None] = print) -> None:
-    """Answer requests until SIGTERM or Ctrl-C. `say` is told the address, and when there is a worker.
+    """Answer requests until SIGTERM or Ctrl-C. `say` receives a line with the address, and one when ready.
 
-    Raises InputError for an address that cannot be listened at, and if no worker can be started.
+    Raises InputError if the address cannot be listened on or no worker can be started.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # asyncio looks for TCP
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # TCP, for asyncio
     with listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -59,23 +59,23 @@ def serve(robots: dict[str, Robot], settings: ServeSettings, say: Callable[[str]
             listener.listen(BACKLOG)
         except (OSError, OverflowError) as error:
             why = getattr(error, "strerror", None) or str(error)
-            raise InputError(f"cannot listen at {settings.host}, port {settings.port}: {why}") from None
+            raise InputError(f"cannot listen on {settings.host}, port {settings.port}: {why}") from None
         asyncio.run(_serve(robots, settings, listener, say))
 
 
 async def _serve(
     robots: dict[str, Robot], settings: ServeSettings, listener: socket.socket, say: Callable[[str], None]
 ) -> None:
-    pool = Pool(robots, settings)
+    pool = WorkerPool(robots, settings)
     config = uvicorn.Config(
         make_app(pool, robots),
         lifespan="off",
         http=Connection,
-        log_level="error",  # what clients do wrong is for them
+        log_level="error",  # mistakes of clients are not logged
         access_log=False,
         server_header=False,
-        timeout_keep_alive=KEPT,
-        timeout_graceful_shutdown=int(settings.longest + GRACE) + 1,
+        timeout_keep_alive=KEEP_ALIVE_TIMEOUT,
+        timeout_graceful_shutdown=int(settings.max_time_limit + GRACE_TIME) + 1,
         ws="none",
     )
     server = _Server(config, pool)
@@ -86,7 +86,7 @@ async def _serve(
         else:
             say(f"ready, with {settings.workers} worker{'s' * (settings.workers > 1)}")
 
-    say(f"listening at {_address(listener)}; loading compiled code (a new machine compiles for a minute)")
+    say(f"listening on {_address(listener)}; loading compiled code (about a minute on a new machine)")
     starting = asyncio.ensure_future(pool.start())
     starting.add_done_callback(started)
     try:

@@ -1,4 +1,4 @@
-"""What a server is told when it starts."""
+"""Settings and timeouts of a server."""
 
 import os
 from dataclasses import dataclass
@@ -6,46 +6,48 @@ from ipaddress import ip_address
 
 from robotdiffuse.core.settings import Count, Natural, Positive, Settings
 
-PREPARING = 300.0
-"""Until a worker that reads a request, or compiles for it, is given up [s]."""
-GRACE = 10.0
-"""Beyond its time limit that a call may take, as for the validator and timing, until its worker is killed [s]."""
-CANCELLING = 1.0
-"""Until a worker that was told to leave its call is killed [s]."""
-SENDING = 10.0
-"""For a client to send a request [s]."""
-TAKING = 60.0
-"""For a client to take what waits for it [s]."""
-KEPT = 5
-"""For a connection to be used again [s]."""
+PREPARE_TIMEOUT = 300.0
+"""Time for a worker to read a request and compile code for it, until the worker is killed [s]."""
+GRACE_TIME = 10.0
+"""Time that a call may take beyond its time limit, e.g. for validation and timing, until its worker is killed
+[s]."""
+CANCEL_TIMEOUT = 1.0
+"""Time for a worker to leave a cancelled call, until the worker is killed [s]."""
+READ_TIMEOUT = 10.0
+"""Time for a client to send a request [s]."""
+WRITE_TIMEOUT = 60.0
+"""Time for a client to read an answer that is waiting for it [s]."""
+KEEP_ALIVE_TIMEOUT = 5
+"""Time that an idle connection stays open [s]."""
 
 
 @dataclass(frozen=True)
 class ServeSettings(Settings):
-    """Limits of a server. The robots that it knows are named apart."""
+    """Address and limits of a server."""
 
     host: str = "127.0.0.1"
-    """Address to listen at."""
+    """Address to listen on."""
     port: Natural = 8000
-    """0: any that is free."""
+    """TCP port; 0 for any free one."""
     workers: Count = os.cpu_count() or 1
     """Processes that plan."""
     queue: Natural = 16
-    """Requests that may wait for a worker; further ones are told to come again."""
-    longest: Positive = 10.0
-    """Time limit that a request may ask for at most [s]."""
-    largest: Count = 8 * 2**20
-    """Bytes that a request may have."""
-    batch: Count = 1000
-    """Lines that a batch may have."""
-    memory: Count = 2 * 2**30
-    """Bytes that a worker may hold after an answer; one that holds more is replaced before the next."""
+    """Requests that may wait for a worker; further ones are answered with 429."""
+    max_time_limit: Positive = 10.0
+    """Largest time limit that a request may ask for [s]."""
+    max_request_size: Count = 8 * 2**20
+    """Largest body of a request [bytes]."""
+    max_batch: Count = 1000
+    """Most lines of a batch."""
+    max_worker_memory: Count = 2 * 2**30
+    """Memory that a worker may hold after an answer [bytes]; one that holds more is replaced before its next
+    request."""
     token: str = ""
-    """That requests must bring; "" for none."""
+    """Bearer token that requests must carry; "" for none."""
 
     @property
     def on_loopback(self) -> bool:
-        """Whether only programs of this machine can connect."""
+        """Whether only programs on this machine can connect."""
         try:
             return ip_address(self.host).is_loopback
         except ValueError:

@@ -1,4 +1,4 @@
-"""What the worker processes of a server do: bytes of a request in, bytes of an answer out."""
+"""Worker process of a server: turns the body of a request into the body of its answer."""
 
 import json
 import os
@@ -30,49 +30,49 @@ from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.server.motions import MOTIONS, read_motion, report_record
-from robotdiffuse.server.settings import GRACE
+from robotdiffuse.server.settings import GRACE_TIME
 from robotdiffuse.validation.validator import Report, Verifier
 
 PLAN, VERIFY = "plan", "verify"
-SEED, TIME_LIMIT = 0, 1.0
-LARGEST_SEED = 2**32 - 1
-"""That all random generators take."""
+DEFAULT_SEED, DEFAULT_TIME_LIMIT = 0, 1.0
+MAX_SEED = 2**32 - 1
+"""Largest seed that all random generators accept."""
 
 
 class Answer(NamedTuple):
-    """Of a worker."""
+    """The answer of a worker."""
 
     code: int
-    """As of HTTP."""
+    """HTTP status code."""
     body: bytes
     status: str
-    """Of the result; valid or invalid; "" for an error."""
+    """Status of the result; for verify, valid or invalid; "" for an error."""
     memory: int = 0
-    """What the worker's process holds [bytes]."""
+    """Memory of the worker process [bytes]."""
 
 
 class Shared(Structure):
-    """Memory of a worker and the server."""
+    """Memory that a worker shares with the server."""
 
     _fields_ = [("cancelled", c_int64), ("due", c_double)]
     cancelled: int
-    """The number of the call that is to be left."""
+    """Number of the call to cancel."""
     due: float
-    """When the call under way will have ended, of the monotonic clock [s]; 0 while its code is compiled."""
+    """Monotonic time by which the running call will have ended [s]; 0 while code is compiled for it."""
 
 
 class Cancelled(BaseException):
-    """Nobody waits for the answer any more."""
+    """The call was cancelled."""
 
 
 @dataclass
 class _State:
-    """What a process keeps between requests."""
+    """State of a worker process between requests."""
 
     robots: dict[str, Robot]
-    """Those that requests may name."""
-    longest: float
-    """Time limit of a request at most [s]."""
+    """Robots that requests may name."""
+    max_time_limit: float
+    """Largest time limit of a request [s]."""
     shared: Shared
 
 
@@ -80,30 +80,32 @@ _state: _State | None = None
 _warm: set[tuple[str, str]] = set()
 
 
-def prepare(robots: dict[str, Robot], longest: float, shared: Shared) -> None:
-    """What is done once in a process."""
-    accept(robots, longest, shared)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the server says when to end: services signal all
+def prepare(robots: dict[str, Robot], max_time_limit: float, shared: Shared) -> None:
+    """Set up a new worker process."""
+    accept(robots, max_time_limit, shared)
+    signal.signal(
+        signal.SIGTERM, signal.SIG_IGN
+    )  # service managers signal all processes; the server ends its workers itself
 
 
-def accept(robots: dict[str, Robot], longest: float, shared: Shared) -> None:
-    """Take requests from now on; see `_State`."""
+def accept(robots: dict[str, Robot], max_time_limit: float, shared: Shared) -> None:
+    """Accept requests from now on; see `_State`."""
     global _state
-    _state = _State(robots, longest, shared)
+    _state = _State(robots, max_time_limit, shared)
 
 
 def warm_up() -> bool:
-    """Load, or compile, what most requests need; whether anything was compiled."""
+    """Load or compile the code that most requests need; returns whether anything was compiled."""
     assert _state is not None
     name, robot = next(iter(_state.robots.items()))
     middle = (robot.lower + robot.upper) / 2
     far = Scene([Box([2.0, 2.0, 2.0], [0.1, 0.1, 0.1])])
-    _warmed(_planner(DEFAULT_PLANNER), Problem(robot, far, middle, middle + 0.1), name)
+    _warm_up_once(_planner(DEFAULT_PLANNER), Problem(robot, far, middle, middle + 0.1), name)
     return compile_seconds() > 0
 
 
-def respond(number: int, what: str, body: bytes) -> Answer:
-    """The answer to a request; raises Cancelled if its call is cancelled by its number."""
+def respond(number: int, endpoint: str, body: bytes) -> Answer:
+    """The answer to a request. Raises Cancelled if the server cancels the call by its number."""
     state = _state
     assert state is not None
 
@@ -113,8 +115,8 @@ def respond(number: int, what: str, body: bytes) -> Answer:
 
     try:
         with left_by(leave):
-            leave()  # told so before it began
-            answer = (_plan if what == PLAN else _validator)(state, body)
+            leave()  # it may have been cancelled before it began
+            answer = (answer_plan if endpoint == PLAN else answer_verify)(state, body)
         return answer._replace(memory=_memory())
     except InputError as error:
         return failed(400, str(error))
@@ -124,7 +126,7 @@ def respond(number: int, what: str, body: bytes) -> Answer:
 
 
 def _memory() -> int:
-    """What this process holds [bytes]; 0 where the system does not say."""
+    """Memory of this process [bytes]; 0 if the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
@@ -133,12 +135,13 @@ def _memory() -> int:
 
 
 def failed(code: int, message: str) -> Answer:
-    """An error as its one line."""
+    """An error as one line of JSON."""
     line = " ".join(message.split())
     return Answer(code, json.dumps({"error": line}).encode() + b"\n", "")
 
 
 def _record(body: bytes) -> object:
+    """The JSON value of a body."""
     try:
         text = body.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -146,30 +149,31 @@ def _record(body: bytes) -> object:
     return parse_json(text, "the request")
 
 
-def _plan(state: _State, body: bytes) -> Answer:
+def answer_plan(state: _State, body: bytes) -> Answer:
+    """The answer to a request to plan. Raises InputError for a bad request."""
     asked = check_fields("the request", _record(body), ("problem",), ARGUMENTS)
     problem = problem_from_record(asked["problem"], state.robots)
     given = {name: value for name, value in asked.items() if name not in ("problem", "planner")}
-    time_limit, seed = given.get("time_limit", TIME_LIMIT), given.get("seed", SEED)
+    time_limit, seed = given.get("time_limit", DEFAULT_TIME_LIMIT), given.get("seed", DEFAULT_SEED)
     for name, value in given.items():
         _check_kind(name, value)
-    if not 0 < time_limit <= state.longest:
-        most = f"it must be above 0 and at most {state.longest:g} s here"
+    if not 0 < time_limit <= state.max_time_limit:
+        most = f"it must be above 0 and at most {state.max_time_limit:g} s here"
         raise InputError(f"time_limit is {shown(time_limit)}; {most}")
-    if not isinstance(seed, int) or not 0 <= seed <= LARGEST_SEED:
-        raise InputError(f"seed is {shown(seed)}; it must be a whole number from 0 to {LARGEST_SEED}")
+    if not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
+        raise InputError(f"seed is {shown(seed)}; it must be an integer from 0 to {MAX_SEED}")
     planner = _planner(asked.get("planner", DEFAULT_PLANNER))
     planner.prepare(problem.robot)
     planner.load_wanted(problem.robot)
     PlanningContext(planner.name, problem, request=_request(given), time_limit=time_limit, seed=seed)
-    _warmed(planner, problem, asked["problem"]["robot"])
-    state.shared.due = time.monotonic() + time_limit + GRACE
+    _warm_up_once(planner, problem, asked["problem"]["robot"])
+    state.shared.due = time.monotonic() + time_limit + GRACE_TIME
     result: PlanResult = planner.plan(problem, **given)
     return _answer(result.record(), result.status.value)
 
 
 ARGUMENTS = ("planner", "time_limit", "seed", *(field.name for field in fields(Request)))
-"""Of a request to plan, besides its problem."""
+"""Fields of a plan request besides its problem."""
 
 
 def _request(given: dict[str, Any]) -> Request:
@@ -177,7 +181,7 @@ def _request(given: dict[str, Any]) -> Request:
 
 
 def _check_kind(name: str, value: object) -> None:
-    """`until` is a text, all other arguments are numbers."""
+    """Raises InputError unless `until` is a string and each other argument a number."""
     if name == "until" and not isinstance(value, str):
         raise unknown_name(name, value, UNTIL)
     if name != "until" and (isinstance(value, bool) or not isinstance(value, int | float)):
@@ -185,7 +189,7 @@ def _check_kind(name: str, value: object) -> None:
 
 
 def _planner(name: object) -> Planner:
-    """A planner that requests name, loaded once."""
+    """The planner of a name, loaded once. Raises InputError for an unknown name."""
     PLANNERS.entry(name)
     return _loaded(str(name))
 
@@ -195,20 +199,21 @@ def _loaded(name: str) -> Planner:
     return load_planner(name)
 
 
-def _warmed(planner: Planner, problem: Problem, robot: str) -> None:
-    """Compile, or load compiled code, before the clock starts."""
+def _warm_up_once(planner: Planner, problem: Problem, robot: str) -> None:
+    """Compile or load code before the time limit starts, once for each planner and robot."""
     if (planner.name, robot) not in _warm:
         planner.warm_up(problem)
         _warm.add((planner.name, robot))
 
 
-def _validator(state: _State, body: bytes) -> Answer:
+def answer_verify(state: _State, body: bytes) -> Answer:
+    """The answer to a request to validate. Raises InputError for a bad request."""
     values = check_fields("the request", _record(body), ("problem",), MOTIONS)
     problem = problem_from_record(values["problem"], state.robots)
     motions = {name: read_motion(name, values[name]) for name in MOTIONS if name in values}
     if not motions:
         raise InputError("the request has neither path nor trajectory")
-    state.shared.due = time.monotonic() + state.longest + GRACE
+    state.shared.due = time.monotonic() + state.max_time_limit + GRACE_TIME
     validator = Verifier(problem)
     reports: dict[str, Report] = {}
     for name, motion in motions.items():

@@ -1,4 +1,4 @@
-"""The worker processes of a server, and who waits for them."""
+"""The worker processes of a server, and the queue of requests for them."""
 
 import asyncio
 import itertools
@@ -14,22 +14,28 @@ from dataclasses import replace
 from typing import Any
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.processes import LoneWorker
+from robotdiffuse.core.processes import SingleWorker
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server import worker
 from robotdiffuse.server.metrics import Metrics
-from robotdiffuse.server.settings import CANCELLING, GRACE, PREPARING, ServeSettings
+from robotdiffuse.server.settings import CANCEL_TIMEOUT, GRACE_TIME, PREPARE_TIMEOUT, ServeSettings
 from robotdiffuse.server.worker import Answer, failed
 
-AGAIN = 1.0
-"""Between two attempts to start a worker [s]."""
-TYPICAL = 0.5
-"""What a request takes, until some have been answered [s]."""
+RESTART_DELAY = 1.0
+"""Time between two attempts to start a worker [s]."""
+INITIAL_REQUEST_SECONDS = 0.5
+"""Assumed time of a request until some have been answered [s]."""
 STOPPING = "the server is stopping"
+GAUGES = {
+    "workers": "Worker processes.",
+    "workers_ready": "Workers that can take requests.",
+    "workers_busy": "Workers that answer a request.",
+    "requests_waiting": "Requests that wait for a worker.",
+}
 
 
 class QueueFullError(Exception):
-    """No more requests may wait; `seconds` until it is worth trying again."""
+    """The queue is full; try again in about `seconds`."""
 
     def __init__(self, seconds: float) -> None:
         super().__init__(f"{seconds:g} s")
@@ -37,117 +43,122 @@ class QueueFullError(Exception):
 
 
 class StoppingError(Exception):
-    """The server ends."""
+    """The server is stopping."""
 
 
-class _Seat:
-    """A worker, and the memory by which it is told which call to leave."""
+class _Slot:
+    """A worker process, and the memory through which its call can be cancelled."""
 
-    def __init__(self, robots: dict[str, Robot], longest: float) -> None:
+    def __init__(self, robots: dict[str, Robot], max_time_limit: float) -> None:
         self.shared = multiprocessing.get_context("spawn").RawValue(worker.Shared)
-        bare = {name: replace(robot) for name, robot in robots.items()}  # without what was compiled of them
-        self.process = LoneWorker(worker.prepare, (bare, longest, self.shared))
+        bare = {name: replace(robot) for name, robot in robots.items()}  # without compiled arrays
+        self.process = SingleWorker(worker.prepare, (bare, max_time_limit), (self.shared,))
 
 
-class Pool:
-    """Workers that answer one request at a time each, in the order in which requests come.
+class WorkerPool:
+    """Workers that each answer one request at a time; requests are served in order of arrival.
 
-    A worker that dies, or takes longer than it may, costs the request that it had: another takes its place.
-    All methods are for one event loop.
+    A worker that dies or exceeds its time is replaced; only its own request fails. Call all methods from one
+    event loop.
     """
 
     def __init__(self, robots: dict[str, Robot], settings: ServeSettings) -> None:
         self.settings, self.metrics = settings, Metrics()
-        self.ready = self.inside = self.busy = 0
-        """Workers that are prepared; places that are taken; workers that are at a request."""
+        self.ready = self.admitted = self.busy = 0
+        """Workers that are ready; requests admitted; workers that answer a request."""
         self.stopping = False
-        self._seats = [_Seat(robots, settings.longest) for _ in range(settings.workers)]
-        self._idle: list[_Seat] = []
-        self._waiting: deque[asyncio.Future[_Seat]] = deque()
+        self._slots = [_Slot(robots, settings.max_time_limit) for _ in range(settings.workers)]
+        self._idle: list[_Slot] = []
+        self._waiting: deque[asyncio.Future[_Slot]] = deque()
         self._numbers = itertools.count(1)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._typical = TYPICAL
+        self._request_seconds = INITIAL_REQUEST_SECONDS
+        for name, description in GAUGES.items():
+            self.metrics.gauge(name, description, lambda name=name: self.state()[name])
 
     async def start(self) -> None:
-        """Prepare the workers, the first one first: where code is not compiled yet, it does that for all.
+        """Start the workers. The first one compiles, if necessary, for all; the others follow.
 
-        Raises InputError if it cannot be started.
+        Raises InputError if the first cannot be started.
         """
-        first, *others = self._seats
+        first, *others = self._slots
         try:
-            await self._prepared(first)
+            await self._warm_up(first)
         except BrokenProcessPool:
             raise InputError("a worker process could not be started; its message is above") from None
-        for seat in others:
-            self._later(self._replace(seat))
+        for slot in others:
+            self._spawn(self._replace(slot))
 
     @contextmanager
-    def places(self, count: int) -> Iterator[None]:
-        """So many requests are inside while this lasts; raises QueueFullError without room for them."""
+    def admit(self, count: int) -> Iterator[None]:
+        """Count `count` requests as admitted within the block. Raises QueueFullError if the queue lacks
+        room."""
         most = self.settings.workers + self.settings.queue
-        if self.inside + count > most:
-            ahead = self.inside / self.settings.workers
-            raise QueueFullError(max(1.0, ahead * self._typical))
-        self.inside += count
+        if self.admitted + count > most:
+            waiting = self.admitted / self.settings.workers
+            raise QueueFullError(max(1.0, waiting * self._request_seconds))
+        self.admitted += count
         try:
             yield
         finally:
-            self.inside -= count
+            self.admitted -= count
 
-    async def run(self, what: str, body: bytes) -> Answer:
-        """The answer to a request, when a worker has time for it. Cancelled, it makes the worker stop."""
+    async def run(self, endpoint: str, body: bytes) -> Answer:
+        """The answer to a request, from the next idle worker. Cancelling this task cancels the worker's
+        call."""
         began = time.monotonic()
-        answer = await self._answer(what, body)
-        self.metrics.answered(what, answer.code, answer.status, time.monotonic() - began)
+        answer = await self._answer(endpoint, body)
+        self.metrics.answered(endpoint, answer.code, answer.status, time.monotonic() - began)
         return answer
 
-    async def _answer(self, what: str, body: bytes) -> Answer:
+    async def _answer(self, endpoint: str, body: bytes) -> Answer:
         try:
-            seat = await self._next_idle()
+            slot = await self._next_idle()
         except StoppingError:
             return failed(503, STOPPING)
         self.busy += 1
         number, began = next(self._numbers), time.monotonic()
         current: Future[Answer] | None = None
         try:
-            seat.shared.due = 0.0
-            current = seat.process.submit(worker.respond, number, what, body)
-            answer = await self._ended(seat, current)
+            slot.shared.due = 0.0
+            current = slot.process.submit(worker.respond, number, endpoint, body)
+            answer = await self._result(slot, current)
         except TimeoutError:
             took = time.monotonic() - began
-            self._later(self._lost(seat))
-            return failed(503, f"the request was given up after {took:.0f} s, and its worker ended")
+            self._spawn(self._replace_lost(slot))
+            return failed(503, f"the request was stopped after {took:.0f} s, and its worker replaced")
         except BrokenProcessPool:
-            self._later(self._lost(seat))
-            return failed(500, "the worker process died of this request, or was killed")
+            self._spawn(self._replace_lost(slot))
+            return failed(500, "the worker process died on this request, or was killed")
         except asyncio.CancelledError:
-            seat.shared.cancelled = number
-            self._later(self._left(seat, current))
+            slot.shared.cancelled = number
+            self._spawn(self._cancel(slot, current))
             raise
         finally:
             self.busy -= 1
-        if answer.memory > self.settings.memory:
-            self.metrics.renewed_workers += 1
-            self._later(self._renew(seat))
+        if answer.memory > self.settings.max_worker_memory:
+            self.metrics.renewed_workers.inc()
+            self._spawn(self._renew(slot))
         else:
-            self._free(seat)
-        self._typical += 0.1 * (time.monotonic() - began - self._typical)
+            self._free(slot)
+        self._request_seconds += 0.1 * (time.monotonic() - began - self._request_seconds)
         return answer
 
-    async def _ended(self, seat: _Seat, current: "Future[Answer]") -> Answer:
-        """The answer; TimeoutError where a call goes on for longer than it may, and than it said."""
+    async def _result(self, slot: _Slot, current: "Future[Answer]") -> Answer:
+        """The answer of a call. Raises TimeoutError if the call exceeds both the limit and its own announced
+        end."""
         began, waiting = time.monotonic(), asyncio.wrap_future(current)
-        waiting.add_done_callback(_seen)
-        until = began + self.settings.longest + GRACE
+        waiting.add_done_callback(_retrieve_error)
+        until = began + self.settings.max_time_limit + GRACE_TIME
         while time.monotonic() < until:
             await asyncio.wait({waiting}, timeout=until - time.monotonic())
             if waiting.done():
                 return waiting.result()
-            until = seat.shared.due or began + PREPARING
+            until = slot.shared.due or began + PREPARE_TIMEOUT
         raise TimeoutError
 
-    async def _next_idle(self) -> _Seat:
-        """First come, first served."""
+    async def _next_idle(self) -> _Slot:
+        """The next idle worker, in order of arrival."""
         if self.stopping:
             raise StoppingError
         if self._idle:
@@ -161,84 +172,86 @@ class Pool:
                 self._free(waiting.result())
             raise
 
-    def _free(self, seat: _Seat) -> None:
+    def _free(self, slot: _Slot) -> None:
+        """Give an idle worker to the request that has waited longest."""
         while self._waiting:
             waiting = self._waiting.popleft()
             if not waiting.done():
-                waiting.set_result(seat)
+                waiting.set_result(slot)
                 return
-        self._idle.append(seat)
+        self._idle.append(slot)
 
     def stop(self) -> None:
-        """Requests that wait are refused; those that a worker has are finished."""
+        """Refuse waiting requests; let running ones finish."""
         self.stopping = True
         for waiting in self._waiting:
             if not waiting.done():
                 waiting.set_exception(StoppingError())
 
     def close(self) -> None:
-        """End the workers, whatever they do."""
+        """Kill the workers."""
         self.stopping = True
         for task in self._tasks:
             task.cancel()
-        for seat in self._seats:
-            seat.process.close(signal.SIGKILL)
+        for slot in self._slots:
+            slot.process.close(signal.SIGKILL)
 
-    def gauges(self) -> dict[str, tuple[str, float]]:
-        """For `Metrics.text`."""
+    def state(self) -> dict[str, int]:
+        """The numbers of workers and waiting requests now, for /health."""
         return {
-            "workers": ("Worker processes.", self.settings.workers),
-            "workers_ready": ("Workers that are prepared.", self.ready),
-            "workers_busy": ("Workers that are at a request.", self.busy),
-            "requests_waiting": ("Requests that wait for a worker.", max(0, self.inside - self.busy)),
+            "workers": self.settings.workers,
+            "workers_ready": self.ready,
+            "workers_busy": self.busy,
+            "requests_waiting": max(0, self.admitted - self.busy),
         }
 
-    async def _left(self, seat: _Seat, current: "Future[Any] | None") -> None:
-        """A worker was told to leave its call: it is idle when it has, or another takes its place."""
+    async def _cancel(self, slot: _Slot, current: "Future[Any] | None") -> None:
+        """Wait until the worker has left a cancelled call; replace it if that takes too long."""
         try:
             if current is not None:
-                await asyncio.wait_for(asyncio.wrap_future(current), CANCELLING)
+                await asyncio.wait_for(asyncio.wrap_future(current), CANCEL_TIMEOUT)
         except (TimeoutError, BrokenProcessPool):
-            await self._lost(seat)
+            await self._replace_lost(slot)
             return
         except worker.Cancelled:
             pass
-        self._free(seat)
+        self._free(slot)
 
-    async def _lost(self, seat: _Seat) -> None:
-        self.metrics.lost_workers += 1
-        await self._renew(seat)
+    async def _replace_lost(self, slot: _Slot) -> None:
+        self.metrics.lost_workers.inc()
+        await self._renew(slot)
 
-    async def _renew(self, seat: _Seat) -> None:
-        """Another worker in this one's place."""
+    async def _renew(self, slot: _Slot) -> None:
+        """Replace a worker by a new one."""
         self.ready -= 1
-        seat.process.end(signal.SIGKILL)
-        await self._replace(seat)
+        slot.process.terminate(signal.SIGKILL)
+        await self._replace(slot)
 
-    async def _replace(self, seat: _Seat) -> None:
-        """Prepare a worker, as often as it takes."""
+    async def _replace(self, slot: _Slot) -> None:
+        """Start a worker; repeat until it succeeds."""
         while True:
             try:
-                await self._prepared(seat)
+                await self._warm_up(slot)
                 return
             except BrokenProcessPool:
-                await asyncio.sleep(AGAIN)
+                await asyncio.sleep(RESTART_DELAY)
 
-    async def _prepared(self, seat: _Seat) -> None:
-        """One that compiled makes place for one that loads: so all give the same numbers, bit for bit."""
-        if await asyncio.wrap_future(seat.process.submit(worker.warm_up)):
-            seat.process.end(signal.SIGKILL)
-            await asyncio.wrap_future(seat.process.submit(worker.warm_up))
+    async def _warm_up(self, slot: _Slot) -> None:
+        """Prepare a worker. If it compiled code, replace it by one that loads the code from the cache, so
+        that all workers give the same numbers, bit for bit."""
+        if await asyncio.wrap_future(slot.process.submit(worker.warm_up)):
+            slot.process.terminate(signal.SIGKILL)
+            await asyncio.wrap_future(slot.process.submit(worker.warm_up))
         self.ready += 1
-        self._free(seat)
+        self._free(slot)
 
-    def _later(self, work: Any) -> None:
+    def _spawn(self, work: Any) -> None:
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
 
-def _seen(done: "asyncio.Future[Answer]") -> None:
-    """asyncio writes down errors that nobody has looked at, such as those of calls that were left."""
+def _retrieve_error(done: "asyncio.Future[Answer]") -> None:
+    """Mark the error of a cancelled call as seen; otherwise asyncio would log it."""
     if not done.cancelled():
         done.exception()

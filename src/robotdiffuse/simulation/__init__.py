@@ -1,18 +1,19 @@
-"""The PyBullet world (extra `sim`): a collision oracle that shares no code with ours, cameras and replay."""
+"""PyBullet simulation (extra `sim`): an independent collision oracle, depth cameras, and replay of
+motions."""
 
 import os
 
 
 def _import_pybullet() -> None:
-    """PyBullet prints when it was built as it is imported, past Python's own streams."""
-    kept = [os.dup(stream) for stream in (1, 2)]
+    """Import PyBullet without the build time that it prints directly to the file descriptors."""
+    saved = [os.dup(stream) for stream in (1, 2)]
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         for stream in (1, 2):
             os.dup2(nowhere, stream)
         import pybullet  # noqa: F401
     finally:
-        for stream, copy in zip((1, 2), kept, strict=True):
+        for stream, copy in zip((1, 2), saved, strict=True):
             os.dup2(copy, stream)
             os.close(copy)
         os.close(nowhere)

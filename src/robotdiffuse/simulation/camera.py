@@ -1,4 +1,4 @@
-"""Depth cameras in the PyBullet world: what a sensor sees of a scene, as a point cloud to plan on."""
+"""Simulated depth cameras: depth images and point clouds of a PyBullet world."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from robotdiffuse.scenes.point_cloud import voxel_thin
 from robotdiffuse.scenes.shapes import PointCloud
 from robotdiffuse.simulation.world import World
 
-PIXEL = (0.0, 1.0)
-"""Where in a pixel, in columns and rows from its upper left corner, PyBullet's renderer takes its sample.
+SAMPLE_OFFSET = (0.0, 1.0)
+"""Position within a pixel, in columns and rows from its upper left corner, that PyBullet's renderer samples.
 
-Found by rendering a sphere: its points then lie on it within 0.1 mm; half a pixel off, within 2 mm.
+Measured by rendering a sphere: its points then lie on it within 0.1 mm; half a pixel off, within 2 mm.
 """
 
 
@@ -28,9 +28,9 @@ class DepthCamera:
     position: tuple[float, float, float]
     """[m]"""
     target: tuple[float, float, float]
-    """The point in the middle of the image [m]."""
+    """The point at the centre of the image [m]."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """What points upwards in the image; not along the line of sight."""
+    """Upward direction in the image; not along the line of sight."""
     width: int = 320
     """[pixels]"""
     height: int = 240
@@ -38,13 +38,13 @@ class DepthCamera:
     field_of_view: float = 0.96
     """Vertical angle [rad]; the default is about that of common stereo depth cameras."""
     near: float = 0.1
-    """Nothing nearer than this is seen [m]."""
+    """Near clipping distance [m]."""
     far: float = 4.0
-    """Nothing farther than this is seen [m]."""
+    """Far clipping distance [m]."""
     noise: float = 0.0
     """Standard deviation of the distance along the ray [m]."""
     dropout: float = 0.0
-    """Share of pixels that return nothing, in [0, 1)."""
+    """Fraction of pixels without a measurement, in [0, 1)."""
 
     def __post_init__(self) -> None:
         for name in ("position", "target", "up"):
@@ -77,28 +77,33 @@ class DepthCamera:
         return np.stack([right, np.cross(right, forward), forward], axis=1)
 
     def rays(self) -> Float[ndarray, "height width 3"]:
-        """From the camera to each pixel, in the base frame, one metre forwards."""
+        """Vectors from the camera through each pixel, in the base frame, 1 m long along the optical axis."""
         slope = np.tan(self.field_of_view / 2)
-        x = (2 * (np.arange(self.width) + PIXEL[0]) / self.width - 1) * slope * self.width / self.height
-        y = (1 - 2 * (np.arange(self.height) + PIXEL[1]) / self.height) * slope
+        x = (
+            (2 * (np.arange(self.width) + SAMPLE_OFFSET[0]) / self.width - 1)
+            * slope
+            * self.width
+            / self.height
+        )
+        y = (1 - 2 * (np.arange(self.height) + SAMPLE_OFFSET[1]) / self.height) * slope
         return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=-1) @ self.rotation.T
 
 
 class RawImage(NamedTuple):
-    """What PyBullet's renderer returns."""
+    """An image of PyBullet's renderer."""
 
     rgb: UInt8[ndarray, "height width 3"]
     depth: Float[ndarray, "height width"]
-    """Along the optical axis [m]; infinite where there is nothing."""
+    """Along the optical axis [m]; infinite where nothing is visible."""
     bodies: Int[ndarray, "height width"]
-    """PyBullet's number of the body; -1: nothing."""
+    """PyBullet's body index; -1 where nothing is visible."""
 
 
 class Light(NamedTuple):
-    """How a picture is lit."""
+    """Lighting of an image."""
 
     direction: tuple[float, float, float] = (0.6, -0.8, 1.4)
-    """Towards the light."""
+    """Direction towards the light."""
     ambient: float = 0.6
     diffuse: float = 0.35
     specular: float = 0.05
@@ -107,13 +112,13 @@ class Light(NamedTuple):
 DAYLIGHT = Light()
 
 
-def take(world: World, camera: DepthCamera, light: Light = DAYLIGHT) -> RawImage:
-    """One picture by PyBullet's software renderer, without noise.
+def capture(world: World, camera: DepthCamera, light: Light = DAYLIGHT) -> RawImage:
+    """Render one image with PyBullet's software renderer, without noise.
 
-    Raises InputError for a world that was made without surfaces to see.
+    Raises InputError for a world that was made without visuals.
     """
-    if not world.look:
-        raise InputError("this world has nothing that a camera could see; make it by World(..., look=True)")
+    if not world.visuals:
+        raise InputError("this world has no visuals for cameras; create it with World(..., visuals=True)")
     view = pybullet.computeViewMatrix(camera.position, camera.target, camera.up)
     near, far = camera.near, camera.far
     projection = pybullet.computeProjectionMatrixFOV(
@@ -141,19 +146,19 @@ def take(world: World, camera: DepthCamera, light: Light = DAYLIGHT) -> RawImage
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """What a camera sees, without noise."""
+    """A depth image without noise."""
 
     depth: Float[ndarray, "height width"]
-    """Along the optical axis [m]; infinite where nothing is seen."""
+    """Along the optical axis [m]; infinite where nothing is visible."""
     labels: Int[ndarray, "height width"]
-    """Index into `names`; -1 where nothing is seen."""
+    """Index into `names`; -1 where nothing is visible."""
     names: tuple[str, ...]
-    """The robot's name, then those of the obstacles."""
+    """Name of the robot, then of the obstacles."""
 
 
 def render(world: World, camera: DepthCamera) -> DepthImage:
-    """The depth image and what is where in it. The world must have been made with `look`."""
-    _, depth, bodies = take(world, camera)
+    """The depth image and the label of each pixel. The world must have visuals."""
+    _, depth, bodies = capture(world, camera)
     labels = np.full(bodies.shape, -1)
     for label, body in enumerate((world.body, *world.obstacles.values())):
         labels[bodies == body] = label
@@ -168,13 +173,14 @@ def point_cloud(
     point_radius: float = 0.01,
     without: Sequence[str] = (),
 ) -> PointCloud:
-    """What the cameras see of the obstacles, in the base frame, as one shape to plan with.
+    """A point cloud of the obstacles as the cameras see them, in the base frame, to plan with.
 
-    The arm stands as last placed; its pixels and those of the obstacles in `without` (the floor, perhaps) are
-    taken out, but they hide what is behind them. Each ray gets its camera's noise and dropout, then one point
-    is kept in each cell of a grid `voxel` wide [m]. `point_radius` [m] is that of the shape.
+    The arm stays in its last configuration. Its pixels and those of the obstacles in `without` (such as the
+    floor) are removed, but they still hide what is behind them. Each ray gets the noise and dropout of its
+    camera; then one point is kept per voxel of edge length `voxel` [m]. `point_radius` [m] becomes that of
+    the cloud.
 
-    The world must have been made with `look`. Raises InputError for a name in `without` that is no obstacle.
+    The world must have visuals. Raises InputError for a name in `without` that is not an obstacle.
     """
     for name in without:
         if name not in world.obstacles:
@@ -182,7 +188,7 @@ def point_cloud(
     kept = [body for name, body in world.obstacles.items() if name not in without]
     clouds = [np.zeros((0, 3))]
     for camera in cameras:
-        _, depth, bodies = take(world, camera)
+        _, depth, bodies = capture(world, camera)
         seen = np.isin(bodies, kept) & (rng.random(bodies.shape) >= camera.dropout)
         rays = camera.rays()[seen]
         lengths = np.linalg.norm(rays, axis=1)

@@ -1,4 +1,4 @@
-"""What PyBullet reads from files: the robot with its masses, point clouds, coloured surfaces."""
+"""Writes the files that PyBullet loads: robots with masses, point clouds, and coloured surfaces."""
 
 from pathlib import Path
 from xml.etree import ElementTree as Xml
@@ -11,20 +11,21 @@ from robotdiffuse.core.transforms import rpy_from_rotation
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.robots.visual_meshes import VisualMesh, load_visual
 
-LEAST_MASS, LEAST_INERTIA = 0.01, 1e-4
-"""Of links without geometry, or next to none [kg], [kg m^2]: PyBullet cannot move a link without mass."""
-CREASE = np.radians(38)
-"""Edges that bend more than this stay sharp in pictures."""
+MIN_MASS, MIN_INERTIA = 0.01, 1e-4
+"""Smallest mass and inertia of a link [kg], [kg m^2]; PyBullet cannot move a link without mass."""
+CREASE_ANGLE = np.radians(38)
+"""Edges with a larger angle between their faces are drawn sharp [rad]."""
 
 
-def write_urdf(robot: Robot, folder: Path, density: float, look: bool) -> Path:
-    """The robot's tree with its convex meshes, each link of uniform density [kg/m^3]; the file in `folder`.
+def write_urdf(robot: Robot, folder: Path, density: float, visuals: bool) -> Path:
+    """Write the robot as a URDF with its convex meshes and uniform density [kg/m^3]; returns the file in
+    `folder`.
 
-    With `look`, links also get the surfaces that the viewer draws. Joints that planning does not move keep
-    their kind but lose their limits: published problems hold grippers wider open than their URDF allows.
+    With `visuals`, links also get the surfaces that the viewer draws. Joints that planning does not move keep
+    their kind but lose their limits, because published problems open grippers wider than their URDF allows.
     """
     root = Xml.Element("robot", name="robot")
-    looks = load_visual(robot) if look else {}
+    visual_meshes = load_visual(robot) if visuals else {}
     for link in robot.link_names:
         element = Xml.SubElement(root, "link", name=link)
         meshes = robot.meshes.get(link, ())
@@ -33,7 +34,7 @@ def write_urdf(robot: Robot, folder: Path, density: float, look: bool) -> Path:
             file = folder / f"{link}_{i}.obj"
             write_obj(file, mesh.vertices, mesh.faces)
             _add_mesh(element, "collision", file)
-        _add_looks(element, looks.get(link, ()), folder / link)
+        _add_visuals(element, visual_meshes.get(link, ()), folder / link)
     for joint in robot.joints:
         _add_joint(root, joint, joint.name in robot.joint_names)
     return _write_tree(root, folder / "robot.urdf")
@@ -42,7 +43,8 @@ def write_urdf(robot: Robot, folder: Path, density: float, look: bool) -> Path:
 def write_points_urdf(
     points: Float[ndarray, "n 3"], radius: float, color: tuple[int, int, int] | None, folder: Path
 ) -> Path:
-    """One link of a sphere for each point; with a colour, to be seen as octahedra. The file in `folder`."""
+    """Write one link with a sphere for each point; with a colour, also octahedra for cameras. Returns the
+    file."""
     root = Xml.Element("robot", name="points")
     element = Xml.SubElement(root, "link", name="points")
     _add_inertia(element, (), 0.0)
@@ -66,7 +68,7 @@ def write_obj(
     faces: Int[ndarray, "f 3"],
     normals: Float[ndarray, "v 3"] | None = None,
 ) -> None:
-    """A Wavefront file of a triangle mesh; with normals, a renderer shades it smoothly."""
+    """Write a triangle mesh as a Wavefront file; with normals, renderers shade it smoothly."""
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
     if normals is None:
         lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
@@ -77,11 +79,11 @@ def write_obj(
 
 
 def write_shaded(file: Path, vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]) -> None:
-    """A Wavefront file with normals: smooth but for sharp edges."""
+    """Write a triangle mesh as a Wavefront file with normals, smooth except at sharp edges."""
     import trimesh
 
     solid = trimesh.Trimesh(vertices, faces, process=False)
-    smooth = trimesh.graph.smooth_shade(solid, angle=CREASE)
+    smooth = trimesh.graph.smooth_shade(solid, angle=CREASE_ANGLE)
     write_obj(
         file, np.array(smooth.vertices), np.array(smooth.faces, np.int64), np.array(smooth.vertex_normals)
     )
@@ -90,22 +92,22 @@ def write_shaded(file: Path, vertices: Float[ndarray, "v 3"], faces: Int[ndarray
 def mass_properties(
     meshes: tuple[ConvexMesh, ...], density: float
 ) -> tuple[float, Float[ndarray, "3"], Float[ndarray, "3 3"]]:
-    """Mass [kg], its centre [m] and inertia about that [kg m^2] of solids in the link frame.
+    """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of solids in the link frame.
 
-    Where solids overlap, their masses add up.
+    Overlapping solids count twice where they overlap.
     """
     import trimesh
 
     parts = []
     for mesh in meshes:
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).mass_properties
-        sign = np.sign(solid.volume)  # negative for faces that look inwards
+        sign = np.sign(solid.volume)  # negative if the faces point inwards
         parts.append((sign * density * solid.volume, solid.center_mass, sign * density * solid.inertia))
     total = float(sum(mass for mass, _, _ in parts))
-    if total < LEAST_MASS:
-        return LEAST_MASS, np.zeros(3), LEAST_INERTIA * np.eye(3)
+    if total < MIN_MASS:
+        return MIN_MASS, np.zeros(3), MIN_INERTIA * np.eye(3)
     center = sum((mass * at for mass, at, _ in parts), np.zeros(3)) / total
-    inertia = LEAST_INERTIA * np.eye(3)
+    inertia = MIN_INERTIA * np.eye(3)
     for mass, at, own in parts:
         arm = at - center
         inertia = inertia + own + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
@@ -127,12 +129,12 @@ def _add_mesh(element: Xml.Element, use: str, file: Path) -> Xml.Element:
     return parent
 
 
-def _add_looks(element: Xml.Element, meshes: tuple[VisualMesh, ...], stem: Path) -> None:
-    """One visual for each colour: PyBullet's renderer knows no colours of faces."""
+def _add_visuals(element: Xml.Element, meshes: tuple[VisualMesh, ...], stem: Path) -> None:
+    """Add one visual for each colour, because PyBullet's renderer has no face colours."""
     for i, mesh in enumerate(meshes):
         palette, color = np.unique(mesh.colors, axis=0, return_inverse=True)
         for k, rgb in enumerate(palette):
-            file = stem.with_name(f"{stem.name}_look_{i}_{k}.obj")
+            file = stem.with_name(f"{stem.name}_visual_{i}_{k}.obj")
             write_shaded(file, mesh.vertices, mesh.faces[color.reshape(-1) == k])
             _add_color(_add_mesh(element, "visual", file), rgb)
 
@@ -156,7 +158,7 @@ def _add_joint(root: Xml.Element, joint: Joint, planned: bool) -> None:
     Xml.SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(rpy_from_rotation(T[:3, :3])))
     if joint.kind in MOVING_KINDS:
         Xml.SubElement(element, "axis", xyz=_numbers(joint.axis))
-        # to Bullet, a lower limit above the upper one means none
+        # in Bullet, a lower limit above the upper one means no limits
         lower, upper = (joint.lower, joint.upper) if planned else (1.0, -1.0)
         limits = {"lower": lower, "upper": upper, "velocity": 1.0, "effort": 1.0}
         Xml.SubElement(element, "limit", {key: _numbers([value]) for key, value in limits.items()})

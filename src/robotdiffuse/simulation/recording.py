@@ -1,4 +1,4 @@
-"""Pictures (.png) and films (.gif) of a replay, by PyBullet's software renderer."""
+"""Pictures (.png) and films (.gif) of a replay, rendered by PyBullet in software."""
 
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -13,45 +13,47 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.simulation.camera import DepthCamera, Light, RawImage, render, take
+from robotdiffuse.simulation.camera import DepthCamera, Light, RawImage, capture, render
 from robotdiffuse.simulation.replay import Replay
 from robotdiffuse.simulation.world import World
 
 LIGHT = Light(direction=(0.5, -0.7, 1.6), ambient=0.62, diffuse=0.42, specular=0.04)
 FLOOR_COLORS = ((0xF0, 0xF1, 0xF3), (0xE4, 0xE6, 0xEA))
-TILE = 0.25
-"""Side of a tile of the floor [m]."""
-GHOST = 0.4
-"""Share of a ghost's own colour in a picture; the rest is what is behind it."""
+TILE_SIZE = 0.25
+"""Edge length of a floor tile [m]."""
+GHOST_OPACITY = 0.4
+"""Opacity of ghosts in a picture."""
 AZIMUTHS = np.radians(np.arange(-60, 300, 45))
-"""Directions from which a view is tried; the one that sees most of the arm is taken."""
+"""Candidate camera directions [rad]; the one that shows most of the arm is used."""
 ELEVATION = 0.42
-"""Of the camera over the middle of the scene [rad]."""
-NEAR = 0.4
-"""Obstacles are in the picture as far as they are this close to a box around the arm [m]."""
-ROOM = 1.03
-"""Factor on the distance at which that all just fits."""
+"""Camera elevation [rad]."""
+SHOWN_DISTANCE = 0.4
+"""The picture shows obstacles up to this distance from a box around the arm [m]."""
+FRAME_MARGIN = 1.03
+"""Factor on the camera distance at which everything just fits."""
 FLOOR_GAP = 0.002
-"""Between the floor and the lowest thing above it [m]."""
+"""Gap between the floor and the lowest object [m]."""
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-MOMENTS = (0.0, 0.33, 0.67, 1.0)
-"""Shares of the duration at which views are validated; a picture shows them all, the last one solid."""
+PICTURE_TIMES = (0.0, 0.33, 0.67, 1.0)
+"""Times of the poses in a picture, as fractions of the duration; the last pose is drawn solid."""
 
 
 @dataclass(frozen=True)
 class FilmSettings:
+    """Size and quality of pictures and films."""
+
     width: int = 640
     """[pixels]"""
     height: int = 480
     """[pixels]"""
     oversampling: int = 2
-    """Pixels rendered for one pixel of the picture, along each side: the renderer leaves edges jagged."""
+    """Rendered pixels per pixel of the picture along each side, against jagged edges."""
     rate: float = 20.0
-    """Frames per second of a film, which runs in real time [1/s]."""
-    most_frames: int = 150
-    """Longer films have fewer frames per second."""
+    """Frame rate of a film [1/s]; films run in real time."""
+    max_frames: int = 150
+    """Most frames of a film; longer films get a lower frame rate."""
     colors: int = 128
-    """In a film's palette."""
+    """Colours of a film's palette."""
     field_of_view: float = 0.6
     """Vertical angle [rad]."""
 
@@ -61,7 +63,7 @@ class FilmSettings:
             ("height", 16, 1080),
             ("oversampling", 1, 4),
             ("rate", 1, 50),
-            ("most_frames", 2, 1000),
+            ("max_frames", 2, 1000),
             ("colors", 2, 256),
         ):
             if not low <= getattr(self, name) <= high:
@@ -73,26 +75,26 @@ class FilmSettings:
 DEFAULT = FilmSettings()
 
 
-FLAT = 0.02
-"""Obstacles that rise no further above the arm's foot are ground [m]."""
+GROUND_HEIGHT = 0.02
+"""Obstacles that rise at most this far above the arm's lowest point count as ground [m]."""
 
 
 def write_png(
     robot: Robot, scene: Scene, run: Replay, file: str | Path, settings: FilmSettings = DEFAULT
 ) -> None:
-    """One picture: the arm where the replay ends, and where it was before as ghosts.
+    """Write a picture of the arm at the end of the replay, with earlier poses as ghosts.
 
-    Raises InputError where the file cannot be written.
+    Raises InputError if the file cannot be written.
     """
     from PIL import Image
 
-    with World(robot, scene, look=True) as world:
+    with World(robot, scene, visuals=True) as world:
         camera = _prepare(world, run, settings)
-        *ghosts, picture = [_shot(world, q, camera) for q in _at(run, MOMENTS)]
+        *ghosts, picture = [_shot(world, q, camera) for q in _at(run, PICTURE_TIMES)]
     pixels, nearest = picture.rgb.astype(np.float64), picture.depth
     for ghost in reversed(ghosts):
         over = (ghost.bodies == world.body) & (ghost.depth < nearest)
-        pixels[over] = GHOST * ghost.rgb[over] + (1 - GHOST) * pixels[over]
+        pixels[over] = GHOST_OPACITY * ghost.rgb[over] + (1 - GHOST_OPACITY) * pixels[over]
         nearest = np.where(over, ghost.depth, nearest)
     content = BytesIO()
     Image.fromarray(_reduced(pixels, settings.oversampling)).save(content, "PNG")
@@ -102,17 +104,17 @@ def write_png(
 def write_gif(
     robot: Robot, scene: Scene, run: Replay, file: str | Path, settings: FilmSettings = DEFAULT
 ) -> None:
-    """A film of the replay in real time that stays a second on its last frame and starts again.
+    """Write a film of the replay in real time, which stops for a second at its end and repeats.
 
-    Raises InputError where the file cannot be written.
+    Raises InputError if the file cannot be written.
     """
     from PIL import Image
 
     duration = float(run.times[-1])
-    # GIF counts in hundredths of a second
-    delay = max(round(100 / settings.rate), int(np.ceil(100 * duration / (settings.most_frames - 1))))
+    # GIF delays are in hundredths of a second
+    delay = max(round(100 / settings.rate), int(np.ceil(100 * duration / (settings.max_frames - 1))))
     shares = np.append(np.arange(0, 100 * duration, delay) / (100 * duration), 1.0)
-    with World(robot, scene, look=True) as world:
+    with World(robot, scene, visuals=True) as world:
         camera = _prepare(world, run, settings)
         shots = [
             Image.fromarray(_reduced(_shot(world, q, camera).rgb, settings.oversampling))
@@ -128,13 +130,13 @@ def write_gif(
 
 
 def _at(run: Replay, shares: "Float[ndarray, 'n'] | tuple[float, ...]") -> Float[ndarray, "n dof"]:
-    """The simulated configurations at shares of the duration."""
+    """The simulated configurations at fractions of the duration."""
     return run.positions[np.rint(np.multiply(shares, len(run.times) - 1)).astype(np.int64)]
 
 
 def _shot(world: World, q: Float[ndarray, "dof"], camera: DepthCamera) -> RawImage:
     world.place(q)
-    return take(world, camera, LIGHT)
+    return capture(world, camera, LIGHT)
 
 
 def _reduced(pixels: ndarray, factor: int) -> UInt8[ndarray, "h w 3"]:
@@ -145,8 +147,8 @@ def _reduced(pixels: ndarray, factor: int) -> UInt8[ndarray, "h w 3"]:
 
 
 def _prepare(world: World, run: Replay, settings: FilmSettings) -> DepthCamera:
-    """Lay a floor and choose the view: arm and obstacles in the image, most of the arm in sight."""
-    poses = _at(run, MOMENTS)
+    """Add a floor, and choose the camera that shows most of the arm."""
+    poses = _at(run, PICTURE_TIMES)
     low, high = _extent(world, poses)
     _add_floor(world, low, high)
     cameras = [_camera(low, high, azimuth, settings) for azimuth in AZIMUTHS]
@@ -157,7 +159,7 @@ def _prepare(world: World, run: Replay, settings: FilmSettings) -> DepthCamera:
 def _camera(
     low: Float[ndarray, "3"], high: Float[ndarray, "3"], azimuth: float, settings: FilmSettings
 ) -> DepthCamera:
-    """Seen from this side, near enough that the box just fits."""
+    """A camera in this direction, as close as the box fits into the image."""
     flat = np.cos(ELEVATION)
     sight = np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(ELEVATION)])
     middle = (low + high) / 2
@@ -171,7 +173,7 @@ def _camera(
     )
     corners = (CORNERS * (high - low) / 2) @ camera.rotation
     wide = slope * np.array([settings.width / settings.height, 1.0])
-    distance = ROOM * float((np.abs(corners[:, :2]) / wide - corners[:, 2:]).max())
+    distance = FRAME_MARGIN * float((np.abs(corners[:, :2]) / wide - corners[:, 2:]).max())
     place = _point(middle + distance * sight)
     return replace(camera, position=place, near=0.02 * distance, far=20 * distance)
 
@@ -181,14 +183,14 @@ def _point(xyz: Float[ndarray, "3"]) -> tuple[float, float, float]:
 
 
 def _visible(world: World, q: Float[ndarray, "dof"], camera: DepthCamera) -> int:
-    """Pixels of a small picture that show the arm."""
+    """Number of pixels of a small image that show the arm."""
     world.place(q)
     small = replace(camera, width=120, height=round(120 * camera.height / camera.width))
     return int((render(world, small).labels == 0).sum())
 
 
 def _extent(world: World, poses: Float[ndarray, "n dof"]) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
-    """Corners of a box around the arm in these poses and what of the obstacles is near it [m]."""
+    """Corners of a box around the arm in these poses and the nearby parts of obstacles [m]."""
     boxes = []
     for q in poses:
         world.place(q)
@@ -199,25 +201,25 @@ def _extent(world: World, poses: Float[ndarray, "n dof"]) -> tuple[Float[ndarray
             if meshes
         ]
     low, high = np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))
-    wide, foot = (low - NEAR, high + NEAR), low[2]
+    wide, foot = (low - SHOWN_DISTANCE, high + SHOWN_DISTANCE), low[2]
     for body in world.obstacles.values():
         bounds = np.array(pybullet.getAABB(body, physicsClientId=world.client))
-        if bounds[1, 2] <= foot + FLAT:
-            continue  # what the arm stands on may leave the image
+        if bounds[1, 2] <= foot + GROUND_HEIGHT:
+            continue  # the ground need not fit into the image
         box = np.clip(bounds, *wide)
         low, high = np.minimum(low, box[0]), np.maximum(high, box[1])
     return low, high
 
 
 def _add_floor(world: World, low: Float[ndarray, "3"], high: Float[ndarray, "3"]) -> None:
-    """Tiles in two greys under everything, to be seen only."""
-    middle, radius = (low + high) / 2, TILE + float((high - low)[:2].max()) / 2
-    count = int(np.ceil(radius / TILE))
+    """Add a floor of tiles in two greys, without collision."""
+    middle, radius = (low + high) / 2, TILE_SIZE + float((high - low)[:2].max()) / 2
+    count = int(np.ceil(radius / TILE_SIZE))
     cells = np.stack(np.meshgrid(*[np.arange(-count, count)] * 2), axis=-1).reshape(-1, 2)
-    cells = cells[np.linalg.norm(cells + 0.5, axis=1) * TILE < radius]
+    cells = cells[np.linalg.norm(cells + 0.5, axis=1) * TILE_SIZE < radius]
     for parity, color in enumerate(FLOOR_COLORS):
         corners = cells[cells.sum(axis=1) % 2 == parity][:, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-        vertices = np.pad(corners.reshape(-1, 2) * TILE, ((0, 0), (0, 1)))
+        vertices = np.pad(corners.reshape(-1, 2) * TILE_SIZE, ((0, 0), (0, 1)))
         faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(corners))[:, None, None]
         xyz = np.array([*middle[:2], low[2] - FLOOR_GAP])
         world.add_surface(vertices, faces.reshape(-1, 3), color, xyz)

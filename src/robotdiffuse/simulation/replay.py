@@ -1,12 +1,12 @@
-"""A timed motion under PyBullet's position control: how well it is tracked, and whether it touches anything.
+"""Replay of a trajectory in PyBullet with position control: tracking errors and contacts.
 
-Each joint has a motor that PyBullet drives towards the position of the trajectory, with its velocity as feed
-forward. Gravity acts; links are of uniform density (`World`), as the robot's file keeps no masses; motors are
-strong, since it keeps no torque limits either. What a replay shows is therefore that the motion is smooth
-enough to be tracked and stays free while it is, not that a certain motor can do it.
+Each joint has a motor that PyBullet drives towards the position of the trajectory, with the velocity as feed
+forward. Gravity acts. Links have uniform density (`World`) and motors are strong, because the robot file has
+neither masses nor torque limits. So a replay shows that the motion is smooth enough to track and free of
+contacts while tracked, not that a certain motor can execute it.
 
-Contact is what pushes. Bullet's meshes are 1 mm too large, so a motion that passes an obstacle closer than
-that (for two links, 2 mm) touches it here.
+Bullet's meshes are 1 mm too large. A motion that passes an obstacle at less than that (2 mm between two
+links) has a contact here.
 """
 
 from dataclasses import dataclass, replace
@@ -25,20 +25,22 @@ from robotdiffuse.simulation.world import DENSITY, World
 
 @dataclass(frozen=True)
 class ReplaySettings:
+    """Settings of the simulation and of its motors."""
+
     time_step: float = 1 / 240
-    """Of the simulation [s]; the default is PyBullet's own."""
+    """Time step of the simulation [s]; the default is PyBullet's own."""
     position_gain: float = 0.3
-    """Share of a position error that a motor takes back in one time step, in (0, 1]."""
+    """Fraction of a position error that a motor corrects in one time step, in (0, 1]."""
     velocity_gain: float = 1.0
-    """Share of a velocity error that a motor takes back in one time step, in (0, 1]."""
+    """Fraction of a velocity error that a motor corrects in one time step, in (0, 1]."""
     force: float = 500.0
-    """Most that a motor gives [N m], [N] for a prismatic joint."""
+    """Largest motor torque [N m], or force [N] for a prismatic joint."""
     gravity: float = 9.81
-    """Along -z of the base [m/s^2]."""
+    """Gravity along -z of the base [m/s^2]."""
     density: float = DENSITY
-    """Of all links [kg/m^3]."""
+    """Density of all links [kg/m^3]."""
     settle: float = 0.25
-    """Time that the motors hold the last configuration after the motion [s]."""
+    """Time for which the motors hold the last configuration after the motion [s]."""
 
     def __post_init__(self) -> None:
         if not 1e-5 <= self.time_step <= 1 / 240:
@@ -58,57 +60,57 @@ DEFAULT = ReplaySettings()
 
 @dataclass(frozen=True)
 class ReplayContact:
-    """Two things that touched during a replay."""
+    """A contact between two bodies during a replay."""
 
     link: str
     other: str
     """An obstacle or another link."""
     time: float
-    """When they first did [s]."""
+    """Time of the first contact [s]."""
     depth: float
-    """The deepest that they went into each other, ever [m]; negative where something was left between them.
+    """Largest penetration depth [m]; negative if a gap remained.
 
-    Bullet's meshes push from 1 mm off, and what it pushes away may never come nearer.
+    Bullet's meshes push from a distance of 1 mm, so that bodies may be pushed apart before they meet.
     """
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """What the simulator did with a trajectory."""
+    """The result of a replay."""
 
     joint_names: tuple[str, ...]
     times: Float[ndarray, "n"]
-    """After each time step, first 0 [s]."""
+    """Simulated times, from 0 [s]."""
     positions: Float[ndarray, "n dof"]
-    """As simulated [rad], [m] for prismatic joints."""
+    """Simulated positions [rad], [m] for prismatic joints."""
     reference: Float[ndarray, "n dof"]
-    """As asked for, at the same times."""
+    """Positions of the trajectory at the same times."""
     tip_errors: Float[ndarray, "n"]
-    """Distance of the robot's tip from where the reference puts it [m]."""
+    """Distance of the robot's tip from its reference position [m]."""
     contacts: tuple[ReplayContact, ...]
-    """By the time at which they began."""
+    """Contacts in order of their first time."""
 
     @property
     def free(self) -> bool:
-        """Whether nothing touched."""
+        """Whether there were no contacts."""
         return not self.contacts
 
     @property
     def max_errors(self) -> Float[ndarray, "dof"]:
-        """The greatest tracking error of each joint [rad]."""
+        """Largest tracking error of each joint [rad]."""
         return np.abs(self.positions - self.reference).max(axis=0)
 
     @property
     def rms_errors(self) -> Float[ndarray, "dof"]:
-        """The root mean square of each joint's tracking error [rad]."""
+        """Root mean square tracking error of each joint [rad]."""
         return np.sqrt(((self.positions - self.reference) ** 2).mean(axis=0))
 
 
 def replay(robot: Robot, scene: Scene, trajectory: Trajectory, settings: ReplaySettings = DEFAULT) -> Replay:
-    """Simulate a trajectory from its first row to the last, and then `settings.settle` seconds of rest.
+    """Simulate a trajectory, and then `settings.settle` seconds of rest.
 
-    An arm that hits an obstacle is held back by it; the simulation goes on to the end. Raises InputError for
-    a trajectory of other joints.
+    An obstacle that the arm hits blocks it; the simulation continues to the end. Raises InputError for a
+    trajectory of other joints.
     """
     if trajectory.joint_names != robot.joint_names:
         raise InputError(
@@ -125,7 +127,8 @@ def replay(robot: Robot, scene: Scene, trajectory: Trajectory, settings: ReplayS
 
 
 def sample(trajectory: Trajectory, times: Float[ndarray, "n"]) -> Float[ndarray, "n dof"]:
-    """Positions at times [s]: cubic between the rows, with their velocities; the last row after the end."""
+    """Positions at times [s], by cubic interpolation with the rows' velocities; the last row after the
+    end."""
     t = np.clip(times, 0.0, trajectory.duration)
     i = np.clip(np.searchsorted(trajectory.times, t, side="right") - 1, 0, len(trajectory.times) - 2)
     h = (trajectory.times[i + 1] - trajectory.times[i])[:, None]
@@ -169,7 +172,7 @@ def _simulate(
             body,
             world.joints,
             pybullet.POSITION_CONTROL,
-            # where the arm should be now, and the speed that takes it to where it should be next
+            # the position for now, and the velocity that leads to the next position
             targetPositions=reference[k - 1].tolist(),
             targetVelocities=velocities[k - 1].tolist(),
             **gains,
@@ -177,7 +180,7 @@ def _simulate(
         pybullet.stepSimulation(physicsClientId=client)
         states = pybullet.getJointStates(body, world.joints, physicsClientId=client)
         positions[k] = [state[0] for state in states]
-        # a step looks for contacts where it begins
+        # a step detects contacts at its beginning
         for link, other, distance in world.touching():
             new = ReplayContact(link, other, float(times[k - 1]), -distance)
             known = contacts.get((link, other), new)
@@ -186,7 +189,7 @@ def _simulate(
 
 
 def _tips(world: World, positions: Float[ndarray, "n dof"]) -> Float[ndarray, "n 3"]:
-    """Where the tip link is [m]."""
+    """Positions of the tip link [m]."""
     tip, at = world.links[world.robot.tip], []
     for q in positions:
         world.place(q)

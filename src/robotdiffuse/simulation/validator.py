@@ -1,9 +1,8 @@
-"""PyBullet as a second, independent validator of collision (extra `sim`).
+"""PyBullet as a second, independent collision validator (extra `sim`).
 
-It shares nothing with our kinematics and collision code but the data: the robot goes to PyBullet as a URDF,
-with its own forward kinematics, broad phase and closest points by its GJK. Bullet blows convex meshes up by
-1 mm; that is taken off here, and what remains of the difference to exact distances is below 1 mm (measured:
-0.6 mm).
+It shares only data with RobotDiffuse's kinematics and collision code: PyBullet loads the robot as a URDF and
+uses its own forward kinematics, broad phase and GJK closest points. Bullet inflates convex meshes by 1 mm,
+which is subtracted here; the remaining difference to exact distances is below 1 mm (measured: 0.6 mm).
 """
 
 from dataclasses import dataclass, replace
@@ -19,27 +18,28 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import World
 
-FAR = 10.0
-"""Distances are looked for up to this [m]."""
+MAX_DISTANCE = 10.0
+"""Distances are measured up to this [m]."""
 
 
 @dataclass(frozen=True)
 class OracleContact:
-    """The nearest thing that PyBullet found at one configuration."""
+    """The closest pair of bodies at one configuration."""
 
     link: str
     other: str
     """An obstacle or another link."""
     distance: float
-    """[m], negative inside."""
+    """Signed distance [m], negative if they overlap."""
     at: float = 0.0
-    """Waypoint index plus fraction, along a path; the row, among frames."""
+    """For a path, waypoint index plus fraction of the segment; for frames, the row."""
 
 
 class PyBulletOracle:
-    """A robot and a scene in a PyBullet world of its own, without a window.
+    """A collision checker with a PyBullet world of its own, without a window.
 
-    Links that no planned joint moves are checked against moving links only. Close it, or use it in a `with`.
+    Links that no planned joint moves are checked only against moving links. Call `close`, or use it in a
+    `with` statement.
     """
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
@@ -53,40 +53,41 @@ class PyBulletOracle:
         self.close()
 
     def close(self) -> None:
-        """End PyBullet's world."""
+        """Close the PyBullet world."""
         self._world.close()
 
     def set_scene(self, scene: Scene) -> None:
-        """Replace the obstacles; the robot stays loaded, which makes this a thousand times cheaper."""
+        """Replace the obstacles; a thousand times cheaper than a new oracle, because the robot stays
+        loaded."""
         self._world.set_scene(scene)
 
-    def nearest(self, q: Float[ndarray, "dof"], within: float = FAR) -> OracleContact | None:
-        """The least signed distance to the scene or between links; None if it exceeds `within` [m]."""
+    def nearest(self, q: Float[ndarray, "dof"], within: float = MAX_DISTANCE) -> OracleContact | None:
+        """The closest pair, link and obstacle or two links; None if its distance exceeds `within` [m]."""
         world = self._world
         world.place(q)
         best: OracleContact | None = None
         for link in world.moving:
             for name, body in world.obstacles.items():
-                best = self._nearer(best, within, link, name, body, -1)
+                best = self._closer(best, within, link, name, body, -1)
         for a, b in world.pairs:
-            best = self._nearer(best, within, a, b, world.body, world.links[b])
+            best = self._closer(best, within, a, b, world.body, world.links[b])
         return best
 
     def distance(self, q: Float[ndarray, "dof"]) -> float:
-        """The least signed distance to the scene or between links [m], at most 10."""
+        """The smallest signed distance to the scene or between links [m], at most MAX_DISTANCE."""
         nearest = self.nearest(q)
-        return FAR if nearest is None else nearest.distance
+        return MAX_DISTANCE if nearest is None else nearest.distance
 
     def collides(self, q: Float[ndarray, "dof"], tolerance: float = 0.0) -> bool:
-        """Whether anything is deeper than the tolerance [m]."""
+        """Whether any pair penetrates deeper than the tolerance [m]."""
         return self.nearest(q, -tolerance) is not None
 
     def check_frames(self, q: Float[ndarray, "n dof"], tolerance: float = 0.001) -> OracleContact | None:
         """The first contact deeper than the tolerance [m] among these configurations, or None.
 
-        Its `at` is the row. All pairs go through Bullet's own broad phase in one call for each configuration,
-        which takes 20 us for a Panda, an eighth of what `nearest` takes; what that finds, `nearest` confirms.
-        Raises InputError for a negative tolerance: the broad phase knows only what touches.
+        Its `at` is the row. Each configuration takes one call of Bullet's broad phase for all pairs (20 us
+        for a Panda, an eighth of `nearest`); `nearest` confirms the contacts found. Raises InputError for a
+        negative tolerance, because the broad phase finds only contacts.
         """
         if tolerance < 0:
             raise InputError(f"tolerance is {tolerance}; it must not be negative")
@@ -103,9 +104,9 @@ class PyBulletOracle:
         return None
 
     def check_path(self, path: Path, step: float = 0.01, tolerance: float = 0.001) -> OracleContact | None:
-        """The first contact deeper than the tolerance [m] among configurations `step` apart, or None.
+        """The first contact deeper than the tolerance [m] at configurations along the path, or None.
 
-        `step` [rad, joint-space L2]. The default tolerance is that of Bullet itself.
+        step: distance between configurations [rad, joint-space L2]. The default tolerance is Bullet's own.
         """
         q = path.positions
         at = [np.arange(1.0)]
@@ -119,7 +120,7 @@ class PyBulletOracle:
         found = self.check_frames(frames, tolerance)
         return None if found is None else replace(found, at=float(places[int(found.at)]))
 
-    def _nearer(
+    def _closer(
         self, best: OracleContact | None, within: float, link: str, other: str, body: int, index: int
     ) -> OracleContact | None:
         world = self._world

@@ -1,4 +1,4 @@
-"""A robot and obstacles in a PyBullet world of its own, without a window: shared by all of this folder."""
+"""World: a robot and obstacles in a PyBullet simulation without a window."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,43 +23,42 @@ from robotdiffuse.scenes.shapes import (
 )
 from robotdiffuse.simulation.model import write_obj, write_points_urdf, write_shaded, write_urdf
 
-MARGIN = 0.001
-"""What Bullet adds around each convex mesh [m]; its own call to set this has no effect."""
+COLLISION_MARGIN = 0.001
+"""Margin that Bullet adds around each convex mesh [m]; Bullet's call to change it has no effect."""
 DENSITY = 1000.0
-"""Of all links, of which URDFs tell us no masses [kg/m^3]. It gives a Panda 19.7 kg; a real one has 18."""
+"""Density of all links [kg/m^3], because robot files have no masses. A Panda gets 19.7 kg; a real one has
+18."""
 OTHER, LINK, OTHER_LINK, DISTANCE, FORCE = 2, 3, 4, 8, 9
-"""Columns of PyBullet's contact points: the second body, links of both, their distance, the normal force."""
+"""Columns of PyBullet's contact points: second body, link of each body, distance, normal force."""
 OBSTACLE_COLORS = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
 FURNITURE_COLOR = (0xCD, 0xC0, 0xAC)
 FURNITURE_SIZE = 0.7
-"""Obstacles with a longer side than this are walls and tables, in a quiet colour [m]."""
+"""Obstacles with a longer side than this count as furniture, with its own colour [m]."""
 
 
 class World:
-    """A robot, its base fixed, and obstacles that can be replaced. Close it, or use it in a `with`.
+    """A robot on a fixed base, and replaceable obstacles. Call `close`, or use it in a `with` statement.
 
-    Collisions are switched on for exactly the pairs that the project checks: links that a planned joint moves
+    Collisions are enabled for exactly the pairs that RobotDiffuse checks: links that a planned joint moves
     against obstacles, and links on different frames unless they are allowed to touch.
     """
 
-    def __init__(self, robot: Robot, scene: Scene, look: bool = False, density: float = DENSITY) -> None:
-        """`look`: give robot and obstacles coloured surfaces, for cameras and pictures; loading takes longer.
-
-        `density` of all links [kg/m^3].
-        """
+    def __init__(self, robot: Robot, scene: Scene, visuals: bool = False, density: float = DENSITY) -> None:
+        """visuals: add coloured surfaces for cameras and pictures, which takes longer to load. density: of
+        all links [kg/m^3]."""
         self.robot = robot
-        self.look = look
+        self.visuals = visuals
         self.client = pybullet.connect(pybullet.DIRECT)
-        # Bullet would take a file of the same name for the same mesh
+        # otherwise Bullet takes a file of the same name for the same mesh
         pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self.client)
         flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
         self._folder = TemporaryDirectory()
-        urdf = write_urdf(robot, Path(self._folder.name), density, look)
+        urdf = write_urdf(robot, Path(self._folder.name), density, visuals)
         self.body: int = pybullet.loadURDF(
             str(urdf), useFixedBase=True, flags=flags, physicsClientId=self.client
         )
         self.links: dict[str, int] = {robot.base: -1}
-        """PyBullet's index of each link, and of the joint that moves it."""
+        """PyBullet's index of each link, which is also that of the joint above it."""
         indices: dict[str, int] = {}
         for index in range(pybullet.getNumJoints(self.body, physicsClientId=self.client)):
             info = pybullet.getJointInfo(self.body, index, physicsClientId=self.client)
@@ -82,14 +81,15 @@ class World:
             if robot.link_frame(a) != robot.link_frame(b)
             and frozenset((a, b)) not in robot.allowed_collisions
         ]
-        """Links that are checked against each other."""
+        """Pairs of links that are checked against each other."""
         self._filter_links(solid)
         for index, value in self.held.items():
             pybullet.resetJointState(self.body, index, value, physicsClientId=self.client)
         self.obstacles: dict[str, int] = {}
-        """PyBullet's number of each obstacle, by name."""
-        self._meshes: dict[tuple[bytes, bytes], int] = {}
-        """PyBullet's number of the shape of each mesh: what a mesh takes, it never gives back."""
+        """PyBullet's body index of each obstacle, by name."""
+        self.mesh_shapes: dict[tuple[bytes, bytes], int] = {}
+        """PyBullet's collision shape of each mesh; reused because PyBullet never frees the memory of a
+        mesh."""
         self.set_scene(scene)
 
     def __enter__(self) -> "World":
@@ -99,13 +99,13 @@ class World:
         self.close()
 
     def close(self) -> None:
-        """End PyBullet's world."""
+        """Close the simulation and delete its files."""
         if pybullet.isConnected(self.client):
             pybullet.disconnect(self.client)
             self._folder.cleanup()
 
     def set_scene(self, scene: Scene) -> None:
-        """Replace all obstacles; the robot stays, which saves loading its meshes."""
+        """Replace all obstacles; the robot stays loaded."""
         for body in self.obstacles.values():
             pybullet.removeBody(body, physicsClientId=self.client)
         self.obstacles = {}
@@ -117,13 +117,13 @@ class World:
                 pybullet.setCollisionFilterPair(self.body, body, index, -1, 0, physicsClientId=self.client)
 
     def place(self, q: Float[ndarray, "dof"]) -> None:
-        """Put the arm at a configuration, at rest."""
+        """Place the arm in a configuration, at rest."""
         pybullet.resetJointStatesMultiDof(
             self.body, self.joints, q[:, None].tolist(), physicsClientId=self.client
         )
 
     def touching(self) -> list[tuple[str, str, float]]:
-        """What pushed on what in the last step: link, obstacle or other link, signed distance [m]."""
+        """Contacts of the last step: link, obstacle or other link, signed distance [m]."""
         links = {index: link for link, index in self.links.items()}
         obstacles = {body: name for name, body in self.obstacles.items()}
         return [
@@ -137,8 +137,10 @@ class World:
         ]
 
     def gap(self, point: tuple) -> float:
-        """Signed distance of one of PyBullet's contact points, without the margins of meshes [m]."""
-        return float(point[DISTANCE] + (2 * MARGIN if point[OTHER] == self.body else MARGIN))
+        """Signed distance [m] of a PyBullet contact point, corrected for the margins of meshes."""
+        return float(
+            point[DISTANCE] + (2 * COLLISION_MARGIN if point[OTHER] == self.body else COLLISION_MARGIN)
+        )
 
     def _filter_links(self, solid: list[str]) -> None:
         checked = {frozenset(pair) for pair in self.pairs}
@@ -167,12 +169,12 @@ class World:
             kind = pybullet.GEOM_CYLINDER if isinstance(shape, Cylinder) else pybullet.GEOM_CAPSULE
             what = {"shapeType": kind, "radius": shape.radius, "height": shape.height}
             xyz, wxyz = shape.center, shape.wxyz
-        look = -1
-        if self.look:
-            # of our own making: PyBullet's spheres and cylinders are coarse
+        visual = -1
+        if self.visuals:
+            # PyBullet's own spheres and cylinders are too coarse
             vertices, faces = _surface(shape)
             large = np.ptp(vertices, axis=0).max() > FURNITURE_SIZE
-            look = self._add_look(vertices, faces, FURNITURE_COLOR if large else color)
+            visual = self._add_visual(vertices, faces, FURNITURE_COLOR if large else color)
         solid = (
             self._mesh(shape.mesh)
             if isinstance(shape, Triangulated)
@@ -180,30 +182,31 @@ class World:
         )
         return pybullet.createMultiBody(
             baseCollisionShapeIndex=solid,
-            baseVisualShapeIndex=look,
+            baseVisualShapeIndex=visual,
             basePosition=xyz.tolist(),
             baseOrientation=[*wxyz[1:], wxyz[0]],
             physicsClientId=self.client,
         )
 
     def _mesh(self, mesh: Mesh) -> int:
-        """The shape of a mesh, hollow as it may be, at the origin."""
+        """PyBullet's collision shape of a mesh, which may be hollow, at the origin."""
         key = mesh.vertices.tobytes(), mesh.faces.tobytes()
-        if key not in self._meshes:
+        if key not in self.mesh_shapes:
             file = Path(self._folder.name) / "obstacle.obj"
             write_obj(file, mesh.vertices, mesh.faces)
-            self._meshes[key] = pybullet.createCollisionShape(
+            self.mesh_shapes[key] = pybullet.createCollisionShape(
                 pybullet.GEOM_MESH,
                 fileName=str(file),
                 flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
                 physicsClientId=self.client,
             )
-        return self._meshes[key]
+        return self.mesh_shapes[key]
 
     def _add_points(self, cloud: PointCloud, color: tuple[int, int, int]) -> int:
-        """One body of as many spheres; only from a URDF does PyBullet take more than 16."""
+        """One body with a sphere for each point, loaded from a URDF because PyBullet otherwise allows only
+        16."""
         file = write_points_urdf(
-            cloud.points, cloud.point_radius, color if self.look else None, Path(self._folder.name)
+            cloud.points, cloud.point_radius, color if self.visuals else None, Path(self._folder.name)
         )
         return pybullet.loadURDF(str(file), useFixedBase=True, physicsClientId=self.client)
 
@@ -214,16 +217,17 @@ class World:
         color: tuple[int, int, int],
         xyz: Float[ndarray, "3"],
     ) -> None:
-        """Something to be seen that nothing collides with, for good; `color` in sRGB, 0 to 255."""
-        look = self._add_look(vertices, faces, color)
+        """Add a surface without collision, which stays until the world is closed; `color` in sRGB, 0 to
+        255."""
+        visual = self._add_visual(vertices, faces, color)
         pybullet.createMultiBody(
-            baseVisualShapeIndex=look, basePosition=xyz.tolist(), physicsClientId=self.client
+            baseVisualShapeIndex=visual, basePosition=xyz.tolist(), physicsClientId=self.client
         )
 
-    def _add_look(
+    def _add_visual(
         self, vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"], color: tuple[int, int, int]
     ) -> int:
-        file = Path(self._folder.name) / "look.obj"  # read when a body is made of it
+        file = Path(self._folder.name) / "visual.obj"  # PyBullet reads it when a body is created
         write_shaded(file, vertices, faces)
         return pybullet.createVisualShape(
             pybullet.GEOM_MESH,
@@ -234,7 +238,7 @@ class World:
 
 
 def _surface(shape: Shape) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
-    """Vertices and faces in the shape's own frame; round ones to 0.2 mm for a radius of 0.25 m."""
+    """Vertices and faces in the shape's own frame, accurate to 0.2 mm for a round shape of radius 0.25 m."""
     import trimesh
 
     match shape:

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.settings import Bound, Count, NotNegative, OneOf, Positive, Settings
+from robotdiffuse.core.deadline import check_timing
+from robotdiffuse.core.settings import Bound, Count, NotNegative, OneOf, Settings
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline
@@ -18,10 +19,27 @@ from robotdiffuse.trajectories.timing_kernel import fastest, sampled, slowdown
 COMPILED, TOPPRA = "compiled", "toppra"
 FINE = 0.001
 """Time between the rows that a limit of jerk is kept by [s]."""
+MOST_ROWS = 200_000
+"""Of a motion between two stops; those of a longer motion are further apart."""
+MOST_FINE_ROWS = 1_000_000
+"""Of a motion between two stops that a limit of jerk is kept by."""
+ROW_SECONDS = 5e-6
+"""What sampling and validating a row takes [s]."""
 LEAST_STEPS = 4
 """Between the rows of a motion however short, or its rows would not tell that it speeds up and brakes."""
 GENTLER = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
-"""Shares of the acceleration limits of which the fastest motion of limited jerk is taken."""
+"""Shares of the acceleration limits of which the fastest motion of limited jerk is taken; while the last one
+is the fastest, further ones follow, each STILL_GENTLER times the one before."""
+STILL_GENTLER = 0.7
+LEAST_WINDOW = 1.5
+"""Rows that the acceleration takes to change at least, however high the limit of jerk: in less than one, the
+velocities of the rows would not agree with their accelerations."""
+LEAST_SCALING = 1e-3
+"""Of velocities and accelerations: a motion with less is a thousand times slower, or has no end."""
+LEAST_JERK = 0.01
+"""Of limits [rad/s³] or [m/s³]; with it a joint takes 15 s to turn by 1 rad."""
+Scaling = Annotated[float, Bound(least=LEAST_SCALING, most=1.0)]
+Jerk = Annotated[float, Bound(least=LEAST_JERK)]
 BETWEEN = 8
 """Parts of a grid interval between which paces and torques are looked at."""
 ROOM = 2e-3
@@ -37,12 +55,13 @@ class TooFastError(RuntimeError):
 @dataclass(frozen=True)
 class TimingSettings(Settings, name="timing"):
     sample_time: Annotated[float, Bound(least=1e-4, most=1.0)] = 0.01
-    """Time between the rows of a trajectory [s]; the step before a stop may be 0.1 to 1.1 times as long."""
-    velocity_scale: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
+    """Time between the rows of a trajectory [s]; the step before a stop may be 0.1 to 1.1 times as long. More
+    in motions that would have more than MOST_ROWS rows."""
+    velocity_scale: Scaling = 1.0
     """Share of the robot's velocity limits that is used."""
-    acceleration_scale: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
+    acceleration_scale: Scaling = 1.0
     """Share of the robot's acceleration limits that is used."""
-    jerk: Positive | None = None
+    jerk: Jerk | None = None
     """Most jerk of any joint [rad/s³] or [m/s³]; None: accelerations may change at once."""
     corner_deviation: NotNegative = 0.1
     """How far a rounded corner may leave the path, if it stays valid there [rad, joint-space L2]."""
@@ -141,28 +160,78 @@ def timed_piece(
     begins: float = 0.0,
     beside: Beside = NOTHING,
 ) -> Rows:
-    """A motion from a speed, or rest, to rest; with limited jerk from rest."""
+    """A motion from a speed, or rest, to rest; with limited jerk from rest.
+
+    Raises OutOfTimeError where a deadline leaves no time for it.
+    """
     grid, limits = timing_grid(line, settings), _limits(robot, settings)
-    if settings.jerk is None:
-        speeds = _slowed(line, grid, _speeds(line, grid, settings.solver, *limits, begins, beside), beside)
-        step = min(settings.sample_time, _lasts(grid, speeds) / LEAST_STEPS)
-        return sampled(line.arrays, grid, speeds, step)
-    every = max(round(settings.sample_time / FINE), 1)
-    step, found = settings.sample_time / every, list[tuple[float, ndarray, int]]()
-    for share in GENTLER:
-        velocity, acceleration = limits[0], share * limits[1]
-        window = max(int(np.ceil(2 * acceleration.max() / settings.jerk / step)), 1)
-        speeds = _speeds(line, grid, settings.solver, velocity, acceleration, beside=beside)
+    if settings.jerk is not None:
+        return _of_limited_jerk(line, grid, *limits, settings, settings.jerk, beside)
+    speeds = _slowed(line, grid, _speeds(line, grid, settings.solver, *limits, begins, beside), beside)
+    lasts = _lasts(grid, speeds)
+    step = min(_spacing(lasts, settings.sample_time, MOST_ROWS), lasts / LEAST_STEPS)
+    _check_rows(lasts, step)
+    return sampled(line.arrays, grid, speeds, step)
+
+
+class _Gentle(NamedTuple):
+    """The fastest motion with a share of the acceleration limits, to be averaged over a window."""
+
+    lasts: float
+    """The mean [s]."""
+    speeds: Float[ndarray, "m"]
+    """So slow that the motion lasts whole steps."""
+    window: int
+    """Steps."""
+
+
+def _of_limited_jerk(
+    line: BlendedPolyline,
+    grid: Float[ndarray, "m"],
+    velocity: Float[ndarray, "dof"],
+    acceleration: Float[ndarray, "dof"],
+    settings: TimingSettings,
+    jerk: float,
+    beside: Beside,
+) -> Rows:
+    """A motion from rest to rest: the mean of one that is the fastest with a share of the accelerations."""
+
+    def gentle(share: float, step: float) -> _Gentle:
+        window = int(np.ceil(max(2 * share * acceleration.max() / jerk / step, LEAST_WINDOW * every)))
+        speeds = _speeds(line, grid, settings.solver, velocity, share * acceleration, beside=beside)
         speeds = _slowed(line, grid, speeds, beside)
         lasts = _lasts(grid, speeds)
-        slower = np.ceil(lasts / step) * step / lasts  # whole steps
-        found.append((lasts * slower + window * step, speeds / slower, window))
-    _, speeds, window = min(found, key=lambda timed: timed[0])
-    rows = sampled(line.arrays, grid, speeds, step)[1:]
-    times, q, v, a = smoothed(*rows, step, window, every)
+        slower = np.ceil(lasts / step) * step / lasts
+        return _Gentle(lasts * slower + window * step, speeds / slower, window)
+
+    every = max(round(settings.sample_time / FINE), 1)
+    step = settings.sample_time / every
+    found = {share: gentle(share, step) for share in GENTLER}
+    best = min(found, key=lambda share: found[share].lasts)
+    while best == min(found):
+        found[STILL_GENTLER * best] = gentle(STILL_GENTLER * best, step)
+        best = min(found, key=lambda share: found[share].lasts)
+    motion, wider = found[best], _spacing(found[best].lasts, step, MOST_FINE_ROWS)
+    if wider > step:
+        step, motion = wider, gentle(best, wider)
+    every = max(every, round(_spacing(motion.lasts, every * step, MOST_ROWS) / step))
+    _check_rows(motion.lasts, step)
+    rows = sampled(line.arrays, grid, motion.speeds, step)[1:]
+    times, q, v, a = smoothed(*rows, step, motion.window, every)
     # the mean of motions within the torque limits may need a hair more
     slower = 1.0 if beside.dynamics is None else _times_too_fast(beside.dynamics, q, v, a)
     return (times * slower, q, v / slower, a / slower**2) if slower > 1 else (times, q, v, a)
+
+
+def _spacing(lasts: float, step: float, most: int) -> float:
+    """Time between the rows of a motion that lasts so long, such that it has no more than `most` [s]."""
+    return max(step, lasts / most)
+
+
+def _check_rows(lasts: float, step: float) -> None:
+    """OutOfTimeError where a deadline leaves no time for the rows of a motion."""
+    count = int(np.ceil(lasts / step))
+    check_timing(f"the {count} rows of a motion of {lasts:.3g} s", ROW_SECONDS * count)
 
 
 def _lasts(grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"]) -> float:
@@ -199,6 +268,7 @@ def _speeds(
     """ṡ at each value of s in the grid, such that the limits are kept in between too."""
     share = 1.0
     while True:
+        check_timing("the fastest speeds")
         limits = share * velocity, share**2 * acceleration
         if solver == TOPPRA:
             speeds = _speeds_by_toppra(line, grid, *limits, begins)
@@ -207,7 +277,7 @@ def _speeds(
         if begins and np.isnan(speeds).any():
             raise TooFastError(f"the motion cannot stop along the path from {begins:.3g} rad/s")
         if not (speeds[1:-1] > 0).all():
-            raise RuntimeError("no timing was found; every path has one, so this is a numerical failure")
+            raise RuntimeError("toppra found no timing; solver=compiled has one for every path")
         slower = slowdown(line.arrays, grid, speeds, velocity, acceleration)
         if begins == 0:
             return speeds / slower

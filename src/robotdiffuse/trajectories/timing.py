@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import MIN_RATE
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Robot
@@ -59,7 +60,7 @@ def time_parameterize(
     Times start at 0 and strictly increase; the first and last rows are the first and last waypoint exactly.
     A path of length zero becomes two equal rows at rest.
 
-    Raises InputError when a joint has no velocity or acceleration limit above 0.
+    Raises InputError when a velocity or acceleration limit of a joint is below MIN_RATE.
     """
     _check_limits(robot)
     rows = _distinct(path.positions)
@@ -131,8 +132,10 @@ def _rounded(
 def _check_limits(robot: Robot) -> None:
     for what in ("velocity", "acceleration"):
         for name, limit in zip(robot.joint_names, getattr(robot, what), strict=True):
-            if not limit > 0:
-                raise InputError(f"{robot.name}: the {what} limit of {name} is {limit}; it must be above 0")
+            if not limit >= MIN_RATE:
+                raise InputError(
+                    f"{robot.name}: the {what} limit of {name} is {limit}; it must be at least {MIN_RATE:g}"
+                )
 
 
 def _distinct(positions: Float[ndarray, "n dof"]) -> Int[ndarray, "m"]:

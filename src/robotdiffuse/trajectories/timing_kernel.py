@@ -16,6 +16,11 @@ BETWEEN, ROUNDING = 1.0002, 1 + 1e-9
 """Spared of limits on curves, since rates between those places were up to 0.025 % greater, and elsewhere."""
 TINY = 1e-7
 """Derivatives by s, which are of length one on lines, count as zero below this."""
+NEGLIGIBLE = 1e-8
+"""Share of an acceleration limit below which the next speed has no part in an acceleration."""
+LEAST_SHARE = 0.01
+"""What ṡ² at a grid point has at least of the one before and of the most that is possible there: where q' of
+a joint changes its sign, the limits would let a motion be so fast that only a stop can follow."""
 
 
 @njit(cache=True)
@@ -71,50 +76,58 @@ def places(line, s, order):
 
 
 @njit(cache=True)
-def _bounds_of_u(first, second, i, width, x, most, weakest, strongest):
-    """The least and greatest u at x in interval i, as lines over x: values at 0 and slopes, since x may be so
-    large that the values there cancel. `most` is the greatest next x."""
-    high, high_slope = most / (2 * width), -1 / (2 * width)
-    low, low_slope = 0.0, -1 / (2 * width)
+def _bounds_of_next(first, second, i, width, x, most, weakest, strongest):
+    """The least and greatest next x from x in interval i, as lines over x: values at 0 and slopes, since x
+    may be so large that the values there cancel. Last, the greatest x within the limits that do not depend
+    on the next x. `most` is the greatest next x.
+
+    With u = (y - x) / (2 width), the acceleration of a joint is alpha x + beta y at both ends.
+    """
+    high, high_slope = most, 0.0
+    low, low_slope = (0.0, LEAST_SHARE) if x < most else (LEAST_SHARE * most, 0.0)
+    greatest = np.inf
     for j in range(first.shape[1]):
         for k in range(2):
-            curve = second[i + k, j]
-            a = first[i + k, j] + (2 * width * curve if k else 0.0)
-            if abs(a) < TINY:
+            pull, curve = first[i + k, j] / (2 * width), second[i + k, j]
+            alpha, beta = (-pull, pull + curve) if k else (curve - pull, pull)
+            weak, strong = weakest[i + k, j], strongest[i + k, j]
+            if abs(beta) * most <= NEGLIGIBLE * min(strong, -weak):
+                if alpha != 0:
+                    greatest = min(greatest, (strong if alpha > 0 else weak) / alpha)
                 continue
-            up, down, slope = strongest[i + k, j] / a, weakest[i + k, j] / a, -curve / a
-            if a < 0:
+            up, down, slope = strong / beta, weak / beta, -alpha / beta
+            if beta < 0:
                 up, down = down, up
             if up + slope * x < high + high_slope * x:
                 high, high_slope = up, slope
             if down + slope * x > low + low_slope * x:
                 low, low_slope = down, slope
-    return low, low_slope, high, high_slope
+    return low, low_slope, high, high_slope, greatest
 
 
 @njit(cache=True)
 def controllable(first, second, grid, velocity, weakest, strongest):
     """The greatest ṡ² at each value of the grid s[m] from which the end can be reached at rest within the
-    limits, from q'[m, dof] and q''[m, dof] there: velocities [dof], least and greatest accelerations
-    [m, dof]."""
+    limits, without a stop before it, from q'[m, dof] and q''[m, dof] there: velocities [dof], least and
+    greatest accelerations [m, dof]. It is above 0 but at the end."""
     n, dof = first.shape
-    x = np.empty(n)  # the most that limits of velocity, and of acceleration where no u helps, allow
-    for i in range(n):
+    x = np.empty(n)
+    for i in range(n):  # what limits of velocity allow
         most = np.inf
         for j in range(dof):
-            if abs(first[i, j]) > TINY:
+            if first[i, j] != 0:
                 most = min(most, (velocity[j] / abs(first[i, j])) ** 2)
-            elif abs(second[i, j]) > TINY:
-                limit = strongest[i, j] if second[i, j] > 0 else weakest[i, j]
-                most = min(most, limit / second[i, j])
         x[i] = most
     x[n - 1] = 0.0
     for i in range(n - 2, -1, -1):
         width = grid[i + 1] - grid[i]
         for _ in range(64):
-            low, low_slope, high, high_slope = _bounds_of_u(
+            low, low_slope, high, high_slope, greatest = _bounds_of_next(
                 first, second, i, width, x[i], x[i + 1], weakest, strongest
             )
+            if x[i] > greatest:
+                x[i] = greatest
+                continue
             if low + low_slope * x[i] <= high + high_slope * x[i] or low_slope <= high_slope:
                 break
             x[i] = min((high - low) / (low_slope - high_slope), x[i])
@@ -124,7 +137,7 @@ def controllable(first, second, grid, velocity, weakest, strongest):
 @njit(cache=True)
 def fastest(first, second, grid, velocity, weakest, strongest, begins=0.0):
     """ṡ [m] at each value of the grid s[m], `begins` at the first and 0 at the last, from what `controllable`
-    takes; NaN where the end cannot be reached from so fast a beginning."""
+    takes; above 0 between them. NaN where the end cannot be reached from so fast a beginning."""
     n = len(grid)
     x = controllable(first, second, grid, velocity, weakest, strongest)
     speeds = np.zeros(n)
@@ -135,8 +148,10 @@ def fastest(first, second, grid, velocity, weakest, strongest, begins=0.0):
     for i in range(n - 1):
         speeds[i] = np.sqrt(now)
         width = grid[i + 1] - grid[i]
-        high, slope = _bounds_of_u(first, second, i, width, now, x[i + 1], weakest, strongest)[2:]
-        now = min(max(now + 2 * width * (high + slope * now), 0.0), x[i + 1])
+        high, slope = _bounds_of_next(first, second, i, width, now, x[i + 1], weakest, strongest)[2:4]
+        # from x[i] at least so much is possible, and in proportion from less
+        least = LEAST_SHARE * now * min(1.0, x[i + 1] / x[i])
+        now = min(max(high + slope * now, least), x[i + 1])
     return speeds
 
 

@@ -6,6 +6,10 @@ row, is a mean of its accelerations and thus at most A. Velocities v0 and v1 at 
 seconds leave its length within h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4, the extremes being full
 acceleration and then full braking. So no limit refuses what an arm can do within it. Whether rates agree is
 asked with twice the greatest acceleration that the motion has or says in place of A, where that is less.
+
+Positions are known to a resolution only, which over a step of nanoseconds hides any velocity. So where rows
+are closer than a millisecond, all this is asked from each row to each later one too, with the resolution of
+these two alone.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,11 +17,17 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
+
+WINDOWS = (1e-3, 4e-3, 16e-3)
+"""Where rows are closer than the first of these [s], mean accelerations are asked for over times of at least
+each; over shorter ones, the resolution of positions hides any."""
+SHORTEST = 1e-12
+"""Shorter times count as this one [s], so that rates over them are finite."""
 
 
 @dataclass(frozen=True)
@@ -151,13 +161,14 @@ def _checks(
     own = np.maximum(_greatest(a, second, change), tolerances.slack * robot.acceleration)
     strongest = np.where(most > 0, np.minimum(share * most, 2 * own), 2 * own)
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
-    possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing + blur
+    possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
+    """Between mean velocities and those that the rows say."""
     yield _Check(
         "rates",
         onwards,
         mean,
         np.abs(mean - (v[1:] + v[:-1]) / 2),
-        possible,
+        possible + blur,
         lambda i, j: f"the velocities that these rows say are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
     beside = _padded(change[:1], change, change[-1:])
@@ -173,6 +184,81 @@ def _checks(
         tolerances.agreement * np.where(most > 0, np.minimum(most, own), own),
         lambda i, j: f"by its velocities between {low[i, j]:.6g} and {high[i, j]:.6g}",
     )
+
+    if step.min(initial=np.inf) >= WINDOWS[0]:
+        return
+    times, resolution = trajectory.times, tolerances.resolution
+    onwards = "mean velocity from an earlier row to here"
+    most = robot.velocity
+    first, span = _since(times, q, (times - times[0])[:, None] * share * most)
+    moved = _changes(q, first) / span
+    yield limited("velocity", onwards, moved, most, share * most + 2 * resolution / span)
+
+    said, room = _summed(step * (v[1:] + v[:-1]) / 2), _summed(step * possible)
+    first, span = _since(times, q - said, room)
+    moved, told = _changes(q, first) / span, _changes(said, first) / span
+    yield _Check(
+        "rates",
+        onwards,
+        moved,
+        np.abs(moved - told),
+        (_changes(room, first) + 2 * resolution) / span,
+        lambda i, j: f"the one that its velocities amount to is {told[i, j]:.6g}",
+    )
+
+    most = robot.acceleration
+    for window in WINDOWS:
+        second, unsure = _second_differences(trajectory, begins, window, resolution, nothing)
+        what = f"mean acceleration by its positions over {1e3 * window:g} ms and more"
+        yield limited("acceleration", what, second, most, share * most + unsure)
+
+
+def _summed(steps: Float[ndarray, "m dof"]) -> Float[ndarray, "n dof"]:
+    """By row."""
+    return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def _since(
+    times: Float[ndarray, "n"], way: Float[ndarray, "n dof"], allowed: Float[ndarray, "n dof"]
+) -> tuple[Int[ndarray, "n dof"], Float[ndarray, "n dof"]]:
+    """For each row the earlier one since which a joint's way has changed most beyond what `allowed` has grown
+    by, in either direction, and the time since then [s]; itself where there is none."""
+    rows, beyond = np.arange(len(way))[:, None], np.full(way.shape, -np.inf)
+    first = np.broadcast_to(rows, way.shape)
+    for signed in (way, -way):
+        room = signed - allowed
+        least = np.minimum.accumulate(room, axis=0)
+        at = np.maximum.accumulate(np.where(room <= least, rows, 0), axis=0)
+        # not the row itself
+        least, at = np.concatenate([room[:1], least[:-1]]), np.concatenate([first[:1], at[:-1]])
+        first = np.where(room - least > beyond, at, first)
+        beyond = np.maximum(beyond, room - least)
+    return first, np.maximum(times[:, None] - times[first], SHORTEST)
+
+
+def _changes(rows: Float[ndarray, "n dof"], first: Int[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+    return rows - np.take_along_axis(rows, first, axis=0)
+
+
+def _second_differences(
+    trajectory: Trajectory,
+    begins: Float[ndarray, "dof"],
+    window: float,
+    resolution: float,
+    nothing: Float[ndarray, "dof"],
+) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
+    """Mean accelerations by positions, about each row, from and to the first rows at least `window` [s] away,
+    and how unsure they are; before and after the motion the arm moves as it begins, and stands."""
+    times, q = trajectory.times, trajectory.positions
+    clock = np.concatenate([times[:1] - window, times, times[-1:] + window])
+    rows = _padded(q[:1] - window * begins, q, q[-1:])
+    low = np.searchsorted(clock, times - window, side="right") - 1
+    high = np.searchsorted(clock, times + window)
+    before, after = (times - clock[low])[:, None], (clock[high] - times)[:, None]
+    apart = (before + after) / 2
+    outside = (low == 0).astype(float) + (high == len(clock) - 1)
+    unsure = 2 * resolution * (1 / before + 1 / after) + outside[:, None] * nothing
+    return ((rows[high] - q) / after - (q - rows[low]) / before) / apart, unsure / apart
 
 
 def _padded(before: ndarray, rows: ndarray, after: ndarray) -> ndarray:

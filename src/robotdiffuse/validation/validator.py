@@ -15,10 +15,10 @@ from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import describe_contact
 from robotdiffuse.collision.motions import Contact, ContinuousCollision
-from robotdiffuse.core.bounds import LARGEST, within
-from robotdiffuse.core.errors import InputError, joined
-from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.core.bounds import MAX_COORDINATE, for_kernels, within
+from robotdiffuse.core.errors import InputError, check_type, joined, shown
+from robotdiffuse.core.types import ROWS, Path, Trajectory
+from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, goal_error, passes
@@ -78,14 +78,32 @@ class Report:
 def verify(problem: Problem, path: Path, settings: VerifySettings = DEFAULT) -> Report:
     """Validate a path for a problem. It has no times, so obstacles that move are left to `verify_trajectory`.
     Raises InputError if its joints are not those of the robot."""
-    return verifier(problem, settings).path(path)
+    return _verifier(problem, settings).path(path)
 
 
 def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
     """Validate a trajectory with its rates and times, and among obstacles that move from its first row to its
     last. Its velocities and accelerations must be those of its positions, from rest, or the problem's start
     velocity, to rest; for what is between the rows see `VerifySettings.chord`."""
-    return verifier(problem, settings).trajectory(trajectory)
+    return _verifier(problem, settings).trajectory(trajectory)
+
+
+def check_motion(what: str, motion: object, kinds: tuple[type, ...]) -> None:
+    """InputError for anything but a motion of one of these kinds."""
+    known = {Path: "a Path, e.g. result.path", Trajectory: "a Trajectory, e.g. result.trajectory"}
+    check_type(what, motion, kinds, ", or ".join(known[kind] for kind in kinds))
+    check_type(f"{what}.joint_names", motion.joint_names, (tuple, list), "a tuple of names")  # type: ignore
+    for name in ("positions", *(("times", *ROWS[1:]) if isinstance(motion, Trajectory) else ())):
+        values = getattr(motion, name)
+        if not isinstance(values, ndarray) or values.dtype.kind not in "iuf":
+            raise InputError(f"{what}.{name} is {shown(values)}; it must be a NumPy array of numbers")
+
+
+def _verifier(problem: object, settings: object) -> "Verifier":
+    """That of a problem; InputError for what is none."""
+    check_problem(problem)
+    check_type("settings", settings, VerifySettings, "VerifySettings")
+    return verifier(problem, settings)  # type: ignore[arg-type]
 
 
 class Verifier:
@@ -96,6 +114,7 @@ class Verifier:
 
     def path(self, path: Path) -> Report:
         """See `verify`."""
+        check_motion("path", path, (Path, Trajectory))
         self._check_shape(path.joint_names, path.positions)
         found = []
         if self.dynamics is not None and within(path.positions):
@@ -105,6 +124,7 @@ class Verifier:
 
     def trajectory(self, trajectory: Trajectory) -> Report:
         """See `verify_trajectory`."""
+        check_motion("trajectory", trajectory, (Trajectory,))
         self._check_shape(trajectory.joint_names, trajectory.positions)
         rows = (trajectory.times, trajectory.velocities, trajectory.accelerations)
         for name, values in zip(("times", "velocities", "accelerations"), rows, strict=True):
@@ -172,10 +192,10 @@ class Verifier:
         `at_rest`: at which rows a timed motion stands still. `along`: times and positions of one for path
         constraints.
         """
-        bad = np.flatnonzero(~(np.abs(q) <= LARGEST).all(axis=1))
+        bad = np.flatnonzero(~(np.abs(q) <= MAX_COORDINATE).all(axis=1))
         if len(bad):
             at = float(bad[0] if times is None else times[bad[0]])
-            message = f"waypoint {bad[0]} holds values that are not finite, or not within ±{LARGEST:g}"
+            message = f"waypoint {bad[0]} holds values that are not finite, or not within ±{MAX_COORDINATE:g}"
             return Report(False, Violation("not_finite", at, message), None, None)
         clock = np.arange(len(q), dtype=float) if times is None else times
         limits = self._limits(q, clock, "waypoint {:g}" if times is None else "{:.3f} s")
@@ -272,7 +292,7 @@ class Verifier:
         settings = self.settings
         if not len(q) > settings.reversals + 2:
             return None
-        kept = _apart(np.ascontiguousarray(q, np.float64), settings.reversal_step)
+        kept = _apart(for_kernels(q), settings.reversal_step)
         steps = np.diff(q[kept], axis=0)
         steps /= np.linalg.norm(steps, axis=1, keepdims=True)
         cosines = (steps[1:] * steps[:-1]).sum(axis=1)

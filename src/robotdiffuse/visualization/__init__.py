@@ -1,4 +1,4 @@
-"""Pictures and replays of motions. Only the command line and the live page import this room."""
+"""Pictures, HTML replays and the interactive page. Only the command line imports this package."""
 
 from robotdiffuse.visualization.picture import PictureSettings, write_picture
 from robotdiffuse.visualization.replay_page import write_replay

@@ -1,4 +1,4 @@
-"""Where to look from: the view that shows most of the arm and its trace, framed tightly."""
+"""Camera placement: the view that shows most of the arm and its trace, framed tightly."""
 
 from dataclasses import dataclass
 
@@ -15,11 +15,13 @@ from robotdiffuse.visualization.style import Surface
 
 AZIMUTHS = 18
 ELEVATIONS = np.radians((15.0, 25.0))
+"""Candidate views: number of azimuths, and elevations [rad]."""
 VERTICAL_FIELD = np.radians(28)
+"""Vertical field of view [rad]."""
 TRACE_POINTS = 120
-"""Configurations at which a motion is looked at."""
-REACH_OF_FRAME = 1.3
-"""Obstacles count for the framing up to this distance from the middle of the arm [m]."""
+"""Number of configurations along a motion that views are scored with."""
+MAX_FRAMING_DISTANCE = 1.3
+"""Obstacles are framed up to this distance from the middle of the arm [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +47,7 @@ class Camera:
         return np.stack([right, np.cross(forward, right), forward])
 
     def project(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-        """Pixel x, y and 1 / depth (negative or zero behind the camera)."""
+        """Pixel x and y, and 1 / depth (0 behind the camera)."""
         x, y, z = ((points - self.eye) @ self.rotation.T).T
         near = np.where(z > 0.05, 1 / np.maximum(z, 0.05), 0.0)
         columns = [0.5 * self.width + self.focal * x * near, 0.5 * self.height + self.focal * y * near, near]
@@ -70,9 +72,9 @@ def framed(
     height: int,
     free: tuple[float, float],
 ) -> Camera:
-    """A camera in the direction `toward` that shows all points as large as they fit.
+    """A camera in the direction `toward`, as close as all points fit.
 
-    `free`: shares of the height that stay free above and below them.
+    free: fractions of the height to leave free above and below.
     """
     target = 0.5 * (points.min(0) + points.max(0))
     distance = 1.0
@@ -102,13 +104,13 @@ def best_view(
     free: tuple[float, float],
     azimuth: float | None = None,
 ) -> Camera:
-    """The framed view, out of AZIMUTHS x ELEVATIONS, in which most of the arm and its trace can be seen.
+    """The framed view, of AZIMUTHS x ELEVATIONS, that shows most of the arm and its trace.
 
-    azimuth: the one to look from, from the x axis of the base [rad]; None: the best.
+    azimuth: the only one to look from, from the x axis of the base [rad]; None: the best.
     """
     moving = np.concatenate([arm.vertices, ghosts.vertices, trace])
     middle = 0.5 * (moving.min(0) + moving.max(0))
-    near = np.linalg.norm(obstacles.vertices - middle, axis=1) < REACH_OF_FRAME
+    near = np.linalg.norm(obstacles.vertices - middle, axis=1) < MAX_FRAMING_DISTANCE
     points = np.concatenate([moving, obstacles.vertices[near]])
     points = points[ConvexHull(points, qhull_options="QJ").vertices]
     small = (160, max(1, 160 * height // width))
@@ -133,7 +135,7 @@ def view_of_motion(
     height: int,
     free: tuple[float, float],
 ) -> Camera:
-    """The best view of a motion among obstacles; `surfaces` and `tool` are those of `look`."""
+    """The best view of a motion among obstacles; `surfaces` and `tool` as from module `style`."""
     q = style.dense(q, TRACE_POINTS)
     poses = style.frames(robot, q)
     colored = zip(scene.shapes, style.obstacle_colors(scene), strict=True)
@@ -146,7 +148,7 @@ def view_of_motion(
 def _score(
     camera: Camera, arm: Surface, ghosts: Surface, trace: Float[ndarray, "n 3"], obstacles: Surface
 ) -> float:
-    """Shares of the arm and, half as much, the ghosts that can be seen, plus the trace's length."""
+    """Visible fraction of the arm, plus half that of the ghosts, plus the visible length of the trace."""
     empty = np.zeros((camera.height, camera.width), np.float32)
     ident = np.empty(empty.shape, np.int32)
     hidden = empty.copy()

@@ -1,4 +1,4 @@
-"""Several replays in one HTML file: pictures on the left to choose from, the replay on the right."""
+"""A gallery of replays in one HTML file: thumbnails on the left, the replay on the right."""
 
 import base64
 import html
@@ -62,7 +62,7 @@ function show(i, scroll = true) {
   if (i === shown || !replays.pages[i]) return;
   shown = i;
   buttons.forEach((button, j) => button.setAttribute("aria-current", i === j));
-  // not at first: inside another page it would scroll that one
+  // not at first: in an iframe it would scroll the outer page
   if (scroll) buttons[i].scrollIntoView({ block: "nearest", inline: "nearest" });
   frame.srcdoc = replays.pages[i].map((part) => replays.parts[part]).join("");
 }
@@ -79,8 +79,8 @@ show(0, false);
 
 
 @dataclass(frozen=True, eq=False)
-class Exhibit:
-    """A motion of the gallery."""
+class GalleryEntry:
+    """A motion in a gallery."""
 
     title: str
     caption: str
@@ -91,49 +91,49 @@ class Exhibit:
 
 def write_gallery(
     robot: Robot,
-    exhibits: Sequence[Exhibit],
+    entries: Sequence[GalleryEntry],
     file: str | FilePath,
     title: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write the gallery as .html; it opens without network.
+    """Write a gallery as .html; it opens offline.
 
-    `progress` is called with the numbers of motions that are drawn and of all. Raises InputError for another
+    `progress` is called with the number of motions drawn so far and in all. Raises InputError for another
     ending or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
     replays, buttons = [], []
-    for i, exhibit in enumerate(exhibits):
-        replays.append(_replay(robot, exhibit))
+    for i, entry in enumerate(entries):
+        replays.append(_replay(robot, entry))
         buttons.append(
-            f'<button><img alt="" src="data:image/jpeg;base64,{_thumbnail(robot, exhibit)}">'
-            f"<b>{html.escape(exhibit.title)}</b><span>{html.escape(exhibit.caption)}</span></button>"
+            f'<button><img alt="" src="data:image/jpeg;base64,{_thumbnail(robot, entry)}">'
+            f"<b>{html.escape(entry.title)}</b><span>{html.escape(entry.caption)}</span></button>"
         )
         if progress is not None:
-            progress(i + 1, len(exhibits))
-    # in JSON a '<' stands only in strings, and escaped it cannot end the script element
+            progress(i + 1, len(entries))
+    # in JSON '<' occurs only in strings; escaped, it cannot end the script element
     data = json.dumps(_shared(replays)).replace("<", "\\u003c")
     page = PAGE.replace("{{title}}", html.escape(title)).replace("{{buttons}}", "".join(buttons))
     write_atomically(target, page.replace("{{replays}}", data))
 
 
 def _shared(pages: list[str]) -> dict[str, list]:
-    """Pages as lists of parts, each kept once: the 3D library and the robot are the same in all."""
+    """Pages split into parts, each stored once, because all share the 3D library and the robot."""
     cut = [re.split(r'(?=<script)|(?="scene":)', page) for page in pages]
     places = {part: i for i, part in enumerate(dict.fromkeys(part for parts in cut for part in parts))}
     return {"parts": list(places), "pages": [[places[part] for part in parts] for parts in cut]}
 
 
-def _replay(robot: Robot, exhibit: Exhibit) -> str:
+def _replay(robot: Robot, entry: GalleryEntry) -> str:
     with TemporaryDirectory() as folder:
         file = FilePath(folder) / "replay.html"
-        write_replay(robot, exhibit.scene, exhibit.motion, file, title=exhibit.title)
+        write_replay(robot, entry.scene, entry.motion, file, title=entry.title)
         return file.read_text("utf-8")
 
 
-def _thumbnail(robot: Robot, exhibit: Exhibit) -> str:
+def _thumbnail(robot: Robot, entry: GalleryEntry) -> str:
     """A small JPEG in base64."""
-    pixels, _ = render(robot, exhibit.scene, exhibit.motion, THUMBNAIL)
+    pixels, _ = render(robot, entry.scene, entry.motion, THUMBNAIL)
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "JPEG", quality=88)
     return base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -1,19 +1,19 @@
-"""A replay in a cell of a notebook."""
+"""Replays in notebook cells."""
 
 import html
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult, ResultFile
 from robotdiffuse.problems.files import problem_from_record
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.visualization.replay_page import write_replay
 
 
 class Replay:
-    """What a notebook shows in a cell."""
+    """The output of a notebook cell: a replay in an iframe."""
 
     def __init__(self, page: str, height: int) -> None:
         self._page, self._height = page, height
@@ -25,14 +25,17 @@ class Replay:
 
 
 def show(result: PlanResult | ResultFile, problem: Problem | None = None, height: int = 560) -> Replay:
-    """The replay of a solved result, as the value of a notebook's cell shows it; in the middle of a cell,
+    """The replay of a solved result, for the last line of a notebook cell; elsewhere in a cell, use
     `display(rd.show(result))`.
 
-    problem: what was asked; results of `plan` know it, and result files that were saved with theirs.
-    height: of the cell [pixels].
+    problem: needed only if the result does not contain it; results of `plan`, and result files saved with
+    their problem, do. height: of the cell [pixels].
 
-    Raises InputError outside a notebook, for a result without a motion and where the problem is not known.
+    Raises InputError outside a notebook, for a result without a motion, and if the problem is unknown.
     """
+    check_type("result", result, (PlanResult, ResultFile), "a result, as of rd.plan or rd.load_result")
+    if problem is not None:
+        check_problem(problem)
     if isinstance(result, ResultFile):
         if problem is None and result.problem is not None:
             problem = problem_from_record(result.problem)
@@ -42,7 +45,7 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
     if motion is None:
         raise InputError(f"there is no motion to show: {result.status.value} ({result.reason})")
     if problem is None:
-        raise InputError("the result does not say what was asked; give it: rd.show(result, problem)")
+        raise InputError("the result does not contain its problem; use rd.show(result, problem)")
     if not _in_notebook():
         raise InputError(
             "rd.show is for notebooks; elsewhere save the result and use `robotdiffuse view`, or "
@@ -56,6 +59,6 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
 
 
 def _in_notebook() -> bool:
-    """Whether a kernel of Jupyter runs this; IPython is not imported for it."""
+    """Whether this runs in a Jupyter kernel; does not import IPython."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return hasattr(shell, "kernel")

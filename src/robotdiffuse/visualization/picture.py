@@ -1,4 +1,4 @@
-"""A picture of a motion as a PNG: drawn in memory, without GPU, window or browser."""
+"""Draws a motion as a PNG picture, in software, without GPU, window or browser."""
 
 import io
 from dataclasses import dataclass
@@ -21,20 +21,24 @@ from robotdiffuse.visualization.rasterizer import blend_ghost, draw, light_latti
 from robotdiffuse.visualization.style import GOAL, START, Surface, join
 
 SUPERSAMPLING = 2
+"""Rendered pixels per pixel along each side."""
 SKY_LIGHTS, SKY_MAP = 60, 320
 KEY_LIGHTS, KEY_MAP = 28, 768
-"""How many directions, and pixels along each side of the map of what each of them reaches."""
-LATTICE = 4
-"""Light is gathered at every fourth pixel of the supersampled image."""
+"""Number of lights of the sky and of the main light, and edge length of the shadow map of each [pixels]."""
+LIGHT_SPACING = 4
+"""Light is computed at every fourth pixel of the supersampled image."""
 KEY_DIRECTION = np.array([0.35, -0.45, 0.82])
-"""Toward the main light, in a frame whose x axis points from the scene to the camera."""
+"""Direction towards the main light, in a frame whose x axis points from the scene to the camera."""
 KEY_SPREAD = 0.075
-"""Radius of the main light as seen from the scene [rad]: it makes the shadows soft."""
+"""Angular radius of the main light [rad], for soft shadows."""
 TUBE_RADIUS = 0.006
+"""Radius of the trace [m]."""
 GROUND_RADIUS = 3.2
-PAPER = (0xF2, 0xF4, 0xF6)
-FREE = (0.05, 0.11)
-"""Shares of the height that stay free above the arm, and below it for the caption."""
+"""Radius of the visible ground [m]."""
+CAPTION_COLOR = (0xF2, 0xF4, 0xF6)
+"""Colour to which the picture fades behind the caption."""
+MARGINS = (0.05, 0.11)
+"""Fractions of the height left free above the arm, and below it for the caption."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ class PictureSettings:
     height: int = 800
     """[pixels]"""
     ghosts: int = 5
-    """See-through arms between start and goal, the start included."""
+    """Number of see-through arms from the start towards the goal."""
     azimuth: float | None = None
     """Of the camera, from the x axis of the base [rad]; None: from where most of the motion can be seen."""
 
@@ -69,14 +73,13 @@ def write_picture(
 ) -> None:
     """Write a picture of a motion as .png.
 
-    The arm at its end is solid, the poses before it fade towards the start, and a tube follows the tool.
-    `result` adds its figures to the caption. Raises InputError for another ending or a file that cannot be
-    written.
+    The arm at the goal is solid, earlier poses are see-through, and a tube follows the tool. `result` adds
+    its figures to the caption. Raises InputError for another ending or a file that cannot be written.
     """
     path = check_output(file, (".png",))
     settings = settings or PictureSettings()
     pixels, _ = render(robot, scene, motion, settings)
-    image = Image.fromarray(_veiled(pixels))
+    image = Image.fromarray(_faded_below(pixels))
     _caption(image, title or robot.name, style.facts(motion, result))
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=False)
@@ -106,16 +109,16 @@ def render(
     faint = join([ghost for ghost, _ in ghosts])
     if camera is None:
         size = settings.width, settings.height
-        camera = best_view(goal, faint, trace, obstacles, *size, FREE, settings.azimuth)
+        camera = best_view(goal, faint, trace, obstacles, *size, MARGINS, settings.azimuth)
     big = Camera(camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height)
     image = _paint(big, join([goal, obstacles, _tube(trace)]), ghosts)
     s = SUPERSAMPLING
     image = image.reshape(settings.height, s, settings.width, s, 3).mean(axis=(1, 3))
-    return _developed(image), camera
+    return _to_srgb(image), camera
 
 
 def _paint(camera: Camera, solid: Surface, ghosts: list[tuple[Surface, float]]) -> Float[ndarray, "h w 3"]:
-    """Linear light of the solid things with the ghosts over them, the far ones first."""
+    """Linear colours of the solid surfaces with the ghosts over them, the far ones first."""
     shape = (camera.height, camera.width)
     image = np.zeros((*shape, 3), np.float32)
     near, ident = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
@@ -131,8 +134,8 @@ def _paint(camera: Camera, solid: Surface, ghosts: list[tuple[Surface, float]]) 
     light = (np.array([0.72, 0.70, 0.66]), np.array([0.80, 0.82, 0.86]), np.array([0.16, 0.15, 0.14]))
     colors = _linear_array(solid.colors)
     seen = (near, ident, screen, solid.faces, solid.normals)
-    lattice = light_lattice(LATTICE, *seen, view, ground[0], sky, key)
-    shade(image, lattice, LATTICE, *seen, colors, view, ground, background, sky, key, light)
+    lattice = light_lattice(LIGHT_SPACING, *seen, view, ground[0], sky, key)
+    shade(image, lattice, LIGHT_SPACING, *seen, colors, view, ground, background, sky, key, light)
     ghosts = sorted(ghosts, key=lambda g: -float(np.linalg.norm(g[0].vertices.mean(0) - camera.eye)))
     for ghost, s in ghosts:
         own, shown = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
@@ -156,7 +159,7 @@ def _key_direction(camera: Camera) -> Float[ndarray, "3"]:
 
 
 def _hemisphere(count: int) -> Float[ndarray, "n 3"]:
-    """Even directions over the upper half sphere (Fibonacci lattice)."""
+    """Evenly spread directions over the upper hemisphere (Fibonacci lattice)."""
     i = np.arange(count)
     z = (i + 0.5) / count
     angle = i * np.pi * (3 - np.sqrt(5))
@@ -164,7 +167,7 @@ def _hemisphere(count: int) -> Float[ndarray, "n 3"]:
 
 
 def _cone(toward: Float[ndarray, "3"], count: int) -> Float[ndarray, "n 3"]:
-    """Even directions within KEY_SPREAD of one (sunflower)."""
+    """Evenly spread directions within KEY_SPREAD of a direction (sunflower pattern)."""
     i = np.arange(count)
     radius = KEY_SPREAD * np.sqrt((i + 0.5) / count)
     angle = i * np.pi * (3 - np.sqrt(5))
@@ -182,7 +185,7 @@ def _axes(toward: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
 
 
 def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tuple:
-    """Orthographic maps of what each light reaches first, in the layout of `raster.shade`."""
+    """Orthographic shadow maps of all lights, in the layout of `rasterizer.shade`."""
     center = np.zeros(3)
     radius = 0.1
     if len(solid.vertices):
@@ -204,7 +207,7 @@ def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tup
 
 
 def _tube(points: Float[ndarray, "n 3"], sides: int = 10) -> Surface:
-    """A round tube along a polyline, coloured from START to GOAL, with balls at both ends."""
+    """A round tube along a polyline, coloured from START to GOAL, with spheres at both ends."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=2)
@@ -225,7 +228,7 @@ def _tube(points: Float[ndarray, "n 3"], sides: int = 10) -> Surface:
     across = np.empty_like(points)
     previous = _axes(along[0])[0]
     for i in range(n):
-        # Carried along with the least twist, so that the tube does not pinch where it turns.
+        # Parallel transport, so that the tube does not pinch in turns.
         previous = previous - along[i] * (along[i] @ previous)
         previous = previous / max(float(np.linalg.norm(previous)), 1e-9)
         across[i] = previous
@@ -251,8 +254,8 @@ def _linear_array(srgb: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def _developed(image: Float[ndarray, "h w 3"]) -> np.ndarray:
-    """Linear light to sRGB bytes; what is brighter than white rolls off smoothly."""
+def _to_srgb(image: Float[ndarray, "h w 3"]) -> np.ndarray:
+    """Linear colours as sRGB bytes; highlights roll off smoothly."""
     knee = 0.75
     over = np.maximum(image - knee, 0)
     image = np.minimum(image, knee) + (1 - knee) * (1 - np.exp(-over / (1 - knee)))
@@ -260,11 +263,11 @@ def _developed(image: Float[ndarray, "h w 3"]) -> np.ndarray:
     return np.round(255 * srgb.clip(0, 1)).astype(np.uint8)
 
 
-def _veiled(pixels: np.ndarray) -> np.ndarray:
-    """The picture with its lower edge fading towards the paper, so that the caption can be read."""
+def _faded_below(pixels: np.ndarray) -> np.ndarray:
+    """The picture faded at its lower edge, so that the caption is readable."""
     rise = (np.linspace(0, 1, len(pixels)) - 0.84).clip(0, None)[:, None, None] / 0.16
     cover = 0.8 * rise * rise * (3 - 2 * rise)
-    return (pixels + cover * (np.array(PAPER) - pixels)).round().astype(np.uint8)
+    return (pixels + cover * (np.array(CAPTION_COLOR) - pixels)).round().astype(np.uint8)
 
 
 def _caption(image: Image.Image, title: str, facts: list[tuple[str, str]]) -> None:

@@ -1,4 +1,5 @@
-"""Compiled triangle rasteriser and shading of the picture: no GPU, no window, the same pixels everywhere."""
+"""Compiled triangle rasterizer and shading of pictures: no GPU or window, the same pixels on every
+machine."""
 
 import numpy as np
 from numba import njit
@@ -8,9 +9,9 @@ from numba import njit
 def draw(near, ident, screen, faces):
     """Draw triangles into a z-buffer.
 
-    near[h, w]: how near the surface is, in any measure that is linear on the screen (1/z for perspective);
-    larger is nearer, only larger values are drawn. ident[h, w]: the face that is seen.
-    screen[v, 3]: x, y in pixels and nearness; triangles with a nearness of 0 or less are left out.
+    near[h, w]: nearness, any measure that is linear on the screen (1/z for perspective); larger is nearer,
+    and only larger values are drawn. ident[h, w]: index of the visible face. screen[v, 3]: x and y in pixels,
+    and nearness; triangles with a nearness of 0 or less are skipped.
     """
     h, w = near.shape
     for f in range(faces.shape[0]):
@@ -43,7 +44,7 @@ def draw(near, ident, screen, faces):
 
 @njit(cache=True)
 def _corner_weights(screen, a, b, c, px, py):
-    """Weights of the three corners at a pixel, corrected for perspective (nearness is 1/z)."""
+    """Perspective-correct weights of the three corners at a pixel (nearness is 1/z)."""
     x0, y0, x1, y1, x2, y2 = (
         screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1],
     )  # fmt: skip
@@ -57,10 +58,10 @@ def _corner_weights(screen, a, b, c, px, py):
 
 @njit(cache=True)
 def _lit(maps, directions, scale, center, size, bias, x, y, z, nx, ny, nz, offset, stride):
-    """Cosine-weighted share of a set of directional lights that reaches a point; every stride-th light.
+    """Cosine-weighted fraction of directional lights that reach a point; uses every stride-th light.
 
-    Each light has an orthographic map of the surface nearest to it. The point is moved along its normal by
-    `bias` to keep a surface from shadowing itself.
+    Each light has an orthographic map of the surfaces nearest to it. The point is moved along its normal by
+    `bias` so that surfaces do not shadow themselves.
     """
     x, y, z = x + nx * bias - center[0], y + ny * bias - center[1], z + nz * bias - center[2]
     got, total = 0.0, 0.0
@@ -74,7 +75,7 @@ def _lit(maps, directions, scale, center, size, bias, x, y, z, nx, ny, nz, offse
         row = int((x * d[1, 0] + y * d[1, 1] + z * d[1, 2]) * scale + 0.5 * size)
         if 0 <= column < size and 0 <= row < size:
             depth = x * d[2, 0] + y * d[2, 1] + z * d[2, 2]
-            # A texel of a surface seen edge-on spans more depth.
+            # a texel of a surface seen edge-on spans more depth
             if maps[k, row, column] > depth + bias * min(4.0, 0.5 / cosine) + 100.0:
                 continue
         got += cosine
@@ -94,7 +95,8 @@ def _grid(x, y, spacing, width, footprint):
 
 @njit(cache=True)
 def _surface(row, column, near, ident, screen, faces, normals, camera, height):
-    """What is seen at a pixel: depth (0: nothing), ray, normal toward the eye, corner weights, if solid."""
+    """The surface at a pixel: depth (0 for none), ray, normal towards the eye, corner weights, whether
+    solid."""
     eye, rays = camera
     px, py = column + 0.5, row + 0.5
     rx = rays[0, 0] * px + rays[0, 1] * py + rays[0, 2]
@@ -118,7 +120,7 @@ def _surface(row, column, near, ident, screen, faces, normals, camera, height):
 
 @njit(cache=True)
 def light_lattice(spacing, near, ident, screen, faces, normals, camera, height, sky, key):
-    """Light at every `spacing`-th pixel, [rows, columns, 7]: depth, normal, sky, key, is it solid."""
+    """Light at every `spacing`-th pixel, [rows, columns, 7]: depth, normal, sky, key, whether solid."""
     rows, columns = near.shape[0] // spacing, near.shape[1] // spacing
     lattice = np.zeros((rows, columns, 7), np.float32)
     eye = camera[0]
@@ -139,7 +141,7 @@ def light_lattice(spacing, near, ident, screen, faces, normals, camera, height, 
 
 @njit(cache=True)
 def _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid):
-    """Light interpolated from those of the four lattice points around that see the same smooth surface."""
+    """Light interpolated from the surrounding lattice points that show the same smooth surface."""
     y, x = row / spacing, column / spacing
     top, left = int(y), int(x)
     sky, key, total = 0.0, 0.0, 0.0
@@ -176,13 +178,13 @@ def shade(
     key,
     light,
 ):
-    """Colour of every pixel (linear light) of the solid things and the ground.
+    """Compute the linear colour of every pixel of the solid surfaces and the ground.
 
     camera: (eye[3], rays[3, 3]) so that the ray through pixel (x, y) is rays @ (x, y, 1), with z-depth 1.
-    lattice, spacing: from light_lattice; where it does not fit (at edges), light is gathered for the pixel
-    itself from a quarter of the lights, another quarter for each pixel of a square of four.
-    ground: (height, radius, base colour[3], line colour[3]); background: (top colour[3], bottom colour[3]);
-    sky, key: (maps, axes, scale, center, size, bias); light: colours[3] of key, sky and bounce.
+    lattice, spacing: from light_lattice. At edges, where the lattice does not fit, a pixel uses a quarter of
+    the lights itself, a different quarter for each pixel in a square of four. ground: (height, radius, base
+    colour[3], line colour[3]); background: (top colour[3], bottom colour[3]); sky, key: (maps, axes, scale,
+    center, size, bias); light: colours[3] of key, sky and bounce.
     """
     h, w = near.shape
     eye, rays = camera
@@ -233,12 +235,12 @@ def shade(
 
 @njit(cache=True)
 def blend_ghost(image, solid, near, ident, screen, faces, normals, colors, camera, toward, tint, alpha):
-    """Lay one see-through arm over the image: its nearest surface, denser where it is seen edge-on."""
+    """Blend one see-through arm over the image: its nearest surface, more opaque where it is seen edge-on."""
     h, w = near.shape
     _, rays = camera
     for row in range(h):
         for column in range(w):
-            # A little nearer than the solid arm: links that turn about their own axis lie on one another.
+            # It must be slightly nearer than the solid arm: links that only turn about their axis coincide.
             if near[row, column] <= 1.003 * solid[row, column]:
                 continue
             px, py = column + 0.5, row + 0.5

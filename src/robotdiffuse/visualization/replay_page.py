@@ -1,4 +1,4 @@
-"""A replay of a motion as one HTML file: 3D, offline, in any browser with WebGL."""
+"""Writes 3D replays of motions as single HTML files, for any browser with WebGL, offline."""
 
 import base64
 import html
@@ -23,12 +23,14 @@ from robotdiffuse.visualization import style
 from robotdiffuse.visualization.camera import TRACE_POINTS, VERTICAL_FIELD, view_of_motion
 from robotdiffuse.visualization.style import GOAL, START, Surface
 
-RATE = 60.0
-"""Most rows of the motion that are kept for each second; the page interpolates between them."""
-MOST_ROWS = 3000
-VIEW = (1600, 1000)
-FREE = (0.09, 0.15)
-"""Shares of the window's height that the first view leaves free for the panels."""
+MAX_ROW_RATE = 60.0
+"""Most rows of the motion per second; the page interpolates between them."""
+MAX_ROWS = 3000
+"""Most rows of the motion."""
+VIEW_SIZE = (1600, 1000)
+"""Window size for which the first view is chosen [pixels]."""
+VIEW_MARGINS = (0.09, 0.15)
+"""Fractions of the window's height that the first view leaves free for the panels."""
 
 
 def write_replay(
@@ -41,11 +43,11 @@ def write_replay(
     title: str | None = None,
     candidates: Sequence[Path] = (),
 ) -> None:
-    """Write a replay of a motion as .html; it holds all that it needs and opens without network.
+    """Write a replay of a motion as a self-contained .html file.
 
-    `result` adds its figures to the header; of `candidates` (other paths of the same robot) the traces of
-    the tool are shown. A path without times moves at a constant speed in joint space.
-    Raises InputError for another ending or a file that cannot be written.
+    `result` adds its figures to the header. For `candidates`, other paths of the same robot, the traces of
+    the tool are shown. A path without times plays at constant speed in joint space. Raises InputError for
+    another ending or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
     title = title or f"{robot.name} · {len(scene.shapes)} obstacle{'' if len(scene.shapes) == 1 else 's'}"
@@ -56,7 +58,7 @@ def write_replay(
     parts = {
         "title": html.escape(title),
         "style": (page / "replay.css").read_text("utf-8"),
-        # In JSON a '<' stands only in strings, and escaped it cannot end the script element.
+        # in JSON '<' occurs only in strings; escaped, it cannot end the script element
         "data": data.replace("<", "\\u003c"),
         "three": (page / "three.min.js").read_text("utf-8"),
         "script": (page / "replay.js").read_text("utf-8"),
@@ -103,8 +105,8 @@ def _page_data(
 def _thinned(
     times: Float[ndarray, "n"], positions: Float[ndarray, "n dof"]
 ) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
-    """At most RATE rows a second and MOST_ROWS in all; short motions keep theirs."""
-    most = int(min(MOST_ROWS, max(2, np.ceil(RATE * times[-1]) + 1)))
+    """At most MAX_ROW_RATE rows per second and MAX_ROWS in all; shorter motions stay unchanged."""
+    most = int(min(MAX_ROWS, max(2, np.ceil(MAX_ROW_RATE * times[-1]) + 1)))
     if len(times) <= most:
         return times, positions
     at = np.linspace(0, times[-1], most)
@@ -112,7 +114,7 @@ def _thinned(
 
 
 def _spheres(robot: Robot) -> list[list[float | int]]:
-    """Frame, x, y, z, radius of the covering spheres."""
+    """Frame, x, y, z and radius of each covering sphere."""
     rows = []
     for link, spheres in robot.spheres.items():
         T = robot.T_frame_link(link)
@@ -135,12 +137,12 @@ def _camera(
     tool: tuple[int, ndarray],
     q: Float[ndarray, "n dof"],
 ) -> dict[str, Any]:
-    camera = view_of_motion(robot, scene, surfaces, tool, q, *VIEW, FREE)
+    camera = view_of_motion(robot, scene, surfaces, tool, q, *VIEW_SIZE, VIEW_MARGINS)
     return {
         "eye": _rounded(camera.eye, 4),
         "target": _rounded(camera.target, 4),
         "field": round(float(np.degrees(VERTICAL_FIELD)), 3),
-        "aspect": VIEW[0] / VIEW[1],
+        "aspect": VIEW_SIZE[0] / VIEW_SIZE[1],
     }
 
 
@@ -153,7 +155,7 @@ def _ground(scene: Scene, colors: list[tuple[int, int, int]]) -> float:
 
 
 def _shape(shape: Shape, color: tuple[int, int, int]) -> dict[str, Any]:
-    """What the page needs to draw an obstacle: its fields, or packed geometry."""
+    """An obstacle for the page: its fields, or packed geometry."""
     record: dict[str, Any] = {"kind": shape.kind, "name": shape.name, "color": color}
     if isinstance(shape, PointCloud):
         low, step, points = _quantised(style.thinned(shape.points))

@@ -1,4 +1,4 @@
-"""What is drawn and in which colours: one look for the picture and the replay."""
+"""Surfaces and colours shared by pictures, replays and the page."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
 
 START, GOAL = (0x4F, 0x7F, 0xD9), (0x10, 0xA3, 0x7F)
-"""sRGB colours of both ends of a motion; the trace runs from one to the other."""
+"""sRGB colours of the start and goal of a motion; the trace fades from one to the other."""
 OBSTACLES = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
 FURNITURE = (0xCD, 0xC0, 0xAC)
-SEEN, UNSEEN = (0x4F, 0x7C, 0xAC), (0xB9, 0x8A, 0xD9)
-"""What cameras saw, and what is taken for occupied beside it."""
+OBSERVED, ASSUMED = (0x4F, 0x7C, 0xAC), (0xB9, 0x8A, 0xD9)
+"""Points that cameras observed, and points assumed to be occupied in unknown space."""
 FURNITURE_SIZE = 0.7
-"""Obstacles with a longer side than this are walls and tables, in a quiet colour [m]."""
-CREASE = np.radians(38)
-"""Edges that bend more than this stay sharp."""
+"""Obstacles with a longer side than this count as furniture, with its own colour [m]."""
+CREASE_ANGLE = np.radians(38)
+"""Edges with a larger angle between their faces are drawn sharp [rad]."""
 UNTIMED_SPEED = 0.8
 """Speed in joint space at which a path without times is shown [rad/s]."""
 
@@ -40,12 +40,13 @@ class Surface:
     faces: Int[ndarray, "f 3"]
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Surface":
+        """The surface after a rigid transform."""
         vertices = self.vertices @ T[:3, :3].T + T[:3, 3]
         return Surface(vertices, self.normals @ T[:3, :3].T, self.colors, self.faces)
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:
-    """One surface of many; an empty one of none."""
+    """One surface from many; an empty one from none."""
     if not surfaces:
         return Surface(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     starts = np.cumsum([0] + [len(s.vertices) for s in surfaces[:-1]])
@@ -60,7 +61,8 @@ def join(surfaces: Sequence[Surface]) -> Surface:
 def creased(
     vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"], colors: Float[ndarray, "f 3"]
 ) -> Surface:
-    """A surface that is shaded smoothly except across sharp edges (CREASE); vertices are split there."""
+    """A surface that is shaded smoothly except across sharp edges (CREASE_ANGLE); vertices are split
+    there."""
     edges = vertices[faces]
     area = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])
     unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
@@ -68,15 +70,15 @@ def creased(
     owner = faces.reshape(-1)[corner]
     counts = np.bincount(owner, minlength=len(vertices))
     first = np.cumsum(counts) - counts
-    # All pairs of corners that share a vertex: `mine` gathers from `other`.
+    # all pairs of corners that share a vertex: `mine` gathers from `other`
     repeats = counts[owner]
     mine = np.repeat(np.arange(len(owner)), repeats)
     within = np.arange(len(mine)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
     other = first[owner[mine]] + within
     face = corner // 3
-    alike = np.einsum("ij,ij->i", unit[face[mine]], unit[face[other]]) > np.cos(CREASE)
+    alike = np.einsum("ij,ij->i", unit[face[mine]], unit[face[other]]) > np.cos(CREASE_ANGLE)
     summed = [np.bincount(mine[alike], area[face[other[alike]], i], minlength=len(owner)) for i in range(3)]
-    normals = np.stack(summed, axis=1).astype(np.float64)  # whole numbers where no face has an area
+    normals = np.stack(summed, axis=1).astype(np.float64)  # integers if no face has an area
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     keys = np.column_stack([owner, np.round(normals * 100), np.round(colors[face] * 255)]).astype(np.int64)
     _, keep, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -86,7 +88,7 @@ def creased(
 
 
 def robot_surfaces(robot: Robot) -> list[Surface]:
-    """The links that are fixed to each of the dof + 1 frames, in the coordinates of that frame."""
+    """The surface of the links on each of the dof + 1 frames, in the coordinates of that frame."""
     by_frame: list[list[Surface]] = [[] for _ in range(robot.dof + 1)]
     for link, meshes in load_visual(robot).items():
         for mesh in meshes:
@@ -96,7 +98,7 @@ def robot_surfaces(robot: Robot) -> list[Surface]:
 
 
 def frames(robot: Robot, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch frames 4 4"]:
-    """T_base_frame of all frames."""
+    """T_base_frame of all frames in each configuration."""
     T = forward_frames(robot, q.reshape(-1, robot.dof))
     return T.reshape(*q.shape[:-1], *T.shape[1:])
 
@@ -107,10 +109,10 @@ def posed(surfaces: list[Surface], T_base_frame: Float[ndarray, "frames 4 4"]) -
 
 
 def tool_point(robot: Robot, surfaces: list[Surface]) -> tuple[int, Float[ndarray, "3"]]:
-    """The frame of the tip and the point in it whose trace is drawn.
+    """The frame of the tip, and the point in it whose trace is drawn [m].
 
-    It lies on the z axis of the tip link, as far out as anything that is fixed to that link reaches:
-    between the fingertips of a gripper.
+    The point lies on the z axis of the tip link, as far out as the surfaces on its frame reach: between the
+    fingertips of a gripper.
     """
     frame, T_frame_tip = robot.link_frame(robot.tip), robot.T_frame_link(robot.tip)
     along = (surfaces[frame].vertices - T_frame_tip[:3, 3]) @ T_frame_tip[:3, 2]
@@ -124,7 +126,7 @@ def trace(robot: Robot, tool: tuple[int, ndarray], q: Float[ndarray, "n dof"]) -
 
 
 def dense(q: Float[ndarray, "n dof"], count: int) -> Float[ndarray, "m dof"]:
-    """`count` configurations at equal steps along a polyline in joint space; one if it does not move."""
+    """`count` configurations equally spaced along a polyline in joint space; one if it does not move."""
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
     if s[-1] == 0:
         return q[:1]
@@ -133,7 +135,7 @@ def dense(q: Float[ndarray, "n dof"], count: int) -> Float[ndarray, "m dof"]:
 
 
 def timed(motion: Path | Trajectory) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:
-    """Times [s] and positions; a path without times is shown at a constant speed in joint space."""
+    """Times [s] and positions of a motion; a path without times gets a constant speed in joint space."""
     if isinstance(motion, Trajectory):
         return motion.times, motion.positions
     steps = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / UNTIMED_SPEED
@@ -147,7 +149,7 @@ def obstacle_colors(scene: Scene) -> list[tuple[int, int, int]]:
 
 def _color(shape: Shape, own: tuple[int, int, int]) -> tuple[int, int, int]:
     if isinstance(shape, SeenPoints | AssumedPoints):
-        return SEEN if isinstance(shape, SeenPoints) else UNSEEN
+        return OBSERVED if isinstance(shape, SeenPoints) else ASSUMED
     return FURNITURE if _extent(shape) > FURNITURE_SIZE else own
 
 
@@ -162,7 +164,7 @@ def _extent(shape: Shape) -> float:
 
 
 def shape_surface(shape: Shape, color: tuple[int, int, int]) -> Surface:
-    """The surface of an obstacle, in the base frame; of a point cloud, an octahedron for each point."""
+    """The surface of an obstacle in the base frame; a point cloud becomes octahedra."""
     import trimesh
 
     T = np.eye(4)
@@ -203,14 +205,15 @@ def _point_surface(cloud: PointCloud, color: tuple[int, int, int]) -> Surface:
 
 
 def thinned(points: Float[ndarray, "n 3"], most: int = 60_000) -> Float[ndarray, "m 3"]:
-    """At most `most` of the points, every k-th one."""
+    """At most `most` of the points: every k-th one."""
     return points[:: -(-len(points) // most)] if len(points) else points
 
 
 def decimated(
     vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"], most: int = 60_000
 ) -> tuple[Float[ndarray, "w 3"], Int[ndarray, "g 3"]]:
-    """At most `most` faces: vertices in one cell of a grid become one, in larger cells until it is enough."""
+    """At most `most` faces: merge the vertices in each cell of a grid, with growing cells until it
+    suffices."""
     cell = float(np.ptp(vertices, axis=0).max()) / 400
     while len(faces) > most:
         _, index = np.unique(np.floor(vertices / cell), axis=0, return_inverse=True)
@@ -224,7 +227,7 @@ def decimated(
 
 
 def facts(motion: Path | Trajectory, result: PlanResult | None) -> list[tuple[str, str]]:
-    """Label and value of what is known about a motion, for the header."""
+    """Labels and values of facts about a motion, for headers and captions."""
     length = result.path_length if result is not None else None
     if length is None:
         length = Path(motion.joint_names, motion.positions).length

@@ -4,7 +4,6 @@ The planners are tested with a prior whose denoiser has a closed form: bumps of 
 straight line. So the tests need no trained weights.
 """
 
-import json
 import os
 import signal
 from dataclasses import replace
@@ -30,7 +29,7 @@ from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import Batches, TrajectoryData
 from robotdiffuse.learning.training.configs import planner_training
-from robotdiffuse.learning.training.planner import _Loss, _model_settings
+from robotdiffuse.learning.training.planner import PlannerLoss, model_settings
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.validation import planning_success
 from robotdiffuse.planning.baselines.edmp import EDMP, ENSEMBLE, EDMPSettings, GuideSettings, quadratic_levels
@@ -58,7 +57,7 @@ PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
 CHECKER = CollisionChecker(PANDA, PROBLEM.scene)
 TRAINING = planner_training("trajectory_prior", {"data": "", "batch": 16, "samples": 640})
 SMALL = replace(
-    _model_settings(TRAINING, None), denoiser_settings=UNetSettings(16, (1, 2), condition_width=16)
+    model_settings(TRAINING, None), denoiser_settings=UNetSettings(16, (1, 2), condition_width=16)
 )
 WAYPOINTS = 48
 
@@ -114,7 +113,7 @@ def test_the_loss_falls() -> None:
     torch.manual_seed(0)
     network, data, rng = MotionModel(RANGES, SMALL), data_of(32), np.random.default_rng(0)
     batches = Batches(data, network, lambda _scenes, _q: np.zeros(0), 0.1, None)
-    loss_of = _Loss(network, PANDA, TRAINING, Processes("cpu"))
+    loss_of = PlannerLoss(network, PANDA, TRAINING, Processes("cpu"))
     optimizer = torch.optim.AdamW(network.parameters(), lr=4e-3)
     losses = []
     for _ in range(40):
@@ -365,27 +364,15 @@ def test_weights_survive_a_file(tmp_path: Path) -> None:
     assert MPD(MPDSettings(weights=str(tmp_path))).network(PANDA) is loaded
 
 
-def test_a_prior_that_was_a_class_of_its_own_is_read(tmp_path: Path) -> None:
-    network = MotionModel(RANGES, SMALL)
-    save_network("trajectory_prior", network, tmp_path, {})
-    file = tmp_path / "trajectory_prior.json"
-    about = json.loads(file.read_text())
-    now = about["settings"]
-    about["settings"] = {"frames": 48, "unet": now["denoiser_settings"], "schedule": now["schedule"]}
-    about["settings"] |= {"trivial_share": 0.1}
-    file.write_text(json.dumps(about))
-    assert load_network("trajectory_prior", str(tmp_path), PANDA).settings == SMALL
-
-
 def test_training_stopped_and_continued_ends_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_motions(tmp_path / "data", PANDA, random_motions(PANDA, 40))
     asked = ["train", "baseline", "trajectory_prior", "--data", str(tmp_path / "data")]
     asked += ["--samples", "80", "--batch", "8"]
-    original, steps = _Loss.__call__, 0
+    original, steps = PlannerLoss.__call__, 0
 
-    def interrupted(self: _Loss, *given):
+    def interrupted(self: PlannerLoss, *given):
         nonlocal steps
         steps += 1
         if steps == 5:
@@ -393,7 +380,7 @@ def test_training_stopped_and_continued_ends_the_same(
         return original(self, *given)
 
     assert main([*asked, "--out", str(tmp_path / "whole")]) == 0
-    monkeypatch.setattr(_Loss, "__call__", interrupted)
+    monkeypatch.setattr(PlannerLoss, "__call__", interrupted)
     assert main([*asked, "--out", str(tmp_path / "parts")]) == 130
     assert main([*asked, "--out", str(tmp_path / "parts")]) == 0
     assert "success" in capsys.readouterr().out

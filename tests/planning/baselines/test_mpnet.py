@@ -18,7 +18,7 @@ from robotdiffuse.learning.networks.mpnet import (
     MPNetNetwork,
     MPNetSettings,
     Perceptron,
-    arranged,
+    sorted_along_curve,
     squared_slope,
 )
 from robotdiffuse.learning.robot_identity import RobotIdentity
@@ -170,10 +170,10 @@ def test_the_order_of_the_points_does_not_matter_and_no_points_are_zeros() -> No
     cloud = torch.from_numpy(rng.uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.9], (2, 40, 3)).astype(np.float32))
     shuffled = cloud[:, torch.from_numpy(rng.permutation(40))]
     torch.testing.assert_close(net.encode(cloud), net.encode(shuffled))
-    near = arranged(cloud, net.region)
+    near = sorted_along_curve(cloud, net.region)
     steps = (near[:, 1:] - near[:, :-1]).norm(dim=-1).mean()
     assert steps < 0.7 * (cloud[:, 1:] - cloud[:, :-1]).norm(dim=-1).mean(), "neighbours are near each other"
-    assert not arranged(torch.zeros(1, 40, 3), net.region).any()
+    assert not sorted_along_curve(torch.zeros(1, 40, 3), net.region).any()
     empty = scene_code(net, CollisionChecker(PANDA, Scene([])), rng)
     torch.testing.assert_close(empty, net.encode(torch.zeros(1, 40, 3)))
 

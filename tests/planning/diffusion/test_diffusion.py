@@ -31,10 +31,10 @@ def samples_of(seed: int) -> list[Path]:
     assert MODEL is not None
     code = encode(MODEL, checker, planner.settings.points, rng)
     ends = LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
-    paths = [Path(PANDA.joint_names, q) for q in planner.draw(MODEL, checker, code, *ends, rng)]
-    for path in paths:
-        path.positions[0], path.positions[-1] = LEFT, RIGHT
-    return paths
+    drawn = planner.draw(MODEL, checker, code, *ends, rng)
+    for q in drawn:
+        q[0], q[-1] = LEFT, RIGHT
+    return [Path(PANDA.joint_names, q) for q in drawn]
 
 
 def test_the_answer_is_the_shortest_valid_sample_as_it_was_drawn() -> None:

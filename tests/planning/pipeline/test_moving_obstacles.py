@@ -8,6 +8,7 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.deadline import OutOfTimeError, deadline
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS
@@ -83,6 +84,12 @@ def test_earliest_waits_for_what_passes() -> None:
     assert not earliest(clear, *args)[1]
 
 
+def test_the_grid_of_times_ends_with_the_time() -> None:
+    args = np.array([0, 2]), np.array([0]), np.array([1]), np.array([0, 3]), np.array([0, 1, 2])
+    with deadline(lambda: -1.0), pytest.raises(OutOfTimeError, match="the grid of times"):
+        earliest(np.ones((3, 10), bool), *args)
+
+
 VELOCITIES = [np.eye(7)[0] * 2.0, np.array([0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6]), -np.eye(7)[0]]
 
 
@@ -112,6 +119,12 @@ def test_motion_begins_moving(velocity: np.ndarray) -> None:
 def test_start_velocities_that_are_none(velocity: list[float], message: str) -> None:
     with pytest.raises(InputError, match=message):
         rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
+
+
+def test_start_velocities_of_nearly_nothing_are_rest() -> None:
+    """1e-300 rad/s divided by its square's root, which is 0."""
+    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-300] * 7).start_velocity is None
+    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-5] * 7).start_velocity is not None
 
 
 def test_start_velocity_into_a_limit() -> None:

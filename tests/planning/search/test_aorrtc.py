@@ -106,7 +106,7 @@ def test_samples_are_in_the_spheroid_of_a_goal() -> None:
 def test_longer_is_no_longer(planner: AORRTC | RRTConnect) -> None:
     planner.plan(AROUND, 1e-3)  # compiles
     first, short, limit = (
-        planner.plan(AROUND, 1.0, seed=3, until=until) for until in ("first", "short", "limit")
+        planner.plan(AROUND, 1.0, seed=3, until=until) for until in ("first", "converged", "time_limit")
     )
     assert first.path_length is not None and short.path_length is not None and limit.path_length is not None
     assert limit.path_length <= short.path_length <= first.path_length
@@ -183,9 +183,12 @@ def test_no_gain_asked_for_is_no_end() -> None:
     [
         ({"until": "soon"}, r"until"),
         ({"clearance": float("nan")}, "clearance is nan"),
-        ({"velocity_scaling": 0.0}, r"velocity_scaling is 0\.0; it must be above 0 and at most 1"),
+        ({"velocity_scaling": 0.0}, r"velocity_scaling is 0\.0; it must be between 0.001 and 1"),
         ({"acceleration_scaling": 1.5}, r"acceleration_scaling is 1\.5"),
+        ({"velocity_scaling": 1e-300}, r"velocity_scaling is 1e-300; it must be between 0.001 and 1"),
+        ({"acceleration_scaling": 1e-6}, r"acceleration_scaling is 1e-06; it must be between 0.001 and 1"),
         ({"jerk": 0.0}, r"jerk is 0\.0; it must be"),
+        ({"jerk": 1e-5}, r"jerk is 1e-05; it must be at least 0\.01"),
     ],
 )
 def test_arguments_are_checked(arguments: dict, message: str) -> None:
@@ -201,7 +204,7 @@ def test_a_short_limit_is_a_time_out() -> None:
 def test_one_slow_validation_does_not_take_later_calls_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """A first call that loads code validated for a second; calls of a tenth of that then ended at once."""
     monkeypatch.setitem(context._finishing, "panda", 1.0)
-    assert AORRTC().plan(AROUND, 0.3, until="limit").solved
+    assert AORRTC().plan(AROUND, 0.3, until="time_limit").solved
     assert context._finishing["panda"] < 1.0
 
 

@@ -97,6 +97,24 @@ def test_what_a_link_carries_is_the_arms_own() -> None:
     assert reasons(replace(robot, tip="hand", joints=(*robot.joints, turn)))["a", "c"] == "default"
 
 
+@pytest.mark.parametrize(
+    ("held", "found"),
+    [({"3": 0.0}, "default"), ({"3": 0.5}, "checked"), ({"3": 0.0, "5": 0.0}, "checked")],
+    ids=["where it overlaps", "elsewhere", "two joints"],
+)
+def test_what_a_link_carries_on_a_held_joint_is_the_arms_own(held: dict[str, float], found: str) -> None:
+    """The bellows of the vendor's Fetch hang from a joint of their own, which planning holds."""
+    robot, z = with_middle(overlapping(0.0)), np.array([0, 0, 1.0])
+    *rest, bellows = robot.joints
+    carried = [Joint("3", "prismatic", "m", "c", bellows.T_parent_joint, z, 0.0, 1.0)]
+    if "5" in held:
+        carried = [replace(carried[0], child="n"), Joint("5", "prismatic", "n", "c", np.eye(4), z, 0.0, 1.0)]
+    turn = Joint("4", "revolute", "m", "hand", np.eye(4), z, -1.0, 1.0)
+    robot = replace(robot, tip="hand", joints=(*rest, *carried, turn), locked=held)
+    assert robot.joint_names == ("1", "2", "4")
+    assert reasons(robot)["a", "c"] == found
+
+
 @pytest.mark.parametrize(("bend", "found"), [(2.2, "pose"), (2.1, "checked")])
 def test_what_touches_in_a_named_pose_is_allowed(bend: float, found: str) -> None:
     """Tucked arms lie upon each other."""

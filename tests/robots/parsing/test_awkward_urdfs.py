@@ -1,17 +1,20 @@
 """Awkward URDFs: each is prepared and plans a motion, or is refused by one line that says what to do."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from helpers.awkward_urdfs import REFUSED, WORKS
-from helpers.made_arms import BALL, chain, row, written
+from helpers.made_arms import BALL, chain, joint, link, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.add import add_robot
 from robotdiffuse.robots.fitting.preparation import LARGE, PreparationSettings
 from robotdiffuse.robots.scaling import reach
@@ -45,6 +48,74 @@ def test_what_cannot_work_is_refused_by_one_line_that_says_what_to_do(name: str,
         add_robot(make(tmp_path), out=tmp_path / "robot", settings=QUICK)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "robot").exists()
+
+
+def on_a_lift(folder: Path, held: int) -> Path:
+    """An arm on a lift, with bellows on so many held joints that always overlap the column behind it."""
+    column = (
+        '<collision><origin xyz="-0.2 0 0.2"/><geometry><box size="0.05 0.05 0.6"/></geometry></collision>'
+    )
+    lift = joint("lift", "base", "lift_link", "prismatic", axis="0 0 1", limits='lower="0" upper="0.2"')
+    short = {"kind": "prismatic", "axis": "0 0 1", "limits": 'lower="0" upper="0.6"'}
+    names = row("bellows", held)
+    parents = ["lift_link", *(f"{name}_link" for name in names)]
+    bellows = [
+        link(f"{name}_link", BALL if name == names[-1] else "")
+        + joint(name, above, f"{name}_link", xyz="0 0 0" if i else "-0.2 0 0", **short)
+        for i, (name, above) in enumerate(zip(names, parents, strict=False))
+    ]
+    stand = link("column", column) + joint("stand", "base", "column", "fixed", xyz="0 0 0")
+    return written(folder, stand, link("lift_link"), lift, *bellows, chain("lift_link", row("j", 3)))
+
+
+def test_an_arm_with_bellows_on_a_held_joint_can_move(tmp_path: Path) -> None:
+    """Of the vendor's Fetch not one configuration was free, and the exit status was 0."""
+    with coarse_grids():
+        report = add_robot(
+            on_a_lift(tmp_path, 1), base="base", tip="j3_link", out=tmp_path / "robot", settings=QUICK
+        )
+    reasons = {frozenset(pair.links): pair.reason for pair in report.pairs}
+    assert reasons[frozenset(("column", "bellows1_link"))] == "default" and report.refusals.free > 0.2
+
+
+def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: Path) -> None:
+    pair = ("column", "bellows2_link")
+    how = {"base": "base", "tip": "j3_link", "out": tmp_path / "robot", "settings": QUICK}
+    with coarse_grids(), pytest.raises(InputError, match="every configuration collides with itself") as error:
+        add_robot(on_a_lift(tmp_path, 2), **how)
+    text = str(error.value)
+    assert f"{pair[0]} and {pair[1]} collide in 100.0%" in text and "--srdf FILE" in text
+    assert f"--allow {pair[0]} {pair[1]}" in text and text.count("--allow") == 1
+    assert not (tmp_path / "robot").exists()
+    with coarse_grids():
+        assert add_robot(on_a_lift(tmp_path, 2), allow=[pair], **how).refusals.free > 0.2
+
+
+def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
+    """Goals of Fetch and Baxter were refused whose arm touches the parts of the torso, but not the torso."""
+    walls = [
+        trimesh.creation.box(np.subtract(high, low), trimesh.transformations.translation_matrix(middle))
+        for low, high in (
+            ((-0.3, -0.2, 0), (0.3, 0.2, 0.05)),
+            ((0.25, -0.2, 0.05), (0.3, 0.2, 0.4)),
+            ((-0.3, -0.2, 0.05), (-0.25, 0.2, 0.4)),
+        )
+        for middle in [np.add(low, high) / 2]
+    ]
+    trimesh.util.concatenate(walls).export(tmp_path / "trough.stl")
+    mesh = '<collision><geometry><mesh filename="trough.stl"/></geometry></collision>'
+    stand = link("trough", mesh) + joint("stand", "base", "trough", "fixed", xyz="0 0 -0.1")
+    urdf = written(tmp_path, stand, chain("base", row("j", 3)))
+    settings = replace(QUICK, parts=replace(QUICK.parts, most=1), samples=400)
+    refused = []
+    for finer in (False, True):
+        with coarse_grids(), pytest.MonkeyPatch.context() as patch:
+            if not finer:
+                patch.setattr(preparation, "_closer", lambda *_: None)
+            report = add_robot(urdf, tip="j3_link", out=tmp_path / str(finer), settings=settings)
+        refused.append(report.refusals.by_parts)
+        assert all(made.covered for made in report.links)
+    assert refused[1] < 0.5 * refused[0]
 
 
 def test_an_arm_four_times_as_large_takes_no_more_spheres(tmp_path: Path) -> None:

@@ -263,6 +263,10 @@ def test_limits_file(tmp_path: Path) -> None:
         ("limits: {}", "no joint_limits"),
         ("joint_limits: {turn: {max_speed: 1}}", "'max_speed'"),
         ("joint_limits: {turn: {max_velocity: -1}}", "max_velocity of turn is -1"),
+        (
+            "joint_limits: {turn: {max_velocity: 1.0e-300}}",
+            "is 1e-300; it must be a number from 1e-06 to 1e+06",
+        ),
         ("joint_limits: {wrist: {max_velocity: 1}}", "'wrist'"),
         ("joint_limits: {turn: {min_position: 5}}", "turn: min_position"),
     ):
@@ -270,6 +274,12 @@ def test_limits_file(tmp_path: Path) -> None:
         with pytest.raises(InputError) as error:
             with_limits(read_urdf(urdf(tmp_path)), read_limits(file))
         assert message in str(error.value)
+
+
+def test_velocity_limits_that_make_motions_endless_are_refused(tmp_path: Path) -> None:
+    file = urdf(tmp_path, ARM.replace('velocity="1.5"', 'velocity="1e-300"'))
+    with pytest.raises(InputError, match="joint turn: velocity limit is 1e-300; it must be at least 1e-06"):
+        read_urdf(file)
 
 
 def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

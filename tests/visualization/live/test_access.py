@@ -1,4 +1,4 @@
-"""Who is let in to the page, and what is said of ports and hosts."""
+"""Which requests reach the page, and errors for ports and hosts."""
 
 import http.client
 import socket
@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.visualization.live.access import SECRET, Door, admitted, bound, is_loopback
+from robotdiffuse.visualization.live.access import SECRET, AccessProxy, accepted_head, is_loopback, listen
 
 
 def request(path: str = "/", **fields: str) -> bytes:
@@ -16,8 +16,8 @@ def request(path: str = "/", **fields: str) -> bytes:
 
 @pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1:8080", "[::1]:9000", "localhost"])
 def test_names_of_this_machine_are_let_in(host: str) -> None:
-    assert admitted(request(Host=host), "") == request(Host=host)
-    assert admitted(request(Host=host, Origin=f"http://{host}"), "")
+    assert accepted_head(request(Host=host), "") == request(Host=host)
+    assert accepted_head(request(Host=host, Origin=f"http://{host}"), "")
 
 
 @pytest.mark.parametrize(
@@ -35,33 +35,33 @@ def test_names_of_this_machine_are_let_in(host: str) -> None:
     ],
 )
 def test_others_are_not(head: bytes) -> None:
-    assert admitted(head, "") is None
+    assert accepted_head(head, "") is None
 
 
 def test_elsewhere_the_path_begins_with_the_token() -> None:
     fields = {"Host": "192.0.2.7:8080"}
-    assert admitted(request("/token", **fields), "token") == request("/", **fields)
-    assert admitted(request("/token/", **fields), "token") == request("/", **fields)
-    assert admitted(request("/token/a/b?c=d", **fields), "token") == request("/a/b?c=d", **fields)
-    assert admitted(request("/token?darkMode", **fields), "token") == request("/?darkMode", **fields)
+    assert accepted_head(request("/token", **fields), "token") == request("/", **fields)
+    assert accepted_head(request("/token/", **fields), "token") == request("/", **fields)
+    assert accepted_head(request("/token/a/b?c=d", **fields), "token") == request("/a/b?c=d", **fields)
+    assert accepted_head(request("/token?darkMode", **fields), "token") == request("/?darkMode", **fields)
     for path in ("/", "/tokens", "/toke", "/?token", "//token", "/other/token"):
-        assert admitted(request(path, **fields), "token") is None
+        assert accepted_head(request(path, **fields), "token") is None
     strange = request("/token", Origin="http://evil.example", **fields)
-    assert admitted(strange, "token") is None
+    assert accepted_head(strange, "token") is None
 
 
 @pytest.mark.parametrize("wrong", ["[::1", "[::fg]:1", "]", "//[", "127.0.0.1]["])
 def test_what_is_no_host_is_not_let_in(wrong: str) -> None:
-    """Python's splitting of URLs raises errors about brackets; found by fuzzing."""
-    assert admitted(request(Host=wrong), "") is None
-    assert admitted(request(Host="localhost", Origin=f"http://{wrong}"), "") is None
+    """urlsplit raises ValueError for brackets in hosts; found by fuzzing."""
+    assert accepted_head(request(Host=wrong), "") is None
+    assert accepted_head(request(Host="localhost", Origin=f"http://{wrong}"), "") is None
 
 
 def test_the_door_hands_on_what_it_lets_in_with_the_secret() -> None:
     inner = socket.create_server(("127.0.0.1", 0))
-    listening = bound("127.0.0.1", 0)
+    listening = listen("127.0.0.1", 0)
     address = listening.getsockname()
-    door = Door(listening, inner.getsockname()[1], "secret", "token")
+    proxy = AccessProxy(listening, inner.getsockname()[1], "secret", "token")
     refused = http.client.HTTPConnection(*address, timeout=10)
     refused.request("GET", "/")
     assert refused.getresponse().status == 403
@@ -75,7 +75,7 @@ def test_the_door_hands_on_what_it_lets_in_with_the_secret() -> None:
     assert (answer.status, answer.read()) == (200, b"hi")
     connection.close()
     inner.close()
-    door.close()
+    proxy.close()
     with pytest.raises(OSError):
         socket.create_connection(address, timeout=1).close()
 
@@ -84,9 +84,9 @@ def test_a_port_that_is_taken_and_a_host_that_is_none() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"port {number} of 127.0.0.1 cannot be used: .*--port"):
-            bound("127.0.0.1", number)
+            listen("127.0.0.1", number)
     with pytest.raises(InputError, match="--host is 'no such host'"):
-        bound("no such host", 0)
+        listen("no such host", 0)
 
 
 def test_loopback() -> None:

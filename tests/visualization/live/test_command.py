@@ -1,4 +1,4 @@
-"""`robotdiffuse live` as a command."""
+"""The command `robotdiffuse live`."""
 
 import http.client
 import re
@@ -73,26 +73,26 @@ def test_elsewhere_nothing_is_served_without_the_token() -> None:
 
 
 def test_viser_itself_lets_no_one_in_but_through_the_door() -> None:
-    """A web page elsewhere may find viser's own port; what opens it is closed before anything is said."""
+    """A page of another site may find viser's own port; its connection is closed before any data is sent."""
     websockets = pytest.importorskip("websockets.sync.client")
     viser = pytest.importorskip("viser")
     from websockets.exceptions import ConnectionClosed
 
-    from robotdiffuse.visualization.live.access import bound
+    from robotdiffuse.visualization.live.access import listen
     from robotdiffuse.visualization.live.files import first_problem
     from robotdiffuse.visualization.live.page import Page
-    from robotdiffuse.visualization.live.session import Choice, Session
+    from robotdiffuse.visualization.live.session import PageOptions, Session
 
-    listening = bound("127.0.0.1", 0)
-    page = Page(Session(first_problem(None, None), Choice("aorrtc")), listening)
+    listening = listen("127.0.0.1", 0)
+    page = Page(Session(first_problem(None, None), PageOptions("aorrtc")), listening)
     try:
         speaks = [f"viser-v{viser.__version__}"]
-        outer, inner = listening.getsockname()[1], page._server.get_port()
+        outer, inner = listening.getsockname()[1], page.server.get_port()
         with websockets.connect(f"ws://127.0.0.1:{outer}/", subprotocols=speaks) as guest:
             assert guest.recv(timeout=20)
         stranger = websockets.connect(f"ws://127.0.0.1:{inner}/", subprotocols=speaks)
         with stranger, pytest.raises(ConnectionClosed):
             assert not stranger.recv(timeout=20)
-        assert page._server.request_share_url() is None
+        assert page.server.request_share_url() is None
     finally:
         page.close()

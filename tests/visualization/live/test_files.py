@@ -1,4 +1,4 @@
-"""What the page begins with, what it takes from a browser, and what it hands out."""
+"""The first problem of the page, uploads, and saved files."""
 
 import json
 import re
@@ -79,7 +79,7 @@ def test_what_is_wrong_with_an_uploaded_problem_is_one_line(text: str, wrong: st
 
 
 def test_uploads_that_are_no_text_or_too_long(demo: Problem) -> None:
-    with pytest.raises(InputError, match=r"p\.yaml is not a text in UTF-8"):
+    with pytest.raises(InputError, match=r"p\.yaml is not UTF-8 text"):
         uploaded_problem(b"\xff\xfe", "p.yaml", demo.robot)
     with pytest.raises(InputError, match="at most 5000000 are read"):
         uploaded_problem(b" " * 5_000_001, "p.yaml", demo.robot)

@@ -1,4 +1,4 @@
-"""The page in a browser: what is clicked and dragged there, and what it shows."""
+"""The page in a real browser: clicks, drags, and what it shows."""
 
 import shutil
 import time
@@ -12,9 +12,9 @@ import pytest
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.problems.goals import PoseGoal
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.visualization.live.access import bound
+from robotdiffuse.visualization.live.access import listen
 from robotdiffuse.visualization.live.files import first_problem, problem_text
-from robotdiffuse.visualization.live.session import Choice, Session
+from robotdiffuse.visualization.live.session import PageOptions, Session
 
 if TYPE_CHECKING:
     from robotdiffuse.visualization.live.page import Page
@@ -36,9 +36,13 @@ FLAGS = [
 """WebGL without a graphics card."""
 PATIENCE, COMPILING = 30_000, 300_000
 """[ms]; a new machine compiles before the first plan."""
-FREE, WRONG = "[data-certificate=free]", "[data-certificate=wrong]"
+VALID, INVALID = "[data-validity=valid]", "[data-validity=invalid]"
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -53,19 +57,19 @@ def browser() -> Iterator[Any]:
 def live() -> Iterator["tuple[Page, str]"]:
     from robotdiffuse.visualization.live.page import Page
 
-    listening = bound("127.0.0.1", 0)
-    page = Page(Session(first_problem(None, None), Choice("aorrtc")), listening)
+    listening = listen("127.0.0.1", 0)
+    page = Page(Session(first_problem(None, None), PageOptions("aorrtc")), listening)
     yield page, "http://{}:{}/".format(*listening.getsockname())
     page.close()
 
 
 @pytest.fixture(scope="module")
 def view(browser: Any, live: "tuple[Page, str]") -> Any:
-    """A browser on the page, which is green."""
+    """A browser with the page open and a valid motion."""
     view = browser.new_page(viewport={"width": 900, "height": 500})
     view.set_default_timeout(PATIENCE)
     view.goto(live[1])
-    view.locator(FREE).wait_for(timeout=COMPILING)
+    view.locator(VALID).wait_for(timeout=COMPILING)
     return view
 
 
@@ -77,7 +81,7 @@ def until(holds: Callable[[], object]) -> None:
 
 
 def beside(view: Any, label: str) -> Any:
-    """The entry that a label stands beside."""
+    """The input with this label."""
     return view.get_by_text(label, exact=True).locator("xpath=following::input[not(@type='hidden')][1]")
 
 
@@ -85,8 +89,8 @@ def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(
     view: Any, live: "tuple[Page, str]"
 ) -> None:
     session = live[0].session
-    beside(view, "Keep planning").uncheck(force=True)
-    until(lambda: not session.state.choice.follow)
+    beside(view, "Plan automatically").uncheck(force=True)
+    until(lambda: not session.state.options.follow)
     view.get_by_role("tab", name="Obstacles").click()
     view.get_by_role("button", name="Add").click()
     view.get_by_role("button", name="Delete").wait_for()
@@ -94,15 +98,15 @@ def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(
     assert motion is not None and motion.trajectory is not None
     q = motion.trajectory.positions[len(motion.trajectory.times) // 2]
     session.move_obstacle("sphere", transform(link_pose(session.state.problem.robot, q, "panda_hand")[:3, 3]))
-    red = view.locator(WRONG)
+    red = view.locator(INVALID)
     red.wait_for()
     assert "inside sphere" in red.inner_text() and "at 0." in red.inner_text()
     assert session.state.motion is motion
     session.move_obstacle("sphere", transform(np.array([-0.5, 0.0, 1.2])))
-    view.locator(FREE).wait_for()
+    view.locator(VALID).wait_for()
     view.get_by_role("button", name="Delete").click()
     until(lambda: all(shape.name != "sphere" for shape in session.state.problem.scene.shapes))
-    session.choose(follow=True)
+    session.set_options(follow=True)
     until(lambda: session.state.answer is not None)
 
 
@@ -118,19 +122,19 @@ def test_a_size_is_typed_beside_its_slider(view: Any, live: "tuple[Page, str]") 
 
 
 def test_the_target_is_dragged(view: Any, live: "tuple[Page, str]") -> None:
-    """By an arrow of its gizmo."""
+    """Drags the target by an arrow of its gizmo."""
     page = live[0]
     before = page.session.state.goal_pose.copy()
     dragged = any(drag_arrow(view, page, before, axis) for axis in (2, 0, 1))
     assert dragged and isinstance(page.session.state.problem.goal, PoseGoal)
     page.session.move_goal(before)
     until(lambda: page.session.state.answer is not None)
-    view.locator(FREE).wait_for()
+    view.locator(VALID).wait_for()
 
 
 def drag_arrow(view: Any, page: "Page", T: np.ndarray, axis: int) -> bool:
-    """Whether the target goes along when the mouse takes an arrow of its gizmo, which may be seen end-on."""
-    arrow = page._goal_gizmo._handle.scale * T[:3, axis]
+    """Whether the target follows when the mouse drags an arrow of its gizmo, which may be seen end-on."""
+    arrow = page.goal_gizmo.handle.scale * T[:3, axis]
     view.mouse.move(*on_screen(view, page, T[:3, 3] + 0.7 * arrow))
     time.sleep(0.1)
     view.mouse.down()
@@ -141,8 +145,8 @@ def drag_arrow(view: Any, page: "Page", T: np.ndarray, axis: int) -> bool:
 
 
 def on_screen(view: Any, page: "Page", point: np.ndarray) -> tuple[float, float]:
-    """Pixel of a point [m], by the camera as the browser reports it."""
-    [client] = page._server.get_clients().values()
+    """Pixel of a point [m], from the camera that the browser reports."""
+    [client] = page.server.get_clients().values()
     camera = client.camera
     x, y, z = rotation_from_quaternion(np.array(camera.wxyz)).T @ (point - camera.position)
     size = view.viewport_size
@@ -152,7 +156,7 @@ def on_screen(view: Any, page: "Page", point: np.ndarray) -> tuple[float, float]
 
 def test_the_trees_of_the_search_are_drawn_when_asked_for(view: Any, live: "tuple[Page, str]") -> None:
     page = live[0]
-    drawn = page._server.scene._handle_from_node_name
+    drawn = page.server.scene._handle_from_node_name
     answer = page.session.state.answer
     view.get_by_role("tab", name="Plan").click()
     box = beside(view, "Search trees")
@@ -167,14 +171,14 @@ def test_the_trees_of_the_search_are_drawn_when_asked_for(view: Any, live: "tupl
 def test_it_plays_and_is_scrubbed(view: Any, live: "tuple[Page, str]") -> None:
     page = live[0]
     view.get_by_role("button", name="Play").click()
-    until(lambda: page._player.playing and page._player.time > 0)
+    until(lambda: page.player.playing and page.player.time > 0)
     view.get_by_role("button", name="Pause").click()
     view.get_by_role("button", name="Play").wait_for()
     entry = beside(view, "Time")
     entry.fill("0.5")
     entry.press("Enter")
-    until(lambda: page._player.time == 0.5)
-    assert not page._player.playing
+    until(lambda: page.player.time == 0.5)
+    assert not page.player.playing
 
 
 def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(
@@ -198,7 +202,7 @@ def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(
     other = problem_text(first_problem(None, "ur5e"))
     upload.set_input_files({"name": "other.yaml", "mimeType": "text/yaml", "buffer": other})
     until(lambda: session.state.problem.robot.name == "ur5e" and session.state.answer is not None)
-    view.locator(FREE).wait_for()
+    view.locator(VALID).wait_for()
 
 
 def test_it_comes_back_after_the_server_restarts(browser: Any, live: "tuple[Page, str]") -> None:
@@ -207,12 +211,12 @@ def test_it_comes_back_after_the_server_restarts(browser: Any, live: "tuple[Page
     view = browser.new_page(viewport={"width": 500, "height": 400})
     number = 0
     for planner in ("aorrtc", "rrt_connect"):
-        listening = bound("127.0.0.1", number)
-        page = Page(Session(live[0].session.state.problem, Choice(planner)), listening)
+        listening = listen("127.0.0.1", number)
+        page = Page(Session(live[0].session.state.problem, PageOptions(planner)), listening)
         if not number:
             number = listening.getsockname()[1]
             view.goto(f"http://127.0.0.1:{number}/")
         until(lambda: beside(view, "Planner").input_value() == planner)  # noqa: B023
-        view.locator(FREE).wait_for()
+        view.locator(VALID).wait_for()
         page.close()
     view.close()

@@ -1,4 +1,4 @@
-"""The session: what changes do, the verdict on the motion shown, and which plans are shown."""
+"""The session: changes, validation of the motion shown, and which plans are shown."""
 
 import re
 import threading
@@ -21,15 +21,15 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
 from robotdiffuse.validation.validator import verify_trajectory
-from robotdiffuse.visualization.live.certificate import FREE, NONE, WRONG, certificate
-from robotdiffuse.visualization.live.latest_task import Latest
-from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, held_at, new_obstacle, resized
-from robotdiffuse.visualization.live.session import Choice, Session, State
+from robotdiffuse.visualization.live.latest_task import LatestTask
+from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, moved_to, new_obstacle, resized
+from robotdiffuse.visualization.live.session import PageOptions, Session, State
+from robotdiffuse.visualization.live.validity import INVALID, NO_MOTION, VALID, validity
 
 START = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 END = np.array([1.2, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 PATIENCE = 300.0
-"""A new machine compiles first [s]."""
+"""Timeout [s]; a new machine compiles first."""
 
 
 def until(session: Session, holds: Callable[[State], object]) -> State:
@@ -41,7 +41,9 @@ def until(session: Session, holds: Callable[[State], object]) -> State:
 
 
 def settled(state: State) -> bool:
-    validated = state.motion is None or (state.verdict is not None and state.verdict.version == state.version)
+    validated = state.motion is None or (
+        state.validation is not None and state.validation.version == state.version
+    )
     return validated and not state.planning
 
 
@@ -51,15 +53,15 @@ def a_problem(shapes: tuple = ()) -> Problem:
 
 @pytest.fixture
 def session() -> Iterator[Session]:
-    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), Choice("aorrtc", 2.0))
-    session.begin()
+    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), PageOptions("aorrtc", 2.0))
+    session.start()
     until(session, settled)
     yield session
     session.close()
 
 
 def in_the_way(session: Session) -> np.ndarray:
-    """T_base_handle of a ball where the hand is halfway through the motion shown."""
+    """T_base_handle of a sphere at the hand halfway through the motion shown."""
     motion = session.state.motion
     assert motion is not None and motion.trajectory is not None
     q = motion.trajectory.positions[len(motion.trajectory.times) // 2]
@@ -69,9 +71,9 @@ def in_the_way(session: Session) -> np.ndarray:
 def test_a_motion_is_planned_validated_and_certified(session: Session) -> None:
     state = session.state
     assert state.motion is not None and state.motion.solved and state.motion is state.answer
-    assert state.verdict is not None and state.verdict.report.valid
-    shown = certificate(state)
-    assert shown.kind == FREE and "clearance at least" in shown.headline
+    assert state.validation is not None and state.validation.report.valid
+    shown = validity(state)
+    assert shown.kind == VALID and "clearance at least" in shown.headline
     assert [stage for stage, _ in state.seconds] == [
         "first path",
         "planning",
@@ -80,18 +82,18 @@ def test_a_motion_is_planned_validated_and_certified(session: Session) -> None:
     ]
 
 
-def test_the_certificate_turns_red_at_once_and_green_with_the_new_plan(session: Session) -> None:
-    session.choose(follow=False)
+def test_the_badge_turns_red_at_once_and_green_with_the_new_plan(session: Session) -> None:
+    session.set_options(follow=False)
     first = until(session, settled).motion
     session.move_obstacle("lamp", in_the_way(session))
     state = until(session, settled)
     assert state.motion is first and state.answer is None
-    shown = certificate(state)
+    shown = validity(state)
     assert re.fullmatch(r"collides: panda_\w+ is \d+\.\d [cm]m inside lamp", shown.headline)
     assert re.fullmatch(r"at \d\.\d\d s of \d\.\d\d s", shown.lines[0])
-    session.choose(follow=True)
+    session.set_options(follow=True)
     state = until(session, lambda state: settled(state) and state.motion is not first)
-    assert certificate(state).kind == FREE
+    assert validity(state).kind == VALID
     assert state.motion is not None and state.motion.trajectory is not None
     assert verify_trajectory(state.problem, state.motion.trajectory).valid
 
@@ -101,16 +103,16 @@ def test_why_there_is_no_plan(session: Session) -> None:
     session.move_obstacle("lamp", transform(hand[:3, 3]))
     state = until(session, settled)
     assert state.answer is not None and state.answer.status is Status.INVALID_GOAL
-    shown = certificate(state)
-    assert shown.kind == WRONG
+    shown = validity(state)
+    assert shown.kind == INVALID
     assert "no new plan: invalid_goal: the goal is in collision" in shown.lines[-1]
 
 
 def test_no_motion_at_all() -> None:
     session = Session(a_problem((Sphere(link_pose(load_robot("panda"), END, "panda_hand")[:3, 3], 0.1),)))
-    session.choose(planner="aorrtc")
-    shown = certificate(until(session, lambda state: state.answer))
-    assert shown.kind == NONE and shown.lines[0].startswith("invalid_goal")
+    session.set_options(planner="aorrtc")
+    shown = validity(until(session, lambda state: state.answer))
+    assert shown.kind == NO_MOTION and shown.lines[0].startswith("invalid_goal")
     session.close()
 
 
@@ -121,11 +123,11 @@ def test_the_target_is_dragged(session: Session) -> None:
     goal = session.state.problem.goal
     assert isinstance(goal, PoseGoal) and goal.frame == session.state.goal_frame
     state = until(session, lambda state: settled(state) and _stands(state, T))
-    assert state.answer is not None and state.answer.solved and certificate(state).kind == FREE
+    assert state.answer is not None and state.answer.solved and validity(state).kind == VALID
 
 
 def _stands(state: State, T: np.ndarray) -> bool:
-    """Whether the configuration that is shown for the goal stands there."""
+    """Whether the configuration shown for the goal reaches it."""
     q, robot = state.goal_configuration, state.problem.robot
     return q is not None and np.allclose(link_pose(robot, q, state.goal_frame), T, atol=1e-5)
 
@@ -134,7 +136,7 @@ def test_a_target_out_of_reach(session: Session) -> None:
     session.move_goal(transform(np.array([3.0, 0.0, 0.5])))
     state = until(session, lambda state: settled(state) and state.goal_configuration is None)
     assert state.answer is not None and state.answer.status is Status.UNREACHABLE_GOAL
-    assert certificate(state).kind == WRONG  # the motion still ends where the goal was
+    assert validity(state).kind == INVALID  # the motion still ends where the goal was
 
 
 def test_the_start_is_dragged_by_its_tip_and_stays_near(session: Session) -> None:
@@ -145,7 +147,7 @@ def test_the_start_is_dragged_by_its_tip_and_stays_near(session: Session) -> Non
     state = until(session, lambda state: not np.array_equal(state.problem.start, START))
     assert np.abs(state.problem.start - START).max() < 0.3
     np.testing.assert_allclose(link_pose(robot, state.problem.start, robot.tip), T, atol=1e-5)
-    assert certificate(until(session, settled)).kind == FREE
+    assert validity(until(session, settled)).kind == VALID
 
 
 def test_a_start_out_of_limits_leaves_the_session_as_it_was(session: Session) -> None:
@@ -171,9 +173,9 @@ def test_obstacles_are_added_resized_and_deleted(session: Session) -> None:
 
 def test_an_unknown_planner_and_a_wrong_limit_are_refused(session: Session) -> None:
     with pytest.raises(InputError, match="unknown planner 'best'"):
-        session.choose(planner="best")
+        session.set_options(planner="best")
     with pytest.raises(InputError, match="time_limit"):
-        session.choose(time_limit=0.0)
+        session.set_options(time_limit=0.0)
 
 
 def test_another_robot_takes_the_motion_away(session: Session) -> None:
@@ -181,8 +183,8 @@ def test_another_robot_takes_the_motion_away(session: Session) -> None:
     start = np.array([0.0, -1.2, 1.2, 0.0, 0.5, 0.0])
     goals = AnyGoal((JointGoal(start + 0.2), JointGoal(start - 0.2)))
     session.open(Problem(ur5, Scene(), start, goals))
-    assert session.state.motion is None and session.state.verdict is None
-    assert certificate(until(session, settled)).kind == FREE
+    assert session.state.motion is None and session.state.validation is None
+    assert validity(until(session, settled)).kind == VALID
 
 
 @pytest.fixture
@@ -193,8 +195,8 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> type[SlowPlanner]:
 
 
 def test_the_latest_request_wins(slow: type[SlowPlanner]) -> None:
-    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), Choice("slow"))
-    session.begin()
+    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), PageOptions("slow"))
+    session.start()
     deadline = time.monotonic() + PATIENCE
     while not slow.calls:
         assert time.monotonic() < deadline
@@ -213,8 +215,8 @@ def test_the_latest_request_wins(slow: type[SlowPlanner]) -> None:
 
 
 def test_an_overtaken_plan_is_dropped_if_it_is_no_longer_free(slow: type[SlowPlanner]) -> None:
-    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), Choice("slow"))
-    session.begin()
+    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "lamp"),)), PageOptions("slow"))
+    session.start()
     deadline = time.monotonic() + PATIENCE
     while not slow.calls:
         assert time.monotonic() < deadline
@@ -228,13 +230,13 @@ def test_an_overtaken_plan_is_dropped_if_it_is_no_longer_free(slow: type[SlowPla
         assert session.state.motion is None
         time.sleep(0.005)
     slow.go.release()
-    assert certificate(until(session, settled)).kind == FREE
+    assert validity(until(session, settled)).kind == VALID
     session.close()
 
 
 def test_a_plan_for_a_robot_that_has_gone_is_dropped(slow: type[SlowPlanner]) -> None:
-    session = Session(a_problem(), Choice("slow"))
-    session.begin()
+    session = Session(a_problem(), PageOptions("slow"))
+    session.start()
     deadline = time.monotonic() + PATIENCE
     while not slow.calls:
         assert time.monotonic() < deadline
@@ -249,26 +251,26 @@ def test_a_plan_for_a_robot_that_has_gone_is_dropped(slow: type[SlowPlanner]) ->
 
 
 def test_a_planner_that_breaks_costs_one_plan(slow: type[SlowPlanner]) -> None:
-    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "broken"),)), Choice("slow"))
-    session.begin()
-    shown = certificate(until(session, settled))
-    assert shown.kind == NONE and shown.lines == ("slow failed: RuntimeError: no such luck",)
-    session.choose(planner="aorrtc")
-    assert certificate(until(session, lambda state: settled(state) and state.motion)).kind == FREE
+    session = Session(a_problem((Sphere([0.0, 0.0, 1.5], 0.05, "broken"),)), PageOptions("slow"))
+    session.start()
+    shown = validity(until(session, settled))
+    assert shown.kind == NO_MOTION and shown.lines == ("slow failed: RuntimeError: no such luck",)
+    session.set_options(planner="aorrtc")
+    assert validity(until(session, lambda state: settled(state) and state.motion)).kind == VALID
     session.close()
 
 
 def test_candidates_of_an_arm_without_weights_are_smooth_noise() -> None:
     start = np.array([0.0, -1.2, 1.2, 0.0, 0.5, 0.0])
     problem = Problem(load_robot("ur5"), Scene(), start, JointGoal(start + 0.4))
-    session = Session(problem, Choice("aorrtc", candidates=True))
-    session.begin()
+    session = Session(problem, PageOptions("aorrtc", candidates=True))
+    session.start()
     drawn = until(session, lambda state: state.candidates).candidates
     assert drawn is not None and drawn.source == "smooth_noise"
     assert drawn.positions.shape[0] == len(drawn.clearances) and (drawn.clearances > 0).all()
     np.testing.assert_allclose(drawn.positions[:, 0], np.tile(start, (len(drawn.positions), 1)), atol=1e-5)
-    assert certificate(until(session, settled)).lines[0].startswith("no obstacles, between links")
-    session.choose(candidates=False)
+    assert validity(until(session, settled)).lines[0].startswith("no obstacles, between links")
+    session.set_options(candidates=False)
     assert session.state.candidates is None
     session.close()
 
@@ -280,13 +282,13 @@ def test_latest_goes_on_after_an_error(caplog: pytest.LogCaptureFixture) -> None
         if 1 / divisor:
             done.set()
 
-    latest = Latest(do, "test")
-    latest.ask(0)
+    latest = LatestTask(do, "test")
+    latest.submit(0)
     deadline = time.monotonic() + PATIENCE
     while "ZeroDivisionError" not in caplog.text:
         assert time.monotonic() < deadline
         time.sleep(0.002)
-    latest.ask(1)
+    latest.submit(1)
     assert done.wait(PATIENCE)
     latest.close()
 
@@ -299,11 +301,11 @@ def test_latest_drops_what_was_not_begun() -> None:
         go.wait()
         done.append(work)
 
-    latest = Latest(do, "test")
-    latest.ask(1)
+    latest = LatestTask(do, "test")
+    latest.submit(1)
     begun.wait()
     for work in (2, 3, 4):
-        latest.ask(work)
+        latest.submit(work)
     go.set()
     deadline = time.monotonic() + PATIENCE
     while done != [1, 4]:
@@ -329,7 +331,7 @@ CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 )
 def test_shapes_go_where_their_handles_are_put(shape) -> None:
     T = transform(np.array([0.5, -0.2, 0.7]), rotation_about(np.array([0.6, 0.0, 0.8]), 1.0))
-    at = handle_pose(held_at(shape, T))
+    at = handle_pose(moved_to(shape, T))
     turned = shape.kind not in ("sphere", "point_cloud")
     np.testing.assert_allclose(at, T if turned else transform(T[:3, 3]), atol=1e-12)
     for name, value in dimensions(shape).items():

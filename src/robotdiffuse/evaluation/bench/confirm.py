@@ -1,4 +1,4 @@
-"""The motions of a bench before a second validator: PyBullet, on the meshes, with its own kinematics."""
+"""Checks the motions of a bench by a second validator: PyBullet, on meshes, with its own kinematics."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from robotdiffuse.problems.held_out import Case
 from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle
 
 STEP = 0.02
-"""Between the configurations that are looked at [rad, joint-space L2]."""
+"""Between checked configurations [rad, joint-space L2]."""
 
 
 class Refuted(NamedTuple):
-    """A motion that was returned as solved and that PyBullet finds in collision."""
+    """A motion that was returned as solved and collides by PyBullet."""
 
     record: Record
     contact: OracleContact
@@ -26,17 +26,19 @@ class Refuted(NamedTuple):
 @dataclass(frozen=True)
 class Confirmation:
     checked: int
-    """Motions that were looked at."""
+    """Number of checked motions."""
     refuted: tuple[Refuted, ...]
 
 
 def confirm(
     out: FilePath, count: int | None, progress: Callable[[int, int], None]
 ) -> dict[str, Confirmation]:
-    """Look at the returned motions in a folder of `bench run`, by planner.
+    """Check the returned motions in a folder of `bench run`; results by planner.
 
-    Those of the first `count` problems of each set; None: of all. `progress` is told how many problems are
-    done, of how many. Raises InputError if the folder holds no records, or is damaged.
+    count: first problems of each set; None: all. progress: called with the numbers of problems done and in
+    all.
+
+    Raises InputError if the folder holds no records or is damaged.
     """
     records = [record for of in read_records(out).values() for record in of]
     by_case: dict[tuple[str, str], list[Record]] = {}
@@ -54,7 +56,7 @@ def confirm(
     checked = {record.planner: 0 for record in records}
     refuted: dict[str, list[Refuted]] = {planner: [] for planner in checked}
     for done, (key, found) in enumerate(by_case.items(), start=1):
-        for record, contact in _looked_at(cases[key], found):
+        for record, contact in _checked(cases[key], found):
             checked[record.planner] += 1
             if contact is not None:
                 refuted[record.planner].append(Refuted(record, contact))
@@ -62,8 +64,8 @@ def confirm(
     return {planner: Confirmation(count, tuple(refuted[planner])) for planner, count in checked.items()}
 
 
-def _looked_at(case: Case, records: list[Record]) -> list[tuple[Record, OracleContact | None]]:
-    """Each motion of a problem, and what PyBullet finds wrong with it."""
+def _checked(case: Case, records: list[Record]) -> list[tuple[Record, OracleContact | None]]:
+    """Each record of a problem with the first contact by PyBullet, None without one."""
     problem = case.problem
     with PyBulletOracle(problem.robot, problem.scene) as oracle:
         names = problem.robot.joint_names

@@ -1,4 +1,4 @@
-"""Success and lengths over time, a curve for each planner."""
+"""Curves of success and path length over time, for each planner."""
 
 from dataclasses import dataclass
 
@@ -12,25 +12,25 @@ from robotdiffuse.evaluation.records import Record
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A planner's success and lengths over time, by its longest calls."""
+    """Success and path lengths of a planner over time, from its calls with the longest limit."""
 
     planner: str
     calls: int
     end: float
-    """What was found later than this [s] is known of some problems alone."""
+    """Results later than this [s] are known for some problems only."""
     found: Float[ndarray, "solved"]
-    """When first paths were found [s], sorted."""
+    """Times of first paths [s], sorted."""
     anytime: bool
-    """Whether paths were improved, in more than a tenth of the solved calls on non-trivial problems."""
+    """Whether more than a tenth of the solved calls on non-trivial problems improved their path."""
     times: Float[ndarray, "t"]
-    """From half of these problems on [s]."""
+    """Times from which half of these problems are solved [s]."""
     ratios: Float[ndarray, "t"]
-    """Median at these times of joint-space length to the best known one, over the non-trivial problems that
-    it solves in the end; those not solved yet count as infinite."""
+    """Median at these times of joint-space length over the best known one, on the non-trivial problems that
+    the planner solves in the end; problems not solved yet count as infinite."""
 
 
 def curves(calls: dict[str, Calls]) -> tuple[Curve, ...]:
-    """On the problems that every planner has been called on."""
+    """The curves on the problems that every planner was called on."""
     with_calls = {name: of for name, of in calls.items() if of}
     keys = sorted(set.intersection(*(set(of) for of in with_calls.values()))) if with_calls else []
     best = {
@@ -48,7 +48,7 @@ def curves(calls: dict[str, Calls]) -> tuple[Curve, ...]:
 
 
 def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], longest: float) -> Curve:
-    """`longest`: limit of any planner [s], where the plot ends."""
+    """The curve of a planner. `longest`: the longest limit of any planner [s], where the plot ends."""
     end = min([longest, *(r.time_limit for r in records.values() if not r.ended_by_itself)])
     done = {key: r for key, r in records.items() if outcome(r, r.time_limit).found <= end}
     found = np.sort([min(r.progress[0][0], end) for r in done.values()])

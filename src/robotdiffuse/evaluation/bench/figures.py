@@ -1,7 +1,7 @@
-"""The figures of a bench's report: what its records say of every planner, problem set and time limit.
+"""The figures of a bench's report, for every planner, problem set and time limit.
 
-A report on a time limit needs no run of its own: records of a longer limit say what was found by then, and a
-call that ended by itself says what a longer limit would have given.
+A time limit needs no calls of its own: records of a longer limit say what was found by then, and a call that
+ended by itself says what a longer limit would have given.
 """
 
 from collections import Counter
@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench.curves import Curve, curves
-from robotdiffuse.evaluation.bench.outcomes import Calls, Key, Outcome, calls_on, counting, outcome
+from robotdiffuse.evaluation.bench.outcomes import Calls, Key, Outcome, calls_on, deciding_record, outcome
 from robotdiffuse.evaluation.bench.run_folder import Bench, plain_name
 from robotdiffuse.evaluation.comscore import Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric
@@ -25,19 +25,19 @@ from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
 from robotdiffuse.problems.families import FAMILIES
 
 LIMITS = (0.1, 1.0, 10.0, 60.0)
-"""Time limits [s] of a report beside those of its records, as far as these are longer."""
+"""Time limits of a report beside those of its records, up to the longest of these [s]."""
 ROP = ("rop", "rop_dense")
-"""Sets that stand beside the paper's figures."""
+"""Problem sets that are compared with the paper's figures."""
 NONTRIVIAL = ", non-trivial"
 
 
 class Timed(NamedTuple):
-    """Beside what the calls of a row were timed."""
+    """Under which conditions the calls of a row were timed."""
 
     runs: frozenset[str]
-    """Numbers of the runs in which they may have been made."""
+    """Numbers of the sessions that may have made them."""
     workers: frozenset[str]
-    """Calls at once, in these runs."""
+    """Calls at a time in these sessions."""
 
     @property
     def text(self) -> str:
@@ -47,11 +47,11 @@ class Timed(NamedTuple):
 
 
 class Mean(NamedTuple):
-    """Over the motions that have the metric; NaN without any."""
+    """The mean over the motions that have a metric; NaN without any."""
 
     value: float
     half: float
-    """Of its 95 % interval, by the standard error."""
+    """Half the width of its 95 % interval, by the standard error."""
 
     @classmethod
     def of(cls, values: Iterable[float]) -> "Mean":
@@ -64,55 +64,55 @@ class Mean(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """A planner's figures at a time limit. Means are over the problems that it solved; NaN without any."""
+    """Figures of a planner at a time limit. Means are over the problems that it solved; NaN without any."""
 
     planner: str
     success: float
     success_interval: tuple[float, float]
     """95 %, by E. B. Wilson's method over problems."""
     collision: float
-    """Share of the problems on which the last answer was a path in collision."""
+    """Share of the problems whose last path was in collision."""
     link_length: float
     """The paper's path length [m]."""
     first: float
     """Median time to the first path [s]."""
     returned: float
-    """Mean time until the planner returns [s], over all problems; an unsolved one counts the limit."""
+    """Mean time until the planner returns [s], over all problems; the limit for an unsolved one."""
     comscore: float
     """Among the rows of this table."""
     paired: Paired | None
-    """Against the reference, by joint-space lengths; None for itself and where it has no row."""
+    """Comparison with the reference by joint-space lengths; None for the reference and without it."""
     full: bool
-    """Whether all solved calls used up the time, if need be by restarts."""
+    """Whether all solved calls used up the limit, with restarts or without."""
     timed: Timed
     measures: dict[str, Mean]
     """Of the returned motions, by the names of METRICS."""
     memory: float
-    """Most memory of the process [MB]."""
+    """Peak memory of the process [MB]."""
     failures: dict[str, int]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Planners at a time limit, on the problems that all of them have been given this time for."""
+    """Planners at a time limit, on the problems for which all of them have results with that limit."""
 
     limit: float
     problems: int
     of: int
-    """Problems of the section."""
+    """Problems in the section."""
     seeds: int
     rows: tuple[Row, ...]
     missing: tuple[str, ...]
-    """Planners that were not run this long."""
+    """Planners without results for this limit."""
     families: dict[str, dict[str, tuple[int, int]]]
     """Solved calls and all calls, by family and planner."""
     keys: tuple[Key, ...]
     load: tuple[float, float] | None
-    """Least and highest load average at the ends of the calls; None where it was not noted."""
+    """Lowest and highest load average after the calls; None if it was not noted."""
 
     @property
     def alike(self) -> bool:
-        """Whether all rows were timed in the same runs, with as many calls at once."""
+        """Whether all rows were timed in the same sessions, with as many calls at a time."""
         return len({row.timed for row in self.rows}) < 2
 
     def row(self, planner: str) -> Row | None:
@@ -120,13 +120,13 @@ class Comparison:
 
     @property
     def metrics(self) -> list[Metric]:
-        """Those that some row has."""
+        """The metrics that some row has."""
         return [m for m in METRICS.values() if any(row.measures[m.name].value < np.inf for row in self.rows)]
 
 
 @dataclass(frozen=True)
 class Section:
-    """A problem set, or its non-trivial part."""
+    """Results on a problem set, or on its non-trivial part."""
 
     name: str
     problem_set: str
@@ -136,15 +136,16 @@ class Section:
 
     @property
     def main(self) -> Comparison:
-        """With most planners and problems, and of those the longest limit."""
+        """The comparison of most planners and problems, and of those with the longest limit."""
         return max(self.comparisons, key=lambda c: (len(c.rows) * c.problems, c.limit))
 
 
 def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Section]:
-    """All problem sets; those of random problems, some of them trivial, also without these.
+    """The results on all problem sets; sets of random problems also without their trivial ones.
 
-    `limits`: the time limits [s] to report; None: those of the records, and LIMITS below them.
-    Raises InputError if no planner was run as long as any of these.
+    limits: time limits to report [s]; None: those of the records, and LIMITS below them.
+
+    Raises InputError if no planner has results for any of these.
     """
     found = []
     for problem_set in bench.problem_sets:
@@ -184,15 +185,15 @@ def _counted(
 ) -> dict[Key, Record]:
     """The records that count for a limit.
 
-    Where a planner has been given this time on the first problems alone, only those count: of the others,
-    the ones that ended by themselves before are known, which are easy ones.
+    If a planner had this limit on the first problems only, the others do not count: of these only calls that
+    ended by themselves are known, which are the easy ones.
     """
-    counted = {key: record for key, of in calls.items() if (record := counting(of, limit)) is not None}
+    counted = {key: record for key, of in calls.items() if (record := deciding_record(of, limit)) is not None}
     if len(counted) == len(calls):
         return counted
     given = [
         (run["seeds"], run["count"] or len(places))
-        for run in bench.runs
+        for run in bench.sessions
         if plain_name(planner) in run["planners"]
         and problem_set in run["problems"]
         and run["time_limit"] >= limit
@@ -254,8 +255,8 @@ def _comparison(
 
 
 def _timed(bench: Bench, outcomes: Sequence[Outcome]) -> Timed:
-    runs = frozenset[str]().union(*(bench.run_of(o.record) for o in outcomes))
-    workers = {str(bench.runs[int(number) - 1].get("workers", "?")) for number in runs}
+    runs = frozenset[str]().union(*(bench.sessions_of(o.record) for o in outcomes))
+    workers = {str(bench.sessions[int(number) - 1].get("workers", "?")) for number in runs}
     return Timed(runs, frozenset(workers))
 
 
@@ -265,7 +266,7 @@ def _mean(values: Iterable[float | None]) -> float:
 
 
 def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
-    """As the paper's, of all calls; the length over the solved ones."""
+    """The paper's four indicators of all calls; the length is that of the solved ones."""
     return Indicators(
         success=100 * float(np.mean([o.solved for o in outcomes])),
         collision=100 * float(np.mean([o.record.in_collision for o in outcomes])),
@@ -275,7 +276,8 @@ def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
 
 
 def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Float[ndarray, "problems"]:
-    """One joint-space length of each problem [rad]: the median of its seeds, NaN if half or more failed."""
+    """The joint-space length of each problem [rad]: the median of its seeds, NaN if half or more of them
+    failed."""
     of: dict[str, list[float]] = {}
     for (name, _), o in zip(keys, outcomes, strict=True):
         of.setdefault(name, []).append(o.joint_length)
@@ -305,7 +307,7 @@ def _row(
     return Row(
         planner=planner,
         success=success,
-        # the seeds of one problem are no independent trials: as many trials as problems
+        # the seeds of one problem are not independent, so trials are problems
         success_interval=wilson_interval(round(success * problems), problems),
         collision=indicators.collision / 100,
         link_length=indicators.length,

@@ -1,4 +1,4 @@
-"""What a call had done by a time limit, told by the record of a call with that limit or a longer one."""
+"""What a call had found by a time limit, from the record of a call with that limit or a longer one."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotdiffuse.core.types import Status
-from robotdiffuse.evaluation.records import CRASHED, ENDED, OVERRAN, RAISED, Record
+from robotdiffuse.evaluation.records import CRASHED, ENDED_EARLY, OVERRAN, RAISED, Record
 
-LATE_SHARE, LATE = 0.1, 0.05
-"""A returned motion may be this share of the limit, or this time [s], late: planners stop in time, and then
-the validator takes its own."""
-SHORTEST = 1 + 1e-6
-"""A path so many times as long as the shortest known one is as short."""
+LATE_SHARE, LATE_SECONDS = 0.1, 0.05
+"""A returned motion counts if it is at most this share of the limit, or this time [s], late: planners stop in
+time, and validation follows."""
+SHORTEST_FACTOR = 1 + 1e-6
+"""A path counts as the shortest if it is at most so many times as long as the shortest known one."""
 RAN_OUT, GAVE_UP, LATER = "time ran out", "gave up before", "found one later"
 FAILURES = {
     RAN_OUT: "no path by the end of the limit",
@@ -21,42 +21,43 @@ FAILURES = {
     "scene collision": "the last path hit an obstacle",
     "self-collision": "the last path hit the arm itself",
     "other refusal": "the last path broke limits, missed the goal or twitched",
-    "ends refused": "start or goal said to be impossible",
+    "ends refused": "start or goal were refused",
     CRASHED: "the process died",
     OVERRAN: "the process did not answer and was killed",
     RAISED: "an exception",
 }
-"""Why calls fail, for tables and plots."""
+"""Reasons of failures, for tables and plots."""
 REFUSED = {"scene_collision": "scene collision", "self_collision": "self-collision"}
 
 Key = tuple[str, int]
 """A problem of a set by name, and a seed."""
 Calls = dict[Key, list[Record]]
-"""The calls of one planner on one problem set, shorter limits first."""
+"""The records of one planner on one problem set, shorter limits first."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a call had done by a time limit."""
+    """What a call had found by a time limit."""
 
     record: Record
     found: float
-    """When the first path was found [s]; infinite if not by the limit."""
+    """Time of the first path [s]; infinite if there was none by the limit."""
     returned: float
-    """When the planner would have returned [s]: the limit for an anytime planner and if nothing was found."""
+    """Time at which the planner returns [s]; the limit for anytime planners and without a path."""
     joint_length: float
-    """Of the best path by then [rad]; NaN without one, as what follows."""
+    """Of the best path by then [rad]; NaN without one."""
     link_length: float
-    """The paper's [m]; a longer path than the returned one is taken as longer by the same factor."""
+    """The paper's path length [m], scaled by the joint lengths if the path by then is not the returned one;
+    NaN without a path."""
 
     @property
     def solved(self) -> bool:
         return self.found < np.inf
 
     def full(self, limit: float, shortest: float) -> bool:
-        """Whether more calls within the limit could not have given a shorter path than this."""
-        nothing_shorter = self.record.trivial and self.joint_length <= SHORTEST * shortest
-        return self.record.restarts is not None or self.returned >= ENDED * limit or nothing_shorter
+        """Whether the planner used up the limit, or no shorter path exists."""
+        nothing_shorter = self.record.trivial and self.joint_length <= SHORTEST_FACTOR * shortest
+        return self.record.restarts is not None or self.returned >= ENDED_EARLY * limit or nothing_shorter
 
     @property
     def failure(self) -> str:
@@ -73,9 +74,9 @@ class Outcome:
         return GAVE_UP if record.ended_by_itself and record.time < self.returned else RAN_OUT
 
 
-def counting(records: Sequence[Record], limit: float) -> Record | None:
-    """The record that says what a planner does within a limit [s], of its calls on one problem with one seed,
-    shorter limits first: of the least limit that is as long, else one that ended by itself."""
+def deciding_record(records: Sequence[Record], limit: float) -> Record | None:
+    """The record that says what a planner finds within a limit [s]: that of the shortest limit as long, else
+    the last that ended by itself. `records` are those of one problem and seed, shorter limits first."""
     for record in records:
         if record.time_limit >= limit:
             return record
@@ -83,8 +84,8 @@ def counting(records: Sequence[Record], limit: float) -> Record | None:
 
 
 def outcome(record: Record, limit: float) -> Outcome:
-    """What was done within a limit [s] that the record counts for."""
-    late = max(LATE_SHARE * limit, LATE) if record.time_limit == limit else 0.0
+    """What the call of a record had found within a limit [s]."""
+    late = max(LATE_SHARE * limit, LATE_SECONDS) if record.time_limit == limit else 0.0
     by_then = [(at, length) for at, length in record.progress if record.solved and at <= limit + late]
     if not by_then:
         return Outcome(record, np.inf, limit, np.nan, np.nan)
@@ -95,7 +96,7 @@ def outcome(record: Record, limit: float) -> Outcome:
 
 
 def calls_on(records: Iterable[Record], problem_set: str) -> Calls:
-    """A planner's calls on a problem set, of its records."""
+    """Those of a planner's records that are on a problem set, by problem and seed."""
     calls: Calls = {}
     for record in records:
         if record.problem_set == problem_set:

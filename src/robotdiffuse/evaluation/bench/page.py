@@ -1,4 +1,4 @@
-"""The page of a bench: plots and tables in one HTML file that needs no network; and what to replay."""
+"""The page of a bench: plots and tables in one HTML file that needs no network; and the motions to replay."""
 
 import html
 import json
@@ -15,7 +15,7 @@ from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.evaluation import style
 from robotdiffuse.evaluation.bench import plots, report
 from robotdiffuse.evaluation.bench.figures import Comparison, Section
-from robotdiffuse.evaluation.bench.outcomes import Outcome, calls_on, counting, outcome
+from robotdiffuse.evaluation.bench.outcomes import Outcome, calls_on, deciding_record, outcome
 from robotdiffuse.evaluation.bench.run_folder import Bench
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import Record
@@ -69,13 +69,13 @@ chosen.limit = mains[chosen.set];
 show();
 """
 
-MOST_REPLAYS = 12
-HARDEST = 2
-"""Solved problems in replays, each with up to three planners; the rest is failures."""
+MAX_REPLAYS = 12
+SOLVED_PROBLEMS = 2
+"""In replays, each with up to three planners; the other replays are of failures."""
 
 
 def write_page(bench: Bench, parts: Sequence[Section], file: str | FilePath, replays: str | None) -> None:
-    """Write the page as .html. `replays`: name of a file beside it with replays, which it shows in a frame.
+    """Write the page as .html. `replays`: name of a file beside it, shown in a frame.
 
     Raises InputError without matplotlib and for a file that cannot be written.
     """
@@ -88,7 +88,7 @@ def write_page(bench: Bench, parts: Sequence[Section], file: str | FilePath, rep
 def write_plots(bench: Bench, parts: Sequence[Section], folder: FilePath) -> list[str]:
     """Write the curves of each problem set as success_SET.svg and length_SET.svg; returns their names.
 
-    Raises InputError as `write_page`.
+    Raises InputError as `write_page` does.
     """
     planners, drawn = list(bench.records), {}
     with style.style():
@@ -97,7 +97,7 @@ def write_plots(bench: Bench, parts: Sequence[Section], folder: FilePath) -> lis
             drawn[f"success_{name}.svg"] = plots.success_over_time(section, planners)
             drawn[f"length_{name}.svg"] = plots.length_over_time(section, planners)
     for file, svg in drawn.items():
-        # the ink is dark
+        # the text is dark
         write_atomically(folder / file, svg.replace("<svg ", '<svg style="background: white" ', 1))
     return list(drawn)
 
@@ -107,18 +107,18 @@ def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
     apart = [section for section in parts if section.name == section.problem_set]
     families = plots.families([section.main for section in apart], planners)
     limits = " and ".join(f"{x:g} s" for x in sorted({section.main.limit for section in apart}))
-    text = f"Share of problems solved within {limits}, with 95 % intervals; in brackets, how many calls"
+    text = f"Share of problems solved within {limits}, with 95 % intervals; in brackets: calls"
     frame = ""
     if replays:
         frame = card(
             "Motions",
             12,
-            "The problems with the longest ways round, by several planners; and problems that planners "
-            "failed on, with a motion that does it where there is one; "
+            "Problems with the longest detours, by several planners; and problems that planners failed on, "
+            "with a motion that solves them if there is one; "
             f'<a href="{html.escape(replays)}">on a page of their own</a>',
             f'<iframe title="replays" loading="lazy" src="{html.escape(replays)}"></iframe>',
         )
-    # in JSON a '<' stands only in strings, and escaped it cannot end the script element
+    # an unescaped '<' in a string could end the script element
     mains = json.dumps({s.name: f"{s.main.limit:g}" for s in parts}).replace("<", "\\u003c")
     content = (
         _picks(parts),
@@ -173,7 +173,7 @@ def _picks(parts: Sequence[Section]) -> str:
 
 
 def _section(bench: Bench, section: Section, planners: list[str]) -> str:
-    """Plots of a problem set, and the tables of each limit."""
+    """Plots of a problem set, and tables of each limit."""
     name = html.escape(section.name)
     curves = ""
     if section.curves:
@@ -181,7 +181,7 @@ def _section(bench: Bench, section: Section, planners: list[str]) -> str:
         curves = card(
             "Success over time",
             6,
-            f"{name}: share of {ran} calls. Learned planners solid, sampling dashed, search dotted",
+            f"{name}: share of {ran} calls. Planners with a network solid, search dashed",
             f'<div class="wide">{plots.success_over_time(section, planners)}</div>',
         ) + card(
             "Length over time",
@@ -214,7 +214,7 @@ def _comparison(bench: Bench, section: Section, comparison: Comparison) -> str:
         )
         if heading.startswith("Quality"):
             plot = plots.metrics(section, comparison, planners)
-            text = "Means of the solved problems with their 95 % intervals; nothing, where nothing was solved"
+            text = "Means over the solved problems with 95 % intervals; empty for planners that solved none"
             cards.append(card("Quality", 12, text, f'<div class="wide">{plot}</div>'))
     return "".join(cards)
 
@@ -228,20 +228,20 @@ def _crashes(bench: Bench) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """A motion that is worth a replay."""
+class Replay:
+    """A motion for the replays."""
 
     title: str
     caption: str
     case: Case
     positions: Float[ndarray, "n dof"]
-    """Waypoints [rad]; the straight line to the goal where nobody found a motion."""
+    """Waypoints [rad]; the straight line to the goal if no planner found a motion."""
 
 
-def worth_showing(bench: Bench, parts: Sequence[Section]) -> list[Shown]:
-    """Motions of the problems with the longest ways round, then of problems on which the reference, or else
-    another planner, failed; all at the main limit of their set and among those in the folder's files."""
-    tries: list[_Tries] = []
+def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
+    """Motions of the problems with the longest detours, then of problems on which the reference, or else
+    another planner, failed; at the main limit of their set, for cases that the folder keeps."""
+    tries: list[_ProblemOutcomes] = []
     for section in (section for section in parts if section.name == section.problem_set):
         calls = {name: calls_on(records, section.problem_set) for name, records in bench.records.items()}
         cases = {case.name: case for case in read_cases(bench.folder, section.problem_set)}
@@ -249,11 +249,14 @@ def worth_showing(bench: Bench, parts: Sequence[Section]) -> list[Shown]:
         for name, seed in section.main.keys:
             if seed == section.main.keys[0][1] and name in cases:
                 found = {
-                    planner: counting(calls[planner][name, seed], section.main.limit) for planner in compared
+                    planner: deciding_record(calls[planner][name, seed], section.main.limit)
+                    for planner in compared
                 }
                 outcomes = {k: outcome(r, section.main.limit) for k, r in found.items() if r is not None}
-                tries.append(_Tries(cases[name], outcomes))
-    hardest = sorted((t for t in tries if t.solved), key=lambda t: (len(t.solved) < 2, -t.detour))[:HARDEST]
+                tries.append(_ProblemOutcomes(cases[name], outcomes))
+    hardest = sorted((t for t in tries if t.solved), key=lambda t: (len(t.solved) < 2, -t.detour))[
+        :SOLVED_PROBLEMS
+    ]
     shown = [motion for t in hardest for motion in _solved(t, bench.reference)]
     failed = [
         t
@@ -261,25 +264,25 @@ def worth_showing(bench: Bench, parts: Sequence[Section]) -> list[Shown]:
         if t.failed and t not in hardest and (t.solved or isinstance(t.case.problem.goal, JointGoal))
     ]
     failed.sort(key=lambda t: (bench.reference not in t.failed, len(t.solved)))
-    return shown + [_failed(t, bench.reference) for t in failed[: MOST_REPLAYS - len(shown)]]
+    return shown + [_failed(t, bench.reference) for t in failed[: MAX_REPLAYS - len(shown)]]
 
 
 @dataclass(frozen=True, eq=False)
-class _Tries:
-    """What the planners made of a problem."""
+class _ProblemOutcomes:
+    """The outcomes of all planners on a problem."""
 
     case: Case
     outcomes: dict[str, Outcome]
 
     @property
     def solved(self) -> list[Record]:
-        """Shortest first."""
+        """Records of the solved calls, shortest path first."""
         records = [o.record for o in self.outcomes.values() if o.solved]
         return sorted(records, key=lambda record: record.joint_length or 0.0)
 
     @property
     def failed(self) -> dict[str, str]:
-        """Why, by planner."""
+        """Reasons of failures by planner."""
         return {name: o.failure for name, o in self.outcomes.items() if not o.solved}
 
     @property
@@ -290,27 +293,27 @@ class _Tries:
         return (best.joint_length or 0.0) / max(straight, 1e-6)
 
 
-def _solved(tries: _Tries, reference: str) -> list[Shown]:
-    """The reference's motion, the shortest and the longest."""
+def _solved(tries: _ProblemOutcomes, reference: str) -> list[Replay]:
+    """The motion of the reference, the shortest and the longest."""
     solved = tries.solved
     chosen = [*(r for r in solved if r.planner == reference), solved[0], solved[-1]]
     shown = []
     for record in {record.planner: record for record in chosen}.values():
         which = "shortest, " if record is solved[0] else "longest, " if record is solved[-1] else ""
         caption = f"{record.joint_length:.2f} rad, {which}in {report.seconds(record.time)} s"
-        shown.append(Shown(f"{record.planner} · {tries.case.name}", caption, tries.case, record.waypoints))
+        shown.append(Replay(f"{record.planner} · {tries.case.name}", caption, tries.case, record.waypoints))
     return shown
 
 
-def _failed(tries: _Tries, reference: str) -> Shown:
+def _failed(tries: _ProblemOutcomes, reference: str) -> Replay:
     failures, solved = tries.failed, tries.solved
     loser = reference if reference in failures else next(iter(failures))
     title = f"{loser} fails · {tries.case.name}"
     if solved:
-        others = f"; here: {solved[0].planner}" + (f", {len(solved)} solve it" if len(solved) > 1 else "")
-        return Shown(title, failures[loser] + others, tries.case, solved[0].waypoints)
+        others = f"; shown: {solved[0].planner}" + (f", {len(solved)} solve it" if len(solved) > 1 else "")
+        return Replay(title, failures[loser] + others, tries.case, solved[0].waypoints)
     problem = tries.case.problem
     assert isinstance(problem.goal, JointGoal)
-    caption = "solved by none; here: the straight line, no solution"
+    caption = "solved by no planner; shown: the straight line, which is no solution"
     line = np.stack([problem.start, problem.goal.positions[0]])
-    return Shown(f"not solved · {tries.case.name}", caption, tries.case, line)
+    return Replay(f"not solved · {tries.case.name}", caption, tries.case, line)

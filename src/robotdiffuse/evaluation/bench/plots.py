@@ -12,23 +12,27 @@ from robotdiffuse.evaluation.bench.run_folder import base_name, plain_name
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.statistics import wilson_interval
 from robotdiffuse.evaluation.style import FAINT, INK, LINE, SOFT, as_svg, make_figure, percent_axis
+from robotdiffuse.planning import PLANNERS, SEARCH
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LEARNED = {
-    "robotdiffuse": "#0c9b74",
-    "diffusion": "#7a9e1c",
-    "mpnet": "#d9622b",
-    "mpinets": "#c23f78",
-    "mpd": "#d99a17",
-    "edmp": "#8b55b8",
-}
-SEARCH = {"a_star": "#6b4a2f", "d_star_lite": "#b08656"}
-BLUES = ("#1d4e9e", "#3f8ae0", "#1b8fa8", "#6a6fd1", "#6fb1ea", "#41597a", "#9c93e6", "#58b9c7", "#8a9bb2")
-"""Of sampling-based planners, which are all others."""
-SOLID, DASHED, DOTTED = "-", (0, (4.5, 1.6)), (0, (1.2, 1.3))
+LEARNED_COLORS = ("#0c9b74", "#7a9e1c", "#d9622b", "#c23f78", "#d99a17", "#8b55b8")
+"""Of planners with a network, in the order of PLANNERS."""
+SEARCH_COLORS = (
+    "#1d4e9e",
+    "#3f8ae0",
+    "#1b8fa8",
+    "#6a6fd1",
+    "#6fb1ea",
+    "#41597a",
+    "#9c93e6",
+    "#58b9c7",
+    "#8a9bb2",
+)
+"""Of search, and of learned planners with weights or settings of their own."""
+SOLID, DASHED = "-", (0, (4.5, 1.6))
 REASONS = dict(
     zip(
         FAILURES,
@@ -43,33 +47,40 @@ REASONS = dict(
 )
 """Colours of failures."""
 assert {CRASHED, OVERRAN, RAISED} <= set(REASONS)
-INSIDE = (0.085, 0.07, 0.655, 0.9)
-"""Of a figure, where the plot is when names stand beside it."""
-LABEL = 7.2
-"""Size of the names in plots [pt]."""
-GAP = 0.0535
+AXES_BESIDE_NAMES = (0.085, 0.07, 0.655, 0.9)
+"""Place of the axes in a figure with names at the right."""
+LABEL_SIZE = 7.2
+"""Of names in plots [pt]."""
+LABEL_GAP = 0.0535
 """Between names beside a plot [share of its height]."""
 
 
 def color_of(planner: str, planners: Sequence[str]) -> str:
-    """The same in all plots of a report on these planners; with restarts, that of the planner without."""
-    planner, own = plain_name(planner), LEARNED | SEARCH
-    others = list(dict.fromkeys(name for name in map(plain_name, planners) if name not in own))
-    return own[planner] if planner in own else BLUES[others.index(planner) % len(BLUES)]
+    """The colour of a planner, the same in all plots of a report on these planners, with restarts or
+    without."""
+    planner, learned = plain_name(planner), [name for name in PLANNERS if is_learned(name)]
+    if planner in learned:
+        return LEARNED_COLORS[learned.index(planner) % len(LEARNED_COLORS)]
+    others = list(dict.fromkeys(name for name in map(plain_name, planners) if name not in learned))
+    return SEARCH_COLORS[others.index(planner) % len(SEARCH_COLORS)]
+
+
+def is_learned(planner: str) -> bool:
+    """Whether a planner has a network, whatever its weights, settings and restarts."""
+    entry = PLANNERS.get(base_name(planner))
+    return entry is not None and entry.kind != SEARCH
 
 
 def line_of(planner: str) -> str | tuple[int, tuple[float, float]]:
-    """Learned planners solid, with other weights and settings too, sampling-based ones dashed, search
-    dotted."""
-    base = base_name(planner)
-    return SOLID if base in LEARNED else DOTTED if base in SEARCH else DASHED
+    """The style of a planner's line: solid with a network, dashed for search."""
+    return SOLID if is_learned(planner) else DASHED
 
 
 def success_over_time(section: Section, planners: Sequence[str]) -> str:
-    """The paper's figure: share of problems solved within a time, on a logarithmic axis."""
+    """Draw the share of problems solved over time on a logarithmic axis, as in the paper's figure."""
     figure = make_figure(6, 3.7)
     figure.set_layout_engine("none")
-    axes = figure.add_axes(INSIDE)
+    axes = figure.add_axes(AXES_BESIDE_NAMES)
     ends = {}
     first = min((c.found[0] for c in section.curves if len(c.found)), default=0.1)
     low, high = _decade_below(first), max(c.end for c in section.curves)
@@ -87,10 +98,10 @@ def success_over_time(section: Section, planners: Sequence[str]) -> str:
 
 
 def length_over_time(section: Section, planners: Sequence[str]) -> str:
-    """Median length against time: a line where a planner improves its paths, else a point."""
+    """Draw the median length over time: a line for planners that improve their paths, else a point."""
     figure = make_figure(6, 3.7)
     figure.set_layout_engine("none")
-    axes = figure.add_axes(INSIDE)
+    axes = figure.add_axes(AXES_BESIDE_NAMES)
     curves = [curve for curve in section.curves if len(curve.times)]
     low = _decade_below(min((c.times[0] for c in curves), default=0.1))
     high = max((c.end for c in section.curves), default=1.0)
@@ -108,7 +119,7 @@ def length_over_time(section: Section, planners: Sequence[str]) -> str:
             axes.plot(
                 middle,
                 last,
-                marker="o" if curve.planner in LEARNED else "s" if curve.planner in SEARCH else "D",
+                marker="o" if is_learned(curve.planner) else "D",
                 markersize=6.5 if style["linewidth"] > 2 else 4.8,
                 color=style["color"],
                 markeredgecolor="white",
@@ -127,7 +138,7 @@ def length_over_time(section: Section, planners: Sequence[str]) -> str:
 
 
 def families(comparisons: Sequence[Comparison], planners: Sequence[str]) -> str:
-    """Success of every planner on every family of problems, with 95 % intervals."""
+    """Draw the success of every planner on every family of problems with 95 % intervals."""
     shown = {family: of for c in comparisons for family, of in c.families.items()}
     titles = [f"{family}  ({max(n for _, n in of.values())})" for family, of in shown.items()]
     figure, panels = _panels(titles, planners, 0.42)
@@ -147,7 +158,7 @@ def families(comparisons: Sequence[Comparison], planners: Sequence[str]) -> str:
 
 
 def failures(section: Section, comparison: Comparison, planners: Sequence[str]) -> str:
-    """Stacked bars of the failed calls by reason, in percent of all calls."""
+    """Draw stacked bars of the failed calls by reason, in percent of all calls."""
     rows = {row.planner: row.failures for row in comparison.rows}
     shown = [name for name in planners if name in rows]
     figure = make_figure(6, 0.258 * len(shown) + 0.85)
@@ -171,7 +182,7 @@ def failures(section: Section, comparison: Comparison, planners: Sequence[str]) 
 
 
 def metrics(section: Section, comparison: Comparison, planners: Sequence[str]) -> str:
-    """A panel for each metric of motions: the means of all planners, with their 95 % intervals."""
+    """Draw a panel for each metric of motions: the means of all planners with their 95 % intervals."""
     rows = {row.planner: row for row in comparison.rows}
     shown = [name for name in planners if name in rows]
     titles = [
@@ -189,11 +200,11 @@ def metrics(section: Section, comparison: Comparison, planners: Sequence[str]) -
     return _svg(figure, f"metrics {section.name} {comparison.limit:g}")
 
 
-def _panels(titles: Sequence[str], planners: Sequence[str], room: float) -> "tuple[Figure, list[Axes]]":
-    """Panels in rows of four, each with a line for each planner. room: for title and ticks [inch]."""
+def _panels(titles: Sequence[str], planners: Sequence[str], margin: float) -> "tuple[Figure, list[Axes]]":
+    """Panels in rows of four, with a line for each planner. `margin`: for title and ticks [inch]."""
     across = min(4, len(titles))
     down = -(-len(titles) // across)
-    figure = make_figure(12, (0.165 * len(planners) + room) * down + 0.1)
+    figure = make_figure(12, (0.165 * len(planners) + margin) * down + 0.1)
     panels = figure.subplots(down, across, squeeze=False, sharey=True).reshape(-1).tolist()
     for panel in panels[len(titles) :]:
         panel.set_axis_off()
@@ -205,17 +216,18 @@ def _panels(titles: Sequence[str], planners: Sequence[str], room: float) -> "tup
 
 
 def _planner_axis(axes: "Axes", planners: Sequence[str]) -> None:
-    """Planners from top to bottom."""
+    """List the planners from top to bottom."""
     axes.grid(axis="x", color=FAINT, linewidth=0.8)
     axes.spines[["left", "bottom"]].set_visible(False)
     axes.tick_params(axis="x", length=0)
     axes.set_ylim(len(planners) - 0.4, -0.6)
     axes.set_yticks(range(len(planners)), planners)
-    axes.tick_params(axis="y", labelcolor=INK, labelsize=LABEL)
+    axes.tick_params(axis="y", labelcolor=INK, labelsize=LABEL_SIZE)
 
 
 def _svg(figure: "Figure", name: str) -> str:
-    """With identifiers that no plot of another name has: a reference into a hidden one draws nothing."""
+    """The figure as SVG with identifiers of its own, as references into another, hidden plot would draw
+    nothing."""
     text = as_svg(figure)
     own = f"p{hashlib.sha256(name.encode()).hexdigest()[:8]}-"
     for reference in ('id="', "url(#", 'href="#'):
@@ -234,7 +246,7 @@ def _stroke(planner: str, planners: Sequence[str]) -> dict[str, Any]:
 
 
 def _decade_below(time: float) -> float:
-    """With a little room, for logarithmic axes from here on."""
+    """The power of ten below a time, with a small margin: the start of a logarithmic axis."""
     return float(10 ** np.floor(np.log10(max(time, 2e-4)) - 0.05))
 
 
@@ -253,12 +265,12 @@ def _time_axis(axes: "Axes", low: float, high: float) -> None:
 
 
 def _names_at_right(axes: "Axes", ends: dict[str, tuple[float, float]], planners: Sequence[str]) -> None:
-    """Names in the colours of their lines beside the plot, in the order of the ends, moved apart where they
-    would touch; a thin line leads from each end to its name."""
+    """Write names beside the plot in the order of the ends of their lines, moved apart so that they do not
+    touch, each with a thin line from the end to the name."""
     transform = axes.transData + axes.transAxes.inverted()
     at = {name: transform.transform(end) for name, end in ends.items()}
     order = sorted(at, key=lambda name: (at[name][1], -planners.index(name)))
-    heights = _spread(np.array([at[name][1] for name in order]), GAP)
+    heights = spread_apart(np.array([at[name][1] for name in order]), LABEL_GAP)
     for name, height in zip(order, heights.tolist(), strict=True):
         (x, y), color = at[name], color_of(name, planners)
         axes.plot(
@@ -286,16 +298,17 @@ def _names_at_right(axes: "Axes", ends: dict[str, tuple[float, float]], planners
             name,
             transform=axes.transAxes,
             color=INK,
-            fontsize=LABEL,
+            fontsize=LABEL_SIZE,
             va="center",
             fontweight="bold" if name == "robotdiffuse" else "normal",
         )
     axes.spines[["bottom"]].set_color(LINE)
 
 
-def _spread(wanted: np.ndarray, gap: float) -> np.ndarray:
-    """Ascending heights as near to these as fits at `gap` from each other, within 0.01 to 0.99."""
-    blocks: list[list[float]] = []  # sum of what their first would want, count
+def spread_apart(wanted: np.ndarray, gap: float) -> np.ndarray:
+    """Ascending heights, at least `gap` apart and within 0.01 to 0.99, as close as possible to the wanted
+    ones."""
+    blocks: list[list[float]] = []  # sum of the heights that their first would take, count
     for value in wanted:
         blocks.append([value, 1])
         while len(blocks) > 1:

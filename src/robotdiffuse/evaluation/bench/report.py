@@ -22,55 +22,57 @@ IN_PAPER = {
     "mpd": "MPD",
     "diffusion": "RobotDiffuse",
 }
-"""Our planners that are rows of the paper's Table 1."""
+"""Planners that are rows of the paper's Table 1."""
 HYBRID = "robotdiffuse"
-"""The planner around the paper's method that is none of its rows."""
-PAPERS = "diffusion"
-"""The paper's method."""
-TITLES = {HYBRID: "hybrid", PAPERS: "RobotDiffuse (paper's method)"}
-"""What planners are whose names do not say it."""
+"""The planner around the paper's method, which is no row of the paper's tables."""
+PAPER_METHOD = "diffusion"
+TITLES = {HYBRID: "hybrid", PAPER_METHOD: "RobotDiffuse (paper's method)"}
+"""Additions to names of planners."""
 UNEQUAL = " †"
 UNEQUAL_NOTE = (
     "† not at equal time: this planner or the reference ended before the limit. `bench run --equal-time` "
-    "calls those that end early again until the limit."
+    "repeats such calls until the limit."
 )
 NOTES = (
-    "A call counts for a limit if its own was at least as long, or if it ended by itself before: more time "
-    "changes nothing then. Compared are the problems on which all planners of a table have such a call.",
-    "success: verified motions found by the limit, with the 95 % interval over problems (Wilson). A motion "
-    "that a call returned up to 10 % or 50 ms after its own limit counts: planners stop in time, then the "
-    "validator takes its own.",
-    "collision: share of problems on which the planner's last answer was a path in collision, which the "
-    "validator refused.",
-    "length: the paper's, the ways of all links together, mean over the problems that the planner itself "
-    "solved; planners that solve easy problems only look short. Where a call ran on and returned a shorter "
-    "path, its length by the limit is the returned one's, scaled by the joint-space lengths.",
-    "ratio: median of joint-space length over that of the reference, on problems that both solve, with its "
-    "95 % interval (bootstrap over problems), at equal time: of planners that use up the limit. restarted: "
-    "one that ends earlier is called again with other seeds until its calls have used up the limit together, "
-    "and the shortest path counts; the time to time the motions that do not count is not in it.",
-    "first: median time to the first path, of the solved. returns: mean time until the planner returns; "
-    "anytime planners use up the limit, and an unsolved problem counts it.",
-    "ComScore: as in the paper, from success, collision, length and time until it returns; each from 0 for "
-    "the worst row of the table to 1 for the best. It depends on which rows there are; those with restarts "
-    "are left out. Beside the paper's Table 1 it is among the paper's rows alone; the hybrid's is what it "
-    "would have in place of the paper's method.",
-    "Quality: means over the solved problems, of the motions that the calls returned at their end. "
-    "clearance: a lower bound, to obstacles (scene), of the arm to itself (self), and the lesser of the two. "
-    "bending: the integral of the squared second derivative of the path, over its squared length. jerk: "
-    "logarithm of the dimensionless jerk, less is smoother; sparc: spectral arc length of the joints' and "
-    "the tip's speed, nearer to 0 is smoother.",
-    "p of success: McNemar's exact test; p of length: Wilcoxon's signed ranks; neither is corrected for the "
-    "number of comparisons. With several seeds, a problem counts as solved if more than half of them are.",
+    "A call counts for a limit if its own limit was at least as long, or if it ended by itself before: "
+    "more time would change nothing. A table compares the problems on which all its planners have such a "
+    "call.",
+    "success: verified motions found by the limit, with the 95 % interval over problems (Wilson). A "
+    "motion that a call returned up to 10 % or 50 ms after its own limit counts: planners stop in time, "
+    "and validation follows.",
+    "collision: share of problems on which the validator refused the planner's last path because it "
+    "collides.",
+    "length: the paper's, the path lengths of all links together, mean over the problems that the planner "
+    "itself solved; planners that solve only easy problems seem short. If a call continued and returned a "
+    "shorter path, its length by the limit is that of the returned path, scaled by the joint-space "
+    "lengths.",
+    "ratio: median of joint-space length over that of the reference, on problems that both solve, with "
+    "its 95 % interval (bootstrap over problems), at equal time: for planners that use up the limit. "
+    "restarted: a planner that ends earlier is called again with other seeds until its calls have used up "
+    "the limit together, and the shortest path counts; the time for timing the other motions does not.",
+    "first: median time to the first path of solved problems. returns: mean time until the planner "
+    "returns; anytime planners use up the limit, and unsolved problems count with it.",
+    "ComScore: as in the paper, from success, collision, length and time until the planner returns, each "
+    "from 0 for the worst row of the table to 1 for the best. It depends on the rows of the table; those "
+    "with restarts are left out. Beside the paper's Table 1 it is computed among the paper's rows alone; "
+    "the hybrid's is computed in place of the paper's method.",
+    "Quality: means over the solved problems of the motions that the calls returned. clearance: a lower "
+    "bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. bending: the "
+    "integral of the squared second derivative of the path, over its squared length. jerk: logarithm of "
+    "the dimensionless jerk, lower is smoother; sparc: spectral arc length of the joints' and the tip's "
+    "speed, closer to 0 is smoother.",
+    "p of success: McNemar's exact test; p of length: Wilcoxon's signed ranks; neither is corrected for "
+    "the number of comparisons. With several seeds, a problem counts as solved if more than half of them "
+    "are.",
 )
 
 
 Spec = Sequence[tuple[Column, Callable[[Row], Cell]]]
-"""Columns of a table on planners, and what stands there."""
+"""Columns of a table of planners, with the functions for their cells."""
 
 
 def named(planner: str) -> str:
-    """As tables call a planner: with what it is, its settings and whether it was restarted."""
+    """The name of a planner in tables: with its title, its settings and whether it was restarted."""
     name, *settings = plain_name(planner).split(":")
     title = TITLES.get(base_name(planner))
     again = ["restarted"] if planner.endswith(RESTARTED) else []
@@ -87,7 +89,7 @@ def _table(
 
 
 def seconds(value: float) -> Cell:
-    """Two digits that matter: times go from 0.1 ms to a minute."""
+    """A time with two significant digits."""
     if not np.isfinite(value):
         return None
     return Figure(f"{value:.{max(0, 1 - int(np.floor(np.log10(max(value, 1e-4)))))}f}", value)
@@ -102,7 +104,7 @@ def percents(shares: tuple[float, float]) -> str:
 
 
 def title(section: Section, comparison: Comparison) -> str:
-    """What is compared: problems, limit and how many."""
+    """The title of a comparison: problem set, limit and number of problems."""
     of = "" if comparison.problems == comparison.of else f" of {comparison.of}"
     plural = "problem" if comparison.problems == 1 else "problems"
     seeds = f", {comparison.seeds} seeds each" if comparison.seeds > 1 else ""
@@ -110,7 +112,7 @@ def title(section: Section, comparison: Comparison) -> str:
 
 
 def main_table(section: Section, comparison: Comparison, reference: str) -> Table:
-    """The paper's columns, with intervals and the ratio of lengths to the reference's."""
+    """The paper's columns, with intervals and the ratio of lengths to those of the reference."""
     spec: Spec = (
         (Column("success", "%", ".1f", "more", scale=100.0, bar=True), lambda row: row.success),
         (Column("95 %", dim=True), lambda row: percents(row.success_interval)),
@@ -128,7 +130,7 @@ def main_table(section: Section, comparison: Comparison, reference: str) -> Tabl
 
 
 def timed_line(comparison: Comparison) -> str:
-    """Whether all rows were timed alike."""
+    """A line that says whether all rows were timed under the same conditions."""
     load = ""
     if comparison.load is not None:
         least, most = comparison.load
@@ -145,7 +147,7 @@ def _ratio(comparison: Comparison, reference: str) -> Spec:
     restarted = {plain_name(row.planner) for row in comparison.rows if row.planner.endswith(RESTARTED)}
 
     def mark(row: Row) -> str | None:
-        """What stands behind a figure; None if there should be none."""
+        """The sign behind a figure; None if the figure is not shown."""
         if row.full and (known is None or known.full):
             return ""
         return None if row.planner in restarted else UNEQUAL
@@ -181,7 +183,7 @@ def quality_table(section: Section, comparison: Comparison) -> Table:
 
 
 def paired_table(section: Section, comparison: Comparison, reference: str) -> Table:
-    """Every planner against the reference on the same problems."""
+    """Comparisons of each planner with the reference on the same problems."""
 
     def p_of_length(pair: Paired) -> Cell:
         return probability(pair.p_length) if pair.both else None
@@ -204,7 +206,7 @@ def probability(p: float) -> str:
 
 
 def failure_table(section: Section, comparison: Comparison) -> Table:
-    """How many calls failed why; reasons that do not occur are left out."""
+    """Numbers of failures by reason; reasons that do not occur are left out."""
     kinds = [kind for kind in FAILURES if any(kind in row.failures for row in comparison.rows)]
     spec: Spec = (
         (Column("failures"), lambda row: sum(row.failures.values())),
@@ -214,10 +216,9 @@ def failure_table(section: Section, comparison: Comparison) -> Table:
 
 
 def paper_table(section: Section, comparison: Comparison) -> Table | None:
-    """The rows of the paper's Table 1, ours beside the printed ones, and the hybrid; None if there are none.
+    """The rows of the paper's Table 1 beside the printed ones, and the hybrid; None without such rows.
 
-    ComScore is that among the paper's rows alone; the hybrid's is what it would have in place of the paper's
-    method.
+    ComScore is computed among the paper's rows alone; the hybrid's in place of the paper's method.
     """
     rows = {row.planner: row for row in comparison.rows if row.planner in (*IN_PAPER, HYBRID)}
     if section.problem_set not in ROP or not rows:
@@ -227,7 +228,7 @@ def paper_table(section: Section, comparison: Comparison) -> Table | None:
     }
     scores = _scores({planner: ours[planner] for planner in IN_PAPER if planner in ours})
     if HYBRID in ours:
-        scores[HYBRID] = _scores({p: of for p, of in ours.items() if p != PAPERS})[HYBRID]
+        scores[HYBRID] = _scores({p: of for p, of in ours.items() if p != PAPER_METHOD})[HYBRID]
     printed = {row.name: row for row in PAPER_TABLE_1}
     cells: list[tuple[Cell, ...]] = []
     for planner in sorted(ours, key=lambda p: p == HYBRID):
@@ -259,7 +260,7 @@ def _scores(rows: dict[str, Indicators]) -> dict[str, float]:
 
 
 def tables(section: Section, comparison: Comparison, reference: str) -> list[Table]:
-    """All of a section at a limit; tables that would say nothing are left out."""
+    """All tables of a comparison, without empty ones."""
     paper = paper_table(section, comparison)
     found = [main_table(section, comparison, reference)]
     if paper is not None:
@@ -273,7 +274,7 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
 
 
 def missing_line(comparison: Comparison) -> str:
-    """Which planners are not in the table; empty if all are."""
+    """A line that names the planners missing from the table; empty if there are none."""
     if not comparison.missing:
         return ""
     return (
@@ -282,9 +283,9 @@ def missing_line(comparison: Comparison) -> str:
 
 
 def about(bench: Bench) -> list[str]:
-    """Where, when and with what the runs were made, a line for each difference."""
+    """Machine, dates and versions of the sessions, a line for each combination."""
     lines: dict[str, list[str]] = {}
-    for run in bench.runs:
+    for run in bench.sessions:
         versions = ", ".join(f"{name} {version}" for name, version in run["versions"].items())
         machine = f"{run.get('processor', '?')}, {run.get('cores', '?')} cores"
         text = f"{machine}, {run.get('workers', '?')} at once; Python {run.get('python', '?')}, {versions}"
@@ -296,7 +297,7 @@ def about(bench: Bench) -> list[str]:
 
 
 def crashes(bench: Bench) -> list[str]:
-    """The reasons of crashes, overruns and exceptions, each with how often it occurs."""
+    """The reasons of crashes, overruns and exceptions with their numbers."""
     counts: dict[str, int] = {}
     for planner, records in bench.records.items():
         for record in records:
@@ -307,7 +308,7 @@ def crashes(bench: Bench) -> list[str]:
 
 
 def markdown(bench: Bench, parts: Sequence[Section]) -> str:
-    """The report with all tables."""
+    """The report as Markdown."""
     lines = [f"# Bench {plain(bench.folder.resolve().name)}", ""]
     lines += [f"- {plain(line)}" for line in about(bench)]
     for section in parts:
@@ -325,7 +326,7 @@ def markdown(bench: Bench, parts: Sequence[Section]) -> str:
 
 
 def latex(bench: Bench, parts: Sequence[Section]) -> str:
-    """A document of all tables; each tabular can be copied into another one that uses booktabs."""
+    """The report as a LaTeX document; each tabular can be copied into documents that use booktabs."""
     lines = [
         r"\documentclass[landscape]{article}",
         r"\usepackage[T1]{fontenc}",

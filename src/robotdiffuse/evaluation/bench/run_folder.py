@@ -1,4 +1,4 @@
-"""What `bench run` left in a folder: its runs, and the records of every planner."""
+"""A folder of `bench run`: its sessions, and the records of every planner."""
 
 import json
 import re
@@ -14,25 +14,25 @@ from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """What `bench run` left in a folder."""
+    """The content of a folder of `bench run`."""
 
     folder: FilePath
-    runs: tuple[dict[str, Any], ...]
-    """What each run noted of itself."""
+    sessions: tuple[dict[str, Any], ...]
+    """A note on each call of `bench run`: machine, versions, settings."""
     records: dict[str, list[Record]]
-    """By planner, in the order of PLANNERS; those that were restarted behind their plain ones."""
+    """By planner, in the order of PLANNERS; rows with restarts follow those without."""
 
     @property
     def reference(self) -> str:
-        """The planner that the others are compared with: at equal time, where it was restarted."""
+        """The planner that the others are compared with; its restarts if it has any."""
         plain = DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
         return plain + RESTARTED if plain + RESTARTED in self.records else plain
 
-    def run_of(self, record: Record) -> frozenset[str]:
-        """The numbers of the runs, from 1, that a call may be of: one, where the call was noted with it."""
+    def sessions_of(self, record: Record) -> frozenset[str]:
+        """The numbers of the sessions, from 1, that may have made the record: one, if the record names it."""
         return frozenset(
             str(i)
-            for i, run in enumerate(self.runs, start=1)
+            for i, run in enumerate(self.sessions, start=1)
             if (
                 run.get("run") == record.run
                 if record.run
@@ -48,19 +48,19 @@ class Bench:
 
 
 def plain_name(planner: str) -> str:
-    """Without restarts."""
+    """The name without the suffix of restarts."""
     return planner.removesuffix(RESTARTED)
 
 
 def base_name(planner: str) -> str:
-    """In PLANNERS: without weights, settings and restarts."""
+    """The name in PLANNERS: without weights, settings and restarts."""
     return re.split("[@:+]", planner, maxsplit=1)[0]
 
 
 def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench:
-    """The records of all planners of a run, or of some, those with restarts among them.
+    """Read the records of all planners, or of some, with their restarts.
 
-    Raises InputError for a folder that `bench run` did not fill, damaged files and planners without records.
+    Raises InputError for a folder without a bench, damaged files and planners without records.
     """
     if planners is not None:
         again = [name + RESTARTED for name in planners]
@@ -73,16 +73,16 @@ def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench
     records = {name: found[name] for name in names}
     for name in names:
         if name.endswith(RESTARTED):
-            # the calls that had no time left for another are those of the plain planner
+            # calls that used up the limit were not repeated: those of the plain planner count
             known = {record.key for record in records[name]}
             there = [record for record in records.get(plain_name(name), ()) if record.key not in known]
             records[name] = records[name] + [replace(record, planner=name) for record in there]
     if not any(records.values()):
-        raise InputError(f"{folder} holds no records yet; go on with `robotdiffuse bench run`")
-    return Bench(folder, _read_runs(folder / "runs.jsonl"), records)
+        raise InputError(f"{folder} holds no records yet; continue with `robotdiffuse bench run`")
+    return Bench(folder, _read_sessions(folder / "runs.jsonl"), records)
 
 
-def _read_runs(file: FilePath) -> tuple[dict[str, Any], ...]:
+def _read_sessions(file: FilePath) -> tuple[dict[str, Any], ...]:
     try:
         lines = file.read_text().splitlines() if file.is_file() else []
         runs = tuple(json.loads(line) for line in lines)

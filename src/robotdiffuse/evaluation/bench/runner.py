@@ -1,4 +1,4 @@
-"""The bench: planners on problems, each call a record that is kept; what is done is not done again."""
+"""The bench: calls planners on problems and keeps a record of each call; kept calls are not repeated."""
 
 import json
 import os
@@ -10,24 +10,24 @@ from pathlib import Path as FilePath
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.output_files import alone_in
-from robotdiffuse.evaluation.bench.entries import Contestant
+from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.bench.workers import on_ray, on_this_machine
 from robotdiffuse.evaluation.machine import processor, versions
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
 from robotdiffuse.evaluation.records import RESTARTED, Record, RecordFile, record_path
-from robotdiffuse.evaluation.runs import Trial, run_trials, trials_of
+from robotdiffuse.evaluation.runs import Run, execute_runs, runs_of
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.held_out import Case
 
 PACKAGES = ("numpy", "numba", "torch", "ompl")
-"""Whose versions are kept with the results, beside our own."""
+"""Packages whose versions are kept with the results."""
 
 
 @dataclass(frozen=True)
 class BenchSettings:
     planners: tuple[str, ...]
-    """Names, each maybe with weights and settings of its own, see `Contestant.of`; or `all` alone."""
+    """Texts of planners, see `PlannerSpec.parse`; or `all` alone."""
     problems: tuple[str, ...]
     """Families (rop, rop_dense, ..., each also with _nontrivial), files or folders."""
     out: FilePath
@@ -43,13 +43,13 @@ class BenchSettings:
     cluster: str | None = None
     """ray: on the cluster that RAY_ADDRESS names; None: this machine."""
     equal_time: bool = False
-    """Whether a planner that ends early is called again with other seeds until the limit, in rows of its own,
-    so that lengths can be compared at equal time."""
+    """Whether planners that end early are called again with other seeds until the limit, in rows of their
+    own, so that lengths can be compared at equal time."""
 
     def __post_init__(self) -> None:
         if self.planners == ("all",):
             object.__setattr__(self, "planners", tuple(PLANNERS))
-        _ = self.contestants
+        _ = self.specs
         for field in ("planners", "problems"):
             names = getattr(self, field)
             if not names or len(set(names)) < len(names):
@@ -65,10 +65,11 @@ class BenchSettings:
             raise InputError(f"cluster is {self.cluster!r}; known: ray")
 
     @property
-    def contestants(self) -> dict[str, Contestant]:
-        """By their names in results. Raises InputError for an unknown planner, or two of one name."""
-        found = [Contestant.of(text) for text in self.planners]
-        labels = [contestant.label for contestant in found]
+    def specs(self) -> dict[str, PlannerSpec]:
+        """The planners by their names in results. Raises InputError for an unknown planner or two of one
+        name."""
+        found = [PlannerSpec.parse(text) for text in self.planners]
+        labels = [spec.label for spec in found]
         if len(set(labels)) < len(labels):
             raise InputError(f"planners is {', '.join(self.planners)!r}; two are called the same")
         return dict(zip(labels, found, strict=True))
@@ -76,42 +77,42 @@ class BenchSettings:
 
 Report = Callable[[str], None]
 Done = Callable[[str, int, int], None]
-"""Told a planner, its calls that are done and all its calls."""
+"""Called with a planner, the number of its calls that are done, and that of all its calls."""
 
 
 def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
-    """Make the calls that are not in the folder yet; returns how many were made.
+    """Make the calls that are missing in the folder; returns how many were made.
 
-    A call need not be made if a shorter time limit did: where the planner ended by itself then, more time
-    gives the same. Raises InputError for bad settings or a planner that cannot be loaded, before any call,
-    and KeyboardInterrupt on Ctrl-C; the same settings go on.
+    A call that ended by itself with a shorter time limit is not repeated: more time gives the same. Raises
+    InputError, before any call, for bad settings or a planner that cannot be loaded, and KeyboardInterrupt on
+    Ctrl-C; another call with the same settings continues.
     """
-    with alone_in(settings.out):
-        contestants = settings.contestants
-        for contestant in contestants.values():
-            contestant.load()
+    with lock_folder(settings.out):
+        specs = settings.specs
+        for spec in specs.values():
+            spec.load()
         cases = gather_cases(list(settings.problems), settings.count, settings.out, report)
-        run = _note_run(settings)
-        labels = [label + of for label in contestants for of in ("", RESTARTED)[: 1 + settings.equal_time]]
+        session = _note_session(settings)
+        labels = [label + of for label in specs for of in ("", RESTARTED)[: 1 + settings.equal_time]]
         files = {label: RecordFile(record_path(settings.out, label)) for label in labels}
-        todo = open_trials({label: file.records for label, file in files.items()}, cases, settings)
+        todo = open_runs({label: file.records for label, file in files.items()}, cases, settings)
         wanted = len(cases) * settings.seeds
-        for label in contestants:
-            done(label, wanted - sum(trial.method == label for trial in todo), wanted)
-        about = {"restarts": settings.equal_time, "run": run, "logs": settings.out / "logs"}
+        for label in specs:
+            done(label, wanted - sum(run.method == label for run in todo), wanted)
+        about = {"restarts": settings.equal_time, "session": session, "logs": settings.out / "logs"}
         if settings.cluster is None:
-            execute = on_this_machine(contestants, workers=settings.workers, **about)
+            execute = on_this_machine(specs, workers=settings.workers, **about)
         else:
-            execute = on_ray(contestants, **about)
-        return run_trials(todo, execute, files, lambda label, left: done(label, wanted - left, wanted))
+            execute = on_ray(specs, **about)
+        return execute_runs(todo, execute, files, lambda label, left: done(label, wanted - left, wanted))
 
 
-def open_trials(
+def open_runs(
     records: Mapping[str, Sequence[Record]], cases: Sequence[Case], settings: BenchSettings
-) -> list[Trial]:
-    """The calls that the records, by planner, do not answer."""
+) -> list[Run]:
+    """The runs that the records, by planner, do not answer."""
     answered: set[tuple[str, str, str, int]] = set()
-    for label in settings.contestants:
+    for label in settings.specs:
         again = {record.key for record in records.get(label + RESTARTED, ())}
         for record in records.get(label, ()):
             same = record.time_limit == settings.time_limit
@@ -120,22 +121,22 @@ def open_trials(
                 enough = same and record.key in again
             if enough:
                 answered.add((label, *record.case))
-    trials = trials_of(cases, settings.contestants, range(settings.seeds), settings.time_limit)
-    return [t for t in trials if (t.method, t.case.problem_set, t.case.name, t.seed) not in answered]
+    runs = runs_of(cases, settings.specs, range(settings.seeds), settings.time_limit)
+    return [t for t in runs if (t.method, t.case.problem_set, t.case.name, t.seed) not in answered]
 
 
-def _note_run(settings: BenchSettings) -> str:
-    """Append where and with what this run is made, for the report; returns what records call it."""
+def _note_session(settings: BenchSettings) -> str:
+    """Append machine, versions and settings of this session to runs.jsonl; its name in records."""
     now = datetime.now(UTC)
-    run = now.strftime("%Y-%m-%d %H:%M:%S")
+    session = now.strftime("%Y-%m-%d %H:%M:%S")
     note = {
-        "run": run,
+        "run": session,
         "date": now.strftime("%Y-%m-%d %H:%M"),
         "processor": processor(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         "versions": {"robotdiffuse": __version__, **versions(PACKAGES)},
-        "planners": list(settings.contestants),
+        "planners": list(settings.specs),
         "problems": [problem_set_name(text) for text in settings.problems],
         "time_limit": settings.time_limit,
         "seeds": settings.seeds,
@@ -146,4 +147,4 @@ def _note_run(settings: BenchSettings) -> str:
     }
     with (settings.out / "runs.jsonl").open("a") as stream:
         stream.write(json.dumps(note) + "\n")
-    return run
+    return session

@@ -1,4 +1,4 @@
-"""Who makes a bench's calls: processes of this machine, or a Ray cluster."""
+"""Executors of a bench: processes of this machine, or a Ray cluster."""
 
 import threading
 from collections import deque
@@ -8,61 +8,61 @@ from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 
 from robotdiffuse.core import processes
-from robotdiffuse.evaluation.bench.entries import Contestant
 from robotdiffuse.evaluation.bench.planner_process import PlannerProcess
+from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.records import RESTARTED, Record
-from robotdiffuse.evaluation.runs import Execute, Fields, Made, Trial
+from robotdiffuse.evaluation.runs import Executor, Fields, Results, Run
 
-CHUNK = 20
-"""Calls of one planner that a node of a cluster makes in one go, with one start of the process."""
-Contestants = Mapping[str, Contestant]
-"""By their labels, which are the methods of trials."""
+RUNS_PER_TASK = 20
+"""Runs of one planner that a node of a cluster makes with one start of the process."""
+PlannerSpecs = Mapping[str, PlannerSpec]
+"""By their labels, which are the methods of runs."""
 
 
 def on_this_machine(
-    contestants: Contestants, workers: int, restarts: bool, run: str, logs: FilePath
-) -> Execute:
-    """A process for each contestant, so many calls at a time; what they print goes to `logs`.
+    specs: PlannerSpecs, workers: int, restarts: bool, session: str, logs: FilePath
+) -> Executor:
+    """An executor with a process for each planner, of which `workers` run at a time; `logs` gets what they
+    print.
 
-    All processes are warmed up before the first call is timed, and take turns: all planners are timed while
-    as much else goes on.
+    All processes are warmed up before the first call is timed. They take turns, so that other work on the
+    machine affects all planners alike.
     """
-    about = {"run": run, "workers": workers}
+    about = {"run": session, "workers": workers}
 
-    def execute(trials: Sequence[Trial]) -> Made:
-        stop, news, ready = threading.Event(), threading.Condition(), deque[tuple[Trial, list[Record]]]()
-        todo: deque[Trial] = deque(trials)
-        first = {trial.method: trial for trial in reversed(trials)}
+    def execute(runs: Sequence[Run]) -> Results:
+        stop, news, ready = threading.Event(), threading.Condition(), deque[tuple[Run, list[Record]]]()
+        todo: deque[Run] = deque(runs)
+        first = {run.method: run for run in reversed(runs)}
         planners = {
-            label: PlannerProcess(contestants[label], logs / f"{label.replace('/', '_')}.log")
-            for label in first
+            label: PlannerProcess(specs[label], logs / f"{label.replace('/', '_')}.log") for label in first
         }
         idle = set(planners)
 
-        def next_trial() -> Trial | None:
-            """The first one whose planner is idle; None when there is nothing left to do."""
+        def next_run() -> Run | None:
+            """The first run whose planner is idle; None when none is left."""
             with news:
                 while todo and not stop.is_set():
-                    for i, trial in enumerate(todo):
-                        if trial.method in idle:
+                    for i, run in enumerate(todo):
+                        if run.method in idle:
                             del todo[i]
-                            idle.remove(trial.method)
-                            return trial
+                            idle.remove(run.method)
+                            return run
                     news.wait()
             return None
 
         def work() -> None:
-            while (trial := next_trial()) is not None:
-                answers = planners[trial.method].plan(trial, restarts)
+            while (run := next_run()) is not None:
+                answers = planners[run.method].plan(run, restarts)
                 with news:
-                    if not stop.is_set():  # else it is the stop that ended the call
-                        ready.append((trial, records_of(trial, answers, about)))
-                    idle.add(trial.method)
+                    if not stop.is_set():  # otherwise the stop ended the call
+                        ready.append((run, records_of(run, answers, about)))
+                    idle.add(run.method)
                     news.notify_all()
 
         pool = ThreadPoolExecutor(workers)
         try:
-            jobs = {pool.submit(planners[label].warm, trial) for label, trial in first.items()}
+            jobs = {pool.submit(planners[label].warm, run) for label, run in first.items()}
             while jobs:
                 jobs = wait(jobs, timeout=0.2).not_done
             jobs = {pool.submit(work) for _ in range(workers)}
@@ -86,43 +86,47 @@ def on_this_machine(
     return execute
 
 
-def records_of(trial: Trial, answers: Sequence[Fields], about: Fields) -> list[Record]:
-    """Those after the first are of restarts."""
-    labels = (trial.method, trial.method + RESTARTED)
+def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Record]:
+    """The records of a run; the second is that of restarts."""
+    labels = (run.method, run.method + RESTARTED)
     found = zip(labels, answers, strict=False)
-    return [trial.record({"planner": label, **about, **answer}) for label, answer in found]
+    return [run.record({"planner": label, **about, **answer}) for label, answer in found]
 
 
-def on_ray(contestants: Contestants, restarts: bool, run: str, logs: FilePath) -> Execute:
-    """Calls in portions, each by a process of its own on a node of a Ray cluster; see `processes.on_ray`.
+def on_ray(specs: PlannerSpecs, restarts: bool, session: str, logs: FilePath) -> Executor:
+    """An executor on a Ray cluster, where each task starts a process for some runs; see `processes.on_ray`.
 
-    The nodes need this package, and weights and files at the same places.
+    The nodes need this package, and weights and files at the same paths.
     """
-    about = {"run": run, "workers": "ray"}
+    about = {"run": session, "workers": "ray"}
 
-    def execute(trials: Sequence[Trial]) -> Made:
-        of = {label: [trial for trial in trials if trial.method == label] for label in contestants}
-        portions = [(label, t[i : i + CHUNK]) for label, t in of.items() for i in range(0, len(t), CHUNK)]
-        calls = [(contestants[label], portion, restarts) for label, portion in portions]
-        for number, (answers, said) in processes.on_ray(_portion, calls):
-            label, portion = portions[number]
+    def execute(runs: Sequence[Run]) -> Results:
+        of = {label: [run for run in runs if run.method == label] for label in specs}
+        tasks = [
+            (label, t[i : i + RUNS_PER_TASK])
+            for label, t in of.items()
+            for i in range(0, len(t), RUNS_PER_TASK)
+        ]
+        calls = [(specs[label], task, restarts) for label, task in tasks]
+        for number, (answers, said) in processes.on_ray(_run_task, calls):
+            label, task = tasks[number]
             if said:
                 logs.mkdir(parents=True, exist_ok=True)
                 with (logs / f"{label.replace('/', '_')}.log").open("a") as log:
                     log.write(said)
-            for trial, answer in zip(portion, answers, strict=True):
-                yield trial, records_of(trial, answer, about)
+            for run, answer in zip(task, answers, strict=True):
+                yield run, records_of(run, answer, about)
 
     return execute
 
 
-def _portion(contestant: Contestant, trials: list[Trial], restarts: bool) -> tuple[list[list[Fields]], str]:
-    """The answers to the trials, and what the planner printed."""
+def _run_task(spec: PlannerSpec, runs: list[Run], restarts: bool) -> tuple[list[list[Fields]], str]:
+    """The answers to the runs, and the planner's output."""
     with TemporaryDirectory() as folder:
         log = FilePath(folder) / "log"
-        process = PlannerProcess(contestant, log)
+        process = PlannerProcess(spec, log)
         try:
-            answers = [process.plan(trial, restarts) for trial in trials]
+            answers = [process.plan(run, restarts) for run in runs]
         finally:
             process.close()
         return answers, log.read_text(errors="replace")

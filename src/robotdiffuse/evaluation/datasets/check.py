@@ -1,6 +1,6 @@
-"""Checks of a data set: every shard whole, its motions validated anew, by our validator and by PyBullet on meshes.
+"""Checks of a data set: every shard is complete, and motions pass the validator and PyBullet on meshes.
 
-Nothing of what the factory said is taken on trust: a problem is rebuilt from its row alone.
+Problems are rebuilt from their rows alone; results of the generation are not trusted.
 """
 
 import time
@@ -39,40 +39,41 @@ KINDS: dict[str, str] = {
     "limits": "joint limits exceeded",
     "collision": "collisions found by the validator",
     "pybullet": "collisions found by PyBullet",
-    "motion": "otherwise refused by the validator",
+    "motion": "refused by the validator for other reasons",
     "cost": "length or detour not as recorded",
     "clearance": "clearance not as recorded",
 }
-"""What can be wrong, and how it is called."""
-EXAMPLES = 5
-"""Of each kind, this many are named."""
+"""Kinds of findings, with their titles."""
+EXAMPLES_PER_KIND = 5
+"""Findings of each kind that are listed."""
 
 LIMIT_SLACK = 1e-6
-"""Limits are held up to this, for waypoints are in single precision [rad]."""
+"""Tolerance of limits [rad], as waypoints are in single precision."""
 CLEARANCE_TOLERANCE = 1e-4
-"""The recorded clearance may differ by this from the least one of the waypoints by covering spheres [m]."""
+"""Largest difference of the recorded clearance from the least one of the waypoints by covering spheres
+[m]."""
 COST_TOLERANCE = 0.05
-"""Waypoints cut corners, timed ones more: they may be shorter than the recorded length by this share ..."""
+"""Waypoints, which cut corners, may be shorter than the recorded length by this share, ..."""
 ROUNDING = 1e-4
-"""... and longer by this; the detour must be as recorded up to this."""
+"""... and longer by this one; also the tolerance of the detour."""
 PYBULLET_STEP = 0.01
-"""PyBullet looks at every waypoint, and between waypoints that are further apart at places no further apart
-than this [rad, joint-space L2]."""
+"""PyBullet checks every waypoint, and configurations between them at most this far apart [rad, joint-space
+L2]."""
 PYBULLET_TOLERANCE = 0.001
-"""Contacts of less depth are Bullet's rounding [m]."""
-CHUNK = 100
-"""Motions of a shard that a process checks at once."""
+"""Contacts of less depth are rounding errors of Bullet [m]."""
+MOTIONS_PER_TASK = 100
+"""Motions of a shard that a process checks in one task."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong."""
+    """A defect."""
 
     kind: str
     """One of KINDS."""
     shard: int
     row: int | None
-    """None: the whole shard."""
+    """None for the whole shard."""
     message: str
 
     @property
@@ -82,25 +83,25 @@ class Finding:
 
 @dataclass(frozen=True)
 class DataCheck:
-    """What was checked and what was found."""
+    """The result of a check."""
 
     robot: str
     shards: int
-    """Shards that were found, whole or damaged."""
+    """Shards, complete or damaged."""
     motions: int
-    """Motions in whole shards."""
+    """Motions in complete shards."""
     planned: int
-    """Motions that the manifest announces."""
+    """Motions according to the manifest."""
     checked: int
     """Motions that were validated."""
     pybullet: bool
-    """Whether PyBullet validated too."""
+    """Whether PyBullet checked too."""
     counts: dict[str, int]
     """Findings by kind, for all of KINDS."""
     examples: tuple[Finding, ...]
     """The first few of each kind, by shard and row."""
     least_clearance: float
-    """The least recorded distance between arm and obstacles of the validated motions [m]; nan if none."""
+    """Least recorded distance between arm and obstacles of the validated motions [m]; NaN without any."""
     seconds: float
     """Wall time."""
 
@@ -110,7 +111,7 @@ class DataCheck:
 
     @property
     def tables(self) -> list[Table]:
-        """What was found, with the first examples of each kind below."""
+        """A table of the result, and one of the first examples of each kind."""
         planned = f" of {self.planned:,} planned" if self.motions < self.planned else ""
         rate = self.checked / max(self.seconds, 1e-9)
         asked = {kind: kind != "pybullet" or self.pybullet for kind in KINDS}
@@ -141,13 +142,15 @@ def check_data(
 ) -> DataCheck:
     """Check the structure of every shard, and `count` random motions (all by default).
 
-    Each motion is validated on a problem that is rebuilt from its row: ends, limits, collision by the validator, and
-    by PyBullet on meshes at and between the waypoints; and what is recorded of it is compared with what is
-    measured. `robot`: that of the data, by default found by the name in the manifest. The motions and the
-    findings do not depend on `workers` (processes). `progress` is called with the numbers of validated motions
-    and of all.
+    The problem of each motion is rebuilt from its row. The validator checks ends, limits and collisions;
+    PyBullet checks collisions on meshes at and between the waypoints. Recorded values are compared with
+    measured ones.
+
+    robot: that of the data; None: found by the name in the manifest. workers: processes; the motions and
+    findings do not depend on them. progress: called with the numbers of motions done and in all.
+
     Raises InputError if there is no data set, for another robot than that of the data, and if PyBullet is
-    wanted but not installed.
+    asked for but not installed.
     """
     began = time.perf_counter()
     manifest = read_manifest(folder)
@@ -162,12 +165,12 @@ def check_data(
         found = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
         rows = {i: size for i, size in sizes.items() if isinstance(size, int)}
         chosen = [
-            (index, picked[i : i + CHUNK])
+            (index, picked[i : i + MOTIONS_PER_TASK])
             for index, picked in pick_rows(rows, count, seed).items()
-            for i in range(0, len(picked), CHUNK)
+            for i in range(0, len(picked), MOTIONS_PER_TASK)
         ]
         total, done, least = sum(len(part) for _, part in chosen), 0, np.inf
-        for part in in_order(processes.each(task.validator, [(some,) for some in chosen])):
+        for part in in_order(processes.each(task.validate, [(some,) for some in chosen])):
             found += part.findings
             done, least = done + part.motions, min(least, part.least_clearance)
             if progress is not None:
@@ -180,7 +183,7 @@ def check_data(
         checked=done,
         pybullet=pybullet,
         counts={kind: sum(f.kind == kind for f in found) for kind in KINDS},
-        examples=tuple(f for kind in KINDS for f in [f for f in found if f.kind == kind][:EXAMPLES]),
+        examples=tuple(f for kind in KINDS for f in [f for f in found if f.kind == kind][:EXAMPLES_PER_KIND]),
         least_clearance=least if done else float("nan"),
         seconds=time.perf_counter() - began,
     )
@@ -199,8 +202,8 @@ def _need_pybullet() -> None:
 
 
 @dataclass(frozen=True)
-class _Validated:
-    """What came out of some rows of a shard."""
+class _PartResult:
+    """The result of some rows of a shard."""
 
     motions: int
     findings: list[Finding]
@@ -209,7 +212,7 @@ class _Validated:
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """What a process does; it travels to it whole."""
+    """The work of a process; it is pickled."""
 
     folder: str
     manifest: Manifest
@@ -217,25 +220,25 @@ class _Task:
     pybullet: bool
 
     def size(self, index: int) -> int | str:
-        """Rows of a shard, or what is wrong with it."""
+        """Number of rows of a shard, or the defect of the shard."""
         try:
             return len(check_shard(self.folder, index, self.manifest))
         except InputError as error:
             return str(error)
 
-    def validator(self, part: tuple[int, Int[ndarray, "n"]]) -> _Validated:
+    def validate(self, part: tuple[int, Int[ndarray, "n"]]) -> _PartResult:
         """Validate some rows of a shard."""
         index, rows = part
         shard = read_shard(self.folder, index)
         findings: list[Finding] = []
         for row in rows.tolist():
-            findings += [Finding(kind, index, row, text) for kind, text in _wrong(self, shard, row)]
+            findings += [Finding(kind, index, row, text) for kind, text in _defects(self, shard, row)]
         if self.pybullet:
-            findings += self._second_opinion(shard, rows)
+            findings += self._pybullet_findings(shard, rows)
         least = float(shard["clearance"][rows].min(initial=np.inf))
-        return _Validated(len(rows), sorted(findings, key=lambda f: f.row or 0), least)
+        return _PartResult(len(rows), sorted(findings, key=lambda f: f.row or 0), least)
 
-    def _second_opinion(self, shard: Shard, rows: Int[ndarray, "n"]) -> Iterator[Finding]:
+    def _pybullet_findings(self, shard: Shard, rows: Int[ndarray, "n"]) -> Iterator[Finding]:
         from robotdiffuse.simulation.validator import PyBulletOracle
 
         with PyBulletOracle(self.robot, Scene([])) as oracle:
@@ -243,7 +246,7 @@ class _Task:
                 try:
                     oracle.set_scene(scenes_of(self.manifest, shard, slice(row, row + 1)).scene(0))
                 except InputError:
-                    continue  # found already
+                    continue  # already a finding
                 path = path_of(self.robot, shard, row)
                 contact = oracle.check_path(path, PYBULLET_STEP, PYBULLET_TOLERANCE)
                 if contact is not None:
@@ -252,8 +255,8 @@ class _Task:
                     yield Finding("pybullet", shard.index, row, text)
 
 
-def _wrong(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
-    """Kind and message of everything that is wrong with a motion but for PyBullet's opinion."""
+def _defects(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
+    """Kind and message of each defect of a motion, without PyBullet."""
     robot, path = task.robot, path_of(task.robot, shard, row)
     yield from _ends(shard, row)
     yield from _limits(robot, path.positions)

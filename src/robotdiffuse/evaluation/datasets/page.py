@@ -1,4 +1,4 @@
-"""A page of plots on a data set: one HTML file that needs no network."""
+"""A page of plots of a data set: one HTML file that needs no network."""
 
 import html
 from functools import partial
@@ -18,10 +18,11 @@ from robotdiffuse.robots.robot import Robot
 
 
 def write_page(folder: str | FilePath, file: str | FilePath, robot: Robot | None = None) -> DataFigures:
-    """Write the page as .html and return the figures that it shows.
+    """Write the page as .html and return its figures.
 
-    `robot`: that of the data, by default found by the name in the manifest; it says where the tips are.
-    Raises InputError without matplotlib, for a file that cannot be written, and as `read_figures`.
+    robot: that of the data, for the positions of the tip; None: found by the name in the manifest.
+
+    Raises InputError without matplotlib, for a file that cannot be written, and as `read_figures` does.
     """
     target = check_output(file, (".html", ".htm"))
     data = read_figures(folder)
@@ -47,7 +48,7 @@ def _cards(data: DataFigures, robot: Robot) -> list[str]:
     tips = Plot(
         "Tip",
         partial(plots.tips, ends),
-        "Where the robot's {tip} starts and ends, of some of the motions",
+        "Start and end positions of the robot's {tip} in some of the motions",
         6,
         3.0,
     )
@@ -68,7 +69,7 @@ def _about(data: DataFigures) -> str:
 def _footer(data: DataFigures) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in data.manifest.versions.items())
     robot = data.manifest.robot_fingerprint
-    return f"Made with {versions}; robot {robot}. The last bar of a histogram holds all that lies beyond."
+    return f"Made with {versions}; robot {robot}. The last bar of a histogram holds all larger values."
 
 
 def _tips(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 3"]:

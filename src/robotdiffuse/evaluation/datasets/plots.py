@@ -1,4 +1,4 @@
-"""The plots of the page on a data set, as SVG. All need matplotlib, which the core install lacks."""
+"""Plots of a data set as SVG. They need matplotlib, which is not part of the core install."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.evaluation.datasets.report import REASONS, DataFigures
+from robotdiffuse.evaluation.datasets.report import OUTCOMES, DataFigures
 from robotdiffuse.evaluation.style import INK, as_svg, make_figure, percent_axis
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 START, GOAL = "#4f7fd9", "#10a37f"
-"""As in the replay."""
-FAMILIES = ("#4f7fd9", "#e09a5f", "#8d76c4", "#5aa7a7")
-OUTCOMES = {"solved": "#10a37f", "unsolved": "#d97b5c", "refused": "#c94f4f", "thinned": "#b9c0c9"}
-GRADES = ("#dfe3e8", "#a9c1ec", "#6b95de", "#34599f")
+"""As in replays."""
+FAMILY_COLORS = ("#4f7fd9", "#e09a5f", "#8d76c4", "#5aa7a7")
+OUTCOME_COLORS = {"solved": "#10a37f", "unsolved": "#d97b5c", "refused": "#c94f4f", "thinned": "#b9c0c9"}
+DIFFICULTY_COLORS = ("#dfe3e8", "#a9c1ec", "#6b95de", "#34599f")
 """From easy to hard."""
-DETOURS = ((1.05, "up to 5 % longer"), (1.25, "up to 25 %"), (np.inf, "more"))
-ABOVE: dict[str, Any] = {
+DETOUR_CLASSES = ((1.05, "up to 5 % longer"), (1.25, "up to 25 %"), (np.inf, "more"))
+LEGEND_ABOVE: dict[str, Any] = {
     "loc": "lower left",
     "bbox_to_anchor": (0.0, 0.98),
     "ncols": 4,
@@ -32,21 +32,21 @@ ABOVE: dict[str, Any] = {
     "borderpad": 0.0,
     "borderaxespad": 0.3,
 }
-"""Where legends are."""
+"""Place of legends."""
 BINS = 50
-TAIL = 0.995
-"""Histograms end at this quantile; what is beyond is in the last bar."""
+LAST_QUANTILE = 0.995
+"""Histograms end at this quantile; the last bar holds all larger values."""
 POINTS_PER_OBSTACLE = 64
-MOST_OBSTACLES = 20_000
-MOST_TIPS = 2_500
+MAX_OBSTACLES = 20_000
+MAX_TIPS = 2_500
 
 
 def outcomes(figure: "Figure", data: DataFigures) -> None:
-    """Bars of what became of the problems."""
+    """Draw bars of the outcomes of problems."""
     axes = figure.subplots()
     tried = max(1, data.counts.get("tried", 0))
-    values = [data.counts.get(name, 0) for name in REASONS]
-    axes.barh(REASONS, values, color=[OUTCOMES[name] for name in REASONS], height=0.62)
+    values = [data.counts.get(name, 0) for name in OUTCOMES]
+    axes.barh(OUTCOMES, values, color=[OUTCOME_COLORS[name] for name in OUTCOMES], height=0.62)
     for i, value in enumerate(values):
         axes.text(value + 0.015 * tried, i, f"{value:,} ({100 * value / tried:.1f} %)", va="center")
     axes.set_xlim(0, 1.42 * max(1, *values))
@@ -57,7 +57,7 @@ def outcomes(figure: "Figure", data: DataFigures) -> None:
 
 
 def lengths(figure: "Figure", data: DataFigures) -> None:
-    """Histogram of the path lengths by family."""
+    """Draw a histogram of the path lengths by family."""
     axes = figure.subplots()
     values = data.all["cost"]
     _histogram(axes, data, values, np.linspace(0, _end(values), BINS))
@@ -65,11 +65,11 @@ def lengths(figure: "Figure", data: DataFigures) -> None:
 
 
 def clearances(figure: "Figure", data: DataFigures) -> None:
-    """Histogram of the clearances by family, with the safety distance marked."""
+    """Draw a histogram of the clearances by family, with the safety distance marked."""
     axes, safety_distance = figure.subplots(), data.safety_distance
     values = 100 * data.all["clearance"]
     end = max(_end(values), 120 * safety_distance)
-    # the safety distance lies between two bars, for many motions keep exactly that
+    # put the safety distance between two bars, as many motions keep exactly that
     width = 100 * safety_distance / max(1, round(BINS * 100 * safety_distance / end)) or end / BINS
     _histogram(axes, data, values, np.arange(0, end + width, width))
     axes.axvline(100 * safety_distance, color=INK, linewidth=1, linestyle=(0, (3, 2)))
@@ -79,7 +79,7 @@ def clearances(figure: "Figure", data: DataFigures) -> None:
 
 
 def detours(figure: "Figure", data: DataFigures) -> None:
-    """Histogram of the detours, on a logarithmic scale, of motions whose straight line is not free."""
+    """Draw a histogram of the detours on a logarithmic scale, of motions whose straight line is not free."""
     axes = figure.subplots()
     blocked = ~data.all["line_free"]
     values = data.all["detour"]
@@ -91,10 +91,10 @@ def detours(figure: "Figure", data: DataFigures) -> None:
 
 
 def difficulty(figure: "Figure", data: DataFigures) -> None:
-    """Shares by detour and by narrowest clearance, a bar for each family."""
+    """Draw shares by detour and by clearance, a bar for each family."""
     rows = data.all
     free, detour, clearance = rows["line_free"], rows["detour"], 100 * rows["clearance"]
-    low = [(~free) & (detour <= edge) for edge, _ in DETOURS]
+    low = [(~free) & (detour <= edge) for edge, _ in DETOUR_CLASSES]
     by_detour = [free, low[0], low[1] & ~low[0], low[2] & ~low[1]]
     edges = (np.inf, 5.0, 2.0, 1.0)
     by_clearance = [
@@ -102,12 +102,12 @@ def difficulty(figure: "Figure", data: DataFigures) -> None:
         for high, lowest in zip(edges, (*edges[1:], -np.inf), strict=True)
     ]
     top, bottom = figure.subplots(2, 1)
-    _shares(top, data, by_detour, ("line free", *(text for _, text in DETOURS)))
+    _shares(top, data, by_detour, ("line free", *(text for _, text in DETOUR_CLASSES)))
     _shares(bottom, data, by_clearance, ("over 5 cm", "2 to 5", "1 to 2", "below 1"))
 
 
 def goals(figure: "Figure", data: DataFigures) -> None:
-    """Numbers of goals that are given and reached, and the excess cost of those that are not the best."""
+    """Draw the numbers of given and reached goals, and the excess cost of those that are not the best."""
     costs = data.sample["goal_costs"].astype(np.float64)
     given, reached = (~np.isnan(costs)).sum(axis=1), np.isfinite(costs).sum(axis=1)
     left, right = figure.subplots(1, 2)
@@ -118,7 +118,7 @@ def goals(figure: "Figure", data: DataFigures) -> None:
     left.bar(at + 0.2, shares[1], 0.4, color=GOAL, label="reached")
     left.set_xlabel("goals")
     left.set_xticks([1, *range(5, most + 1, 5)])
-    left.legend(**ABOVE)
+    left.legend(**LEGEND_ABOVE)
     percent_axis(left)
     best = np.nanmin(np.where(np.isinf(costs), np.nan, costs), axis=1, keepdims=True)
     excess = 100 * (costs / best - 1)
@@ -133,7 +133,7 @@ def goals(figure: "Figure", data: DataFigures) -> None:
 
 
 def joints(figure: "Figure", data: DataFigures) -> None:
-    """A histogram for each joint between its limits: all waypoints, and the ends."""
+    """Draw a histogram for each joint between its limits: all waypoints, starts and goals."""
     manifest, q = data.manifest, data.sample["trajectories"]
     across = min(7, manifest.dof)
     rows = -(-manifest.dof // across)
@@ -163,7 +163,7 @@ def joints(figure: "Figure", data: DataFigures) -> None:
 
 
 def obstacles(figure: "Figure", data: DataFigures) -> None:
-    """Density of the obstacles' volume, seen from above and from the side."""
+    """Draw the density of the obstacles' volume from above and from the side."""
     points = _obstacle_points(data)
     half = max(1.0, 1.05 * float(np.abs(points).max(initial=0.0)))
     for axes, (name, across) in zip(_views(figure), (("top", 1), ("side", 2)), strict=True):
@@ -181,11 +181,11 @@ def obstacles(figure: "Figure", data: DataFigures) -> None:
 
 
 def tips(positions: dict[str, Float[ndarray, "n 3"]], figure: "Figure", data: DataFigures) -> None:
-    """Where the tip is at both ends, seen from above and from the side."""
+    """Draw the positions of the tip at both ends from above and from the side."""
     half = 1.05 * max(0.2, *(float(np.abs(p).max(initial=0.0)) for p in positions.values()))
     for axes, (name, across) in zip(_views(figure), (("top", 1), ("side", 2)), strict=True):
         for (end, points), color in zip(positions.items(), (START, GOAL), strict=True):
-            few = points[:: -(-len(points) // MOST_TIPS)] if len(points) else points
+            few = points[:: -(-len(points) // MAX_TIPS)] if len(points) else points
             size = 3.0 if len(few) > 800 else 6.0
             axes.scatter(
                 few[:, 0], few[:, across], size, color, alpha=0.6, linewidths=0, label=end, rasterized=True
@@ -222,11 +222,11 @@ def _ramp() -> "Colormap":
 
 
 def _obstacle_points(data: DataFigures) -> Float[ndarray, "n 3"]:
-    """Points spread evenly in the obstacles, as many in each; turned cubes are taken as if they were not."""
+    """Random points in the obstacles, as many in each; the rotation of boxes is ignored."""
     kinds, params = data.sample["obstacle_kinds"], data.sample["obstacle_params"]
     rows = params[kinds > 0].astype(np.float64)
     kinds = kinds[kinds > 0]
-    step = max(1, -(-len(rows) // MOST_OBSTACLES))
+    step = max(1, -(-len(rows) // MAX_OBSTACLES))
     rows, kinds = rows[::step], kinds[::step]
     cube = np.random.default_rng(0).uniform(-1, 1, (8 * POINTS_PER_OBSTACLE, 3))
     ball = cube[np.linalg.norm(cube, axis=1) <= 1][:POINTS_PER_OBSTACLE]
@@ -240,13 +240,13 @@ def _obstacle_points(data: DataFigures) -> Float[ndarray, "n 3"]:
 
 
 def _present(data: DataFigures) -> list[tuple[str, str, ndarray]]:
-    """Name, colour and rows of the families that occur."""
-    colors = {name: FAMILIES[i % len(FAMILIES)] for i, name in enumerate(data.manifest.families)}
+    """Name, colour and rows of each family that occurs."""
+    colors = {name: FAMILY_COLORS[i % len(FAMILY_COLORS)] for i, name in enumerate(data.manifest.families)}
     return [(name, colors[name], rows) for name, rows in data.families.items()]
 
 
 def _end(values: Float[ndarray, "n"]) -> float:
-    return float(max(np.quantile(values, TAIL), 1e-3))
+    return float(max(np.quantile(values, LAST_QUANTILE), 1e-3))
 
 
 def _histogram(
@@ -256,7 +256,7 @@ def _histogram(
     bins: Float[ndarray, "b"],
     chosen: ndarray | None = None,
 ) -> None:
-    """Stacked by family, in percent of all that is shown; what is out of the bins is in the last ones."""
+    """Draw a histogram stacked by family in percent of all shown values; outliers are in the outer bins."""
     chosen = np.ones(len(values), bool) if chosen is None else chosen
     families = _present(data)
     parts = [values[rows & chosen].clip(bins[0], bins[-1]) for _, _, rows in families]
@@ -266,20 +266,20 @@ def _histogram(
     axes.set_xlim(bins[0], bins[-1])
     percent_axis(axes)
     if len(families) > 1:
-        axes.legend(**ABOVE)
+        axes.legend(**LEGEND_ABOVE)
 
 
 def _shares(axes: "Axes", data: DataFigures, classes: list[ndarray], labels: tuple[str, ...]) -> None:
-    """A bar of 100 % for each family, cut by classes."""
+    """Draw a bar of 100 % for each family, divided by classes."""
     families = _present(data)
     left = np.zeros(len(families))
     names = [name for name, _, _ in families]
-    for chosen, color, label in zip(classes, GRADES, labels, strict=True):
+    for chosen, color, label in zip(classes, DIFFICULTY_COLORS, labels, strict=True):
         shares = np.array([100 * chosen[rows].mean() for _, _, rows in families])
         axes.barh(names, shares, left=left, color=color, height=0.62, label=label)
         for i, share in enumerate(shares):
             if share >= 9:
-                dark = color in GRADES[2:]
+                dark = color in DIFFICULTY_COLORS[2:]
                 axes.text(
                     left[i] + share / 2,
                     i,
@@ -295,16 +295,16 @@ def _shares(axes: "Axes", data: DataFigures, classes: list[ndarray], labels: tup
     axes.set_xticks([])
     axes.spines[["bottom", "left"]].set_visible(False)
     axes.tick_params(axis="y", labelcolor=INK)
-    axes.legend(**ABOVE)
+    axes.legend(**LEGEND_ABOVE)
 
 
 class Plot(NamedTuple):
-    """What a page shows."""
+    """A plot of the page."""
 
     title: str
     draw: "Callable[[Figure, DataFigures], None]"
     text: str
-    """What it shows, with fields for `str.format` that the page fills in."""
+    """Its caption, with fields for `str.format` that the page fills in."""
     width: int = 4
     """In columns of the page."""
     height: float = 2.3
@@ -317,7 +317,7 @@ class Plot(NamedTuple):
 
 
 PLOTS = (
-    Plot("Problems", outcomes, "What became of the {tried:,} problems that were drawn"),
+    Plot("Problems", outcomes, "Outcomes of the {tried:,} problems"),
     Plot("Path length", lengths, "Joint-space length of the motions, by family of scenes"),
     Plot(
         "Clearance",
@@ -325,12 +325,12 @@ PLOTS = (
         "Least distance between arm and obstacles; the search keeps {cm} away from the ends",
     ),
     Plot("Detour", detours, "Path length over that of the straight line, where the line is not free"),
-    Plot("Difficulty", difficulty, "How far round the motion has to go, and how narrow it gets"),
+    Plot("Difficulty", difficulty, "Detours and clearances"),
     Plot("Goals", goals, "Goal configurations per problem, and what the others cost over the best one"),
     Plot(
         "Joints",
         joints,
-        "Where the joints are between their limits: all waypoints, starts and goals{drawn}",
+        "Joint values between their limits: all waypoints, starts and goals{drawn}",
         width=12,
     ),
     Plot(
@@ -341,4 +341,4 @@ PLOTS = (
         height=3.0,
     ),
 )
-"""Of every data set; the tips need the robot, see `page`."""
+"""The plots of every data set; that of the tips needs the robot, see `page`."""

@@ -1,4 +1,4 @@
-"""What is in a data set: its figures, and tables of them. `page` draws the same as a page of plots."""
+"""Figures of a data set, and tables of them; `page` draws them as plots."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,14 +18,14 @@ QUANTITIES = {
     "detour": Column("detour", "", ".3f"),
     "clearance": Column("clearance", "[cm]", ".3f", scale=100.0),
 }
-"""What is told of every motion: arrays, and how they are shown."""
+"""Arrays that are shown of every motion, and their columns."""
 SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
-"""Quantiles that tell how a quantity is spread over the motions."""
-SAMPLE = 20_000
+"""Quantiles of each quantity over the motions."""
+SAMPLED_MOTIONS = 20_000
 """Motions, spread evenly over the set, whose larger arrays are kept for the plots."""
-FRAMES_KEPT = 24
-"""Waypoints of each of these, spread evenly."""
-SMALL = (
+SAMPLED_WAYPOINTS = 24
+"""Of each of these motions, spread evenly."""
+ARRAYS_OF_ALL = (
     "cost",
     "clearance",
     "end_clearance",
@@ -36,13 +36,20 @@ SMALL = (
     "goal_index",
 )
 """Arrays that are kept of all motions."""
-LARGE = ("start", "goals", "goal_costs", "target_pose", "obstacle_kinds", "obstacle_params", "trajectories")
+ARRAYS_OF_SAMPLE = (
+    "start",
+    "goals",
+    "goal_costs",
+    "target_pose",
+    "obstacle_kinds",
+    "obstacle_params",
+    "trajectories",
+)
 """Arrays that are kept of the sample."""
-REASONS = ("solved", "unsolved", "refused", "thinned")
-"""What becomes of a problem that was tried."""
-KEPT_SLACK = 0.002
-"""By this a motion may come closer than the safety distance and still count as keeping it: waypoints cut
-corners [m]."""
+OUTCOMES = ("solved", "unsolved", "refused", "thinned")
+"""Outcomes of problems."""
+SAFETY_TOLERANCE = 0.002
+"""A motion keeps the safety distance if it comes closer by at most this, as waypoints cut corners [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +61,13 @@ class DataFigures:
     bytes: int
     """Size on disk."""
     counts: dict[str, int]
-    """What became of the problems that were tried, by REASONS and `tried`: sums of the shards' counts."""
+    """Numbers of problems `tried` and by OUTCOMES, over all shards."""
     splits: dict[str, int]
     """Trajectories by split."""
     all: dict[str, ndarray] = field(repr=False)
-    """SMALL, of all motions."""
+    """ARRAYS_OF_ALL, of all motions."""
     sample: dict[str, ndarray] = field(repr=False)
-    """SMALL and LARGE of the sample; `trajectories` with FRAMES_KEPT waypoints."""
+    """Both kinds of arrays of the sample; `trajectories` with SAMPLED_WAYPOINTS waypoints."""
 
     @property
     def trajectories(self) -> int:
@@ -68,63 +75,68 @@ class DataFigures:
 
     @property
     def success(self) -> float:
-        """Share of the problems that were solved, thinned ones left out; nan if there are none."""
+        """Share of solved problems, without thinned ones; NaN without any."""
         tried = self.counts.get("tried", 0) - self.counts.get("thinned", 0)
         return self.counts.get("solved", 0) / tried if tried else float("nan")
 
     @cached_property
     def families(self) -> dict[str, Bool[ndarray, "n"]]:
-        """Which motions are of a family, for those that occur."""
+        """The motions of each family that occurs."""
         of = {name: self.all["family"] == i for i, name in enumerate(self.manifest.families)}
         return {name: chosen for name, chosen in of.items() if chosen.any()}
 
     @property
     def safety_distance(self) -> float:
-        """The distance that searches set out with [m]: the greatest that any of them kept."""
+        """The safety distance that searches begin with [m]: the largest that any of them kept."""
         return float(self.all["safety_distance"].max())
 
     @property
     def kept(self) -> float:
-        """Share of motions that come no closer than the safety distance, or than the closer of start and
-        goal."""
+        """Share of motions that come no closer than the safety distance or than their closer end."""
         least = np.minimum(self.safety_distance, self.all["end_clearance"].min(axis=1))
-        return float((self.all["clearance"] >= least - KEPT_SLACK).mean())
+        return float((self.all["clearance"] >= least - SAFETY_TOLERANCE).mean())
 
     @property
     def kept_throughout(self) -> float:
-        """Share that keeps the safety distance all along, of motions whose ends have it; nan if none have."""
+        """Share of motions that keep the safety distance throughout, of those whose ends keep it; NaN without
+        any."""
         apart = self.all["clearance"][self.all["end_clearance"].min(axis=1) >= self.safety_distance]
-        return float((apart >= self.safety_distance - KEPT_SLACK).mean()) if len(apart) else float("nan")
+        return (
+            float((apart >= self.safety_distance - SAFETY_TOLERANCE).mean()) if len(apart) else float("nan")
+        )
 
     @property
     def trivial(self) -> float:
-        """Share of motions that the straight line would have done."""
+        """Share of motions whose straight line is free."""
         return float(self.all["line_free"].mean())
 
     @property
     def goals_reached(self) -> float:
-        """Mean number of goals that a search reached."""
+        """Mean number of goals that the search reached."""
         return float(np.isfinite(self.sample["goal_costs"]).sum(axis=1).mean())
 
 
 def read_figures(folder: str | FilePath) -> DataFigures:
-    """Read what figures and plots need, one shard at a time. Raises InputError if there is no data set, or it
-    is damaged or empty."""
+    """Read the arrays of figures and plots, one shard at a time. Raises InputError if there is no data set,
+    or it is damaged or empty."""
     manifest = read_manifest(folder)
     indices = existing_shards(folder)
-    every = max(1, manifest.trajectories // SAMPLE)
-    waypoints = np.unique(np.linspace(0, manifest.waypoints - 1, FRAMES_KEPT).round().astype(int))
+    every = max(1, manifest.trajectories // SAMPLED_MOTIONS)
+    waypoints = np.unique(np.linspace(0, manifest.waypoints - 1, SAMPLED_WAYPOINTS).round().astype(int))
     small: list[dict[str, ndarray]] = []
     sample: list[dict[str, ndarray]] = []
     counts: dict[str, int] = {}
     splits = np.zeros(len(SPLITS), np.int64)
     size = first = 0
     for index in indices:
-        shard = read_shard(folder, index, tuple({*SMALL, *LARGE}))
+        shard = read_shard(folder, index, tuple({*ARRAYS_OF_ALL, *ARRAYS_OF_SAMPLE}))
         rows = np.arange(-first % every, len(shard), every)
         first += len(shard)
-        small.append({name: shard[name] for name in SMALL})
-        picked = {name: np.array(shard[name][rows]) for name in {*SMALL, *LARGE} - {"trajectories"}}
+        small.append({name: shard[name] for name in ARRAYS_OF_ALL})
+        picked = {
+            name: np.array(shard[name][rows])
+            for name in {*ARRAYS_OF_ALL, *ARRAYS_OF_SAMPLE} - {"trajectories"}
+        }
         sample.append(picked | {"trajectories": np.array(shard["trajectories"][np.ix_(rows, waypoints)])})
         splits += np.bincount(split_of(scenes_of(manifest, shard)), minlength=len(SPLITS))
         for name, value in shard.counts.items():
@@ -138,13 +150,13 @@ def read_figures(folder: str | FilePath) -> DataFigures:
         bytes=size,
         counts=counts,
         splits=dict(zip(SPLITS, splits.tolist(), strict=True)),
-        all={name: np.concatenate([part[name] for part in small]) for name in SMALL},
+        all={name: np.concatenate([part[name] for part in small]) for name in ARRAYS_OF_ALL},
         sample={name: np.concatenate([part[name] for part in sample]) for name in sample[0]},
     )
 
 
 def facts(data: DataFigures) -> list[tuple[str, str]]:
-    """Figures, and what they are: the head of a report."""
+    """Figures and their captions, for the head of a report."""
     planned, waypoints = data.manifest.trajectories, data.trajectories * data.manifest.waypoints
     train, *held_out = ((name, f"{count:,}") for name, count in data.splits.items())
     spacing = "length" if data.manifest.timing == "arc" else "time"
@@ -167,8 +179,8 @@ def facts(data: DataFigures) -> list[tuple[str, str]]:
 
 
 def tables(data: DataFigures) -> list[Table]:
-    """What is printed of a data set."""
-    lost = ", ".join(f"{data.counts.get(name, 0):,} {name}" for name in REASONS[1:])
+    """The tables of a data set."""
+    lost = ", ".join(f"{data.counts.get(name, 0):,} {name}" for name in OUTCOMES[1:])
     about = [
         *((what, value) for value, what in facts(data)),
         (f"of {data.counts.get('tried', 0):,} problems", lost),
@@ -199,5 +211,5 @@ def tables(data: DataFigures) -> list[Table]:
 
 
 def size_in_words(size: int) -> str:
-    """A size on disk in words."""
+    """A size on disk with its unit."""
     return f"{size / 1e9:.2f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"

@@ -1,4 +1,5 @@
-"""What is where no camera saw: an auto-encoder that completes observed volumes, trained on random scenes."""
+"""The occupancy completion network, which predicts obstacles where no camera saw; trained on random
+scenes."""
 
 from functools import cache
 from typing import TYPE_CHECKING
@@ -16,11 +17,11 @@ if TYPE_CHECKING:
 def predict(
     volume: "ObservedVolume", network: "CompletionNetwork | None" = None
 ) -> Float32[ndarray, "112 112 64"]:
-    """The probability that each voxel of 2 cm holds an obstacle; 0 where it was seen free, and farther than
-    1 m from a Panda's shoulder, where nothing was learned.
+    """The probability that each voxel of 2 cm holds an obstacle.
 
-    The grid begins at the volume's LOW. `network`: None for the one that comes with the package. Computed in
-    bf16 where the processor does so fast.
+    It is 0 in voxels that were seen free, and farther than 1 m from a Panda's shoulder, which training did
+    not cover. The grid begins at the volume's LOW. network: None for the one that comes with the package.
+    Computed in bf16 on CPUs that multiply it fast.
     """
     import torch
 

@@ -1,4 +1,5 @@
-"""What the completing network learns from: fresh scenes, seen by cameras that a person would place.
+"""Training samples of the completion network: random scenes seen by cameras placed as a person would place
+them.
 
 Nothing here loads PyTorch, so that processes that only draw samples start quickly.
 """
@@ -21,36 +22,36 @@ from robotdiffuse.problems.families.family import Range, base_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-FINE = VOXEL / 2
+FINE_VOXEL_SIZE = VOXEL / 2
 """Edge of the voxels that are predicted [m]."""
 FINE_SHAPE = (2 * SHAPE[0], 2 * SHAPE[1], 2 * SHAPE[2])
-STEP = 0.01
-"""Depths behind surfaces are kept in whole steps of this [m]."""
+DEPTH_STEP = 0.01
+"""Depths behind surfaces are stored in whole steps of this [m]."""
 OCCUPIED, FREE, SHADOW, OUT_OF_VIEW = 1, 2, 4, 8
 BITS = (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW)
-"""Of `Sample.seen`."""
+"""The bits of `Sample.seen`."""
 
 
 @dataclass(frozen=True)
 class CameraPlaces:
-    """Where cameras stand. Lengths in [m], angles in [rad]."""
+    """Distribution of camera poses. Lengths in [m], angles in [rad]."""
 
     distance: Range = (1.2, 2.0)
-    """From the base's axis, on the ground."""
+    """Horizontal distance from the base's axis."""
     height: Range = (0.4, 1.6)
     front_share: float = 0.75
-    """Share of the cameras that are in front, on the arm's side of the obstacles."""
+    """Share of the cameras that stand in front, on the arm's side of the obstacles."""
     front: float = 2.0
-    """How far from there they may stand, seen from the base."""
+    """Largest angle about the base between such a camera and the direction opposite the obstacles."""
     target_spread: float = 0.2
-    """Standard deviation of what is in the middle of the image from a place before the arm."""
+    """Standard deviation of the point that a camera looks at, about a point in front of the arm."""
     field_of_view: Range = (0.75, 1.1)
-    """Vertical."""
+    """Vertical field of view."""
     roll: float = 0.05
-    """Standard deviation."""
+    """Standard deviation of the roll about the optical axis."""
 
     def draw(self, scene: Scene, rng: Generator) -> tuple[ndarray, float]:
-        """T_base_camera, and the vertical field of view."""
+        """A random T_base_camera, and the vertical field of view."""
         middle = np.mean(
             [s.bounds.mean(axis=0)[:2] for s in scene.shapes if s.name != "floor"] or [np.zeros(2)], axis=0
         )
@@ -65,32 +66,31 @@ class CameraPlaces:
 
 
 CAMERAS = CameraPlaces()
-SIZE = (160, 120)
+IMAGE_SIZE = (160, 120)
 """Width and height of images [pixels]."""
-SECOND_VIEW = 0.3
+TWO_VIEWS_SHARE = 0.3
 """Share of the samples with two views."""
-NOISY = 0.5
+NOISE_SHARE = 0.5
 """Share of the samples with noise, of up to twice the usual strength."""
-NO_RANGE = 0.5
-"""Share of these in which what is out of range returns nothing, as with most real cameras."""
-
-NO_FLOOR = 0.1
+OUT_OF_RANGE_SHARE = 0.5
+"""Share of the noisy samples in which surfaces out of range return no depth, as with most real cameras."""
+NO_FLOOR_SHARE = 0.1
 """Share of the samples without a floor: the arm stands on a pedestal."""
 
 
 class Sample(NamedTuple):
-    """An observed volume and what is true of it, packed."""
+    """An observed volume and the true occupancy, packed."""
 
     seen: UInt8[ndarray, "56 56 32"]
-    """Bits."""
+    """The bits of `BITS`."""
     behind: UInt8[ndarray, "56 56 32"]
-    """In steps of STEP."""
+    """Depth behind the nearest surface, in units of DEPTH_STEP."""
     truth: UInt8[ndarray, "56 56 32"]
-    """Whether the eight voxels of 2 cm in each hold obstacles: bit 4 x + 2 y + z."""
+    """Whether each of a voxel's eight voxels of 2 cm holds an obstacle: bit 4 x + 2 y + z."""
 
 
 class Samples(NamedTuple):
-    """Many of them: the same arrays with one more axis in front."""
+    """Many samples: the arrays of `Sample` with a leading axis."""
 
     seen: UInt8[ndarray, "n 56 56 32"]
     behind: UInt8[ndarray, "n 56 56 32"]
@@ -98,20 +98,20 @@ class Samples(NamedTuple):
 
 
 def pack(volume: ObservedVolume) -> tuple[UInt8[ndarray, "56 56 32"], UInt8[ndarray, "56 56 32"]]:
-    """`seen` and `behind` of a sample."""
+    """`Sample.seen` and `Sample.behind` of an observed volume."""
     seen = np.zeros(SHAPE, np.uint8)
     for bit, of in zip(BITS, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=True):
         seen |= of * np.uint8(bit)
-    return seen, np.minimum(np.rint(volume.behind / STEP), 255).astype(np.uint8)
+    return seen, np.minimum(np.rint(volume.behind / DEPTH_STEP), 255).astype(np.uint8)
 
 
 def true_voxels(scene: Scene) -> Bool[ndarray, "112 112 64"]:
-    """Which voxels of 2 cm hold obstacles."""
-    return voxels_within(scene, LOW, FINE, FINE_SHAPE)
+    """The voxels of 2 cm that hold obstacles."""
+    return voxels_within(scene, LOW, FINE_VOXEL_SIZE, FINE_SHAPE)
 
 
 def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> UInt8[ndarray, "56 56 32"]:
-    """`truth` of a sample."""
+    """`Sample.truth` of an occupancy."""
     out = np.zeros(SHAPE, np.uint8)
     for bit in range(8):
         out |= fine[bit >> 2 :: 2, bit >> 1 & 1 :: 2, bit & 1 :: 2] * np.uint8(1 << bit)
@@ -119,47 +119,48 @@ def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> UInt8[ndarray, "56 56 32"]:
 
 
 def unpack_fine(truth: UInt8[ndarray, "*b"]) -> Bool[ndarray, "*b 8"]:
-    """The eight bits of each."""
+    """The eight bits of each number, the inverse of `pack_fine`."""
     return (truth[..., None] >> np.arange(8, dtype=np.uint8) & 1).astype(np.bool_)
 
 
 def camera_view(
     scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Generator, cameras: CameraPlaces = CAMERAS
 ) -> DepthView:
-    """What a camera sees from a random place."""
+    """A depth view of the scene from a random pose."""
     T, angle = cameras.draw(scene, rng)
-    focal = SIZE[1] / 2 / np.tan(angle / 2)
-    intrinsics = (focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
-    return ray_cast(scene, T, intrinsics, SIZE, robot, q)
+    focal = IMAGE_SIZE[1] / 2 / np.tan(angle / 2)
+    intrinsics = (focal, focal, (IMAGE_SIZE[0] - 1) / 2, (IMAGE_SIZE[1] - 1) / 2)
+    return ray_cast(scene, T, intrinsics, IMAGE_SIZE, robot, q)
 
 
 def random_configuration(checker: CollisionChecker, robot: Robot, rng: Generator) -> Float[ndarray, "dof"]:
-    """Uniform among the free ones, or any if they are hard to find."""
+    """A uniform configuration without collision; with collision if 64 draws find none without."""
     q = rng.uniform(robot.lower, robot.upper, (64, robot.dof))
     free = np.flatnonzero(checker.free(q))
     return q[free[0]] if len(free) else q[0]
 
 
 def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> Sample:
-    """A random scene of one of the families, and what one or two cameras see of it."""
+    """A random scene of one of the families, observed by one or two cameras."""
     family = load_family(families[int(rng.integers(len(families)))])
     scene = family.scene(rng, base_spheres(robot))
-    if rng.random() < NO_FLOOR:
+    if rng.random() < NO_FLOOR_SHARE:
         scene = Scene([shape for shape in scene.shapes if shape is not family.floor])
     q = random_configuration(CollisionChecker(robot, scene), robot, rng)
-    views = [camera_view(scene, robot, q, rng) for _ in range(1 + (rng.random() < SECOND_VIEW))]
-    if rng.random() < NOISY:
-        strength, blind = 2 * rng.random(), rng.random() < NO_RANGE
+    views = [camera_view(scene, robot, q, rng) for _ in range(1 + (rng.random() < TWO_VIEWS_SHARE))]
+    if rng.random() < NOISE_SHARE:
+        strength, hide_far = 2 * rng.random(), rng.random() < OUT_OF_RANGE_SHARE
         usual = DepthNoise()
         noise = DepthNoise(
             strength * usual.spread, strength * usual.missing, min(strength * usual.flying, 0.9)
         )
-        views = [noise.applied(_blind(view) if blind else view, rng) for view in views]
+        views = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in views]
     seen, behind = pack(observe(views, robot, q))
     return Sample(seen, behind, pack_fine(true_voxels(scene)))
 
 
-def _blind(view: DepthView) -> DepthView:
+def _without_infinity(view: DepthView) -> DepthView:
+    """The view with no measurement (0) where nothing was in range."""
     depth = np.where(np.isfinite(view.depth), view.depth, 0.0)
     return DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)
 

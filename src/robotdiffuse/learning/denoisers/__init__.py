@@ -2,8 +2,8 @@
 
 Millions of parameters of the defaults (48 waypoints) and of `paper_size` (254 waypoints) for a Panda, and
 the time of a forward pass of the defaults on a batch of 16, one thread, in units of the transformer's (5.8
-ms in bf16, 10.7 ms in fp32; torch 2.13, CPU with AVX-512 BF16). Other work was running, so times are good to
-about 20 %.
+ms in bf16, 10.7 ms in fp32; torch 2.13, CPU with AVX-512 BF16). Other work was running, so times are
+accurate to about 20 %.
 
 | denoiser        | default | paper's size | bf16 | fp32 |
 |-----------------|---------|--------------|------|------|
@@ -15,20 +15,24 @@ about 20 %.
 
 from robotdiffuse.core.registry import Entry, Registry
 
-_ROOM = "robotdiffuse.learning.denoisers."
+_PACKAGE = "robotdiffuse.learning.denoisers."
 DENOISERS = Registry(
     "denoiser",
     {
         "transformer": Entry(
-            _ROOM + "transformer:Transformer", "encoder-only transformer, the paper's", "TransformerSettings"
+            _PACKAGE + "transformer:Transformer",
+            "encoder-only transformer, the paper's",
+            "TransformerSettings",
         ),
         "encoder_decoder": Entry(
-            _ROOM + "encoder_decoder:EncoderDecoder", "encoder-decoder transformer", "EncoderDecoderSettings"
+            _PACKAGE + "encoder_decoder:EncoderDecoder",
+            "encoder-decoder transformer",
+            "EncoderDecoderSettings",
         ),
         "decoder_only": Entry(
-            _ROOM + "decoder_only:DecoderOnly", "decoder-only transformer", "DecoderOnlySettings"
+            _PACKAGE + "decoder_only:DecoderOnly", "decoder-only transformer", "DecoderOnlySettings"
         ),
-        "unet": Entry(_ROOM + "unet:UNet", "temporal U-Net", "UNetSettings"),
+        "unet": Entry(_PACKAGE + "unet:UNet", "temporal U-Net", "UNetSettings"),
     },
 )
 """By the name in settings and checkpoints."""

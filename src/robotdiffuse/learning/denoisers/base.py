@@ -13,24 +13,27 @@ from robotdiffuse.core.settings import Count, Settings
 
 @dataclass(frozen=True)
 class DenoiserSettings(Settings):
-    """Of any denoiser."""
+    """Settings of a denoiser."""
 
     @classmethod
     def paper_size(cls) -> "DenoiserSettings":
-        """At about the size of the paper's network: 8 layers of width 512 and a token per waypoint."""
+        """Settings of about the size of the paper's network: 8 layers of width 512 and a token per
+        waypoint."""
         return cls()
 
 
 @dataclass(frozen=True)
 class AttentionSettings(DenoiserSettings):
-    """What the transformers share. The paper does not say how many heads and how large a hidden layer its
-    network has: those of `paper_size` are of the network that it follows, the motion diffusion model of Tevet
-    et al. 2023."""
+    """Settings of all transformers.
+
+    The paper states neither the number of heads nor the size of the hidden layer: `paper_size` has those of
+    the network that the paper follows, the motion diffusion model of Tevet et al. 2023.
+    """
 
     width: Count = 160
     """Size of a token; even (paper: 512)."""
     layers: Count = 6
-    """(paper: 8)"""
+    """Number of blocks (paper: 8)."""
     heads: Count = 5
     """Attention heads; a divisor of width."""
     hidden: Count = 480
@@ -51,7 +54,7 @@ class AttentionSettings(DenoiserSettings):
         return cls(512, 8, 4, 1024, patch=1)
 
     def tokens(self, waypoints: int) -> int:
-        """How many patches so many waypoints are. Raises InputError unless they can be cut into patches."""
+        """The number of patches. Raises InputError unless the waypoints can be divided into patches."""
         if waypoints % self.patch:
             raise InputError(
                 f"{self.settings_name}.patch is {self.patch}; it must divide the {waypoints} waypoints"
@@ -60,15 +63,15 @@ class AttentionSettings(DenoiserSettings):
 
 
 class Denoiser(nn.Module, ABC):
-    """Predicts the clean trajectory from a noisy one, of waypoints or of the control points of a spline."""
+    """A network from a noisy trajectory to the output that the model's objective defines."""
 
     out: nn.Linear
     """The last layer. It starts at zero, so that an untrained network predicts the mean trajectory."""
 
     def __init__(self, settings: Any, waypoints: int, dof: int, features: int, condition: int) -> None:
-        """settings: of the class that DENOISERS names beside the denoiser.
-        waypoints: rows of a trajectory, features: numbers per row of the input.
-        condition: numbers in [z, start, goal]; start and goal are the last `dof` each.
+        """settings: of the class that DENOISERS names for the denoiser.
+        features: inputs per waypoint.
+        condition: numbers in [z, start, goal]; start and goal are the last two times `dof`.
         """
         super().__init__()
         self.settings, self.waypoints, self.dof = settings, waypoints, dof
@@ -80,4 +83,4 @@ class Denoiser(nn.Module, ABC):
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
     ) -> Float[Tensor, "batch waypoints dof"]:
-        """The clean trajectory. `level` is t / T in [0, 1]."""
+        """The output for noisy trajectories; level is t / T in [0, 1]."""

@@ -1,4 +1,4 @@
-"""A decoder-only transformer: each waypoint sees z_tk and the waypoints before it (paper: Table 2)."""
+"""A decoder-only transformer: each waypoint attends to z_tk and the waypoints before it (paper: Table 2)."""
 
 from dataclasses import dataclass
 
@@ -19,14 +19,14 @@ from robotdiffuse.learning.denoisers.layers import (
 
 @dataclass(frozen=True)
 class DecoderOnlySettings(AttentionSettings, name="decoder_only"):
-    """Waypoints of one token see each other."""
+    """Waypoints of one patch attend to each other."""
 
 
 class DecoderOnly(Denoiser):
     """Causal self attention over [z_tk, waypoints ...], after Radford et al. 2018.
 
-    z_tk carries the condition, and with it the goal, and the noise level. It is the first token, and so the
-    only one that all waypoints see. No waypoint is drawn after another: one pass predicts them all.
+    z_tk carries the condition, which includes the goal, and the noise level. It is the first token, and so
+    the only one that all waypoints attend to. Waypoints are not drawn in turn: one pass predicts them all.
     """
 
     positions: Tensor
@@ -54,7 +54,7 @@ class DecoderOnly(Denoiser):
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
     ) -> Float[Tensor, "batch waypoints dof"]:
-        """The clean trajectory. `level` is t / T in [0, 1]."""
+        """The output for noisy trajectories; level is t / T in [0, 1]."""
         batch = features.shape[0]
         z_tk = self.condition(condition) + self.level(level)
         tokens = self.embed(features.reshape(batch, len(self.positions) - 1, -1))

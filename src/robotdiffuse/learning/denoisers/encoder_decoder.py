@@ -24,8 +24,9 @@ class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
     width: Count = 144
     """Size of a token; even."""
     layers: Count = 4
-    """Of the decoder."""
+    """Blocks of the decoder."""
     encoder_layers: Count = 2
+    """Blocks of the encoder."""
     heads: Count = 4
     """Attention heads; a divisor of width."""
     hidden: Count = 432
@@ -37,8 +38,8 @@ class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
 
 
 class EncoderDecoder(Denoiser):
-    """After Vaswani et al. 2017, with norms first: the tokens z, start, goal and t go through the encoder,
-    the waypoints through the decoder. Waypoints see each other both ways, for they are not drawn in turn."""
+    """After Vaswani et al. 2017, with norms first: the encoder takes the tokens z, start, goal and t, the
+    decoder the waypoints. Attention between waypoints is not causal, since they are not drawn in turn."""
 
     positions: Tensor
 
@@ -70,7 +71,7 @@ class EncoderDecoder(Denoiser):
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
     ) -> Float[Tensor, "batch waypoints dof"]:
-        """The clean trajectory. `level` is t / T in [0, 1]."""
+        """The output for noisy trajectories; level is t / T in [0, 1]."""
         batch = features.shape[0]
         parts = zip(self.condition, condition.split(self.sizes, -1), strict=True)
         memory = torch.stack([*(embed(part) for embed, part in parts), self.level(level)], 1).float()

@@ -1,4 +1,4 @@
-"""Layers that the denoisers share. The stream of tokens is fp32; the linear layers may be bf16."""
+"""Layers shared by the denoisers. The residual stream is fp32; the linear layers may be bf16."""
 
 import numpy as np
 import torch
@@ -6,15 +6,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-DENSE_TOKENS = 96
-"""Up to so many tokens, attention on a CPU is written out. Measured with torch 2.13 on one thread, batch 16,
-8 heads of 64 numbers, forward and backward, written out against fused [ms]: 49 tokens 6.7 and 6.7, 97 tokens
-20 and 20, 128 tokens 42 and 29, 255 tokens 161 and 107; forward alone 1.7 and 1.9, 6.4 and 5.7, 9.7 and 8.6,
-68 and 34, on a busy machine. The fused kernel's backward pass in bf16 takes 23 ms at 49 tokens."""
+MAX_UNFUSED_TOKENS = 96
+"""Up to this number of tokens, attention on a CPU does without the fused kernel. Measured with torch 2.13 on
+one thread, batch 16, 8 heads of 64 numbers, forward and backward, unfused against fused [ms]: 49 tokens 6.7
+and 6.7, 97 tokens 20 and 20, 128 tokens 42 and 29, 255 tokens 161 and 107; forward alone 1.7 and 1.9, 6.4 and
+5.7, 9.7 and 8.6, 68 and 34, on a busy machine. The fused kernel's backward pass in bf16 takes 23 ms at 49
+tokens."""
 
 
 class Linear(nn.Linear):
-    """A linear layer that takes its input in the type of its weights, so that they may be kept in bf16."""
+    """A linear layer that converts its input to the type of its weights, which may be bf16."""
 
     def forward(self, input: Tensor) -> Tensor:
         return functional.linear(input.to(self.weight.dtype), self.weight, self.bias)
@@ -50,7 +51,8 @@ def positions(tokens: int, width: int) -> Float[Tensor, "tokens width"]:
 
 
 def split_heads(x: Tensor, parts: int, heads: int) -> tuple[Tensor, ...]:
-    """[batch, tokens, parts * width] to so many [batch, heads, tokens, width / heads], on a CPU in fp32."""
+    """[batch, tokens, parts * width] split into `parts` tensors [batch, heads, tokens, width / heads]; on a
+    CPU in fp32."""
     batch, tokens, _ = x.shape
     x = x.view(batch, tokens, parts, heads, -1).permute(2, 0, 3, 1, 4)
     return (x if x.is_cuda else x.to(torch.float32, memory_format=torch.contiguous_format)).unbind(0)
@@ -62,30 +64,30 @@ def attend(
     v: Float[Tensor, "batch heads others size"],
     causal: bool = False,
 ) -> Float[Tensor, "batch tokens width"]:
-    """Attention of tokens to others; `causal`: each only to those up to itself.
+    """Attention of tokens to others; causal: each token only to those up to itself.
 
-    Written out with plain matrix products for short sequences on a CPU, where the fused kernel gains little;
-    fused for long ones and on a GPU. In fp32 on a CPU: bf16 makes short sequences slower.
+    Plain matrix products serve short sequences on a CPU, where the fused kernel gains little; the fused
+    kernel serves long ones and GPUs. In fp32 on a CPU: bf16 makes short sequences slower.
     """
     batch, heads, tokens, size = q.shape
-    if q.is_cuda or k.shape[2] > DENSE_TOKENS:
+    if q.is_cuda or k.shape[2] > MAX_UNFUSED_TOKENS:
         mixed = functional.scaled_dot_product_attention(q, k, v, is_causal=causal)
     else:
         scores = (q * size**-0.5) @ k.transpose(-1, -2)
         if causal:
             later = torch.ones(tokens, tokens, dtype=torch.bool, device=q.device).triu(1)
             scores = scores.masked_fill(later, -torch.inf)
-        # filled up to a multiple of 16, softmax over few tokens is eight times as fast
-        filled = functional.pad(scores, (0, -scores.shape[-1] % 16), value=-torch.inf)
-        mixed = torch.softmax(filled, dim=-1)[..., : scores.shape[-1]] @ v
+        # padded to a multiple of 16, softmax over few tokens is eight times as fast
+        padded = functional.pad(scores, (0, -scores.shape[-1] % 16), value=-torch.inf)
+        mixed = torch.softmax(padded, dim=-1)[..., : scores.shape[-1]] @ v
     return mixed.transpose(1, 2).reshape(batch, tokens, heads * size)
 
 
 class Block(nn.Module):
-    """Pre-norm self attention and feed-forward network."""
+    """A transformer block: pre-norm self attention and feed-forward network."""
 
     def __init__(self, width: int, heads: int, hidden: int, layers: int, causal: bool = False) -> None:
-        """`layers`: number of blocks that follow each other; the more, the less each one adds at first."""
+        """layers: number of blocks in a row; the more, the smaller the initial weights of each."""
         super().__init__()
         self.heads, self.causal = heads, causal
         self.norm_attention = nn.LayerNorm(width)
@@ -110,7 +112,7 @@ class Block(nn.Module):
 
 
 class CrossBlock(Block):
-    """Between the two, attention to the tokens of an encoder (the decoder of Vaswani et al. 2017)."""
+    """A block with attention to the tokens of an encoder in between (the decoder of Vaswani et al. 2017)."""
 
     def __init__(self, width: int, heads: int, hidden: int, layers: int) -> None:
         super().__init__(width, heads, hidden, layers)
@@ -131,12 +133,12 @@ class CrossBlock(Block):
 
 
 def start_small(layer: nn.Linear, layers: int) -> None:
-    """Initial weights of the last layer of a residual branch, one of so many in a row."""
+    """Initialise the last layer of a residual branch, one of `layers` in a row."""
     nn.init.normal_(layer.weight, std=0.02 / (2 * layers) ** 0.5)
     nn.init.zeros_(layer.bias)
 
 
 def start_at_zero(layer: nn.Linear) -> None:
-    """Initial weights of the last layer of a network."""
+    """Initialise the last layer of a network to zero."""
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)

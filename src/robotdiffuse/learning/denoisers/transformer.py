@@ -20,8 +20,8 @@ from robotdiffuse.learning.denoisers.layers import (
 @dataclass(frozen=True)
 class TransformerSettings(AttentionSettings, name="transformer"):
     add_z_tk: bool = True
-    """Whether z_tk is also added to every other token, which spares the first layer from having to spread it;
-    otherwise it is a token and no more (the paper's)."""
+    """Whether z_tk is also added to every other token, so that the first layer need not distribute it;
+    otherwise it is only a token (the paper's)."""
 
     @classmethod
     def paper_size(cls) -> "TransformerSettings":
@@ -55,7 +55,7 @@ class Transformer(Denoiser):
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
     ) -> Float[Tensor, "batch waypoints dof"]:
-        """The clean trajectory. `level` is t / T in [0, 1]."""
+        """The output for noisy trajectories; level is t / T in [0, 1]."""
         batch = features.shape[0]
         z_tk = self.condition(condition) + self.level(level)
         tokens = self.embed(features.reshape(batch, len(self.positions), -1)) + self.positions

@@ -1,4 +1,5 @@
-"""Encoders of the scene: point cloud to a few numbers. A new one is one file and one line in ENCODERS."""
+"""Encoders of the scene: from a point cloud to a few numbers. A new one is one file and one line in
+ENCODERS."""
 
 from typing import TYPE_CHECKING
 
@@ -7,43 +8,35 @@ from robotdiffuse.core.registry import Entry, Registry
 if TYPE_CHECKING:
     from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings
 
-_ROOM = "robotdiffuse.learning.encoders."
-COMPLETES = "completion"
-"""The kind that `train completion` trains."""
+_PACKAGE = "robotdiffuse.learning.encoders."
 ENCODERS = Registry(
     "encoder",
     {
         "compression_autoencoder": Entry(
-            _ROOM + "compression_autoencoder:CompressionAutoencoder",
+            _PACKAGE + "compression_autoencoder:CompressionAutoencoder",
             "the paper's: a perceptron on 1,400 points in a fixed order",
             "CompressionAutoencoderSettings",
             "alone",
         ),
         "point_autoencoder": Entry(
-            _ROOM + "point_autoencoder:PointAutoencoder",
+            _PACKAGE + "point_autoencoder:PointAutoencoder",
             "a perceptron on each point, pooled: any number of points in any order",
             "PointAutoencoderSettings",
             "alone",
         ),
-        "pointnet": Entry(_ROOM + "pointnet:PointNet", "PointNet", "PointNetSettings", "jointly"),
-        "dgcnn": Entry(_ROOM + "dgcnn:DGCNN", "DGCNN", "DGCNNSettings", "jointly"),
-        "completing_autoencoder": Entry(
-            _ROOM + "completing_autoencoder:CompletingAutoencoder",
-            "the bottleneck of the network that completes what cameras see, as it comes with the package",
-            "CompletingAutoencoderSettings",
-            COMPLETES,
-        ),
+        "pointnet": Entry(_PACKAGE + "pointnet:PointNet", "PointNet", "PointNetSettings", "jointly"),
+        "dgcnn": Entry(_PACKAGE + "dgcnn:DGCNN", "DGCNN", "DGCNNSettings", "jointly"),
     },
 )
-"""By the name in settings and checkpoints. Of three kinds: trained alone, with a loss of its own, and frozen
-then; jointly with the planner, by the planner's loss; or a part of the completing network, frozen."""
+"""By the name in settings and checkpoints. Two kinds: "alone" is trained with a loss of its own and then
+frozen; "jointly" is trained with the planner, by the planner's loss."""
 
 
 def make_encoder(name: str, settings: "EncoderSettings | None" = None) -> "Encoder":
-    """A fresh encoder of that name; without settings, with its defaults."""
+    """An untrained encoder of that name; None: with its default settings."""
     return ENCODERS.load(name)(settings or ENCODERS.defaults(name))
 
 
 def encoder_name(encoder: "Encoder") -> str:
-    """Name of an encoder's kind in ENCODERS."""
+    """The name of an encoder's class in ENCODERS."""
     return next(name for name in ENCODERS if ENCODERS.load(name) is type(encoder))

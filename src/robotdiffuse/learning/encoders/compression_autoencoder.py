@@ -1,8 +1,8 @@
 """The paper's compression auto-encoder (section Condition embedding); its encoder is PointEnet.
 
 A perceptron on 1,400 points in a fixed order, 4200 -> 786 -> 512 -> 256 -> 60, and its mirror image. The
-paper leaves open what the order is and the activation. The order is by x, then y, then z; the activation is
-PReLU, as in MPNet (Qureshi et al. 2019), whose encoder this resembles down to the form of its loss.
+paper states neither the order nor the activation. Here the points are sorted by x, then y, then z, and the
+activation is PReLU, as in MPNet (Qureshi et al. 2019), whose encoder has the same form and loss.
 """
 
 from collections.abc import Iterable
@@ -26,13 +26,13 @@ class CompressionAutoencoderSettings(EncoderSettings):
     code: Count = 60
     """Size of z."""
     cloud: Count = 1400
-    """Points of a cloud: the input is three times as long."""
+    """Points of an input cloud; the input has three numbers for each."""
     hidden: Sizes = (786, 512, 256)
-    """Layers of the encoder between the cloud and z; the decoder has the same, from the last to the first."""
+    """Layers of the encoder between the cloud and z; the decoder has the same in reverse order."""
 
 
 class CompressionAutoencoder(Autoencoder):
-    """z = MLP(all points, one after the other)."""
+    """z = MLP(all points, concatenated)."""
 
     any_size = False
     settings: CompressionAutoencoderSettings
@@ -45,8 +45,8 @@ class CompressionAutoencoder(Autoencoder):
     def arrange(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch cloud 3"]:
         """As many points as the network takes, sorted by x, then y, then z.
 
-        Of more points, every so-manieth in that order is kept; fewer are repeated. No point: zeros. Clouds of
-        that size by `surface_clouds(..., ordered=True)` stay as they are, up to rounding.
+        More points are thinned evenly in that order, fewer are repeated, and an empty cloud becomes zeros.
+        Clouds of that size by `surface_clouds(..., ordered=True)` stay as they are, up to rounding.
         """
         batch, points, _ = cloud.shape
         wanted = self.settings.cloud
@@ -56,7 +56,7 @@ class CompressionAutoencoder(Autoencoder):
         coordinates = list((cloud * near[..., None]).unbind(-1))
         sort_points(coordinates)
         ordered = torch.stack(coordinates, -1)
-        # those that do not count are zeros now; behind the others with them, which keep their order
+        # points that do not count are zeros now: move them behind the others, which keep their order
         filled = (ordered != 0).any(-1)
         ordered = ordered.gather(1, (~filled).byte().argsort(stable=True, dim=1)[..., None].expand(-1, -1, 3))
         at = (torch.arange(wanted, device=cloud.device) * 2 + 1) * filled.sum(1, keepdim=True)
@@ -68,7 +68,7 @@ class CompressionAutoencoder(Autoencoder):
             return self.encoder(self.arrange(cloud.float()).flatten(1))
 
     def decode(self, code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch cloud 3"]:
-        """Reconstructed points [m], in order, from z before standardisation."""
+        """Reconstructed points [m], in the order of `arrange`, from z before standardisation."""
         with fp32(code):
             return self.decoder(code.float()).view(len(code), -1, 3)
 
@@ -77,8 +77,8 @@ class CompressionAutoencoder(Autoencoder):
     ) -> tuple[Float[Tensor, ""], dict[str, float]]:
         """The first term of l_AE: the mean over points of the squared distance to the reconstruction [m^2].
 
-        The equation's K, which it does not define, is the number of points; its i-hat is the text's x-hat.
-        `reconstruction` is the root of the loss [m].
+        The equation does not define K: it is taken as the number of points, and i-hat as the text's x-hat.
+        The error `reconstruction` is the root of the loss [m].
         """
         with fp32(cloud):
             points = self.arrange(cloud.float())
@@ -88,8 +88,8 @@ class CompressionAutoencoder(Autoencoder):
     def penalised(self) -> Iterable[Tensor]:
         """The encoder's weights.
 
-        The equation has (theta^2_ij)^2, which read by the letter is a sum of fourth powers. MPNet's equation
-        has the same place as theta^e_ij, the encoder's weights, squared: taken to be what is meant.
+        The equation has (theta^2_ij)^2, which literally is a sum of fourth powers. MPNet's equation has the
+        square of theta^e_ij, the encoder's weights, in that place; this is taken to be meant.
         """
         return (layer.weight for layer in self.encoder if isinstance(layer, nn.Linear))
 

@@ -2,7 +2,7 @@
 
 Each layer joins every point with its nearest neighbours, in the space of that layer's own input, and takes
 the maximum over the edges of h(x_i, x_j - x_i). The original's h is a linear layer, batch norm and leaky
-ReLU. Here the norm is over the channels of a point (see pointnet.py for why) and comes after the maximum.
+ReLU. Here the norm is over the channels of a point (pointnet.py says why) and comes after the maximum.
 Without a norm on the edges, the maximum commutes with the rest: with h = W [x_i, x_j - x_i] = (A - B) x_i +
 B x_j, it is over B x_j alone, and the layer costs two matrix products per point instead of one per edge.
 """
@@ -17,26 +17,26 @@ from torch.nn import functional
 
 from robotdiffuse.core.settings import Count, Sizes
 from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max, pool_mean
-from robotdiffuse.learning.max_pool import greatest
+from robotdiffuse.learning.max_pool import max_pool
 
-SLOPE = 0.2
-"""Of the leaky ReLU below zero, as in the original."""
-FAR = 1e9
-"""Squared distance to points that do not count."""
+NEGATIVE_SLOPE = 0.2
+"""Slope of the leaky ReLU below zero, as in the original."""
+IGNORED_DISTANCE = 1e9
+"""Squared distance that is given to points that do not count."""
 
 
 @dataclass(frozen=True)
 class DGCNNSettings(EncoderSettings):
-    """Sizes small enough for training on a CPU; the paper's are in brackets."""
+    """Sizes for training on a CPU; the original's are in brackets."""
 
     cloud: Count = 128
-    """Points of the clouds that it is given (1024)."""
+    """Points of an input cloud (1024)."""
     neighbours: Count = 8
-    """Nearest points that each is joined with (20)."""
+    """Nearest points that each point is joined with (20)."""
     edges: Sizes = (32, 32, 64)
-    """Layers of edge convolution (64, 64, 128, 256)."""
+    """Widths of the layers of edge convolution (64, 64, 128, 256)."""
     embedding: Count = 192
-    """Features of a point, from all those layers together, that are pooled (1024)."""
+    """Features of a point, computed from all these layers, that are pooled (1024)."""
     head: tuple[Count, ...] = (192,)
     """Layers between the pooled features and z (512, 256)."""
 
@@ -50,16 +50,17 @@ class DGCNNSettings(EncoderSettings):
 def neighbours(
     x: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"], count: int
 ) -> Int64[Tensor, "batch points neighbours"]:
-    """Index of the `count` nearest points that count, itself included; itself again where there are fewer."""
+    """Indices of each point's `count` nearest neighbours, itself included; where there are fewer, itself
+    again."""
     with torch.no_grad(), fp32(x):
         x = x.detach().float()
         squared = x.square().sum(-1)
         # |a - b|^2 without |a|^2, which is the same for all neighbours of a
         apart = torch.baddbmm(squared[:, None], x, x.mT, alpha=-2.0)
-        apart = apart.masked_fill(~near[:, None], FAR)
+        apart = apart.masked_fill(~near[:, None], IGNORED_DISTANCE)
         found = apart.topk(min(count, x.shape[1]), dim=-1, largest=False, sorted=False)
         itself = torch.arange(x.shape[1], device=x.device)[:, None]
-        return torch.where(found.values < FAR, found.indices, itself)
+        return torch.where(found.values < IGNORED_DISTANCE, found.indices, itself)
 
 
 class EdgeConvolution(nn.Module):
@@ -79,14 +80,14 @@ class EdgeConvolution(nn.Module):
         other = self.other(x)
         offset = other.shape[1] * torch.arange(len(other), device=x.device)[:, None, None]
         joined = other.flatten(0, 1)[(index + offset).flatten(0, 1)]
-        most = greatest(joined).view_as(other)
-        return functional.leaky_relu(self.norm(self.own(x) + most), SLOPE)
+        pooled = max_pool(joined).view_as(other)
+        return functional.leaky_relu(self.norm(self.own(x) + pooled), NEGATIVE_SLOPE)
 
 
 class DGCNN(Encoder):
     """z = MLP(max-pool and mean-pool of MLP(outputs of all edge convolutions))."""
 
-    any_size = False  # how far neighbours are is how dense the cloud is
+    any_size = False  # distances to neighbours depend on the density of the cloud
 
     def __init__(self, settings: DGCNNSettings) -> None:
         super().__init__(settings)
@@ -96,11 +97,11 @@ class DGCNN(Encoder):
         self.embed = nn.Sequential(
             nn.Linear(sum(settings.edges), settings.embedding),
             nn.LayerNorm(settings.embedding),
-            nn.LeakyReLU(SLOPE),
+            nn.LeakyReLU(NEGATIVE_SLOPE),
         )
         sizes = (2 * settings.embedding, *settings.head)
         self.empty = nn.Parameter(torch.zeros(sizes[0]))
-        head = [(nn.Linear(a, b), nn.LayerNorm(b), nn.LeakyReLU(SLOPE)) for a, b in pairwise(sizes)]
+        head = [(nn.Linear(a, b), nn.LayerNorm(b), nn.LeakyReLU(NEGATIVE_SLOPE)) for a, b in pairwise(sizes)]
         self.head = nn.Sequential(
             *(part for parts in head for part in parts), nn.Linear(sizes[-1], settings.code)
         )

@@ -18,10 +18,10 @@ from torch.nn import functional
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Sizes
 from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
 
-QUERIES = 96
-"""Points per cloud at which the distance field is reconstructed."""
+DISTANCE_QUERIES = 96
+"""Positions per cloud at which the distance field is reconstructed."""
 DISTANCE_CAP = 0.5
-"""Reconstructed distances are capped [m]."""
+"""Reconstructed distances are capped at this [m]."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class PointAutoencoderSettings(EncoderSettings):
     points: Sizes = (64, 128, 256)
     """Layers of the perceptron on each point."""
     octaves: Natural = 4
-    """Sines and cosines of the coordinates that a point comes with, of wavelengths 4 m, 2 m, ..."""
+    """Wavelengths (4 m, 2 m, ...) of the sines and cosines of its coordinates that each point is given."""
     hidden: Count = 384
-    """Layer between the pooled features and z, and in the decoder."""
+    """Width of the layer between the pooled features and z, and of the decoder's."""
     decoded: Count = 192
     """Points that the decoder reconstructs."""
     distance_weight: NotNegative = 4.0
-    """In training: weight of the error of the reconstructed distance field beside the Chamfer distance, both
-    in metres."""
+    """In training: weight of the error of the distance field relative to the Chamfer distance, both in
+    metres."""
 
 
 class PointAutoencoder(Autoencoder):
@@ -75,13 +75,13 @@ class PointAutoencoder(Autoencoder):
             x = functional.relu(self.points[0](self._waves(cloud)))
         for layer in list(self.points)[1:]:
             x = functional.relu(layer(x))
-        x = x * near  # features are not negative, so a zero loses every maximum
+        x = x * near  # features are not negative, so zeros never change a maximum
         count = near.sum(1)
         pooled = torch.cat([x.amax(1).float(), x.float().sum(1) / count.clamp(min=1)], -1)
         return self.head(torch.where(count > 0, pooled, empty)).float()
 
     def _waves(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch waves"]:
-        """Coordinates with their sines and cosines, which let a small perceptron tell places apart."""
+        """Coordinates with their sines and cosines, by which a small perceptron distinguishes positions."""
         angles = [points * (torch.pi / 2 * 2**octave) for octave in range(self.settings.octaves)]
         return torch.cat([points, *(part for a in angles for part in (a.sin(), a.cos()))], -1)
 
@@ -92,7 +92,7 @@ class PointAutoencoder(Autoencoder):
     def distance(
         self, code: Float[Tensor, "batch code"], at: Float[Tensor, "batch queries 3"]
     ) -> Float[Tensor, "batch queries"]:
-        """Reconstructed distance [m] of places to the cloud, from z before standardisation."""
+        """Reconstructed distance [m] of positions to the cloud, from z before standardisation."""
         return (
             self.query(self.query_code(code)[:, None] + self.query_point(self._waves(at))).float().squeeze(-1)
         )
@@ -106,7 +106,7 @@ class PointAutoencoder(Autoencoder):
         `distance_of_constant`, that of a constant, all [m].
         """
         near = self.near(cloud)
-        at = self._spots(cloud, rng)
+        at = self._query_positions(cloud, rng)
         index, _ = nearest(at, cloud, near)
         truth = (at - pick(cloud, index)).norm(dim=-1).clamp(max=DISTANCE_CAP)
         truth = torch.where(near.any(1)[:, None], truth, DISTANCE_CAP)
@@ -121,18 +121,26 @@ class PointAutoencoder(Autoencoder):
         }
         return apart + self.settings.distance_weight * field, errors
 
-    def _spots(
+    def _query_positions(
         self, cloud: Float[Tensor, "batch points 3"], rng: Generator
     ) -> Float[Tensor, "batch queries 3"]:
-        """Places to ask for the distance: half of them close to the surfaces, the others anywhere."""
+        """Positions at which the distance is reconstructed: half of them close to the surfaces."""
         batch, points, _ = cloud.shape
         low, high = np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.3])
-        spots = torch.from_numpy(rng.uniform(low, high, (batch, QUERIES, 3)).astype(np.float32))
-        chosen = torch.from_numpy(rng.integers(0, points, QUERIES // 2))
-        spread = torch.from_numpy(0.1 * rng.standard_normal((batch, QUERIES // 2, 3), dtype=np.float32))
-        spots, close = spots.to(cloud.device), cloud[:, chosen] + spread.to(cloud.device)
+        positions = torch.from_numpy(rng.uniform(low, high, (batch, DISTANCE_QUERIES, 3)).astype(np.float32))
+        chosen = torch.from_numpy(rng.integers(0, points, DISTANCE_QUERIES // 2))
+        spread = torch.from_numpy(
+            0.1 * rng.standard_normal((batch, DISTANCE_QUERIES // 2, 3), dtype=np.float32)
+        )
+        positions, close = positions.to(cloud.device), cloud[:, chosen] + spread.to(cloud.device)
         away = ~self.near(close)[..., None]
-        return torch.cat([torch.where(away, spots[:, : QUERIES // 2], close), spots[:, QUERIES // 2 :]], 1)
+        return torch.cat(
+            [
+                torch.where(away, positions[:, : DISTANCE_QUERIES // 2], close),
+                positions[:, DISTANCE_QUERIES // 2 :],
+            ],
+            1,
+        )
 
     def penalised(self) -> Iterable[Tensor]:
         """All parameters."""
@@ -142,20 +150,19 @@ class PointAutoencoder(Autoencoder):
 def nearest(
     a: Float[Tensor, "batch n 3"], b: Float[Tensor, "batch m 3"], allowed: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Index [batch n] of the nearest point of `b` that is allowed ([batch m] of bool), and the reverse.
-
-    The reverse [batch m] is the index of the nearest point of `a` to each of `b`.
+    """For each point of a, the index [batch n] of the nearest point of b that is allowed ([batch m] of bool);
+    and for each point of b the index [batch m] of the nearest point of a.
     """
     with torch.no_grad(), fp32(a):
         b = torch.where(allowed[..., None], b, 100.0).float()
-        # |a - b|^2 without its constant |a|^2, which is added for the reverse only.
+        # |a - b|^2 without |a|^2, which is constant over b, and so is needed for the reverse only
         squared = torch.baddbmm(b.square().sum(-1)[:, None], a.float(), b.mT, alpha=-2.0)
         forth = squared.argmin(2)
         return forth, squared.add_(a.float().square().sum(-1)[..., None]).argmin(1)
 
 
 def pick(points: Float[Tensor, "batch n 3"], index: Tensor) -> Float[Tensor, "batch m 3"]:
-    """Points [batch m] by index."""
+    """The points with these indices [batch m]."""
     return points.gather(1, index[..., None].expand(-1, -1, 3))
 
 
@@ -164,7 +171,7 @@ def chamfer(
 ) -> Float[Tensor, ""]:
     """Chamfer distance [m]: root mean square distance to the nearest point of the other set, both ways.
 
-    `near` [batch m] says which points of the cloud count; clouds without any are left out.
+    near: which points of the cloud count [batch m]; clouds without any are left out.
     """
     to_cloud, to_decoded = nearest(decoded, cloud, near)
     forth = (decoded - pick(cloud, to_cloud)).square().sum(-1)

@@ -1,11 +1,11 @@
 """PointNet (Qi et al. 2017, "PointNet: Deep Learning on Point Sets"), trained with the planner.
 
 A perceptron on each point, a maximum over the points, and a perceptron on that; two small networks of the
-same form turn the coordinates and the features first. Other than in the original, features are normalised
-over the channels of a point (layer norm) and not over the batch: a code must not depend on the other clouds,
+same form first transform the coordinates and the features. Unlike the original, features are normalised over
+the channels of a point (layer norm) and not over the batch: a code must not depend on the other clouds,
 clouds may hold points that do not count, and averaged weights have no averaged batch statistics. There is no
-dropout, and no loss that keeps the feature transform orthogonal, as the planner's loss is the only one; the
-transforms start close to the identity.
+dropout, and no loss that keeps the feature transform orthogonal, since the planner's loss is the only one;
+the transforms start close to the identity.
 """
 
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, 
 
 @dataclass(frozen=True)
 class PointNetSettings(EncoderSettings):
-    """Sizes small enough for training on a CPU; the paper's are in brackets."""
+    """Sizes for training on a CPU; the original's are in brackets."""
 
     cloud: Count = 256
-    """Points of the clouds that it is given (1024)."""
+    """Points of an input cloud (1024)."""
     input_transform: bool = True
-    """Multiply the coordinates by a matrix that a small network makes of the cloud."""
+    """Whether the coordinates are multiplied by a matrix that a small network predicts from the cloud."""
     feature_transform: bool = True
-    """The same with the features of the first layers."""
+    """Whether the features of the first layers are transformed in the same way."""
     first: Sizes = (32, 32)
     """Layers on each point before the feature transform (64, 64)."""
     second: Sizes = (32, 64, 192)
@@ -36,7 +36,7 @@ class PointNetSettings(EncoderSettings):
     transform: Sizes = (16, 32, 64)
     """Layers on each point within a transform's network (64, 128, 1024)."""
     transform_head: tuple[Count, ...] = (32,)
-    """Layers after its maximum (512, 256)."""
+    """Layers of a transform's network after the maximum (512, 256)."""
     head: tuple[Count, ...] = (192,)
     """Layers between the maximum and z (512, 256)."""
 
@@ -54,7 +54,7 @@ class PointNetSettings(EncoderSettings):
 
 
 def layers(sizes: tuple[int, ...]) -> nn.Sequential:
-    """Linear, layer norm, ReLU for each size after the first; nothing if there is none."""
+    """Linear layer, layer norm and ReLU for each size after the first."""
     return nn.Sequential(
         *(
             part

@@ -1,8 +1,8 @@
-"""The networks by name. A new one is one file and one line in NETWORKS."""
+"""The trained networks by name. A new one is one file and one line in NETWORKS."""
 
 from robotdiffuse.core.registry import Entry, Registry
 
-_ROOM = "robotdiffuse.learning.networks."
+_PACKAGE = "robotdiffuse.learning.networks."
 NETWORKS = Registry(
     "network",
     {
@@ -13,13 +13,13 @@ NETWORKS = Registry(
             "planner --robot NAME",
         ),
         "mpnet": Entry(
-            _ROOM + "mpnet:MPNetNetwork",
+            _PACKAGE + "mpnet:MPNetNetwork",
             "MPNet: the next configuration on the way to the goal",
             "MPNetSettings",
         ),
         "mpinets": Entry(
-            _ROOM + "mpinets:MPiNetsNetwork",
-            "MPiNets: a policy that sees points of scene, arm and target",
+            _PACKAGE + "mpinets:MPiNetsNetwork",
+            "MPiNets: a policy with points of scene, arm and target as its input",
             "MPiNetsNetworkSettings",
         ),
         "trajectory_prior": Entry(
@@ -30,4 +30,4 @@ NETWORKS = Registry(
         ),
     },
 )
-"""Kind: what follows `robotdiffuse train` where a network is trained; empty for a baseline."""
+"""An entry's kind is the command after `robotdiffuse train` that trains it; empty: `baseline NAME`."""

@@ -1,4 +1,4 @@
-"""What the networks of the learned baselines share: the robot that they are for, and how they are trained."""
+"""The base class of the learned baselines' networks, with the interface that trains them."""
 
 from typing import Any, ClassVar
 
@@ -16,7 +16,7 @@ class BaselineNetwork(Network):
     """A network that `train_baseline` trains; `settings` are of the class that NETWORKS names."""
 
     training_defaults: ClassVar[dict[str, Any]] = {}
-    """Its own defaults of fields of `BaselineTraining`, e.g. batch."""
+    """The network's own defaults of fields of `BaselineTraining`, for example batch."""
 
     def __init__(self, robot: RobotIdentity, settings: Any) -> None:
         super().__init__()
@@ -24,7 +24,7 @@ class BaselineNetwork(Network):
         self.dof, self.normalizer = robot.dof, robot.normalizer()
 
     def fit_statistics(self, data: TrajectoryData) -> None:
-        """Fill buffers from the trajectories for training; called before a run."""
+        """Fill buffers with statistics of the training trajectories; called before a run."""
 
     def loss(
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
@@ -33,5 +33,5 @@ class BaselineNetwork(Network):
         raise NotImplementedError
 
     def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
-        """What the network by itself solves of some of the held-out problems, as a share; None: not known."""
+        """Share of some held-out problems that the network solves by itself; None: not measured."""
         return None

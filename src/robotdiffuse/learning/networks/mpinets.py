@@ -1,4 +1,4 @@
-"""MPiNets: a policy that sees a labelled point cloud and moves the arm one step at a time.
+"""MPiNets: a policy from a labelled point cloud to the arm's next step.
 
 A. Fishman et al., "Motion Policy Networks", CoRL 2022. PointNet++ encodes one cloud of points of the scene,
 of the robot at its current configuration q_t and of the target; a few layers encode q_t; both together are
@@ -18,14 +18,16 @@ Differences from the paper:
   balls of 0.2 and 0.6 m for the sparser cloud (512 and 128 of 128; 0.05 and 0.3 m); narrower layers (the
   paper's end in 1,024, then 4,096, 2,048, 2,048 features); batches of 128 at a rate of 2e-3 (10 at 1e-4);
   losses on the robot's points of the cloud (1,024).
-- *Target*: a configuration, as our problems demand it to 1e-4 rad, where the paper's is a pose of the hand.
-  So the target's points are those of the whole arm at the goal, the configuration encoder sees the direction
-  to the goal configuration too, and points are labelled by link, not only as scene, robot or target.
+- *Target*: a configuration, to be reached within 1e-4 rad, where the paper's is a pose of the hand. So the
+  target's points are those of the whole arm at the goal, the direction to the goal configuration is a further
+  input of the configuration encoder, and points are labelled by link, not only as scene, robot or target.
 - The floor, which is part of every scene, is in the collision loss but not in the cloud.
-- The collision loss is on the arm's covering spheres, which stick out a little, not on points.
-- The expert's motions are ours, of 48 waypoints (50), forwards or backwards, with a stand-still at the end.
-- Displacements are output in units of the experts' mean step, and weights begin as K. He et al. (ICCV 2015)
-  have them: with PyTorch's defaults, signals fade in so many layers, and learning takes many times as long.
+- The collision loss is on the arm's covering spheres, which protrude a little, not on points.
+- The expert's motions are those of our data, of 48 waypoints (paper: 50), forwards or backwards, with one
+  step at rest at the end.
+- Displacements are output in units of the experts' mean step, and weights are initialised as in K. He et al.
+  (ICCV 2015): with PyTorch's defaults signals fade over the many layers, and learning takes many times as
+  long.
 """
 
 from dataclasses import dataclass, field
@@ -52,14 +54,15 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
-SMOOTH = 0.1
-"""Added to the distance to the goal, in units of half the joint ranges, where it is made a direction."""
+DIRECTION_OFFSET = 0.1
+"""Added to the distance to the goal [half joint ranges] by which the way to it is divided, so that the
+direction fades near the goal."""
 LOSS_UNIT = 0.01
-"""[m], so that losses are not far from 1."""
-ROLL_OUTS = 40
-"""Held-out problems of `success`."""
-ROLL_OUT_STEPS = 80
-"""Most steps of each; the experts take 47."""
+"""Losses are divided by this [m], so that they are near 1."""
+SUCCESS_PROBLEMS = 40
+"""Held-out problems that `success` rolls the policy out on."""
+MAX_ROLL_OUT_STEPS = 80
+"""Largest number of steps of a roll-out; the experts take 47."""
 
 
 @dataclass(frozen=True)
@@ -69,39 +72,40 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
     robot_points: Count = 12
     """Points of each moving link at the current configuration (paper: 2,048 in all)."""
     target_points: Count = 6
-    """The first so many of these at the goal (paper: 128 in all, of the gripper)."""
+    """Of these, the first so many are also given at the goal (paper: 128 in all, of the gripper)."""
     region: VisibleRegion = field(default_factory=VisibleRegion)
-    """Where points of the scene count."""
+    """The region in which points of the scene count."""
     centres: tuple[Count, Count] = (96, 24)
-    """Of the two set abstractions (paper: 512, 128)."""
+    """Centres of the two set abstractions (paper: 512, 128)."""
     neighbours: tuple[Count, Count] = (16, 16)
-    """Most points around each centre (paper: 128, 128)."""
+    """Points around each centre (paper: 128, 128)."""
     radii: tuple[Positive, Positive] = (0.2, 0.6)
-    """Of the balls [m] (paper: 0.05, 0.3)."""
+    """Radii of the balls around centres [m] (paper: 0.05, 0.3)."""
     first_widths: Sizes = (32, 32, 64)
-    """Layers of the first set abstraction (paper: 64, 64, 64)."""
+    """Widths of the layers of the first set abstraction (paper: 64, 64, 64)."""
     second_widths: Sizes = (96, 128, 192)
-    """Of the second (paper: 128, 128, 256)."""
+    """Widths of the second (paper: 128, 128, 256)."""
     all_widths: Sizes = (256, 512)
-    """Of all points together (paper: 512, 512, 1,024)."""
+    """Widths of the layers on all points together (paper: 512, 512, 1,024)."""
     cloud_widths: tuple[Count, Count] = (512, 256)
-    """Layers after PointNet++, the last of which is its code (paper: 4,096, 2,048, 2,048)."""
+    """Widths after PointNet++; the last one is the size of the code (paper: 4,096, 2,048, 2,048)."""
     joint_widths: Sizes = (32, 64, 128, 128, 64)
-    """Layers of the configuration encoder (the paper's)."""
+    """Widths of the configuration encoder (the paper's)."""
     decoder_widths: Sizes = (512, 256, 128)
-    """Layers of the decoder (the paper's)."""
+    """Widths of the decoder (the paper's)."""
     point_match: NotNegative = 1.0
     """Weight of the loss on points of the arm (the paper's)."""
     collision: NotNegative = 5.0
     """Weight of the loss on the distance to the scene (the paper's)."""
     margin: NotNegative = 0.03
-    """Distance to the scene at which it sets in [m] (the paper's)."""
+    """Distance to the scene below which the collision loss acts [m] (the paper's)."""
     noise: NotNegative = 0.015
     """Standard deviation of the noise on the input configuration [rad] (the paper's)."""
     trivial_share: Share = 0.3
-    """Share of the samples from motions whose straight line is free too."""
+    """Share of the samples from motions between ends whose straight line is free too."""
     near: NotNegative = 0.3
-    """In `success`: largest distance of a joint at which the goal is reached by a straight edge [rad]."""
+    """In `success`: within this distance of every joint, the goal is connected by a straight segment
+    [rad]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -126,24 +130,25 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
 
 
 GROUPS = 16
-"""Of the group normalisation (the paper's)."""
+"""Groups of the group normalisation (the paper's)."""
 
 
 class Steps(NamedTuple):
-    """Training samples: one step of a motion each."""
+    """Training samples, each of them one step of a motion."""
 
     q: Float32[Tensor, "n dof"]
-    """Where the arm is, with noise [rad]."""
+    """The arm's configuration, with noise [rad]."""
     expert: Float32[Tensor, "n dof"]
     """The next waypoint of the motion [rad]."""
     goal: Float32[Tensor, "n dof"]
     clouds: Float32[Tensor, "n points 3"]
-    """Of the scenes [m]."""
+    """Clouds of the scenes [m]."""
     scenes: PackedScenes
 
 
 class MPiNetsNetwork(BaselineNetwork):
-    """The policy. It loads the robot, bundled or from its URDF, for surface points and covering spheres."""
+    """The policy. It loads the robot, bundled or from its URDF, for the surface points and covering
+    spheres."""
 
     training_defaults: ClassVar[dict[str, Any]] = {"batch": 128, "learning_rate": 2e-3}
     settings: MPiNetsNetworkSettings
@@ -151,7 +156,7 @@ class MPiNetsNetwork(BaselineNetwork):
     def __init__(self, robot: RobotIdentity, settings: MPiNetsNetworkSettings) -> None:
         super().__init__(robot, settings)
         s, kinematics = settings, ForwardKinematics(load_robot(robot.source))
-        # always the same points, so that a checkpoint needs no copy of them
+        # the same points every time, so that a checkpoint need not store them
         self._surface = SurfacePoints(kinematics, s.robot_points, np.random.default_rng(0))
         self._distance = ArmDistance(kinematics)
         on_arm = self._surface(torch.zeros(self.dof)).shape[0]
@@ -162,7 +167,7 @@ class MPiNetsNetwork(BaselineNetwork):
         labels.append(1 + links + self._target // s.robot_points)
         label = torch.cat([part.reshape(-1) for part in labels])
         self._labels = nn.functional.one_hot(label, 1 + 2 * links).float()
-        """One-hot: scene, each link of the robot, each link of the target."""
+        """One-hot labels: scene, each link of the robot, each link of the target."""
         self.first = SetAbstraction(1 + 2 * links, s.first_widths, s.centres[0], s.neighbours[0], s.radii[0])
         self.second = SetAbstraction(
             s.first_widths[-1], s.second_widths, s.centres[1], s.neighbours[1], s.radii[1]
@@ -187,10 +192,10 @@ class MPiNetsNetwork(BaselineNetwork):
         nn.init.normal_(last.weight, std=0.01)
         self.register_buffer("step", torch.full((self.dof,), 0.02))
         self.step: Tensor
-        """Size of an expert's step, in units of half the joint ranges."""
+        """Root mean square step of the experts, in units of half the joint ranges."""
 
     def fit_statistics(self, data: TrajectoryData) -> None:
-        """The size of the experts' steps."""
+        """Set the size of the experts' steps."""
         some = data.q[:20_000]
         steps = np.diff(self.normalizer.to_unit(some), axis=1)
         size = np.sqrt(np.square(steps).mean((0, 1)))
@@ -207,12 +212,12 @@ class MPiNetsNetwork(BaselineNetwork):
         with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
             labels = self._labels.to(torch.bfloat16 if fast_bf16() else torch.float32)
             at, features = self.first(points, labels.expand(len(q), *labels.shape))
-            seen = self.cloud_code(self.together(*self.second(at, features)))
+            cloud_code = self.cloud_code(self.together(*self.second(at, features)))
         # bf16 would round configurations to a hundredth of a radian
         x = self.normalizer.to_unit(q)
         way = self.normalizer.to_unit(goal) - x
-        direction = 2 * way / (way.norm(dim=-1, keepdim=True) + SMOOTH)
-        code = torch.cat([seen.float(), self.joint_code(torch.cat([x, direction], -1))], -1)
+        direction = 2 * way / (way.norm(dim=-1, keepdim=True) + DIRECTION_OFFSET)
+        code = torch.cat([cloud_code.float(), self.joint_code(torch.cat([x, direction], -1))], -1)
         return self.normalizer.from_unit((x + self.step * self.decoder(code)).clamp(-1, 1))
 
     def loss(
@@ -242,19 +247,19 @@ class MPiNetsNetwork(BaselineNetwork):
         return Steps(here, after, end, clouds, scenes)
 
     def clouds(self, scenes: PackedScenes, rng: np.random.Generator) -> Float32[Tensor, "n points 3"]:
-        """Random clouds of scenes as the network wants them [m]; zeros where nothing is in reach."""
+        """Random clouds of scenes for the network's input [m]; zeros where nothing is in reach."""
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         return surface_clouds(scenes, self.settings.scene_points, generator, region=self.settings.region)
 
     def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
-        """Share of some motions that are not trivial that a single roll-out brings, free of collision, near
-        enough to the goal that a free straight edge leads to it."""
-        rows = np.flatnonzero(~data.trivial)[:ROLL_OUTS]
+        """Share of some non-trivial problems that a single roll-out solves: it comes near the goal, and the
+        motion with a straight segment to the goal is free of collision."""
+        rows = np.flatnonzero(~data.trivial)[:SUCCESS_PROBLEMS]
         if not len(rows):
             return None
         scenes, q = data.scenes[rows], data.q[rows].astype(np.float32)
         roll_outs = RollOuts(self, self.clouds(scenes, rng), q[:, 0], q[:, -1])
-        for _ in range(ROLL_OUT_STEPS):
+        for _ in range(MAX_ROLL_OUT_STEPS):
             roll_outs.stop(roll_outs.distances() < self.settings.near)
             if not roll_outs.running.any():
                 break
@@ -265,7 +270,7 @@ class MPiNetsNetwork(BaselineNetwork):
 
 
 class RollOuts:
-    """Motions that the policy makes step by step, several at once."""
+    """Rolls out the policy step by step on several problems at once."""
 
     def __init__(
         self,
@@ -277,22 +282,24 @@ class RollOuts:
         """clouds of the scenes [m]; start and goal in [rad]."""
         self.network, self._clouds, self._goal = network, clouds, goal
         self.waypoints = [start]
-        """[n, dof] after each step [rad]; roll-outs that have stopped stay where they are."""
+        """[n, dof] before the first and after each step [rad]; stopped roll-outs stay where they are."""
         self.running = np.ones(len(start), bool)
 
     def distances(self) -> Float[ndarray, "n"]:
-        """How far the joint farthest from its goal is [rad]."""
+        """Largest distance of a joint to its goal [rad]."""
         return np.abs(self.waypoints[-1] - self._goal).max(1)
 
     def stop(self, which: Bool[ndarray, "n"]) -> None:
+        """Stop these roll-outs."""
         self.running &= ~which
 
     def advance(self, noise: Float32[ndarray, "n dof"] | None = None) -> None:
-        """One step of those that run; `noise` [rad] is added to where the policy sees the arm."""
+        """Advance the running roll-outs by one step; noise [rad] is added to the policy's input
+        configuration."""
         rows = np.flatnonzero(self.running)
-        seen = self.waypoints[-1] if noise is None else self.waypoints[-1] + noise
+        input_q = self.waypoints[-1] if noise is None else self.waypoints[-1] + noise
         normalizer = self.network.normalizer
-        q = normalizer.from_unit(normalizer.to_unit(seen[rows]).clip(-1, 1))
+        q = normalizer.from_unit(normalizer.to_unit(input_q[rows]).clip(-1, 1))
         with torch.inference_mode():
             at, goal = torch.from_numpy(q), torch.from_numpy(self._goal[rows])
             moved = self.network(self._clouds[torch.from_numpy(rows)], at, goal).numpy()

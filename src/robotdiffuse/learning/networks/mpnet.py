@@ -1,4 +1,4 @@
-"""MPNet's networks: Enet, which encodes the obstacles, and Pnet, which takes the next step to the goal.
+"""MPNet's networks: Enet, which encodes the obstacles, and Pnet, which predicts the next step to the goal.
 
 A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
 Learning-based and Classical Motion Planners", T-RO 2020. Enet is a contractive auto-encoder of the obstacles'
@@ -8,23 +8,25 @@ randomness comes from. The planner around it is `planning.baselines.mpnet`.
 
 Differences from the paper:
 
-- Enet and Pnet are smaller, to be trained in an hour of one core; see the settings for the paper's sizes.
-- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here one run does both, one after
-  the other: z of an auto-encoder alone does not keep what decides about collisions, and end to end is cheap,
-  as the waypoints of a trajectory share their z.
-- The paper's clouds list the obstacles in a fixed order. A sensed cloud has none, so points are sorted along
-  a space-filling curve: neighbours in the list are neighbours in space, and a perceptron can average them.
+- Enet and Pnet are smaller, so that they train in an hour of one core; the settings name the paper's sizes.
+- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here one run does both in
+  turn: z of an auto-encoder alone loses what decides about collisions, and training end to end is cheap, as
+  the waypoints of a trajectory share their z.
+- The paper's clouds list the obstacles in a fixed order, which a sensed cloud lacks. So points are sorted
+  along a space-filling curve: neighbours in the list are neighbours in space, and a perceptron can average
+  them.
 - The contractive penalty is that of S. Rifai et al., "Contractive auto-encoders", ICML 2011, which the paper
   names; its equation has the squared weights in that place.
-- Pnet gives the step to the next waypoint, in units of the steps of the data, in place of the waypoint: so
-  dropout disturbs the step alone, not where the arm already is.
-- A quarter of Pnet's outputs is dropped, not half: of its narrower layers about as many are left as in the
-  paper. With half, Pnet learns far less in the training that it has here.
+- Pnet outputs the step to the next waypoint, in units of the data's steps, in place of the waypoint: so
+  dropout disturbs the step alone, not the arm's current configuration.
+- A quarter of Pnet's outputs is dropped, not half: its narrower layers then keep about as many as in the
+  paper. With half, Pnet learns far less in this shorter training.
 - Waypoints are 0.7 rad apart on our demonstrations, from a random waypoint on; those of the paper are the
-  vertices of optimised RRT* paths. It is a sixth of a path on average, and the chords are 0.3 % shorter than
-  the paths; steps of one length leave no doubt about it, as steps of a share of the path would.
-- Half of the samples have a later waypoint for their goal, not the last one: such pairs are what
-  bidirectional planning and replanning ask for.
+  vertices of optimised RRT* paths. A step is a sixth of a path on average, and the chords are 0.3 % shorter
+  than the paths. All steps have this length, so that the target is unambiguous; steps of a share of the
+  path's length would not be.
+- Half of the samples have as their goal a later waypoint other than the last one: bidirectional planning and
+  replanning ask for such pairs.
 """
 
 from collections.abc import Sequence
@@ -48,43 +50,44 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
-BITS = 10
-"""Of each coordinate in the place of a point along the space-filling curve."""
+CURVE_BITS = 10
+"""Bits of each coordinate that determine a point's position on the space-filling curve."""
 SUCCESS_PROBLEMS = 64
+"""Held-out problems that `success` tries."""
 SUCCESS_STEPS = 24
-"""Calls of Pnet in a motion of `success`."""
+"""Calls of Pnet for each of these."""
 
 
 @dataclass(frozen=True)
 class MPNetSettings(Settings, name="mpnet"):
     points: Count = 320
-    """Points of the cloud that Enet sees (paper: 1,400, of a plane)."""
+    """Points of Enet's input cloud (paper: 1,400, of a plane)."""
     encoder_layers: Sizes = (384, 256, 128)
     """Layers of Enet between the cloud and z (paper: 512, 256, 128)."""
     decoder_layer: Count = 128
-    """The one layer between z and the reconstruction, which is of no use after the training (paper: the
-    mirror image of Enet)."""
+    """The one layer between z and the reconstruction, used in training only (paper: the mirror image of
+    Enet)."""
     code: Count = 60
     """Size of z (paper: 28, for a plane)."""
     contraction: NotNegative = 1e-3
     """lambda, the weight of the contractive penalty [m^2]."""
     pretraining: Annotated[float, Bound(least=0.0, below=1.0)] = 0.1
-    """Share of the training, the first, in which Enet is trained as an auto-encoder."""
+    """Share of the training, at its beginning, in which Enet is trained as an auto-encoder."""
     layers: Sizes = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
     """Layers of Pnet (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
     dropout: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
     """Share of the outputs of Pnet's layers that is dropped, in planning as in training (paper: 0.5,
     of wider layers)."""
     steady_layers: Natural = 2
-    """So many of Pnet's layers, the last, have no dropout (paper: nearly all have it)."""
+    """Number of Pnet's last layers without dropout (paper: nearly all have it)."""
     step: Positive = 0.7
-    """Way along the path from one waypoint to the next [rad, joint-space L2]."""
+    """Distance along the path from one waypoint to the next [rad, joint-space L2]."""
     waypoints: Count = 8
     """Samples drawn of each trajectory; they share z."""
     sub_goals: Share = 0.5
     """Share of the samples whose goal is a later waypoint of the trajectory than its last one."""
     trivial_share: Share = 0.15
-    """Share of the trajectories in training whose straight line is free as well."""
+    """Share of the training trajectories between ends whose straight line is free too."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -100,7 +103,7 @@ class MPNetNetwork(BaselineNetwork):
     training_defaults: ClassVar[dict[str, Any]] = {"batch": 1024}
     settings: MPNetSettings
     region: VisibleRegion = PANDA_REGION
-    """Where points on obstacles count."""
+    """The region in which points on obstacles count."""
 
     def __init__(self, robot: RobotIdentity, settings: MPNetSettings | None = None) -> None:
         super().__init__(robot, settings or MPNetSettings())
@@ -115,7 +118,7 @@ class MPNetNetwork(BaselineNetwork):
         self.step_scale: Tensor
 
     def fit_statistics(self, data: TrajectoryData) -> None:
-        """The root mean square of the steps between waypoints, which Pnet's output is in units of."""
+        """Set the unit of Pnet's output: the root mean square of the steps between waypoints."""
         if len(data):
             rng = np.random.default_rng(0)
             rows = data.draw(5_000, self.settings.trivial_share, rng)
@@ -124,8 +127,8 @@ class MPNetNetwork(BaselineNetwork):
             self.step_scale.fill_(max(float(np.sqrt(np.mean(step**2))), 1e-3))
 
     def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
-        """z of clouds of `settings.points` points, in any order [m]; all zeros: nothing is in the way."""
-        return self.encoder(arranged(cloud, self.region).flatten(1))
+        """z of clouds of `settings.points` points in any order [m]; all zeros: no obstacles."""
+        return self.encoder(sorted_along_curve(cloud, self.region).flatten(1))
 
     def next_states(
         self,
@@ -145,10 +148,11 @@ class MPNetNetwork(BaselineNetwork):
     def loss(
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
     ) -> Float[Tensor, ""]:
-        """The auto-encoder's loss in the first part of the training [m^2], then Pnet's, through Enet.
+        """The auto-encoder's loss [m^2] in the first part of the training, then Pnet's, end to end through
+        Enet.
 
-        Samples are `waypoints` to a scene. Pnet's is the mean squared error of the steps, in units of their
-        size in the data.
+        Each scene has `waypoints` samples. Pnet's loss is the mean squared error of the steps, in units of
+        the data's steps.
         """
         of = self.settings
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
@@ -167,8 +171,8 @@ class MPNetNetwork(BaselineNetwork):
     def autoencoder_loss(
         self, cloud: Float[Tensor, "batch points 3"], generator: Generator
     ) -> Float[Tensor, ""]:
-        """The mean squared distance of points to their reconstructions, and lambda |dz / d cloud|^2 [m^2]."""
-        flat = arranged(cloud, self.region).flatten(1)
+        """The mean squared distance of points to their reconstructions plus lambda |dz / d cloud|^2 [m^2]."""
+        flat = sorted_along_curve(cloud, self.region).flatten(1)
         z, slopes = self.encoder.with_slopes(flat)
         error = (self.decoder(z).float() - flat).view(len(cloud), -1, 3).square().sum(-1).mean()
         signs = torch.empty_like(z).bernoulli_(0.5, generator=generator) * 2 - 1
@@ -177,11 +181,11 @@ class MPNetNetwork(BaselineNetwork):
     def clouds(
         self, data: TrajectoryData, rows: Int[ndarray, "scenes"], generator: Generator
     ) -> Float[Tensor, "scenes points 3"]:
-        """A random cloud of the obstacles of each of these trajectories [m]."""
+        """A random cloud [m] of the obstacles of each of these trajectories."""
         return surface_clouds(data.scenes[rows], self.settings.points, generator, region=self.region)
 
     def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
-        """Share of held-out problems solved by one run of bidirectional planning, without any replanning."""
+        """Share of held-out problems solved by one run of bidirectional planning, without replanning."""
         rows = np.flatnonzero(~data.trivial)[:SUCCESS_PROBLEMS]
         if not len(rows):
             return None
@@ -206,7 +210,8 @@ class MPNetNetwork(BaselineNetwork):
     def _samples(
         self, q: Float[ndarray, "scenes waypoints dof"], rng: np.random.Generator
     ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
-        """Configurations, the waypoints that follow them, and goals, in random directions [rad]."""
+        """Configurations, the waypoints after them, and goals [rad], along trajectories in a random
+        direction."""
         of, last = self.settings, q.shape[1] - 1
         spacing = np.linalg.norm(np.diff(q, axis=1), axis=2).mean(1)
         stride = np.clip(np.rint(of.step / np.maximum(spacing, 1e-6)), 1, last).astype(np.int64)
@@ -223,7 +228,7 @@ class MPNetNetwork(BaselineNetwork):
 
 
 def refined(path: Float[ndarray, "n waypoints dof"], parts: int) -> Float[ndarray, "n _ dof"]:
-    """The path with so many equal parts in place of each of its segments."""
+    """The path with each segment divided into so many equal parts."""
     n, waypoints, dof = path.shape
     share = (np.arange(parts, dtype=path.dtype) / parts)[:, None]
     dense = path[:, :-1, None] + share * np.diff(path, axis=1)[:, :, None]
@@ -231,7 +236,7 @@ def refined(path: Float[ndarray, "n waypoints dof"], parts: int) -> Float[ndarra
 
 
 class Perceptron(nn.Module):
-    """Linear layers with a PReLU between each two."""
+    """Linear layers with PReLUs between them."""
 
     def __init__(self, sizes: Sequence[int], dropout: float = 0.0, dropped_layers: int = 0) -> None:
         """Dropout follows the first `dropped_layers` activations."""
@@ -247,7 +252,7 @@ class Perceptron(nn.Module):
     def forward(
         self, x: Float[Tensor, "batch inputs"], generator: Generator | None = None
     ) -> Float[Tensor, "batch outputs"]:
-        """Dropout is drawn from the generator; None: there is none."""
+        """The output; dropout is drawn from the generator, None: no dropout."""
         for i, activation in enumerate(self.activations):
             x = activation(self.linear[i](x))
             if generator is not None and i < self.dropped_layers:
@@ -256,7 +261,7 @@ class Perceptron(nn.Module):
         return self.linear[-1](x)
 
     def weight(self, layer: int) -> Float[Tensor, "outputs inputs"]:
-        """Of the linear layer of this number."""
+        """The weight of the linear layer with this index."""
         weight = self.linear[layer].weight
         assert isinstance(weight, Tensor)
         return weight
@@ -264,7 +269,7 @@ class Perceptron(nn.Module):
     def with_slopes(
         self, x: Float[Tensor, "batch inputs"]
     ) -> tuple[Float[Tensor, "batch outputs"], list[Float[Tensor, "batch _"]]]:
-        """The output, and the slopes of the activations where they are, from the first layer on."""
+        """The output, and the slopes of the activations at their inputs, from the first layer on."""
         slopes: list[Tensor] = []
         for i, activation in enumerate(self.activations):
             x = self.linear[i](x)
@@ -279,7 +284,7 @@ def squared_slope(
 ) -> Float[Tensor, "batch"]:
     """|J^T s|^2 of the Jacobian J at each input; with random signs s its mean is |J|^2, the sum of squares.
 
-    (M. Hutchinson 1990.) One step back through the layers, where all of J would take one for each output.
+    (M. Hutchinson 1990.) It takes one backward pass, where all of J would take one for each output.
     """
     v = signs
     for i in range(len(slopes), 0, -1):
@@ -287,16 +292,16 @@ def squared_slope(
     return (v @ network.weight(0)).float().square().sum(1)
 
 
-def arranged(
+def sorted_along_curve(
     cloud: Float[Tensor, "batch points 3"], region: VisibleRegion
 ) -> Float[Tensor, "batch points 3"]:
     """The points in the order of a space-filling curve (G. Morton 1966), in the region's frame [m].
 
-    Positions are relative to the region's centre; those of an empty cloud, all zeros, are left at zero.
+    Positions are relative to the region's centre; an empty cloud, all zeros, stays zero.
     """
     filled: Bool[Tensor, "batch 1 1"] = (cloud != 0).flatten(1).any(1)[:, None, None]
     local = (cloud - torch.tensor(region.center).to(cloud)) * filled
-    cells = ((local / region.reach + 1) * 2 ** (BITS - 1)).long().clamp(0, 2**BITS - 1)
+    cells = ((local / region.reach + 1) * 2 ** (CURVE_BITS - 1)).long().clamp(0, 2**CURVE_BITS - 1)
     for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
         cells = (cells | (cells << shift)) & mask
     place = (cells[..., 0] << 2) | (cells[..., 1] << 1) | cells[..., 2]

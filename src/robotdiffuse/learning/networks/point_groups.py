@@ -1,7 +1,7 @@
 """Compiled grouping of point clouds for PointNet++: furthest point sampling and ball query in one pass.
 
-Both are of C. Qi et al., "PointNet++", NeurIPS 2017. The distances from a new centre to all points, which
-the sampling needs, are those that its ball query needs.
+Both are of C. Qi et al., "PointNet++", NeurIPS 2017. Both need the
+distances from a new centre to all points, which are computed once.
 """
 
 import numpy as np
@@ -10,11 +10,12 @@ from numba import njit
 
 @njit(cache=True, nogil=True, fastmath=True)
 def group_points(points, count, neighbours, radius):
-    """Centres [n, count] and the points around each [n, count, neighbours], as indices into points [n, m, 3].
+    """Indices into points [n, m, 3] of centres [n, count], and of the points around each [n, count,
+    neighbours].
 
-    Centres: first the point furthest from the mean, then always the one furthest from those that are chosen.
-    Around a centre: the nearest points within the radius, the nearest first, which is the centre itself;
-    where there are fewer, the centre repeats. So the order of the points makes no difference.
+    The first centre is the point farthest from the mean, each further one the point farthest from the centres
+    so far. Around a centre: the nearest points within the radius, beginning with the centre itself; where
+    there are fewer, the centre repeats. So the order of the points makes no difference.
     """
     n, m = points.shape[:2]
     centres = np.empty((n, count), np.int64)

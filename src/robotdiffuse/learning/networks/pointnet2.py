@@ -1,7 +1,7 @@
 """PointNet++ without normalisation layers, as MPiNets uses it: set abstraction, then all points at once.
 
 C. Qi et al., "PointNet++: Deep hierarchical feature learning on point sets in a metric space", NeurIPS 2017.
-Around each centre the nearest points of the ball are taken; the authors take the first that they find.
+Around each centre the nearest points of the ball are taken; the authors take the first in the cloud's order.
 """
 
 from itertools import pairwise
@@ -11,12 +11,13 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-from robotdiffuse.learning.max_pool import greatest
+from robotdiffuse.learning.max_pool import max_pool
 from robotdiffuse.learning.networks.point_groups import group_points
 
 
-class _Rectified(torch.autograd.Function):
-    """relu(x W^T + b), whose gradient for b is a product: PyTorch's sum over bf16 rows is slow on CPUs."""
+class _LinearReLU(torch.autograd.Function):
+    """relu(x W^T + b), whose gradient for b is a matrix product: PyTorch's sum over bf16 rows is slow on
+    CPUs."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -33,7 +34,7 @@ class _Rectified(torch.autograd.Function):
 
 
 class PooledLayers(nn.Module):
-    """Linear layers with ReLUs that see each point by itself, and the maximum of a group's points."""
+    """Linear layers with ReLUs on each point by itself, then the maximum over a group's points."""
 
     def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
         super().__init__()
@@ -45,15 +46,15 @@ class PooledLayers(nn.Module):
         rows = x.reshape(-1, x.shape[-1])
         for layer in self.layers:
             weight, bias = (parameter.to(x.dtype) for parameter in layer.parameters())
-            rows = _Rectified.apply(rows, weight, bias)
-        # the last bias and ReLU do not change which point is the greatest
+            rows = _LinearReLU.apply(rows, weight, bias)
+        # the last bias and ReLU do not change which point has the maximum
         rows = rows @ self.last.weight.to(x.dtype).t()
-        best = greatest(rows.view(-1, x.shape[-2], self.last.out_features))
+        best = max_pool(rows.view(-1, x.shape[-2], self.last.out_features))
         return (best + self.last.bias.to(x.dtype)).relu().view(*x.shape[:-2], -1)
 
 
 class SetAbstraction(nn.Module):
-    """Some of the points, each with features of what is around it."""
+    """Selects some of the points, with features computed from the points around each."""
 
     def __init__(
         self, channels: int, widths: tuple[int, ...], centres: int, neighbours: int, radius: float
@@ -66,7 +67,7 @@ class SetAbstraction(nn.Module):
     def forward(
         self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n channels"]
     ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m width"]]:
-        """The centres [m] and their features; points in [m]."""
+        """The centres and their features; points and centres in [m]."""
         found = group_points(points.detach().numpy(), self.centres, self.neighbours, self.radius)
         centres, around = (torch.from_numpy(part) for part in found)
         at = _rows(points, centres)
@@ -76,7 +77,7 @@ class SetAbstraction(nn.Module):
 
 
 class GroupAll(nn.Module):
-    """Features of all points together."""
+    """Computes features of all points together."""
 
     def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
         super().__init__()
@@ -89,7 +90,7 @@ class GroupAll(nn.Module):
 
 
 def _rows(values: Float[Tensor, "b n c"], at: Int64[Tensor, "b *m"]) -> Float[Tensor, "b *m c"]:
-    """The rows of each cloud that `at` names."""
+    """The rows of each cloud with the indices `at`."""
     b, n, c = values.shape
     first = torch.arange(0, b * n, n).view(b, *[1] * (at.dim() - 1))
     return values.reshape(b * n, c).index_select(0, (at + first).reshape(-1)).view(*at.shape, c)

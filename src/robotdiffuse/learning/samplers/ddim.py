@@ -1,16 +1,4 @@
-"""DDIM (Song et al. 2021): deterministic, or with a share of the noise drawn afresh at every step.
-
-It is Euler's method for flows too. On the flow schedule, with t from 1 to 0, x_t = (1 - t) x_0 + t n and the
-velocity is dx/dt = n - x_0. The predicted x_0 makes it v = (x_t - x_0) / t, and Euler's step from t to s is
-
-    x_s = x_t + (s - t) v = (s / t) x_t + (1 - s / t) x_0.
-
-DDIM keeps x_0 and the noise n = (x_t - (1 - t) x_0) / t that belongs to it, and mixes them anew:
-
-    x_s = (1 - s) x_0 + s n = (s / t) x_t + (1 - s - s (1 - t) / t) x_0 = (s / t) x_t + (1 - s / t) x_0,
-
-the same rule. On other schedules DDIM is Euler's method in x / signal over noise / signal (eq. 14 there).
-"""
+"""DDIM (Song et al. 2021): deterministic, or with a share of fresh noise at every step."""
 
 from itertools import pairwise
 
@@ -24,16 +12,16 @@ from robotdiffuse.learning.samplers.sampler import DrawNoise, Predict, check_eta
 def ddim(
     predict: Predict, schedule: NoiseSchedule, draw_noise: DrawNoise, steps: int, eta: float = 0.0
 ) -> Float[ndarray, "count ..."]:
-    """See `Sampler`."""
+    """Samples by DDIM; arguments and errors as in `Sampler`."""
     check_eta(eta)
     levels = schedule.sampling_levels(steps).tolist()
     x = draw_noise()
     for level, lower in pairwise(levels[:-1]):
-        x = ddim_step(x, predict(x, level), schedule, level, lower, draw_noise, eta)
+        x = _step(x, predict(x, level), schedule, level, lower, draw_noise, eta)
     return predict(x, levels[-2])
 
 
-def ddim_step(
+def _step(
     x: Float[ndarray, "count ..."],
     clean: Float[ndarray, "count ..."],
     schedule: NoiseSchedule,
@@ -42,15 +30,14 @@ def ddim_step(
     draw_noise: DrawNoise,
     eta: float,
 ) -> Float[ndarray, "count ..."]:
-    """x at the level `lower` from x at `level` and its clean prediction (Song et al. 2021, eq. 12).
+    """x at the level `lower`, from x at `level` and its clean prediction (Song et al. 2021, eq. 12).
 
-    The noise seen in x is kept, but for the share that is drawn afresh: eq. 16 there, written so that it
-    also holds for schedules that do not keep the variance (flows).
+    The noise found in x is kept, except for the share that is drawn afresh (eq. 16).
     """
     signal, noise = float(schedule.signal[level]), float(schedule.noise[level])
     signal_low, noise_low = float(schedule.signal[lower]), float(schedule.noise[lower])
-    seen = (x - signal * clean) / noise
+    found = (x - signal * clean) / noise
     added = max(noise**2 - (signal / signal_low * noise_low) ** 2, 0.0) ** 0.5
     fresh = eta * noise_low / noise * added
-    x = signal_low * clean + (noise_low**2 - fresh**2) ** 0.5 * seen
+    x = signal_low * clean + (noise_low**2 - fresh**2) ** 0.5 * found
     return x + fresh * draw_noise() if fresh > 0 else x

@@ -1,4 +1,5 @@
-"""DDPM, ancestral sampling (Ho et al. 2020): the paper's sampler, with all T levels; MPD's and EDMP's."""
+"""DDPM, ancestral sampling (Ho et al. 2020): the sampler of the paper, with all T levels, of MPD and of
+EDMP."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -11,8 +12,9 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.diffusion import NoiseSchedule
 from robotdiffuse.learning.samplers.sampler import DrawNoise, Predict, check_eta
 
-Move = Callable[[ndarray, int], ndarray]
-"""The mean of a step [count, ...], and how many steps are still to come, to the mean that is used."""
+MoveMean = Callable[[ndarray, int], ndarray]
+"""From the mean of a step [count, ...] and the number of steps that remain to the mean that is used
+instead."""
 
 
 def ddpm(
@@ -22,9 +24,9 @@ def ddpm(
     steps: int | None = None,
     eta: float = 1.0,
 ) -> Float[ndarray, "count ..."]:
-    """See `Sampler`; None for `steps` is all T of them.
+    """Samples by DDPM; arguments and errors as in `Sampler`. None for `steps`: all T.
 
-    Ancestral sampling draws all of its noise afresh, so `eta` changes nothing.
+    Ancestral sampling draws all of its noise afresh, so `eta` has no effect.
     """
     check_eta(eta)
     levels = schedule.sampling_levels(schedule.steps if steps is None else steps)
@@ -36,19 +38,21 @@ def ancestral(
     schedule: NoiseSchedule,
     draw_noise: DrawNoise,
     levels: Int[ndarray, "steps"],
-    move: Move | None = None,
+    move: MoveMean | None = None,
     noise_scale: float = 1.0,
 ) -> Float[ndarray, "count ..."]:
-    """Ancestral sampling (Ho et al. 2020, algorithm 2) at any levels, with means that may be moved.
+    """Samples by ancestral sampling (Ho et al. 2020, algorithm 2) at any levels; the means may be moved.
 
     Each x is drawn from q(x_lower | x_level, x_0) at the predicted x_0, whose variance is beta tilde (Ho et
     al. 2020, eq. 7; between any two levels, Kingma et al. 2021, eq. 25).
 
-    levels: falling; the first is where standard noise is put, and below the last comes the clean x_0.
-    move: moves the means, down the costs of a guide, say (MPD, algorithm 1).
-    noise_scale: factor of the standard deviation that is added to the means (MPD: 0.5).
+    levels: falling. Sampling begins with standard noise at the first and ends with the clean x_0 below the
+        last.
+    move: replaces the mean of a step, for example by one further down the costs of a guide (MPD, algorithm
+        1).
+    noise_scale: factor of the standard deviation of the noise that is added to the means (MPD: 0.5).
 
-    Raises InputError for levels that do not fall, or are not of the schedule.
+    Raises InputError for levels that do not fall, or that the schedule lacks.
     """
     if not len(levels) or np.any(np.diff(levels) >= 0) or not 1 <= levels[-1] <= levels[0] <= schedule.steps:
         raise InputError(f"levels is {levels.tolist()}; they must fall from at most {schedule.steps} to 1")

@@ -1,4 +1,4 @@
-"""Training of a learned baseline on the same planned trajectories as the product's own network."""
+"""Training of a learned baseline's network on the same planned trajectories as the diffusion model."""
 
 from pathlib import Path as FilePath
 from typing import Any
@@ -17,14 +17,14 @@ from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.config import BaselineTraining
 from robotdiffuse.learning.training.loop import Validation
 from robotdiffuse.learning.training.processes import Processes
-from robotdiffuse.learning.training.task import MotionTrainee, train
+from robotdiffuse.learning.training.task import MotionTask, train
 from robotdiffuse.robots import load_robot
 
 
 def baseline_training(name: str, given: dict[str, Any]) -> BaselineTraining:
-    """The settings of a network, and what is given beside them, which wins.
+    """The training settings of a baseline's network, with the given changes.
 
-    Raises InputError for an unknown name, listing the known, and for a network that is no baseline.
+    Raises InputError for an unknown name, listing the known ones, and for a network that is no baseline.
     """
     kind = NETWORKS.load(name)
     if not issubclass(kind, BaselineNetwork):
@@ -37,15 +37,15 @@ def baseline_training(name: str, given: dict[str, Any]) -> BaselineTraining:
 def train_baseline(settings: BaselineTraining, out: str) -> dict[str, float]:
     """Train a network with its default settings; write NAME.safetensors and NAME.json into the folder `out`.
 
-    The same call continues a run that was interrupted. Returns `validation`, the loss on trajectories kept
-    aside, `success`, what it solves of them by itself, and `samples`. Raises as `trainee.train`, and
-    InputError if the data do not fit.
+    The same call continues a run that was interrupted. Returns `validation`, the loss on held-out
+    trajectories, `success`, the share of their problems that the network solves by itself, and `samples`.
+    Raises as `task.train`, and InputError if the data do not fit.
     """
     processes = Processes(settings.device)
-    return train(_BaselineTrainee(settings, processes), settings, out, processes)
+    return train(_BaselineTask(settings, processes), settings, out, processes)
 
 
-class _BaselineTrainee(MotionTrainee):
+class _BaselineTask(MotionTask):
     module: BaselineNetwork
 
     def __init__(self, settings: BaselineTraining, processes: Processes) -> None:
@@ -54,11 +54,11 @@ class _BaselineTrainee(MotionTrainee):
         kind, own = NETWORKS.load(settings.name), NETWORKS.defaults(settings.name)
         self.module = kind(RobotIdentity.of(robot), own)
         super().__init__(settings, robot, None, processes)
-        self.module.fit_statistics(self.kept)
+        self.module.fit_statistics(self.train_data)
         self.identity = {"robot": robot.name, "network": repr(own)}
 
     def loss_of(
-        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, held_out: bool
+        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
     ) -> Float[Tensor, ""]:
         return self.module.loss(data, self.settings.batch, fraction, rng)
 
@@ -69,7 +69,7 @@ class _BaselineTrainee(MotionTrainee):
         return validation
 
     def success(self, rng: np.random.Generator) -> float | None:
-        return self.module.success(self.held_out, self.robot, rng)
+        return self.module.success(self.validation_data, self.robot, rng)
 
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
         save_network(self.title, self.module, folder, training)

@@ -1,4 +1,4 @@
-"""What training draws from: planned trajectories with the codes of their scenes, and random scenes."""
+"""Training data: planned trajectories with the codes of their scenes, random scenes, and batches of these."""
 
 import hashlib
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
@@ -22,15 +22,14 @@ from robotdiffuse.learning.checkpoint import fingerprint
 from robotdiffuse.learning.clearance_features import PackedClearanceFn
 from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.learning.training.views import clouds_of_views, codes_of_views
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 
 
 def random_scenes(count: int, max_obstacles: int, rng: np.random.Generator) -> PackedScenes:
-    """Scenes for the encoder, a third each: two large obstacles as in ROP, several of the sizes of
-    dense ROP, and any number of boxes and spheres of any size and orientation."""
+    """Random scenes for training an encoder. A third each: two large obstacles as in ROP; several of the
+    sizes of dense ROP; any number of boxes and spheres of any size and orientation."""
     family = rng.integers(0, 3, count)
     number = np.where(family == 0, 2, rng.integers(0, max_obstacles + 1, count))
     shape = (count, max_obstacles)
@@ -60,32 +59,29 @@ class TrajectoryData:
     """[rad], float32, evenly spaced along the path."""
     scenes: PackedScenes
     trivial: Bool[ndarray, "n"]
-    """The straight line from start to goal is free too."""
+    """Whether the straight line from start to goal is free too."""
     codes: Float[ndarray, "n code"] | None
-    """z of each scene, float16; None where the encoder is trained along, or there is none."""
+    """z of each scene, float16; None if there is no frozen encoder."""
     digest: str
-    """SHA-256 of the shards, the first 16 digits."""
+    """The first 16 digits of the SHA-256 of the shards."""
     validation: int
-    """So many rows, the last, are of the split for validation; the others are of that for training."""
-    clouds: Float16[ndarray, "n points 3"] | None = None
-    """What an encoder that is trained along is told of a view of each scene [m]; None where it is told of
-    whole scenes."""
+    """Number of rows of the validation split, which come last; the others are of the training split."""
 
     def __len__(self) -> int:
         return len(self.q)
 
     def split(self, most: int) -> "tuple[TrajectoryData, TrajectoryData]":
-        """The rows for training, and at most so many of those for validation."""
+        """The rows for training, and at most `most` of those for validation."""
         cut = len(self) - self.validation
         return self._rows(slice(None, cut), 0), self._rows(slice(cut, cut + most), min(most, self.validation))
 
     @cached_property
     def pools(self) -> tuple[Int[ndarray, "m"], Int[ndarray, "k"]]:
-        """Rows that are trivial, and rows that are not."""
+        """Indices of the trivial rows, and of the others."""
         return np.flatnonzero(self.trivial), np.flatnonzero(~self.trivial)
 
     def draw(self, count: int, trivial_share: float, rng: np.random.Generator) -> Int[ndarray, "count"]:
-        """Random rows, so large a share of them trivial where the data have both kinds."""
+        """Indices of random rows, with this share of trivial ones if the data have both kinds."""
         share = trivial_share if all(map(len, self.pools)) else float(len(self.pools[0]) > 0)
         easy = rng.random(count) < share
         rows = np.empty(count, np.int64)
@@ -101,12 +97,11 @@ class TrajectoryData:
             None if self.codes is None else self.codes[rows],
             self.digest,
             validation,
-            None if self.clouds is None else self.clouds[rows],
         )
 
 
-_Part = tuple[ndarray, PackedScenes, ndarray, ndarray, ndarray]
-"""Motions, scenes, whether trivial, codes and clouds."""
+_Part = tuple[ndarray, PackedScenes, ndarray, ndarray]
+"""Trajectories, scenes, whether they are trivial, codes."""
 
 
 def load_data(
@@ -115,45 +110,37 @@ def load_data(
     encoder: Encoder | None,
     waypoints: int,
     report: Callable[[str], None],
-    turns: int = 0,
-    views: bool = False,
-    along: Encoder | None = None,
+    turned_copies: int = 0,
 ) -> TrajectoryData:
-    """The rows for training and validation of a data set, at `waypoints` waypoints, with the codes of their
+    """The rows of a data set for training and validation, resampled to `waypoints`, with codes of their
     scenes.
 
-    turns: copies of each row for training that are turned by random angles, see `turns.py`; none if the
-        robot's first joint is not vertical.
-    views: whether an encoder is told what one camera sees of each scene, see `views.random_views`, and not of
-        all its surfaces.
-    along: with `views`, the encoder that is trained along: the rows have clouds for it, and no codes.
+    turned_copies: copies of each training row that are turned by random angles, see `datasets.augmentation`;
+        none if the robot's first joint is not vertical.
+    report: called with messages on the progress.
 
-    Codes are kept beside the shards, in files named by shard and encoder; where the folder cannot be written
-    they are made each time. Without an encoder there are none. `report` is told what is being done. Raises
-    InputError, naming the file, if there is no data set, a shard is damaged, or the robot is another.
+    Codes are cached beside the shards, in files named by shard and encoder; if the folder cannot be written,
+    they are computed at every call. Without an encoder there are none. Raises InputError, naming the file, if
+    there is no data set, a shard is damaged, or the robot is another.
     """
-    if turns and not turns_about_vertical(robot):
-        report(f"data: no turned copies, for {robot.joint_names[0]} does not turn about the base's vertical")
-        turns = 0
+    if turned_copies and not turns_about_vertical(robot):
+        report(f"data: no turned copies, as {robot.joint_names[0]} does not turn about the base's vertical")
+        turned_copies = 0
     parts: dict[str, list[_Part]] = {"train": [], "validation": []}
-    encoder_print = "" if encoder is None else fingerprint(encoder) + "-views" * views
+    encoder_fingerprint = "" if encoder is None else fingerprint(encoder)
     prints: list[str] = []
     count, shards = 0, len(shard_indices(folder))
-    for rows in read_rows(folder, robot, waypoints, turns):
+    for rows in read_rows(folder, robot, waypoints, turned_copies):
         prints += [rows.shard.fingerprint] * (rows.turn == 0)
-        key = f"{rows.shard.fingerprint}-{encoder_print}" + (f"-turn{rows.turn}" if rows.turn else "")
-        starts = rows.q[:, 0] if views else None
-        codes = _codes(FilePath(folder), rows.scenes, encoder, key, robot, starts)
-        clouds = np.zeros((len(codes), 0, 3), np.float16)
-        if starts is not None and along is not None:
-            clouds = clouds_of_views(along, rows.scenes, robot, starts, _rng_of(key))
+        key = f"{rows.shard.fingerprint}-{encoder_fingerprint}" + (f"-turn{rows.turn}" if rows.turn else "")
+        codes = _codes(FilePath(folder), rows.scenes, encoder, key)
         for name, found in parts.items():
             of = rows.split == SPLITS.index(name)
-            found.append((rows.q[of], rows.scenes[of], rows.shard["line_free"][of], codes[of], clouds[of]))
+            found.append((rows.q[of], rows.scenes[of], rows.shard["line_free"][of], codes[of]))
             count += int(of.sum())
-        if rows.turn == turns:
+        if rows.turn == turned_copies:
             report(f"data: {len(prints)} of {shards} shards, {count:,} trajectories")
-    q, scenes, trivial, codes, clouds = zip(*parts["train"], *parts["validation"], strict=True)
+    q, scenes, trivial, codes = zip(*parts["train"], *parts["validation"], strict=True)
     return TrajectoryData(
         np.concatenate(q),
         PackedScenes.joined(scenes),
@@ -161,12 +148,7 @@ def load_data(
         None if encoder is None else np.concatenate(codes),
         hashlib.sha256("".join(prints).encode()).hexdigest()[:16],
         sum(len(part[0]) for part in parts["validation"]),
-        np.concatenate(clouds) if views and along is not None else None,
     )
-
-
-def _rng_of(key: str) -> np.random.Generator:
-    return np.random.default_rng(int(key[:8], 16))
 
 
 def _codes(
@@ -174,11 +156,8 @@ def _codes(
     scenes: PackedScenes,
     encoder: Encoder | None,
     key: str,
-    robot: Robot,
-    starts: Float[ndarray, "n dof"] | None,
 ) -> Float[ndarray, "n code"]:
-    """Codes of scenes, or with starts of views of them, kept in a file named by `key`; of no numbers where
-    there is no encoder."""
+    """Codes of scenes, cached in a file named by `key`; without an encoder they have no numbers."""
     if encoder is None:
         return np.zeros((len(scenes), 0), np.float16)
     cache = folder / "codes" / f"{key}.npy"
@@ -188,25 +167,21 @@ def _codes(
             if len(codes) == len(scenes):
                 return codes
         except (OSError, ValueError, EOFError):
-            pass  # damaged: made again below
-    if starts is None:
-        codes = encode_scenes(encoder, scenes, _rng_of(key))
-    else:
-        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
-            codes = codes_of_views(encoder, scenes, robot, starts, _rng_of(key))
+            pass  # damaged: computed again below
+    codes = encode_scenes(encoder, scenes, np.random.default_rng(int(key[:8], 16)))
     try:
         buffer = BytesIO()
         np.save(buffer, codes)
         write_atomically(cache, buffer.getvalue(), make_folder=True)
     except InputError:
-        pass  # a read-only data folder: the codes are made again next time
+        pass  # a read-only data folder: the codes are computed again next time
     return codes
 
 
 def encode_scenes(
     encoder: Encoder, scenes: PackedScenes, rng: np.random.Generator
 ) -> Float[ndarray, "n code"]:
-    """z of each scene from a random cloud, as float16."""
+    """z of each scene from a random cloud, float16."""
     codes = [np.zeros((0, encoder.settings.code), np.float16)]
     for i in range(0, len(scenes), 256):
         clouds = scene_clouds(encoder, scenes[i : i + 256], rng)
@@ -218,7 +193,7 @@ def encode_scenes(
 def scene_clouds(
     encoder: Encoder, scenes: PackedScenes, rng: np.random.Generator, points: int | None = None
 ) -> Float32[Tensor, "n points 3"]:
-    """A random cloud of each scene as the encoder wants them, or of so many points [m]."""
+    """A random cloud of each scene [m], of `points` points; None: of the encoder's number."""
     settings = encoder.settings
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     return surface_clouds(scenes, points or settings.cloud, generator, region=settings.region)
@@ -231,32 +206,32 @@ def fast_bf16() -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Noisy trajectories and their clean ones; float32."""
+    """Noisy trajectories and the clean ones they were made from; float32."""
 
-    features: Float[ndarray, "n rows features"]
+    features: Float[ndarray, "n waypoints features"]
     level: Float[ndarray, "n"]
     """t / T"""
     condition: Float[ndarray, "n condition"]
-    """With zeros for z where there are clouds."""
+    """With zeros for z if there are clouds."""
     clouds: Float32[Tensor, "n points 3"] | None
-    """Of the scenes [m], where the encoder is trained along."""
-    clean: Float[ndarray, "n rows dof"]
-    noisy: Float[ndarray, "n rows dof"]
-    target: Float[ndarray, "n rows dof"]
-    """What the network is to output, by the model's objective."""
+    """Clouds of the scenes [m], for an encoder that is trained jointly."""
+    clean: Float[ndarray, "n waypoints dof"]
+    noisy: Float[ndarray, "n waypoints dof"]
+    target: Float[ndarray, "n waypoints dof"]
+    """The output that the network is trained towards, by the model's objective."""
     weight: Float[ndarray, "n"]
-    """Of the squared error of the output, by level."""
+    """Weight of the squared error of the output, by level."""
     clean_weight: Float[ndarray, "n"]
-    """The same of errors of the clean trajectory that the output stands for."""
-    base: Float[ndarray, "n rows dof"]
-    """What rows are relative to, see `Between`."""
+    """Weight of the squared error of the clean trajectory that the output stands for."""
+    base: Float[ndarray, "n waypoints dof"]
+    """`Reference.base` of the trajectories."""
     signal: Float[ndarray, "n 1 1"]
     noise_level: Float[ndarray, "n 1 1"]
     scenes: PackedScenes
 
 
 class Batches:
-    """Draws training batches: rows of the data, forwards or reversed (as good a path), at random levels."""
+    """Draws training batches: rows of the data at random levels, half of them reversed, which are as good."""
 
     def __init__(
         self,
@@ -272,27 +247,25 @@ class Batches:
     def draw(self, count: int, rng: np.random.Generator) -> Batch:
         """A random batch."""
         rows = self.data.draw(count, self.trivial_share, rng)
-        # One level from each of `count` equal parts of the range: less variance than independent draws.
+        # one level from each of `count` equal parts of the range: less variance than independent draws
         parts = (np.arange(count) + rng.random(count)) / count
         levels = 1 + (parts * self.model.schedule.steps).astype(np.int64)
         return self.at(rows, np.minimum(levels, self.model.schedule.steps), rng)
 
     def at(self, rows: ndarray, levels: ndarray, rng: np.random.Generator) -> Batch:
-        """These rows at these noise levels."""
+        """The batch of these rows at these noise levels."""
         data, model, schedule = self.data, self.model, self.model.schedule
         scenes = data.scenes[rows]
         codes, clouds = np.zeros((len(rows), model.settings.code), np.float32), None
         if data.codes is not None:
             codes = data.codes[rows].astype(np.float32)
-        elif data.clouds is not None:
-            clouds = torch.from_numpy(data.clouds[rows].astype(np.float32))
         elif model.encoder is not None:
             clouds = scene_clouds(model.encoder, scenes, rng)
         q = data.q[rows]
         back = rng.random(len(rows)) < 0.5
         q[back] = q[back, ::-1]
-        between = model.between(q[:, 0], q[:, -1])
-        clean = model.to_rows(q, between)
+        reference = model.reference(q[:, 0], q[:, -1])
+        clean = model.normalize(q, reference)
         signal, noise_level = (
             a[levels].astype(np.float32)[:, None, None] for a in (schedule.signal, schedule.noise)
         )
@@ -301,9 +274,9 @@ class Batches:
         target = model.objective.target(clean, noise, signal, noise_level)
         weight = model.objective.weight(schedule, levels, self.weight_limit)
         per_output = model.objective.clean_per_output(schedule.signal[levels], schedule.noise[levels])
-        held = model.hold(noisy.copy(), between)
+        held = model.hold_ends(noisy.copy(), reference)
         return Batch(
-            features=model.features(held, between, lambda at: self.clearances(scenes, at)),
+            features=model.features(held, reference, lambda at: self.clearances(scenes, at)),
             level=(levels / schedule.steps).astype(np.float32),
             condition=model.condition(codes, q[:, 0], q[:, -1]),
             clouds=clouds,
@@ -312,7 +285,7 @@ class Batches:
             target=target,
             weight=weight.astype(np.float32),
             clean_weight=(weight / per_output**2).astype(np.float32),
-            base=between.base,
+            base=reference.base,
             signal=signal,
             noise_level=noise_level,
             scenes=scenes,

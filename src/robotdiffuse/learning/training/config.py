@@ -1,4 +1,4 @@
-"""Settings of training runs: what all share, and those of an encoder, the diffusion model and a baseline."""
+"""Settings of training runs: the common ones, and those of encoders, the diffusion model and baselines."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -17,9 +17,9 @@ from robotdiffuse.core.settings import (
 )
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import DenoiserSettings
-from robotdiffuse.learning.encoders import COMPLETES, ENCODERS
+from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.encoders.base import EncoderSettings
-from robotdiffuse.learning.motion_model import MOST_WAYPOINTS, ModelParts
+from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.training.losses import LossSettings
 
@@ -29,30 +29,32 @@ DEVICES = ("cpu", "cuda")
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingSettings(Settings):
-    """What every training run is told."""
+    """Settings of every training run."""
 
     minutes: Positive | None = 40.0
     """Length of the run in wall time [min]; the learning rate reaches 0 at its end. None: by `samples`."""
     samples: Count | None = None
-    """Length of the run in training samples. Runs of a given length are reproducible, timed ones are not."""
+    """Length of the run in training samples. Runs of this kind are reproducible, timed ones are not."""
     seed: Natural = 0
     batch: Count = 128
     """Samples per step."""
     learning_rate: Positive = 1e-3
-    """Peak, for AdamW."""
+    """Peak learning rate of AdamW."""
     warmup_steps: Natural = 500
     weight_decay: NotNegative = 0.0
     gradient_norm: Positive = 1.0
     """Gradients are scaled down to this norm."""
     average: ShareBelowOne = 0.9995
-    """Decay of the moving average of the weights; the average is what is kept."""
+    """Decay of the moving average of the weights; the average is what is saved."""
     bad_steps: Count = 10
-    """So many steps in a row with a loss that is not finite take training back to the last checkpoint."""
+    """After this number of consecutive steps with a loss that is not finite, training goes back to the last
+    checkpoint."""
     threads: Count = 1
-    """Threads of PyTorch: one thread beside other work is several times faster than two."""
+    """Threads of PyTorch. While other processes keep the cores busy, one is several times faster than two."""
     device: Annotated[str, OneOf(DEVICES)] | None = None
     """cpu or cuda; None: cuda if there is one."""
     checkpoint_seconds: NotNegative = 120.0
+    """Time between checkpoints [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,7 +69,7 @@ class EncoderTraining(TrainingSettings):
     """Training of an auto-encoder of point clouds alone; it is frozen afterwards (paper, eq. l_AE)."""
 
     name: Annotated[str, OneOf(ENCODERS)] = "point_autoencoder"
-    """Which one; an encoder that is trained alone."""
+    """Name of an encoder that is trained alone."""
     minutes: Positive | None = 5.0
     batch: Count = 32
     """Clouds per step."""
@@ -78,21 +80,20 @@ class EncoderTraining(TrainingSettings):
     max_obstacles: Natural = 12
     """Most obstacles in a training scene."""
     points: Count = 256
-    """Most points of a training cloud; each step takes between an eighth and all of them. An encoder for
+    """Largest training cloud; each step takes between an eighth and all of these points. An encoder for
     clouds of one size gets that size."""
     regularization: NotNegative = 1e-7
     """The paper's lambda: weight of the sum of squared weights, in the unit of the reconstruction's loss."""
     encoder: Annotated[EncoderSettings | None, SettingsOf("name", ENCODERS)] = None
-    """None: the defaults of that encoder."""
+    """Settings of the encoder; None: its defaults."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         alone = [name for name, entry in ENCODERS.items() if entry.kind == "alone"]
         if self.name not in alone:
-            completes = ENCODERS[self.name].kind == COMPLETES
-            how = "by train completion" if completes else "jointly with the planner"
             raise InputError(
-                f"name is {self.name}, an encoder that is trained {how}, not alone; alone: {', '.join(alone)}"
+                f"name is {self.name}, an encoder that is trained jointly with the planner, not alone; "
+                f"alone: {', '.join(alone)}"
             )
 
 
@@ -103,11 +104,12 @@ class MotionTraining(TrainingSettings):
     data: str
     """Folder of a data set of `robotdiffuse data generate`."""
     robot: str = "panda"
-    """Bundled name, or path to a URDF: the robot that the data are for."""
-    waypoints: Annotated[int, Bound(least=3.0, most=MOST_WAYPOINTS)] = 48
+    """Bundled name, or path to a URDF: the robot of the data."""
+    waypoints: Annotated[int, Bound(least=3.0, most=MAX_WAYPOINTS)] = 48
     """Waypoints of a trajectory (paper: 254)."""
-    turns: Natural = 5
-    """Copies of each trajectory turned about the vertical with their scenes, if the first joint is so."""
+    turned_copies: Natural = 5
+    """Copies of each trajectory, turned about the vertical with their scenes, if the first joint is
+    vertical."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,47 +117,44 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Training of the diffusion model."""
 
     encoder: str | None
-    """Folder with a trained encoder, or with a completing network, or completing_autoencoder for the one that
-    comes with the package: they stay as they are. Or the name of another encoder, pointnet or dgcnn, say,
-    that starts untrained and is trained along, by the planner's loss, on clouds drawn anew each time. None
-    for a prior, which sees no scene."""
-    views: bool = False
-    """Whether the encoder is told what one camera sees of each scene, and not of all its surfaces."""
+    """Folder with a trained encoder, which stays frozen; or the name of an encoder, for example pointnet or
+    dgcnn, that is trained jointly, by the planner's loss, on fresh clouds for every batch. None for a prior,
+    whose inputs do not include the scene."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
-    """Peak, for AdamW (paper: 3e-4)."""
+    """Peak learning rate of AdamW (paper: 3e-4)."""
     weight_decay: NotNegative = 0.01
     weight_limit: Positive | None = 5.0
-    """Most that a noise level weighs in the loss, see NoiseSchedule.weight; None: all weigh the same."""
+    """Largest weight of a noise level in the loss, see NoiseSchedule.weight; None: all have the same
+    weight."""
     losses: LossSettings = field(default_factory=LossSettings)
     """The paper's losses of joints, points and collision."""
     trivial_share: Share = 0.1
-    """Share of the batch whose straight line is free. They teach to leave the line alone."""
+    """Share of the batch with a free straight line from start to goal, so that the network learns to keep
+    it."""
     smooth_noise: bool = True
-    """Noise with the covariance of the trajectories over the waypoints; otherwise white (the paper's)."""
+    """Whether the noise has the covariance of the trajectories over the waypoints; otherwise white (the
+    paper's)."""
     validation_problems: Natural = 32
-    """Held-out problems that are planned, without guidance, at every checkpoint."""
+    """Held-out problems that are sampled without guidance at every checkpoint."""
     encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = None
-    """Of an encoder that is trained along; None: its defaults."""
+    """Settings of an encoder that is trained jointly; None: its defaults."""
     denoiser_settings: Annotated[DenoiserSettings | None, SettingsOf("denoiser", DENOISERS)] = None
-    """None: the defaults of that denoiser."""
+    """Settings of the denoiser; None: its defaults."""
     condition_drop: ShareBelowOne = 0.0
     """Share of the samples whose condition [z, start, goal] is hidden from the denoiser, for classifier-free
-    guidance (paper: "randomly masked", no share given; Ho and Salimans 2022: 0.1 or 0.2). 0: no guidance."""
+    guidance (paper: "randomly masked", without a number; Ho and Salimans 2022: 0.1 or 0.2). 0: the model
+    cannot be used without its condition."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.target == "limits" and self.smooth_noise:
             raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
-        if self.views and self.encoder is None:
-            raise InputError("views is True and encoder is None; without an encoder no scene is seen at all")
-        if self.encoder_settings is not None and ENCODERS.entry(self.encoder).kind == COMPLETES:
-            raise InputError(f"encoder_settings are given; {self.encoder} comes trained, with its own")
 
     @property
     def jointly(self) -> bool:
-        """Whether the encoder is trained along."""
-        return self.encoder in ENCODERS and ENCODERS.entry(self.encoder).kind != COMPLETES
+        """Whether the encoder is trained with the planner, and not frozen."""
+        return self.encoder in ENCODERS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +162,6 @@ class BaselineTraining(MotionTraining):
     """Training of a baseline's network."""
 
     name: Annotated[str, OneOf(NETWORKS)]
-    """Which network."""
+    """Name of the network."""
     device: Annotated[str, OneOf(("cpu",))] | None = "cpu"
-    """The networks are small."""
+    """The networks are small: they train on the CPU."""

@@ -1,11 +1,12 @@
-"""Named settings of planner training: the paper's, the compact ones that ship, the rows of its Table 2, and
-the prior of MPD and EDMP (see `planning.baselines.guided_prior`).
+"""Named settings of planner training: the paper's, those of the bundled weights, the rows of the paper's
+Table 2, and the prior of MPD and EDMP (see `planning.baselines.guided_prior`).
 
-The rows share everything but what they compare, and a size that a CPU can train. Unlike `paper` they diffuse
-48 waypoints in patches of 4, as residuals to the straight line, with smooth noise: fewer samples teach more.
-Only the row that predicts the noise has the paper's white noise: smooth noise has next to nothing of the high
-frequencies, so the least error there, divided by the little signal of the last levels, is what is sampled.
-Their networks see no clearances, as the paper's: these would make up for what an encoder loses.
+The rows of Table 2 differ only in what they compare, and have a size that a CPU can train. Unlike `paper`
+they diffuse 48 waypoints in patches of 4, as residuals to the straight line, with smooth noise, which takes
+fewer samples to learn. Only the row that predicts the noise has the paper's white noise: smooth noise has
+almost no high frequencies, so small errors in them, divided by the small signal of the last levels, would
+dominate the samples. Clearances are no inputs of these networks, as in the paper: they would compensate for
+what an encoder loses.
 """
 
 from typing import Any, NamedTuple
@@ -20,24 +21,24 @@ from robotdiffuse.learning.training.losses import LossSettings
 JOINT = LossSettings()
 JOINT_POINT = LossSettings(point=0.3, waypoints=4)
 JOINT_POINT_COLLISION = LossSettings(point=0.3, collision=0.05, begin=0.3, waypoints=4)
-"""The paper gives no weights; these make the three losses of one size when predictions are 5 cm off."""
+"""The paper gives no weights; with these the three losses are of one size when predictions are 5 cm off."""
 
-_ROW = {"sees_clearances": False, "condition_drop": 0.1, "losses": JOINT_POINT_COLLISION}
+_TABLE2_ROW = {"clearance_features": False, "condition_drop": 0.1, "losses": JOINT_POINT_COLLISION}
 
 
 class Config(NamedTuple):
     description: str
     changes: dict[str, Any]
-    """To the fields of PlannerTraining."""
+    """Changes to the defaults of PlannerTraining."""
 
 
 CONFIGS: dict[str, Config] = {
     "compact": Config(
-        "what ships: 48 waypoints, 1.7 M parameters, sees clearances and their gradients",
+        "the bundled weights: 48 waypoints, 1.7 M parameters, clearances and their gradients as inputs",
         {
             "minutes": None,
             "samples": 2_400_000,
-            "sees_gradients": True,
+            "clearance_gradients": True,
             "condition_drop": 0.1,
             "losses": JOINT_POINT_COLLISION,
         },
@@ -50,31 +51,30 @@ CONFIGS: dict[str, Config] = {
             "batch": 64,
             "learning_rate": 3e-4,
             "waypoints": 254,
-            "turns": 0,
+            "turned_copies": 0,
             "target": "absolute",
             "smooth_noise": False,
             "sampler": "ddpm",
             "sampling_steps": None,
             "denoiser_settings": TransformerSettings.paper_size(),
-            **_ROW,
+            **_TABLE2_ROW,
         },
     ),
-    "table2_pointnet": Config("encoder PointNet, trained along", {**_ROW, "encoder": "pointnet"}),
-    "table2_dgcnn": Config("encoder DGCNN, trained along", {**_ROW, "encoder": "dgcnn"}),
-    "table2_completing": Config(
-        "encoder completing_autoencoder, frozen", {**_ROW, "encoder": "completing_autoencoder"}
+    "table2_pointnet": Config("encoder PointNet, trained jointly", {**_TABLE2_ROW, "encoder": "pointnet"}),
+    "table2_dgcnn": Config("encoder DGCNN, trained jointly", {**_TABLE2_ROW, "encoder": "dgcnn"}),
+    "table2_unet": Config("temporal U-Net", {**_TABLE2_ROW, "denoiser": "unet"}),
+    "table2_transformer": Config(
+        "encoder-decoder transformer", {**_TABLE2_ROW, "denoiser": "encoder_decoder"}
     ),
-    "table2_unet": Config("temporal U-Net", {**_ROW, "denoiser": "unet"}),
-    "table2_transformer": Config("encoder-decoder transformer", {**_ROW, "denoiser": "encoder_decoder"}),
-    "table2_decoder_only": Config("decoder-only transformer", {**_ROW, "denoiser": "decoder_only"}),
+    "table2_decoder_only": Config("decoder-only transformer", {**_TABLE2_ROW, "denoiser": "decoder_only"}),
     "table2_noise": Config(
-        "noise instead of x_0 is predicted", {**_ROW, "objective": "noise", "smooth_noise": False}
+        "the noise is predicted instead of x_0", {**_TABLE2_ROW, "objective": "noise", "smooth_noise": False}
     ),
-    "table2_joint": Config("L_joint alone", {**_ROW, "losses": JOINT}),
-    "table2_joint_point": Config("L_joint and L_point", {**_ROW, "losses": JOINT_POINT}),
-    "table2_jpc": Config("L_joint, L_point and L_collision", _ROW),
+    "table2_joint": Config("L_joint alone", {**_TABLE2_ROW, "losses": JOINT}),
+    "table2_joint_point": Config("L_joint and L_point", {**_TABLE2_ROW, "losses": JOINT_POINT}),
+    "table2_jpc": Config("L_joint, L_point and L_collision", _TABLE2_ROW),
     "trajectory_prior": Config(
-        "the prior of MPD and EDMP, which sees no scene: temporal U-Net, T = 255, noise predicted",
+        "the prior of MPD and EDMP, without the scene as input: temporal U-Net, T = 255, noise predicted",
         {
             "minutes": 40.0,
             "learning_rate": 2e-3,
@@ -87,7 +87,7 @@ CONFIGS: dict[str, Config] = {
             "sampling_steps": 25,
             "target": "limits",
             "objective": "noise",
-            "sees_clearances": False,
+            "clearance_features": False,
             "smooth_noise": False,
             "weight_limit": None,
             "validation_problems": 24,
@@ -97,15 +97,16 @@ CONFIGS: dict[str, Config] = {
 
 
 def planner_training(name: str, given: dict[str, Any]) -> PlannerTraining:
-    """The settings of a config, and what is given beside it, which wins.
+    """The training settings of a config, with the given changes.
 
-    Raises InputError for an unknown name, listing the known.
+    Raises InputError for an unknown name, listing the known ones, and if neither config nor changes name an
+    encoder.
     """
     if name not in CONFIGS:
         raise unknown_name("config", name, CONFIGS)
     changes = CONFIGS[name].changes | given
     if "encoder" not in changes:
-        raise InputError(f"config {name} needs an encoder: give a folder with a trained one")
+        raise InputError(f"config {name} needs an encoder: name a folder with a trained one")
     if given.get("minutes") is not None:
         changes["samples"] = None
     elif given.get("samples") is not None:

@@ -1,4 +1,5 @@
-"""Training of an auto-encoder of point clouds alone, and what can be read from the codes of any encoder."""
+"""Training of an auto-encoder of point clouds, and a linear read-out that compares the codes of any
+encoder."""
 
 from pathlib import Path as FilePath
 from typing import Any
@@ -15,32 +16,31 @@ from robotdiffuse.learning.training.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.loop import Validation
 from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.task import Trainee, train
+from robotdiffuse.learning.training.task import TrainingTask, train
 
-READ, CHECKED = 2048, 512
-"""Scenes that a linear read-out is fitted to, and further ones that it is validated by."""
-SPOTS = np.stack(
+READOUT_SCENES, TEST_SCENES = 2048, 512
+"""Scenes that a linear read-out is fitted to, and further ones that it is tested on."""
+READOUT_POSITIONS = np.stack(
     np.meshgrid([-0.6, -0.2, 0.2, 0.6], [-0.6, -0.2, 0.2, 0.6], [0.2, 0.5, 0.8], indexing="ij"), -1
 ).reshape(-1, 3)
-"""Places around the arm [m] whose distance to the obstacles is read out."""
-NEAR = 0.3
-"""Distances are capped to plus and minus this [m]."""
-RIDGE = 1e-3
-"""Of the variance of a code's numbers, so that none is needed too much."""
+"""Positions around the arm [m] whose distance to the obstacles is read out."""
+MAX_READOUT_DISTANCE = 0.3
+"""Distances are clipped to plus and minus this [m]."""
+RELATIVE_RIDGE = 1e-3
+"""Regularisation of the fit, relative to the mean variance of a code's numbers."""
 
 
 def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
     """Train an auto-encoder; write encoder.safetensors and encoder.json into the folder `out`.
 
-    The same call continues a run that was interrupted. Returns errors on fresh clouds, all in metres: those
-    of the reconstruction, see the encoder's `loss`, and those of `linear_readout`; and `samples`. Raises as
-    `trainee.train`.
+    The same call continues a run that was interrupted. Returns errors on fresh clouds [m], those of the
+    reconstruction (see the encoder's `loss`) and of `linear_readout`, and `samples`. Raises as `task.train`.
     """
     processes = Processes(settings.device)
-    return train(_EncoderTrainee(settings, processes), settings, out, processes)
+    return train(_EncoderTask(settings, processes), settings, out, processes)
 
 
-class _EncoderTrainee(Trainee):
+class _EncoderTask(TrainingTask):
     title = "encoder"
     module: Autoencoder
 
@@ -60,13 +60,13 @@ class _EncoderTrainee(Trainee):
         return error + settings.regularization * theta
 
     def validate(self, fraction: float) -> Validation:
-        return Validation(self._validator(128, 123)[0].item())
+        return Validation(self._validation(128, 123)[0].item())
 
     def finish(self) -> dict[str, float]:
         settings = self.settings
         rng = np.random.default_rng(settings.seed + 1)
-        scenes = random_scenes(READ, settings.max_obstacles, rng)
-        report = self._validator(512, settings.seed + 2)[1]
+        scenes = random_scenes(READOUT_SCENES, settings.max_obstacles, rng)
+        report = self._validation(512, settings.seed + 2)[1]
         trained = self._trained = on_cpu(self.module)
         with torch.no_grad():
             clouds = scene_clouds(trained, scenes, rng).split(256)
@@ -76,7 +76,7 @@ class _EncoderTrainee(Trainee):
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
         save_encoder(self._trained, folder, training)
 
-    def _validator(self, count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    def _validation(self, count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
         with torch.no_grad():
             return self._reconstruction(count, self._most, np.random.default_rng(seed))
 
@@ -90,24 +90,30 @@ class _EncoderTrainee(Trainee):
 
 
 def linear_readout(encoder: Encoder, max_obstacles: int, rng: np.random.Generator) -> dict[str, float]:
-    """What of a scene stands in z in plain sight: a yardstick that is the same for all encoders.
+    """Errors of a linear read-out of z, the same measure for all encoders.
 
-    A linear map from z to the signed distances of fixed places around the arm to the obstacles, fitted to
-    random scenes and validated by others. `readout`: its mean error [m]; `readout_of_constant`: that of the mean
-    distances, with no z at all.
+    A linear map from z to the signed distances of fixed positions around the arm to the obstacles is fitted
+    to random scenes and tested on others. `readout`: its mean error [m]; `readout_of_constant`: the error of
+    the mean distances, without z.
     """
-    scenes = random_scenes(READ + CHECKED, max_obstacles, rng)
+    scenes = random_scenes(READOUT_SCENES + TEST_SCENES, max_obstacles, rng)
     with torch.no_grad():
         clouds = scene_clouds(encoder, scenes, rng).split(256)
         z = torch.cat([encoder(part) for part in clouds]).numpy().astype(np.float64)
-    wanted = scenes.distances(SPOTS).clip(-NEAR, NEAR).astype(np.float64)
-    z -= z[:READ].mean(0)
-    mean = wanted[:READ].mean(0)
-    gram = z[:READ].T @ z[:READ]
-    ridge = max(RIDGE * np.trace(gram) / len(gram), np.finfo(np.float64).tiny)
-    weights = np.linalg.solve(gram + ridge * np.eye(len(gram)), z[:READ].T @ (wanted[:READ] - mean))
-    error = wanted[READ:] - mean
+    wanted = (
+        scenes.distances(READOUT_POSITIONS)
+        .clip(-MAX_READOUT_DISTANCE, MAX_READOUT_DISTANCE)
+        .astype(np.float64)
+    )
+    z -= z[:READOUT_SCENES].mean(0)
+    mean = wanted[:READOUT_SCENES].mean(0)
+    gram = z[:READOUT_SCENES].T @ z[:READOUT_SCENES]
+    ridge = max(RELATIVE_RIDGE * np.trace(gram) / len(gram), np.finfo(np.float64).tiny)
+    weights = np.linalg.solve(
+        gram + ridge * np.eye(len(gram)), z[:READOUT_SCENES].T @ (wanted[:READOUT_SCENES] - mean)
+    )
+    error = wanted[READOUT_SCENES:] - mean
     return {
-        "readout": float(np.abs(error - z[READ:] @ weights).mean()),
+        "readout": float(np.abs(error - z[READOUT_SCENES:] @ weights).mean()),
         "readout_of_constant": float(np.abs(error).mean()),
     }

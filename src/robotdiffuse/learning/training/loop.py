@@ -1,4 +1,4 @@
-"""What all training runs share: optimiser, schedule, checkpoints, log, bad steps, interruption."""
+"""The loop of all training runs: optimiser, learning rate, checkpoints, log, bad steps, interruption."""
 
 import csv
 import io
@@ -22,8 +22,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.output_files import alone_in, write_atomically
-from robotdiffuse.learning.checkpoint import read_tensors, renamed, write_tensors
+from robotdiffuse.core.output_files import lock_folder, write_atomically
+from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
 from robotdiffuse.learning.training.config import TrainingSettings
 from robotdiffuse.learning.training.processes import Processes
 
@@ -31,15 +31,18 @@ FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", 
 """Settings that may differ between the parts of one run."""
 LOG_EVERY = 50
 """Steps per row of log.csv."""
-COLUMNS = ("step", "samples", "minutes", "learning_rate", "loss", "validation", "success", "skipped")
+LOG_COLUMNS = ("step", "samples", "minutes", "learning_rate", "loss", "validation", "success", "skipped")
 MAX_ROLLBACKS = 5
+"""After so many returns to a checkpoint a run has diverged."""
 
 
 class Validation(NamedTuple):
+    """Figures of a validation."""
+
     loss: float
-    """On data that are kept aside."""
+    """On held-out data."""
     success: float | None = None
-    """Share of sampled motions that are free, of a planner's network."""
+    """Share of held-out problems that the network solves by itself; None: not measured."""
 
 
 LossFn = Callable[[np.random.Generator], Float[Tensor, ""]]
@@ -48,7 +51,7 @@ LossFn = Callable[[np.random.Generator], Float[Tensor, ""]]
 
 @dataclass
 class Position:
-    """How far a run is."""
+    """Progress of a run."""
 
     step: int = 0
     samples: int = 0
@@ -58,14 +61,14 @@ class Position:
 
 
 class TrainingRun:
-    """Trains a module's parameters; picks up where an earlier run in the same folder stopped.
+    """Trains a module's parameters; continues an earlier run in the same folder.
 
-    After a resumption everything is as if it had not been interrupted: weights, their average, moments of the
+    A resumed run gives the same result as an uninterrupted one: weights, their average, moments of the
     optimiser and the random states come from the checkpoint.
 
-    Several processes, started by torchrun, are one run: each draws batches of its own, of the settings' size,
-    and takes the step of their mean gradient. The first one validates, shows progress and writes all files;
-    the others read the folder too. They stop, skip and roll back together.
+    Several processes, started by torchrun, are one run: each draws its own batches of the settings' size, and
+    all step by their mean gradient. The first one validates, shows progress and writes all files; the others
+    read the folder too. They stop, skip and roll back together.
     """
 
     def __init__(
@@ -76,9 +79,8 @@ class TrainingRun:
         identity: dict[str, str],
         processes: Processes,
     ) -> None:
-        """`identity`: what else must be the same when the run is resumed, e.g. the robot.
-
-        The module is on the device of `processes`.
+        """module: on the device of `processes`. identity: what must be the same when the run is resumed
+        besides the settings, for example the robot.
         """
         self.module, self.settings, self.out, self.processes = module, settings, FilePath(out), processes
         self.parameters: dict[str, nn.Parameter] = {
@@ -92,7 +94,7 @@ class TrainingRun:
             weight_decay=settings.weight_decay,
             fused=True,
         )
-        # the first process draws what a run of one process draws
+        # the first process draws what a run with a single process draws
         seed = [settings.seed, processes.index] if processes.index else settings.seed
         self.rng = np.random.default_rng(seed)
         self.at = Position()
@@ -107,7 +109,7 @@ class TrainingRun:
 
     @property
     def fraction(self) -> float:
-        """How much of the run is done, 0 to 1."""
+        """Fraction of the run that is done, 0 to 1."""
         if self.settings.samples is not None:
             return min(1.0, self.at.samples / self.settings.samples)
         return min(1.0, self.at.seconds / (60 * (self.settings.minutes or 1.0)))
@@ -117,12 +119,10 @@ class TrainingRun:
         loss: Callable[[np.random.Generator], Float[Tensor, ""]],
         validate: Callable[[], Validation],
         title: str,
-        after_checkpoint: Callable[[], object] | None = None,
     ) -> None:
         """Train to the end. Ctrl-C stores a checkpoint first, then raises KeyboardInterrupt.
 
-        `after_checkpoint` is called after all checkpoints but the last. Raises InputError if another training
-        uses the folder.
+        Raises InputError if another training uses the folder, or if the loss diverges.
         """
         threads = torch.get_num_threads()
         torch.set_num_threads(self.settings.threads)
@@ -144,8 +144,6 @@ class TrainingRun:
                         progress.update(task, completed=self.fraction, rate=f"{rate:,.0f}/s", loss=text)
                     if due:
                         self._checkpoint(validate, progress.console, title)
-                        if after_checkpoint is not None:
-                            after_checkpoint()
                         saved = time.monotonic()
                 self._checkpoint(validate, progress.console, title)
                 if stopped:
@@ -154,10 +152,10 @@ class TrainingRun:
             torch.set_num_threads(threads)
 
     def _alone(self) -> AbstractContextManager[None]:
-        return alone_in(self.out) if self.processes.first else nullcontext()
+        return lock_folder(self.out) if self.processes.first else nullcontext()
 
     def step(self, loss: LossFn) -> None:
-        """One step of the optimiser; a loss or gradient that is not finite changes no weight."""
+        """One step of the optimiser, which is skipped if the loss or the gradient is not finite."""
         self.optimizer.param_groups[0]["lr"] = self.settings.learning_rate * self._lr()
         self.optimizer.zero_grad(set_to_none=True)
         value = loss(self.rng)
@@ -201,7 +199,7 @@ class TrainingRun:
 
     @contextmanager
     def averaged(self) -> Iterator[None]:
-        """Within, the module has the average of its weights."""
+        """A context in which the module has the moving average of its weights."""
         kept = {name: p.detach().clone() for name, p in self.parameters.items()}
         with torch.no_grad():
             for name, p in self.parameters.items():
@@ -229,7 +227,7 @@ class TrainingRun:
             "" if success is None else f"{success:.4g}",
             self.at.skipped,
         )
-        self.rows.append(dict(zip(COLUMNS, row, strict=True)))
+        self.rows.append(dict(zip(LOG_COLUMNS, row, strict=True)))
 
     def _checkpoint(self, validate: Callable[[], Validation], console: Console, title: str) -> None:
         validation = None
@@ -253,7 +251,7 @@ class TrainingRun:
     def save(self) -> None:
         """Write training.safetensors and log.csv, each whole or not at all.
 
-        When a process returns, the checkpoint is there: none ends the run before.
+        All processes return only after the checkpoint is written.
         """
         states = self.processes.gather(self.rng.bit_generator.state)
         if self.processes.first:
@@ -278,19 +276,21 @@ class TrainingRun:
         }
         write_tensors(self._file, tensors, notes)
         text = io.StringIO()
-        writer: csv.DictWriter[str] = csv.DictWriter(text, COLUMNS)
+        writer: csv.DictWriter[str] = csv.DictWriter(text, LOG_COLUMNS)
         writer.writeheader()
         writer.writerows(self.rows)
         write_atomically(self.out / "log.csv", text.getvalue(), make_folder=True)
 
     def _plot(self) -> None:
-        """Write the log for TensorBoard, where that is installed (extra `train`)."""
+        """Write the log for TensorBoard if that is installed (extra `train`)."""
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
             return
         folder = self.out / "tensorboard"
-        shutil.rmtree(folder, ignore_errors=True)  # all of it anew: a resumed run leaves no second curve
+        shutil.rmtree(
+            folder, ignore_errors=True
+        )  # written anew, so that a resumed run leaves no second curve
         with SummaryWriter(str(folder)) as writer:
             for row in self.rows:
                 for name in ("learning_rate", "loss", "validation", "success"):
@@ -325,7 +325,7 @@ class TrainingRun:
             ) from None
 
     def _check_same(self, notes: dict) -> None:
-        now, before = json.loads(json.dumps(self.settings.to_json())), renamed(notes["settings"])
+        now, before = json.loads(json.dumps(self.settings.to_json())), notes["settings"]
         alone = {"processes": "1"}
         now, before = now | alone | self.identity, before | alone | notes["identity"]
         for name, value in now.items():
@@ -338,7 +338,7 @@ class TrainingRun:
 
 @contextmanager
 def _stop_requested() -> Iterator[threading.Event]:
-    """An event that Ctrl-C or a request to end sets, so that a step is never torn."""
+    """An event that SIGINT and SIGTERM set, so that the current step is finished first."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop

@@ -1,7 +1,7 @@
-"""The paper's losses of a predicted motion: L_joint, L_point and L_collision, in PyTorch, differentiable.
+"""Parts of the paper's losses L_joint, L_point and L_collision of a predicted motion, differentiable.
 
-Predictions are compared as motions of joints, as motions of points of the arm's surface, and with the scene:
-by the hinge h on the signed distance of the arm to obstacles (paper, section "Optimize via Robot Feedback").
+L_joint compares motions of the joints, L_point motions of points on the arm's surface, and L_collision is the
+hinge h on the signed distance of the arm to obstacles (paper, section "Optimize via Robot Feedback").
 """
 
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 
 POINT_UNIT = 0.1
-"""[m] in L_point and L_collision, so that they are of the size of L_joint."""
-FAR = 1.0
-"""Distance to an empty scene [m]."""
+"""Distances in L_point and L_collision are divided by this [m], so that they are of the size of L_joint."""
+MAX_DISTANCE = 1.0
+"""Largest distance that is computed [m]; also the distance to an empty scene."""
 EPSILON = 1e-12
-"""Added to squared lengths [m^2], whose root then has a gradient everywhere."""
+"""Added to squared lengths [m^2], so that their root has a gradient everywhere."""
 
 
 @dataclass(frozen=True)
@@ -36,25 +36,28 @@ class LossSettings(Settings, name="losses"):
     collision: NotNegative = 0.0
     """lambda_collision"""
     safe_distance: NotNegative = 0.05
-    """S of the hinge h [m]: the arm is pushed away where it is closer."""
+    """S of the hinge h [m]: distances below it are penalised."""
     begin: Share = 0.0
-    """Share of the training after which L_collision sets in, rising over a tenth of it: at first predictions
-    are too far off for its gradient to mean anything."""
+    """Share of the training after which L_collision begins; it rises over a tenth of the training. Earlier
+    predictions are too far off for a meaningful gradient."""
     points: Count = 6
     """Points of each link's surface in L_point."""
     waypoints: Count = 8
-    """Waypoints, drawn for each batch, that L_point and L_collision look at."""
+    """Waypoints, drawn for each batch, on which L_point and L_collision are computed."""
 
     def collision_weight(self, fraction: float) -> float:
-        """lambda_collision when this share of the training is done."""
+        """lambda_collision when this fraction of the training is done."""
         return self.collision * float(np.clip((fraction - self.begin) / 0.1, 0.0, 1.0))
 
 
 class SurfacePoints:
-    """Points fixed to the moving links: what forward kinematics is applied to in L_point."""
+    """Points fixed to the surfaces of the moving links, to which L_point applies forward kinematics."""
 
     def __init__(self, kinematics: ForwardKinematics, per_link: int, rng: np.random.Generator) -> None:
-        """`per_link` points of each link, uniform by area on its convex meshes."""
+        """Draw per_link points of each link, uniform by area on its convex meshes.
+
+        Raises InputError if no moving link has a mesh.
+        """
         robot = kinematics.robot
         self._kinematics = kinematics
         frames, points = [], []
@@ -73,7 +76,7 @@ class SurfacePoints:
         self._local = torch.nn.functional.pad(local, (0, 1), value=1.0)
 
     def __call__(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch points 3"]:
-        """Places of the points in the base frame [m]; q in [rad]."""
+        """Positions of the points in the base frame [m]; q in [rad]."""
         T = self._kinematics(q)[..., self._frame, :3, :]
         return (T @ self._local[..., None])[..., 0]
 
@@ -88,7 +91,7 @@ def _on_triangles(corners: Float[ndarray, "n 3 3"], count: int, rng: np.random.G
 
 
 class ArmDistance:
-    """Signed distance of an arm's covering spheres to packed scenes, a different one for each trajectory."""
+    """Signed distance of an arm's covering spheres to packed scenes, one scene for each trajectory."""
 
     def __init__(self, kinematics: ForwardKinematics) -> None:
         arrays = compile_robot(kinematics.robot)
@@ -108,10 +111,10 @@ class ArmDistance:
         centres = (T[..., :3] * self._centres[:, None]).sum(-1) + T[..., 3]
         at = centres.movedim(-1, 0).flatten(2).contiguous()
         obstacles = _obstacles(scenes).to(at)
-        with torch.no_grad():  # the distance to the nearest has a gradient, that to the others has none
+        with torch.no_grad():  # only the distance to the nearest obstacle has a gradient
             slot, least = _nearest(at, obstacles, scenes.kinds > 0)
         rows = torch.arange(len(slot), device=slot.device)[:, None]
-        distance = torch.where(least < FAR, _distance(at, obstacles[:, rows, slot]), FAR)
+        distance = torch.where(least < MAX_DISTANCE, _distance(at, obstacles[:, rows, slot]), MAX_DISTANCE)
         if scenes.floors is not None:
             top = torch.from_numpy(scenes.floors[:, 2] + scenes.floors[:, 5] / 2).to(at)[:, None]
             there = torch.from_numpy(scenes.floors.any(1)).to(at.device)[:, None]
@@ -120,7 +123,7 @@ class ArmDistance:
 
 
 def _obstacles(scenes: PackedScenes) -> Float[Tensor, "16 n slots"]:
-    """Centre, half of the edges, radius and rotation; a sphere is a box without size, but for its radius."""
+    """Centre, half edges, radius and rotation of the obstacles; a sphere is a box of size 0 with a radius."""
     box, sphere = (scenes.kinds == BOX)[..., None], (scenes.kinds == SPHERE)[..., None]
     centre, size, wxyz = np.split(scenes.params, (3, 6), -1)
     rotation = rotation_from_quaternion(np.where(box, wxyz, [1, 0, 0, 0])).reshape(*scenes.kinds.shape, 9)
@@ -131,8 +134,8 @@ def _obstacles(scenes: PackedScenes) -> Float[Tensor, "16 n slots"]:
 def _nearest(
     at: Float[Tensor, "3 n points"], obstacles: Float[Tensor, "16 n slots"], present: Bool[ndarray, "n slots"]
 ) -> tuple[Int64[Tensor, "n points"], Float[Tensor, "n points"]]:
-    """The slot of the obstacle next to each point, and its distance [m], FAR at most."""
-    least = torch.full_like(at[0], FAR)
+    """The slot of the obstacle nearest to each point, and its distance [m], at most MAX_DISTANCE."""
+    least = torch.full_like(at[0], MAX_DISTANCE)
     slot = torch.zeros_like(least, dtype=torch.int64)
     for j in np.flatnonzero(present.any(0)):
         rows = torch.from_numpy(np.flatnonzero(present[:, j])).to(at.device)
@@ -145,7 +148,7 @@ def _nearest(
 def _distance(
     at: Float[Tensor, "3 n points"], obstacles: Float[Tensor, "16 n #points"]
 ) -> Float[Tensor, "n points"]:
-    """To one obstacle each [m]."""
+    """Signed distance of each point to one obstacle [m]."""
     centre, half, radius, rotation = obstacles.split((3, 3, 1, 9))
     local = ((at - centre)[:, None] * rotation.unflatten(0, (3, 3))).sum(0)
     outside = local.abs() - half

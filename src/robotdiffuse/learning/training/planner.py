@@ -1,4 +1,4 @@
-"""Training of the diffusion model, with a frozen encoder or one that is trained along."""
+"""Training of the diffusion model, with a frozen encoder or one that is trained jointly."""
 
 import copy
 from dataclasses import fields
@@ -21,7 +21,7 @@ from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryDat
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.task import MotionTrainee, train
+from robotdiffuse.learning.training.task import MotionTask, train
 from robotdiffuse.learning.training.validation import planning_success
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
@@ -29,23 +29,23 @@ from robotdiffuse.robots.robot import Robot
 
 VALIDATION_SAMPLES = 4
 """Trajectories sampled for each problem of a validation."""
-STATISTICS = 20_000
-"""Most trajectories that scale, mean and covariance are taken of."""
+MAX_STATISTICS_TRAJECTORIES = 20_000
+"""Largest number of trajectories for scale, mean and covariance."""
 
 
 def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
-    """Train the diffusion model; write model.safetensors and model.json, all that planning needs; a prior
-    is trajectory_prior.safetensors.
+    """Train the diffusion model; write model.safetensors and model.json, all that planning needs; for a prior
+    trajectory_prior.safetensors and .json.
 
-    The same call continues a run that was interrupted. Returns `validation`, the loss on trajectories kept
-    aside, `success`, the share of the motions that it samples for them by itself that are free, and
-    `samples`. Raises as `trainee.train`, and InputError if the data or the encoder do not fit.
+    The same call continues a run that was interrupted. Returns `validation`, the loss on held-out
+    trajectories, `success`, the share of free motions among those sampled for their problems, and `samples`.
+    Raises as `task.train`, and InputError if the data or the encoder do not fit.
     """
     processes = Processes(settings.device)
-    return train(PlannerTrainee(settings, processes), settings, out, processes)
+    return train(PlannerTask(settings, processes), settings, out, processes)
 
 
-class PlannerTrainee(MotionTrainee):
+class PlannerTask(MotionTask):
     """The diffusion model in training."""
 
     def __init__(self, settings: PlannerTraining, processes: Processes) -> None:
@@ -55,48 +55,51 @@ class PlannerTrainee(MotionTrainee):
         if settings.encoder is not None:
             frozen = None if settings.jointly else load_encoder(settings.encoder)
             encoder = frozen or make_encoder(settings.encoder, settings.encoder_settings)
-        model = MotionModel(RobotIdentity.of(robot), _model_settings(settings, encoder))
-        # codes are made on the CPU: the frozen one stays there
+        model = MotionModel(RobotIdentity.of(robot), model_settings(settings, encoder))
+        # codes are computed on the CPU: the frozen encoder stays there
         model.encoder = copy.deepcopy(encoder)
-        along = model.encoder if settings.jointly else None
-        super().__init__(settings, robot, frozen, processes, settings.views, along)
+        super().__init__(settings, robot, frozen, processes)
         self.own, self.title = settings, model.settings.network
-        hard = self.kept.q[~self.kept.trivial]
-        model.fit_statistics((hard if len(hard) else self.kept.q)[:STATISTICS], settings.smooth_noise)
+        hard = self.train_data.q[~self.train_data.trivial]
+        model.fit_statistics(
+            (hard if len(hard) else self.train_data.q)[:MAX_STATISTICS_TRAJECTORIES], settings.smooth_noise
+        )
         self.module = self.model = model.to(processes.device)
-        self.identity = {"robot": robot.name} | self._print("encoder_fingerprint")
-        # batches are made, and validations planned, on the CPU
-        self._here = on_cpu(model)
+        self.identity = {"robot": robot.name} | self._encoder_fingerprint("encoder_fingerprint")
+        # batches are computed, and problems of validations sampled, on the CPU
+        self._on_cpu = on_cpu(model)
         self.clearances = packed_clearances(robot, model.settings)
-        self._loss = _Loss(model, robot, settings, processes)
+        self._loss = PlannerLoss(model, robot, settings, processes)
 
     def loss_of(
-        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, held_out: bool
+        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
     ) -> Float[Tensor, ""]:
         own = self.own
-        batches = Batches(data, self._here, self.clearances, own.trivial_share, own.weight_limit)
+        batches = Batches(data, self._on_cpu, self.clearances, own.trivial_share, own.weight_limit)
         batch, dropped = batches.draw(own.batch, rng), None
-        if own.condition_drop > 0 and not held_out:
+        if own.condition_drop > 0 and not validating:
             dropped = torch.from_numpy(rng.random(own.batch) < own.condition_drop)
         return self._loss(batch, fraction, rng, dropped)
 
     def success(self, rng: np.random.Generator) -> float:
-        if self._here is not self.model:
-            self._here.load_state_dict(self.model.state_dict())
+        if self._on_cpu is not self.model:
+            self._on_cpu.load_state_dict(self.model.state_dict())
         problems = self.own.validation_problems
-        return planning_success(self._here, self.robot, self.held_out, problems, VALIDATION_SAMPLES, rng)
+        return planning_success(
+            self._on_cpu, self.robot, self.validation_data, problems, VALIDATION_SAMPLES, rng
+        )
 
     def about(self) -> dict[str, Any]:
-        return super().about() | self._print("encoder")
+        return super().about() | self._encoder_fingerprint("encoder")
 
-    def _print(self, name: str) -> dict[str, str]:
+    def _encoder_fingerprint(self, name: str) -> dict[str, str]:
         return {} if self.model.encoder is None else {name: fingerprint(self.model.encoder)}
 
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
         save_network(self.title, self.model, folder, training)
 
 
-def _model_settings(settings: PlannerTraining, encoder: Encoder | None) -> MotionModelSettings:
+def model_settings(settings: PlannerTraining, encoder: Encoder | None) -> MotionModelSettings:
     return MotionModelSettings(
         encoder=None if encoder is None else encoder_name(encoder),
         encoder_settings=None if encoder is None else encoder.settings,
@@ -106,8 +109,8 @@ def _model_settings(settings: PlannerTraining, encoder: Encoder | None) -> Motio
     )
 
 
-class _Loss:
-    """The loss of a batch: the objective's on the rows, L_point and L_collision (paper, eq. L)."""
+class PlannerLoss:
+    """Computes the loss of a batch: that of the objective, L_point and L_collision (paper, eq. L)."""
 
     def __init__(
         self, model: MotionModel, robot: Robot, settings: PlannerTraining, processes: Processes
@@ -127,7 +130,7 @@ class _Loss:
         rng: np.random.Generator,
         dropped: Bool[Tensor, "n"] | None = None,
     ) -> Float[Tensor, ""]:
-        """`fraction` of the training is done; `dropped`: samples whose condition is hidden."""
+        """The loss. fraction: of the training that is done; dropped: samples whose condition is hidden."""
         model, losses, device = self.model, self.settings, self.processes.device
         features, level, condition, target, weight = (
             torch.from_numpy(a).to(device)
@@ -143,17 +146,17 @@ class _Loss:
         collision_weight = losses.collision_weight(fraction)
         if self.points is not None or collision_weight > 0:
             clean_weight = torch.from_numpy(batch.clean_weight).to(device)
-            error = error + clean_weight * self._in_space(batch, output, collision_weight, rng)
+            error = error + clean_weight * self._workspace_losses(batch, output, collision_weight, rng)
         return error.mean()
 
-    def _in_space(
+    def _workspace_losses(
         self,
         batch: Batch,
-        output: Float[Tensor, "n rows dof"],
+        output: Float[Tensor, "n waypoints dof"],
         collision_weight: float,
         rng: np.random.Generator,
     ) -> Float[Tensor, "n"]:
-        """L_point and L_collision of each sample, at a few waypoints."""
+        """L_point and L_collision of each sample, at some of the waypoints."""
         model, losses = self.model, self.settings
         last = model.settings.waypoints - 1
         waypoints = sorted(
@@ -164,7 +167,7 @@ class _Loss:
             for a in (batch.noisy, batch.signal, batch.noise_level, batch.clean, batch.base)
         )
         predicted = model.objective.clean(noisy, output, signal, noise_level)
-        # the ends are held, whatever is predicted there
+        # the ends are held, so predictions there do not count
         predicted = torch.cat([clean[:, :1], predicted[:, 1:-1], clean[:, -1:]], 1)
         q = model.joints_at(predicted, base, waypoints)
         error = q.new_zeros(len(q))

@@ -1,4 +1,4 @@
-"""Samples drawn ahead of the training by processes of their own, without changing what is drawn."""
+"""Draws training samples in advance in worker processes, without changing what is drawn."""
 
 import copy
 import multiprocessing
@@ -9,36 +9,37 @@ from concurrent.futures import Future, ProcessPoolExecutor
 
 import numpy as np
 
-from robotdiffuse.core.processes import interrupts_not_passed_on, prepare_worker
-from robotdiffuse.core.registry import Added, added
+from robotdiffuse.core.processes import block_interrupts_in_children, prepare_worker
+from robotdiffuse.core.registry import AddedEntries, added_entries
 from robotdiffuse.learning.completion.samples import Samples, draw_samples
 from robotdiffuse.robots.robot import Robot
 
-NICE = 5
-"""The training itself comes first."""
-DEPTH = 3
-"""Batches that are drawn ahead, for each process."""
-MOST = 2**62
+NICENESS = 5
+"""Workers give way to the training itself."""
+BATCHES_AHEAD = 3
+"""Batches drawn in advance, for each worker."""
+SEED_LIMIT = 2**62
+"""Seeds of samples are below this."""
 
 
-class SamplesAhead:
-    """Batches of samples for a training that draws nothing else from its random numbers.
+class SamplePrefetcher:
+    """Batches of samples for a training that draws nothing else from its random number generator.
 
-    What comes next is known from a copy of these; so a run that is resumed has the same batches.
+    A copy of the generator tells the seeds of the next batches, so a resumed run has the same batches.
     """
 
     def __init__(self, families: Sequence[str], robot: Robot, batch: int, workers: int) -> None:
-        """`workers` 0: the samples are drawn when they are asked for."""
+        """workers: number of worker processes; 0: `next` draws the samples itself."""
         self._families, self._robot, self._batch = tuple(families), robot, batch
-        self._depth = DEPTH * workers
+        self._depth = BATCHES_AHEAD * workers
         self._pool: ProcessPoolExecutor | None = None
         if workers:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(workers, context, _begin, (added(),))
+            self._pool = ProcessPoolExecutor(workers, context, _start_worker, (added_entries(),))
         self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
 
     def next(self, rng: np.random.Generator) -> Samples:
-        """The batch of the seeds that `rng` draws."""
+        """The batch of samples with the seeds that `rng` draws."""
         seeds = self._seeds(rng)
         if self._pool is None:
             return draw_samples(self._families, self._robot, seeds)
@@ -53,19 +54,20 @@ class SamplesAhead:
         return self._pending.popleft()[1].result()
 
     def close(self) -> None:
+        """Stop the workers."""
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _seeds(self, rng: np.random.Generator) -> tuple[int, ...]:
-        return tuple(rng.integers(MOST, size=self._batch).tolist())
+        return tuple(rng.integers(SEED_LIMIT, size=self._batch).tolist())
 
     def _submit(self, seeds: tuple[int, ...]) -> None:
         assert self._pool is not None
-        with interrupts_not_passed_on():
+        with block_interrupts_in_children():
             job = self._pool.submit(draw_samples, self._families, self._robot, seeds)
         self._pending.append((seeds, job))
 
 
-def _begin(entries: Added) -> None:
+def _start_worker(entries: AddedEntries) -> None:
     prepare_worker(entries)
-    os.nice(NICE)
+    os.nice(NICENESS)

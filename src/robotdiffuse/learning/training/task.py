@@ -1,7 +1,7 @@
-"""What is trained, and the one way in which all of it is: a run, its validations, and what is kept of it."""
+"""Training tasks, and the one function that runs them all: `train`."""
 
+import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -15,25 +15,25 @@ from robotdiffuse.learning.checkpoint import versions
 from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.learning.training.batches import TrajectoryData, load_data
 from robotdiffuse.learning.training.config import MotionTraining, TrainingSettings
-from robotdiffuse.learning.training.growing_data import GrowingData
 from robotdiffuse.learning.training.loop import TrainingRun, Validation
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.robots.robot import Robot
 
-HELD_OUT = 2000
-"""Most trajectories of the split for validation that are looked at."""
+MAX_VALIDATION_TRAJECTORIES = 2000
+"""Largest number of trajectories of the validation split that are used."""
 VALIDATION_BATCHES = 8
+"""Batches of these in a validation."""
 
 
-class Trainee(ABC):
+class TrainingTask(ABC):
     """A network in training: its loss, its validation, and the files that it leaves."""
 
     title: str
-    """In progress and messages."""
+    """Name in progress and messages."""
     module: nn.Module
-    """On the device of the processes."""
+    """The network, on the device of the processes."""
     identity: dict[str, str]
-    """What else than the settings must be the same when a run is resumed, e.g. the robot."""
+    """What must be the same when a run is resumed besides the settings, for example the robot."""
 
     @abstractmethod
     def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
@@ -41,11 +41,7 @@ class Trainee(ABC):
 
     @abstractmethod
     def validate(self, fraction: float) -> Validation:
-        """By what is kept aside; the same at every call but for the weights."""
-
-    def grow(self) -> bool:
-        """After all checkpoints but the last: take in data that are new; whether there were any."""
-        return False
+        """Figures on held-out data, which are the same data at every call."""
 
     def finish(self) -> dict[str, float]:
         """The figures of the trained network."""
@@ -53,99 +49,80 @@ class Trainee(ABC):
         return {"validation": loss} | ({} if success is None else {"success": success})
 
     def about(self) -> dict[str, Any]:
-        """What the checkpoint says of the training, besides settings and figures."""
+        """What the checkpoint says about the training, besides settings and figures."""
         return {}
 
     @abstractmethod
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
-        """Write weights and their description."""
+        """Write the weights and their description."""
 
 
-def train(trainee: Trainee, settings: TrainingSettings, out: str, processes: Processes) -> dict[str, float]:
+def train(task: TrainingTask, settings: TrainingSettings, out: str, processes: Processes) -> dict[str, float]:
     """Train to the end and write the files into the folder `out`; returns the figures.
 
-    The same call continues a run that was interrupted. Where torchrun started several processes, all call
-    this and get the same result, see `TrainingRun`. Raises InputError if the folder holds a different run,
-    and KeyboardInterrupt, after a checkpoint, on Ctrl-C.
+    The same call continues a run that was interrupted. If torchrun started several processes, all call this
+    and get the same result, see `TrainingRun`. Raises InputError if the folder holds a different run, and
+    KeyboardInterrupt, after a checkpoint, on Ctrl-C.
     """
-    run = TrainingRun(trainee.module, out, settings, trainee.identity, processes)
-    run.loop(
-        lambda rng: trainee.loss(run.fraction, rng),
-        lambda: trainee.validate(run.fraction),
-        trainee.title,
-        trainee.grow,
-    )
+    run = TrainingRun(task.module, out, settings, task.identity, processes)
+    run.loop(lambda rng: task.loss(run.fraction, rng), lambda: task.validate(run.fraction), task.title)
     if not processes.first:
         return processes.share(None)
     with run.averaged():
-        report = trainee.finish() | {"samples": float(run.at.samples)}
+        report = task.finish() | {"samples": float(run.at.samples)}
         minutes = round(run.at.seconds / 60, 2)
-        about = trainee.about() | {"minutes": minutes} | report | versions()
-        trainee.save(FilePath(out), {"settings": settings.to_json(), **about})
+        about = task.about() | {"minutes": minutes} | report | versions()
+        task.save(FilePath(out), {"settings": settings.to_json(), **about})
     return processes.share(report)
 
 
-class MotionTrainee(Trainee):
-    """A network that learns from planned trajectories.
-
-    While the data factory is still filling the folder, the shards that are there are used, and new ones from
-    the next checkpoint on; such a run is not reproducible, see `GrowingData`.
-    """
+class MotionTask(TrainingTask):
+    """The training of a network on planned trajectories."""
 
     def __init__(
-        self,
-        settings: MotionTraining,
-        robot: Robot,
-        encoder: Encoder | None,
-        processes: Processes,
-        views: bool = False,
-        along: Encoder | None = None,
+        self, settings: MotionTraining, robot: Robot, encoder: Encoder | None, processes: Processes
     ) -> None:
-        """encoder: the frozen one that makes codes of the scenes, if there is one. views, along: see
-        `load_data`.
+        """encoder: the frozen encoder that computes the codes of the scenes, if there is one.
 
         Raises InputError if the data do not fit the robot, or there are none for training.
         """
         self.settings, self.robot, self.processes = settings, robot, processes
-
-        def read(report: Callable[[str], None]) -> TrajectoryData:
-            asked = settings.data, robot, encoder, settings.waypoints, report, settings.turns
-            return load_data(*asked, views, along)
-
-        self.data = GrowingData(settings.data, read, processes)
-        self.kept, self.held_out = self.data.now.split(HELD_OUT)
-        if not len(self.kept):
+        # the first process caches the codes of the scenes for the others
+        with processes.first_goes_first():
+            self.data = load_data(
+                settings.data, robot, encoder, settings.waypoints, self._report, settings.turned_copies
+            )
+        self.train_data, self.validation_data = self.data.split(MAX_VALIDATION_TRAJECTORIES)
+        if not len(self.train_data):
             raise InputError(f"data folder {settings.data} holds no trajectory for training")
+
+    def _report(self, text: str) -> None:
+        if self.processes.first:
+            print(text, file=sys.stderr)
 
     @abstractmethod
     def loss_of(
-        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, held_out: bool
+        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
     ) -> Float[Tensor, ""]:
-        """The loss of a random batch of these data; `held_out`: for validation."""
+        """The loss of a random batch of these data."""
 
     @abstractmethod
     def success(self, rng: np.random.Generator) -> float | None:
-        """What the network by itself solves of some held-out problems, as a share; None: not known."""
+        """Share of some held-out problems that the network solves by itself; None: not measured."""
 
     def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
-        return self.loss_of(self.kept, fraction, rng, held_out=False)
+        return self.loss_of(self.train_data, fraction, rng, validating=False)
 
     def validate(self, fraction: float) -> Validation:
-        if not len(self.held_out):
+        if not len(self.validation_data):
             return Validation(float("nan"))
         rng = np.random.default_rng(7)
         with torch.no_grad():
             losses = [
-                self.loss_of(self.held_out, fraction, rng, held_out=True).item()
+                self.loss_of(self.validation_data, fraction, rng, validating=True).item()
                 for _ in range(VALIDATION_BATCHES)
             ]
             return Validation(float(np.mean(losses)), self.success(rng))
 
-    def grow(self) -> bool:
-        grown = self.data.grow()
-        if grown:
-            self.kept, self.held_out = self.data.now.split(HELD_OUT)
-        return grown
-
     def about(self) -> dict[str, Any]:
-        return {"data": self.data.now.digest, "trajectories": len(self.data.now)}
+        return {"data": self.data.digest, "trajectories": len(self.data)}

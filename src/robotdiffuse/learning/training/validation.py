@@ -1,11 +1,11 @@
-"""Validations that plan: what a network in training would solve by itself, without search, and without
-guidance unless it sees no scene.
+"""Validation by sampling: the share of problems that a network in training solves without search, and without
+guidance unless the scene is not among its inputs.
 
-Covering spheres decide, not the validator: it is for curves of training, which compare a network with itself.
+Collision checks of the covering spheres decide, not the validator: the figures are for training curves, which
+compare a network with itself.
 """
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
@@ -13,16 +13,17 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.batches import TrajectoryData, encode_scenes
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 SAMPLING_STEPS = 6
-"""Of every network alike, so that all of the levels do not take longer than the training."""
-PRIOR_GUIDANCE = 4
-"""Gradient steps that a prior, which sees no scene, is helped by at each step of the second half."""
-BETWEEN = 6
-"""Places that are checked in each step from waypoint to waypoint."""
+"""Sampling steps of every network, so that validation takes less time than the training."""
+PRIOR_GUIDANCE_STEPS = 4
+"""Guidance of a prior, whose inputs do not include the scene: gradient steps in each guided sampling step."""
+CHECKS_PER_SEGMENT = 6
+"""Configurations that are checked in each segment from waypoint to waypoint."""
 
 
 def planning_success(
@@ -33,7 +34,7 @@ def planning_success(
     candidates: int,
     rng: np.random.Generator,
 ) -> float:
-    """Share of sampled trajectories that are free, for the first so many problems that are not trivial.
+    """Share of free trajectories among `candidates` samples for each of the first non-trivial problems.
 
     nan if the data hold no such problem.
     """
@@ -54,27 +55,24 @@ def _sampled_free(
     code = np.zeros(0)
     if data.codes is not None:
         code = data.codes[row]
-    elif data.clouds is not None and model.encoder is not None:
-        with torch.inference_mode():
-            code = model.encoder(torch.from_numpy(data.clouds[row : row + 1].astype(np.float32)))[0].numpy()
     elif model.encoder is not None:
         code = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
     guidance = CollisionGuidance(checker)
 
     def guide(q: ndarray, _level: float) -> ndarray:
-        return guidance(q, PRIOR_GUIDANCE)[0]
+        return guidance(q, PRIOR_GUIDANCE_STEPS)[0]
 
     start, goal = q[0].astype(np.float64), q[-1].astype(np.float64)
     clearances = link_clearances(checker, model.settings)
-    steps = min(SAMPLING_STEPS, model.schedule.steps)
+    settings = SamplingSettings(samples=candidates, sampling_steps=min(SAMPLING_STEPS, model.schedule.steps))
     guided = guide if model.encoder is None else None
-    q = model.sample(code.astype(np.float32), start, goal, candidates, rng, clearances, steps, guided)
-    return free_in(checker, q)
+    q = model.sample(start, goal, code.astype(np.float32), clearances, rng, settings, guided)
+    return free_in_scene(checker, q)
 
 
-def free_in(checker: CollisionChecker, q: Float[ndarray, "n waypoints dof"]) -> Bool[ndarray, "n"]:
-    """Which motions are free in one scene, at their waypoints and at places between them."""
-    share = np.linspace(0, 1, BETWEEN, endpoint=False)[:, None]
+def free_in_scene(checker: CollisionChecker, q: Float[ndarray, "n waypoints dof"]) -> Bool[ndarray, "n"]:
+    """Which motions are free in the checker's scene, at their waypoints and between them."""
+    share = np.linspace(0, 1, CHECKS_PER_SEGMENT, endpoint=False)[:, None]
     dense = q[:, :-1, None] + share * np.diff(q, axis=1)[:, :, None]
     every = np.concatenate([dense.reshape(len(q), -1, q.shape[-1]), q[:, -1:]], 1)
     free = checker.free(every.reshape(-1, q.shape[-1])).reshape(len(q), -1)
@@ -84,6 +82,8 @@ def free_in(checker: CollisionChecker, q: Float[ndarray, "n waypoints dof"]) -> 
 def motions_free(
     robot: Robot, scenes: PackedScenes, q: Float[ndarray, "n waypoints dof"]
 ) -> Bool[ndarray, "n"]:
-    """Which motions are free, each in a scene of its own."""
+    """Which motions are free, each in its own scene."""
     checkers = (CollisionChecker(robot, scenes.scene(i)) for i in range(len(scenes)))
-    return np.array([free_in(of, motion)[0] for of, motion in zip(checkers, q[:, None], strict=True)], bool)
+    return np.array(
+        [free_in_scene(of, motion)[0] for of, motion in zip(checkers, q[:, None], strict=True)], bool
+    )

@@ -153,9 +153,9 @@ def sample(
     quiet_steps: more steps at the last level, to which no noise is added (MPD: 5).
     stop: asked before every step; None is returned if it says so.
     """
-    between = prior.between(starts, goals)
-    told = prior.condition(np.zeros((len(starts), 0), np.float32), starts, goals)
-    predicted = prior.predictor(between, told, lambda _: np.zeros(0))
+    reference = prior.reference(starts, goals)
+    condition = prior.condition(np.zeros((len(starts), 0), np.float32), starts, goals)
+    predicted = prior.predictor(reference, condition, lambda _: np.zeros(0))
 
     def predict(x: ndarray, level: int) -> ndarray:
         if stop():
@@ -163,7 +163,8 @@ def sample(
         return predicted(x, level)
 
     def move(x: ndarray, left: int) -> ndarray:
-        return prior.to_rows(guide(prior.joints(prior.hold(x, between), between), left), between)
+        mean = prior.joints(prior.hold_ends(x, reference), reference)
+        return prior.normalize(guide(mean, left), reference)
 
     with torch.inference_mode(), one_thread():
         try:
@@ -174,7 +175,7 @@ def sample(
                 x = move(predict(x, int(levels[-1])), 0)
         except _StoppedError:
             return None
-    q = prior.joints(prior.within(x), between)
+    q = prior.joints(prior.clipped(x), reference)
     q[:, 0], q[:, -1] = starts, goals
     return q
 

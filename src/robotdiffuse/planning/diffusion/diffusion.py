@@ -13,11 +13,10 @@ Unless the settings say otherwise, the weights are used with the sampler and the
 without guidance this is the network alone: `guidance_steps` 0.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -25,12 +24,11 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Count, Natural, NotNegative, OneOf, Share
+from robotdiffuse.core.settings import Count, Natural, NotNegative
 from robotdiffuse.core.types import Path
-from robotdiffuse.learning.costs.cost import Cost
-from robotdiffuse.learning.costs.path_constraints import path_constraints
+from robotdiffuse.learning.costs import CostStep, path_constraint_cost
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
-from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.weights_registry import weights_for
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
@@ -46,37 +44,24 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class SamplingSettings(LearnedSettings):
-    """How batches of trajectories are drawn from a trained model."""
+class GuidedSamplingSettings(SamplingSettings, LearnedSettings):
+    """How batches of trajectories are drawn from a trained model under guidance."""
 
-    samples: Count = 16
-    """Trajectories per batch."""
-    sampling_steps: Count | None = None
-    """Calls of the denoiser per batch; None: as many as the weights name."""
-    sampler: Annotated[str, OneOf(SAMPLERS)] | None = None
-    """Name in `learning.samplers.SAMPLERS`; None: the one that the weights name."""
-    eta: Share = 0.0
-    """Fresh noise per denoising step: 0 is DDIM, 1 is ancestral sampling."""
     guidance_steps: Natural = 8
     """Gradient steps at each guided denoising step."""
-    guided_share: Share = 0.5
-    """Share of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
     points: Count = 320
-    """Points of the cloud that the encoder sees (paper: 1,400), unless it wants clouds of its own size."""
+    """Points of the encoder's input cloud (paper: 1,400), unless it takes clouds of one size."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 
 
 @dataclass(frozen=True)
-class DiffusionSettings(SamplingSettings, name="diffusion"):
-    guidance_scale: float = 1.0
-    """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further,
-    0 hides it. Other than 1 needs weights that were trained with a condition_drop above 0."""
+class DiffusionSettings(GuidedSamplingSettings, name="diffusion"):
     optimize_time: NotNegative = 0.0
     """Time in which further batches are drawn after the first that has a valid sample [s]; the shortest of
     all is the answer."""
 
 
-Own = TypeVar("Own", bound=SamplingSettings)
+Own = TypeVar("Own", bound=GuidedSamplingSettings)
 
 
 class ModelSampler(LearnedPlanner[Own]):
@@ -93,6 +78,10 @@ class ModelSampler(LearnedPlanner[Own]):
             return None
         return self.network(robot)
 
+    def guidance_scale(self, model: "MotionModel") -> float:
+        """Scale of classifier-free guidance for a model."""
+        return self.settings.guidance_scale
+
     def draw(
         self,
         model: "MotionModel",
@@ -102,20 +91,18 @@ class ModelSampler(LearnedPlanner[Own]):
         goals: Float[ndarray, "k dof"],
         rng: np.random.Generator,
         clearances: "ClearanceFn | None" = None,
-        of_problem: Mapping[str, Cost] = MappingProxyType({}),
-        guidance_scale: float = 1.0,
+        problem_costs: Sequence[CostStep] = (),
     ) -> Float[ndarray, "count waypoints dof"]:
         """A batch of samples under guidance, shared out among the nearest goals.
 
-        code: as by `encode`; None: hidden, as all of the condition, from weights that can do without it.
-        clearances: what the model is told of the obstacles; None: what is true.
-        guidance_scale: of classifier-free guidance, see `MotionModel.denoise_guided`.
-        of_problem: as for `CollisionGuidance`.
+        code: from `encode`; None: the whole condition is hidden, of weights that can do without it.
+        clearances: the model's inputs about the obstacles; None: those of the checker's scene.
+        problem_costs: as for `CollisionGuidance`.
         """
         from robotdiffuse.learning.clearance_features import link_clearances
 
         settings = self.settings
-        guidance = CollisionGuidance(checker, settings.guidance, of_problem)
+        guidance = CollisionGuidance(checker, settings.guidance, problem_costs)
         goals = nearest_goals(start, goals, settings.samples)
         counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(goals))]
         clearances = clearances or link_clearances(checker, model.settings)
@@ -125,18 +112,13 @@ class ModelSampler(LearnedPlanner[Own]):
 
         parts = [
             model.sample(
-                code,
                 start,
                 goal,
-                count,
-                rng,
+                code,
                 clearances,
-                settings.sampling_steps,
+                rng,
+                replace(settings, samples=count, guidance_scale=self.guidance_scale(model)),
                 guide if settings.guidance_steps else None,
-                settings.eta,
-                guidance_scale,
-                settings.sampler,
-                settings.guided_share,
             )
             for goal, count in zip(goals, counts, strict=True)
         ]
@@ -146,12 +128,12 @@ class ModelSampler(LearnedPlanner[Own]):
 def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
-    """z of a scene: its point cloud through the frozen encoder; of so many points, unless the encoder wants
-    clouds of its own size."""
+    """z of a scene: its point cloud through the frozen encoder; of so many points, unless the encoder takes
+    clouds of one size."""
     assert model.encoder is not None  # a prior is no network of these planners
-    told = model.encoder.settings
-    count = points if model.encoder.any_size else told.cloud
-    return model.encode(sample_surface(checker.scene, count, rng, told.region), rng)
+    settings = model.encoder.settings
+    count = points if model.encoder.any_size else settings.cloud
+    return model.encode(sample_surface(checker.scene, count, rng, settings.region), rng)
 
 
 def _projected(
@@ -176,19 +158,10 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         start, goals = start_goal.rows()
         code = encode(model, start_goal.checker, self.settings.points, rng)
         names, constraints = context.problem.robot.joint_names, context.validator.constraints
-        costs = {} if constraints is None else {"path_constraints": path_constraints(constraints, SHARE)}
+        costs = [] if constraints is None else [path_constraint_cost(constraints, SHARE)]
         every, valid, until = list[Path](), list[Path](), context.time_limit
         while not every or context.elapsed < until:
-            batch = self.draw(
-                model,
-                start_goal.checker,
-                code,
-                start,
-                goals,
-                rng,
-                of_problem=costs,
-                guidance_scale=self.settings.guidance_scale,
-            )
+            batch = self.draw(model, start_goal.checker, code, start, goals, rng, problem_costs=costs)
             if constraints is not None:
                 batch = [_projected(constraints, q) for q in batch]
             paths = [Path(names, start_goal.complete(q)) for q in batch]

@@ -2,11 +2,14 @@
 
 The straight line if it is free. Else a search for a first path, within milliseconds, then ever shorter ones;
 and, for a share of the work, batches of trajectories sampled by the diffusion model under collision guidance,
-or, where none of them is free, the same after more gradient steps (refinement). Of the scene the model is
-told clearances, and no code (see `RobotDiffuse.code`). For an arm without weights the batches are smooth
-noise after as many such steps (see smooth_noise.py). What the batches propose is simplified by the same code
-as what search finds, and the shortest path of either bounds the next search. Everything goes through the
-validator, and the result names the stage that its path comes from.
+or, where none of them is free, the same after more gradient steps (refinement). The model's inputs are
+clearances and, by default, no code of the scene (see the setting `guidance_scale`). What the batches propose
+is simplified by the same code as what search finds, and the shortest path of either bounds the next search.
+Everything goes through the validator, and the result names the stage that its path comes from.
+
+For an arm without weights the batches are smooth noise after as many such steps (see smooth_noise.py). They
+are drawn only once search has a path: before that they solve less than search does in their time, see
+benchmarks/results/hard_arms.txt.
 
 Under path constraints it is search alone: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
 shorter (the mean of 20 upright cups and of 20 lines; median: the same).
@@ -31,7 +34,7 @@ from robotdiffuse.core.settings import Bound, Count, Natural
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.weights_registry import weights_for
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.diffusion.diffusion import ModelSampler, SamplingSettings, encode
+from robotdiffuse.planning.diffusion.diffusion import GuidedSamplingSettings, ModelSampler, encode
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.learned import nearest_goals
 from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS
@@ -56,10 +59,14 @@ LOAD_SECONDS = 3.0
 
 
 @dataclass(frozen=True)
-class RobotDiffuseSettings(SamplingSettings, name="robotdiffuse"):
+class RobotDiffuseSettings(GuidedSamplingSettings, name="robotdiffuse"):
     sampling_steps: Count | None = 2
     """Calls of the denoiser per batch. With guidance, more bring no more solved problems, see
     benchmarks/results/guidance.txt."""
+    guidance_scale: float = 0.0
+    """Scale of classifier-free guidance. At 0 the condition is hidden, and the scene's code is not computed:
+    with it paths are as long, see benchmarks/results/network_inputs.txt. Weights that cannot do without their
+    condition are then sampled with 1."""
     refinement_steps: Natural = 40
     """Most gradient steps on the sampled trajectories that still collide."""
     shortened: Count = 6
@@ -88,8 +95,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         """What they took of late [s]: the last one, or more if those before did."""
 
     def prepare(self, robot: Robot) -> None:
-        """See `planning.planner.Planner`: given weights. Those of the package are loaded in a call's own time,
-        if it has LOAD_SECONDS left for that, else by `warm_up` and `load_wanted`."""
+        """See `planning.planner.Planner`: given weights. Those of the package are loaded in a call's own
+        time, if it has LOAD_SECONDS left for that, else by `warm_up` and `load_wanted`."""
         if self.settings.weights is not None:
             self._load(robot)
 
@@ -122,9 +129,10 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
             return plan_constrained(context, start_goal, settings.search)
         search = AnytimeSearch(context, start_goal, settings.search, AORRTC.name)
-        weights = self.weights(robot)
+        weights, help_out = self.weights(robot), None
         if weights is not None:
             batches = _NetworkBatches(self, context, start_goal, search, weights)
+            help_out = batches.offer
         else:
             batches = _Batches(self, context, start_goal, search)
             note = f"there are no weights for {robot.name}; planned by search and smooth noise"
@@ -142,15 +150,20 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             search,
             lambda: search.pays(settings.search.gain, settings.search.patience),
             improve,
-            batches.offer,
+            help_out,
         )
 
     def code(
         self, model: "MotionModel", checker: CollisionChecker, rng: np.random.Generator
     ) -> Float[ndarray, "code"] | None:
-        """What the network is told beside clearances: z of the scene if its weights cannot do without. Those
-        that ship can, and paths are as long with it, see benchmarks/results/network_inputs.txt."""
-        return None if model.settings.null_condition else encode(model, checker, self.settings.points, rng)
+        """z of the scene; None if the network's condition is hidden."""
+        hidden = self.guidance_scale(model) == 0.0
+        return None if hidden else encode(model, checker, self.settings.points, rng)
+
+    def guidance_scale(self, model: "MotionModel") -> float:
+        """The setting; 1 in place of 0 for weights that cannot do without their condition."""
+        scale = self.settings.guidance_scale
+        return 1.0 if scale == 0.0 and not model.settings.null_condition else scale
 
     def refine(
         self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]
@@ -160,7 +173,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
 
 class _Batches:
-    """Batches of smooth noise in the anytime loop of a call."""
+    """Batches of smooth noise in the anytime loop of a call, once it has a path."""
 
     def __init__(
         self, planner: RobotDiffuse, context: PlanningContext, start_goal: StartGoal, search: AnytimeSearch

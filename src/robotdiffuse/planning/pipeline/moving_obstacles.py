@@ -18,9 +18,11 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy import ndarray
 
 from robotdiffuse.collision.kernels.moving_obstacles import free_over
 from robotdiffuse.collision.moving_obstacles import MovingCollision, links_of
+from robotdiffuse.core.deadline import OutOfTimeError, check_timing
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Trajectory
 from robotdiffuse.planning.context import PlanningContext, Request
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
 
 STEP = 0.02
 """Of the grid of times [s]."""
+CELL_SECONDS = 1e-8
+"""What a time and a configuration of the grid take at least [s]."""
 TRAVEL = 0.02
 """No point of the arm moves further between two configurations of the grid [m]."""
 PATIENCE, LONGER = 5.0, 3.0
@@ -79,7 +83,11 @@ def plan_among_moving(
         tried += 1
         horizon = max(horizon, found.trajectory.duration)
         for clearance in (context.clearance, 0.0):
-            timed = _timed(context, problem, collision, found.path, clearance)
+            try:
+                with context.deadline():
+                    timed = _timed(context, problem, collision, found.path, clearance)
+            except OutOfTimeError as error:
+                return context.out_of_time(error)
             if timed is None:
                 continue
             report = context.validator.trajectory(timed)
@@ -147,11 +155,16 @@ def _timed(
     longest = sum(motion.ticks for motion in rests.motions if motion.target == motion.source + 1) // len(
         PACES
     )
-    times = STEP * np.arange(int(LONGER * longest + PATIENCE / STEP))
+    count = int(LONGER * longest + PATIENCE / STEP)
+    check_timing(f"a grid of {count} times", CELL_SECONDS * count * len(configurations))
+    times = STEP * np.arange(count)
     speed = max(one.greatest_speed for one in problem.moving)
     asked = clearance + (TRAVEL + speed * STEP) / 2
     clear = free_over(links, collision.tracks, configurations, times, asked)
-    cells = [rests.cells(motion, configurations) for motion in rests.motions]
+    cells = list[ndarray]()
+    for motion in rests.motions:
+        check_timing("the grid of times")
+        cells.append(rests.cells(motion, configurations))
     way, found = earliest(
         clear,
         np.searchsorted(s, rests.places),

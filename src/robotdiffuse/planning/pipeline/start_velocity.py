@@ -66,6 +66,8 @@ def plan_in_motion(
     found = context.finish(waypoints, result.stage or planner.name, notes=notes)
     if found is not None:
         return found
+    if context.ended:
+        return context.unsolved()
     why = context.validator.path(replace(result.path, positions=waypoints)).violation
     what = "" if why is None else f": {why.message}"
     return context.fail(

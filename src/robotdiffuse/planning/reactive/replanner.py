@@ -14,6 +14,7 @@ was last seen. Nothing that is promised rests on it.
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Annotated
 
 import numpy as np
@@ -26,7 +27,7 @@ from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.collision.moving_obstacles import MovingCollision
 from robotdiffuse.core.bounds import numbers, rigid_transform, within
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, transform
@@ -35,7 +36,7 @@ from robotdiffuse.planning.context import PlanningContext, Request
 from robotdiffuse.planning.reactive.timed_path import Course, Speeds
 from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
@@ -111,6 +112,10 @@ class Replanner:
     ) -> None:
         """Finds the first path. Raises InputError for a problem without moving obstacles, and for one that
         has no path among what stands still."""
+        check_problem(problem)
+        check_type("settings", settings, ReplannerSettings, "ReplannerSettings")
+        if not isinstance(seed, Integral) or seed < 0:
+            raise InputError(f"seed is {shown(seed)}; it must be a whole number, at least 0")
         if not problem.moving:
             raise InputError("problem.moving is empty; a Replanner needs obstacles that move")
         for what in ("waypoints", "constraints", "payload"):

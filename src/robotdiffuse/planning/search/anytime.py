@@ -11,9 +11,10 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import finer
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, Positive, Settings
-from robotdiffuse.core.types import FIRST, SHORT, Tree
+from robotdiffuse.core.types import CONVERGED, FIRST, Tree
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.start_goal import StartGoal
@@ -176,7 +177,7 @@ class AnytimeSearch:
 
     def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
         """Take a path between the ends that is free in `space`, simplified, if it is the shortest so far."""
-        path = np.ascontiguousarray(path, np.float32)
+        path = for_kernels(path, np.float32)
         settings = self.settings
         path = simplify(self.space, path, settings.smoothings)
         length = path_length(path)
@@ -315,7 +316,7 @@ def anytime(
 
     def ended() -> bool:
         done = context.until == FIRST or search.shortest or context.remaining <= 0
-        return done or (context.until == SHORT and not pays())
+        return done or (context.until == CONVERGED and not pays())
 
     answers = Answers(context, start_goal)
     while search.first(context.search_until, help_out):

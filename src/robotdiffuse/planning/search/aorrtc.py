@@ -21,7 +21,7 @@ STEP = 1_000
 @dataclass(frozen=True)
 class AORRTCSettings(SearchSettings, name="aorrtc"):
     gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.005
-    """Until "short", the search ends when its last doubling took off a smaller share of the length ..."""
+    """Until "converged", the search ends when its last doubling took off a smaller share of the length ..."""
     patience: Natural = 8_000
     """... but not before so many iterations."""
 

@@ -21,7 +21,7 @@ SLICE = 20
 SHARE, AT_ENDS = 0.95, 1e-6
 """Of the tolerances that the search keeps; where start or goal need more, they and this are kept."""
 SEARCHES = 2
-"""Until "short": paths found, the shortest of which is the answer."""
+"""Until "converged": paths found, the shortest of which is the answer."""
 SHORTCUTS = 60
 """Of each path that is found."""
 

@@ -14,7 +14,7 @@ from robotdiffuse.planning.start_goal import StartGoal
 @dataclass(frozen=True)
 class RRTConnectSettings(SearchSettings, name="rrt_connect"):
     searches: Count = 2
-    """Until "short": paths found, the shortest of which is the answer."""
+    """Until "converged": paths found, the shortest of which is the answer."""
     optimize_time: NotNegative = 0.0
     """... and time spent on restarts after the first path [s]."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.robots.fitting.allowed_collisions import BY_SRDF, CHECKED, LIMITS, NAMED, POSE, PairReport
-from robotdiffuse.robots.fitting.false_collisions import Refusals
+from robotdiffuse.robots.fitting.false_collisions import PairRefusals, Refusals
 from robotdiffuse.robots.fitting.preparation import LinkReport, PreparationSettings, Progress, prepare
 from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
@@ -20,6 +20,8 @@ from robotdiffuse.robots.user_data_dir import user_robots
 
 LITTLE, REFUSED = 0.2, 0.08
 """Shares of free configurations, and of those that spheres refuse, from which on there is a warning."""
+MOST_PROPOSED = 3
+"""Pairs that the error for a robot that is never free proposes, where none collides always."""
 TAKEN_FOR_SAFE = {
     LIMITS: "up to a stop of one joint, which its limits allow",
     POSE: "as in a pose that the SRDF names",
@@ -91,6 +93,28 @@ class AddReport:
         return (*found, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
+def never_free(refusals: Refusals) -> bool:
+    """Whether every configuration that was looked at collides with itself, so that nothing can be planned."""
+    return refusals.free == 0 or refusals.by_parts == 1
+
+
+def never_free_error(urdf: str | Path, refusals: Refusals) -> InputError:
+    """The error for a robot that is never free; it proposes the pairs of links that always collide, or else
+    those that collide most often."""
+
+    def colliding(pair: PairRefusals) -> float:
+        return max(pair.colliding, pair.by_parts)
+
+    often = sorted(refusals.pairs, key=lambda pair: -colliding(pair))
+    worst = [pair for pair in often if colliding(pair) == 1] or often[:MOST_PROPOSED]
+    names = "; ".join(f"{' and '.join(pair.links)} collide in {colliding(pair):.1%}" for pair in worst)
+    options = " ".join(f"--allow {' '.join(pair.links)}" for pair in worst)
+    return InputError(
+        f"{urdf}: every configuration collides with itself: {names}; if the links may touch, allow it by "
+        f"{options}, or give the SRDF, which knows such pairs, by --srdf FILE"
+    )
+
+
 def add_robot(
     urdf: str | Path,
     name: str | None = None,
@@ -112,7 +136,7 @@ def add_robot(
 
     `name` defaults to the URDF's; `out`, the folder, to `user_robots() / name`; `limits` is a file in the
     form of MoveIt's joint_limits.yaml. The same input and seed give the same robot. Raises InputError for
-    bad input.
+    bad input, and for a robot that always collides with itself.
 
     Groups, poses and passive joints are those of `srdf`, or of the SRDF found beside the URDF. Pairs of links
     that need no check are found by sampling and compared with the SRDF's; a given `srdf` allows its pairs
@@ -141,6 +165,8 @@ def add_robot(
     allowed |= {frozenset(pair): NAMED for pair in allow}
     surfaces = {link: tree.surfaces(link) for link in robot.meshes}
     made = prepare(robot, surfaces, settings or PreparationSettings(), seed, progress, allowed)
+    if never_free(made.refusals):
+        raise never_free_error(urdf, made.refusals)
     differences = tuple(
         PairDifference(pair.links, pair.reason, pair.colliding, known.get(frozenset(pair.links), CHECKED))
         for pair in made.sampled

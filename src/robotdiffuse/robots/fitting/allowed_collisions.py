@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.optimize import linprog
 
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.fitting.convex_parts import planes_of
@@ -31,6 +32,9 @@ FEWER = 10
 OFTEN, UNCERTAIN = 0.2, 0.25
 """Share of the configurations in which links collide that a joint's stops keep apart, at least, and of the
 variance of colliding that the other joints may explain, at most."""
+MOST_HELD = 1
+"""Held joints through which a link of the arm carries another one of its own, as a lift its bellows: behind
+more of them is a head, or another arm."""
 COARSE = 0.03
 """Meshes of links that overlap in a named pose by no more are taken for coarse there [m]."""
 ROUNDING = 1e-9
@@ -77,10 +81,12 @@ def find_allowed_collisions(
     between them skipped); pairs that always or never collide; and pairs that collide in the default pose,
     with the joints between them at zero. For such a pair the limits of the joints say that the manufacturer
     holds that pose to be safe, so the meshes are coarse there. Hence it must be within the limits, and both
-    links must be the arm's own: the limits know nothing of a tool that is fixed to the last link. For the
-    same reason a pair is allowed that collides in a fifth of the configurations or more, up to a stop of one
-    joint between them, which alone says where: stops are where the links on both sides of a joint meet. And
-    so is one that overlaps a little in a pose that an SRDF names, as the tucked one.
+    links must be the arm's own: the limits know nothing of a tool that is fixed to the last link, or of
+    another arm. A link behind one held joint is the arm's own too, if the pair also collides with that joint
+    where it is held: planning cannot move it away. Because of the limits a pair is allowed as well that
+    collides in a fifth of the configurations or more, up to a stop of one joint between them, which alone
+    says where: stops are where the links on both sides of a joint meet. And so is one that overlaps a little
+    in a pose that an SRDF names, as the tucked one.
 
     Meshes are tested with Coal, where the covering spheres do not already show that they are apart. Pairs
     that never collided are driven together by random descent from their closest samples; those that can be
@@ -90,7 +96,7 @@ def find_allowed_collisions(
     default = np.clip(np.zeros((1, len(links.joints))), links.lower, links.upper)
     q = links.random(settings.samples, rng)
     poses = links.poses(q)
-    default_poses = links.poses(default)
+    default_poses, held_poses = links.poses(default), links.poses(links.named({})[None])
     named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
     adjacent = _adjacent(robot)
 
@@ -99,13 +105,14 @@ def find_allowed_collisions(
             return ADJACENT
         if colliding.mean() >= settings.always:
             return ALWAYS
-        between = _own_between(robot, a, b)
-        zero = between is not None and all(joint.lower <= 0 <= joint.upper for joint in between)
-        if zero and links.collide(default_poses, a, b, 0):
+        by_default = _own_between(robot, a, b, MOST_HELD)
+        zero = by_default is not None and all(joint.lower <= 0 <= joint.upper for joint in by_default)
+        if zero and links.collide(default_poses, a, b, 0) and links.collide(held_poses, a, b, 0):
             return DEFAULT
         if any(-COARSE < links.mesh_distance(pose, a, b) <= 0 for pose in named):
             return POSE
-        if colliding.mean() >= OFTEN and any(links.stops(joint, q, colliding) for joint in between or ()):
+        between = _own_between(robot, a, b) or ()
+        if colliding.mean() >= OFTEN and any(links.stops(joint, q, colliding) for joint in between):
             return LIMITS
         descents = settings.descents if near.min() < NEAR else settings.descents // 5
         if not colliding.any() and not _descend(links, a, b, q[np.argsort(near)[:descents]], rng):
@@ -149,8 +156,9 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
     return False
 
 
-def _own_between(robot: Robot, a: str, b: str) -> list[Joint] | None:
-    """The movable joints between two links of the arm itself; None if one of them is not the arm's."""
+def _own_between(robot: Robot, a: str, b: str, most_held: int = 0) -> list[Joint] | None:
+    """The movable joints between two links of the arm itself; None if one of them is not the arm's. Through
+    so many held joints at most, `most_held`, a link of the arm may carry another one of its own."""
     by_child = {joint.child: joint for joint in robot.joints}
 
     def joints_above(link: str) -> list[Joint]:
@@ -158,9 +166,11 @@ def _own_between(robot: Robot, a: str, b: str) -> list[Joint] | None:
 
     def own(link: str) -> bool:
         """What its links carry is the arm's own too, as the bellows of a lift; but for the last one's."""
-        moving = [joint for joint in above[link] if joint.kind in MOVING_KINDS][:1]
-        tool = robot.at_end(link) and above[link][:1] != moving
-        return not tool and all(joint in robot.planned_joints for joint in moving)
+        planned = [joint for joint in above[link] if joint in robot.planned_joints][:1]
+        carried = above[link][: above[link].index(planned[0])] if planned else above[link]
+        held = [joint for joint in carried if joint.kind in MOVING_KINDS]
+        tool = robot.at_end(link) and above[link][:1] != planned
+        return not tool and len(held) <= most_held
 
     above = {link: joints_above(link) for link in (a, b)}
     if not own(a) or not own(b):
@@ -304,8 +314,8 @@ class Links:
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
         """Signed distance between the covering spheres of two links [m]: at most that of their meshes."""
-        spheres = self.robot.spheres
-        return -deepest_touches(poses[a], poses[b], spheres[a], spheres[b], NEAR, -np.inf)[0]
+        first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
+        return -deepest_touches(poses[a], poses[b], first, second, NEAR, -np.inf)[0]
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""

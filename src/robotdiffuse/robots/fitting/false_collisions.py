@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
 from robotdiffuse.robots.fitting.allowed_collisions import Links
 from robotdiffuse.robots.fitting.convex_parts import Surface
@@ -85,7 +86,8 @@ def measure_refusals(
     column = {joint.name: i for i, joint in enumerate(links.joints)}
     found = []
     for a, b in robot.checked_pairs():
-        depth, middle = deepest_touches(poses[a], poses[b], robot.spheres[a], robot.spheres[b], 0.0, 0.0)
+        first, second = (for_kernels(robot.spheres[link]) for link in (a, b))
+        depth, middle = deepest_touches(poses[a], poses[b], first, second, 0.0, 0.0)
         spheres = depth > 0
         for table in tables.get(frozenset((a, b)), ()):
             spheres &= ~table.at(*(q[:, column[name]] for name in table.joints))

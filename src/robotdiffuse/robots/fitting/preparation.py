@@ -174,8 +174,14 @@ def prepare(
         if refusals.by_spheres <= settings.refused or k == settings.rounds:
             break
         robot = _refined(robot, links, refusals, k, settings, seed)
-    progress("done", steps, steps)
     _, _, robot, refusals = min(tried, key=lambda one: one[:2])  # finer is not always better
+    closer = _closer(robot, links, refusals, settings, seed)
+    if closer is not None:
+        again = measure_refusals(closer, surfaces, settings.samples, np.random.default_rng(seed))
+        worst = max(refusals.by_spheres, settings.refused)
+        if again.by_parts < refusals.by_parts and again.by_spheres <= worst:
+            robot, refusals = closer, again
+    progress("done", steps, steps)
     return Prepared(robot, tuple(_report(robot, name) for name in links), pairs, sampled, refusals)
 
 
@@ -229,9 +235,37 @@ def _refined(
             known = [] if link.bounds.tight is None else [link.bounds.tight]
             link.bounds = replace(link.bounds, tight=np.concatenate([*known, places]))
         robot = link.fit(robot, settings.spheres, seed)
-    of_parts = Links(robot)
-    tables = {table.links: table for table in robot.tables}
-    for pair in sorted(close | {pair for pair in tables if coarse & {*pair}}):
+    stale = {table.links for table in robot.tables if coarse & {*table.links}}
+    return _with_tables(robot, close | stale, settings)
+
+
+def _closer(
+    robot: Robot, links: dict[str, _Link], refusals: Refusals, settings: PreparationSettings, seed: int
+) -> Robot | None:
+    """The robot with finer parts where pairs of links overlap by parts alone; None if none were found to.
+
+    Start and goal are often such contacts, of an arm at rest beside its own body.
+    """
+    places: dict[str, list[ndarray]] = {}
+    for pair in refusals.pairs:
+        for name in pair.links:
+            if len(pair.coarse[name]):
+                places.setdefault(name, []).append(pair.coarse[name])
+    if not places:
+        return None
+    coarse = set(places)
+    for name in sorted(coarse):
+        link = links[name]
+        known = [] if link.tight is None else [link.tight]
+        link.tight = np.concatenate([*known, *places[name]])
+        robot = link.fit(link.decompose(robot), settings.spheres, seed)
+    return _with_tables(robot, {table.links for table in robot.tables if coarse & {*table.links}}, settings)
+
+
+def _with_tables(robot: Robot, pairs: set[tuple[str, str]], settings: PreparationSettings) -> Robot:
+    """The robot with tables over the joints between some pairs of links made, or made again."""
+    of_parts, tables = Links(robot), {table.links: table for table in robot.tables}
+    for pair in sorted(pairs):
         tables[pair] = joint_table(robot, of_parts, pair, settings.finest / 4)
     return replace(robot, tables=tuple(tables.values()))
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.fitting.convex_parts import split
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
@@ -121,7 +122,7 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], fine
     Triangles that no one sphere holds are cut in four, until all are held, or a corner is found that is in
     no sphere, or they are smaller than `finest` [m].
     """
-    triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    triangles, spheres = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), for_kernels(spheres)
     single = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
     while len(triangles):
         corners = triangles.reshape(-1, 3)

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from robotdiffuse.core.bounds import FASTEST, LARGEST
+from robotdiffuse.core.bounds import MAX_RATE, MAX_COORDINATE, MIN_RATE
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.robots.parsing.urdf import ACCELERATION_PER_VELOCITY, JERK_PER_ACCELERATION
@@ -66,13 +66,11 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
         kind = "position" if key.endswith("position") else key.removeprefix("max_")
         if entry.get(f"has_{kind}_limits") is False:
             continue
-        most = LARGEST if kind == "position" else FASTEST
+        most = MAX_COORDINATE if kind == "position" else MAX_RATE
         number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or abs(value) > most or (kind != "position" and value <= 0):
-            raise InputError(
-                f"{file}: {key} of {joint} is {shown(value)}; it must be a number within "
-                f"±{most:g}, above 0 for a rate"
-            )
+        if not number or abs(value) > most or (kind != "position" and value < MIN_RATE):
+            rule = f"within ±{most:g}" if kind == "position" else f"from {MIN_RATE:g} to {most:g}"
+            raise InputError(f"{file}: {key} of {joint} is {shown(value)}; it must be a number {rule}")
         fields[FIELDS[key]] = float(value)
     return fields
 

@@ -4,9 +4,10 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.input_files import is_file, read_bytes
+from robotdiffuse.core.input_files import input_file, is_file, read_bytes
 
 MOST_PACKAGES = 32
 """Packages of a xacro file that are looked for one after the other."""
@@ -92,12 +93,28 @@ def _with_prefixes(text: bytes) -> bytes:
 def _compiled(path: Path, packages: Packages) -> bytes:
     try:
         import xacro
-        from xacrodoc import packages as known  # which xacro asks from then on
+        from xacrodoc import packages as known
     except ImportError:
         raise InputError(
             f"{path} is a xacro file; install what compiles it, pip install 'robotdiffuse[xacro]', or "
             f"compile it elsewhere: xacro {path.name} > {path.name.split('.')[0]}.urdf"
         ) from None
+    for module in (xacro, known):
+        module.open = _open_file  # type: ignore[attr-defined]
+    try:
+        return _by_xacro(xacro, known, path, packages)
+    finally:
+        for module in (xacro, known):
+            del module.open  # type: ignore[attr-defined]
+
+
+def _open_file(file: str | Path, mode: str = "r") -> IO[Any]:
+    """`open` for xacro: it would wait for ever for a pipe that is included."""
+    return input_file(file).open(mode)
+
+
+def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:
+    """`known`: the packages that xacro asks for."""
     known.reset()
     known.walk_up_from(path)
     known.update_package_cache(packages.folders)
@@ -106,7 +123,7 @@ def _compiled(path: Path, packages: Packages) -> bytes:
             xacro.init_stacks(str(path.resolve()))  # what is included is looked for from here
             document = xacro.parse(None, str(path.resolve()))
             xacro.process_doc(document, mappings={})
-            return document.toxml("utf-8")  # type: ignore[attr-defined]
+            return document.toxml("utf-8")
         except Exception as error:  # xacro raises whatever it meets, and wraps what was raised within it
             why = " ".join(str(error).split())
             missing = MISSING.search(why)

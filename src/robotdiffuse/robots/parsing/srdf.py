@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from robotdiffuse.core.bounds import LARGEST
+from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import is_file, parse_xml, read_bytes
 from robotdiffuse.robots.robot import MOVING_KINDS, Joint
@@ -110,10 +110,10 @@ def read_srdf(file: str | Path) -> Srdf:
             value = float(text(element, "value").split()[0])
         except ValueError:
             value = math.nan
-        if not abs(value) <= LARGEST:
+        if not abs(value) <= MAX_COORDINATE:
             raise InputError(
                 f"{path}: joint {element.get('name')}: value is {shown(element.get('value'))}; "
-                f"it must be a number within ±{LARGEST:g}"
+                f"it must be a number within ±{MAX_COORDINATE:g}"
             )
         return value
 

@@ -10,7 +10,7 @@ import trimesh
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import FASTEST, LARGEST, SMALLEST, points, within
+from robotdiffuse.core.bounds import MAX_RATE, MAX_COORDINATE, MIN_RATE, MIN_SIZE, points, within
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import parse_xml, read_triangles
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
@@ -180,7 +180,7 @@ class UrdfTree:
             raise InputError(f"{self.path}: joint {name}: its {what} link {shown(link)} is not in the file")
         return link
 
-    def _numbers(self, text: str, count: int, what: str, most: float = LARGEST) -> Float[ndarray, "n"]:
+    def _numbers(self, text: str, count: int, what: str, most: float = MAX_COORDINATE) -> Float[ndarray, "n"]:
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
@@ -294,7 +294,7 @@ class UrdfTree:
         given: dict[str, float] = {}
         for what in ("lower", "upper", "velocity"):
             if limit is not None and limit.get(what) is not None:
-                text, most = limit.get(what, ""), FASTEST if what == "velocity" else LARGEST
+                text, most = limit.get(what, ""), MAX_RATE if what == "velocity" else MAX_COORDINATE
                 given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit", most)[0])
         if joint.kind == "continuous":
             given["lower"], given["upper"] = -TURNS, TURNS
@@ -306,6 +306,11 @@ class UrdfTree:
         if lower > upper:
             raise InputError(f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}")
         velocity = given.get("velocity", 0.0)
+        if 0 < velocity < MIN_RATE:
+            raise InputError(
+                f"{self.path}: joint {joint.name}: velocity limit is {velocity:g}; it must be at least "
+                f"{MIN_RATE:g}, or 0 where there is none"
+            )
         if velocity <= 0:
             velocity = DEFAULT_VELOCITY
             self.notes.append(f"joint {joint.name} has no velocity limit; {velocity:g} taken")
@@ -394,7 +399,7 @@ class UrdfTree:
         def positive(name: str, count: int) -> Float[ndarray, "n"]:
             what = f"link {link}: {shape.tag} {name}"
             values = self._numbers(shape.get(name, ""), count, what)
-            if (values < SMALLEST).any():
+            if (values < MIN_SIZE).any():
                 raise InputError(f"{self.path}: {what} is {shown(shape.get(name))}; it must be positive")
             return values
 
@@ -438,7 +443,7 @@ class UrdfTree:
 
     def _scale(self, shape: ET.Element, where: str) -> Float[ndarray, "3"]:
         scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"{where} scale")
-        if (np.abs(scale) < SMALLEST).any():
+        if (np.abs(scale) < MIN_SIZE).any():
             raise InputError(f"{where} scale is {shown(shape.get('scale'))}; no number of it may be 0")
         return scale
 

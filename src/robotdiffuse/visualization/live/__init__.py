@@ -1,2 +1,1 @@
-"""The interactive page: a session, which knows nothing of browsers, and its view in one. Only the command
-line imports this room."""
+"""The interactive page: a session, which is independent of browsers, and its view in the browser."""

@@ -1,9 +1,8 @@
-"""What stands between the network and the page: viser itself lets in whoever connects.
+"""Access: a proxy in front of viser, which by itself accepts every connection.
 
-Requests come here first. Let in are those whose path begins with the token, where there is one; that name the
-host as people on this machine do, where only they may come (a page elsewhere whose name was pointed at this
-machine does not); and, of those that open the connection through which all goes, those that this very page
-made. They are handed on to viser on a port of its own, with a secret that no one else has.
+The proxy accepts a request if its path begins with the token, or, without a token, if its Host header names
+this machine (which stops DNS rebinding). A request with an Origin header must come from this page. Accepted
+requests are forwarded to viser on a local port, with a secret header that only the proxy knows.
 """
 
 import asyncio
@@ -18,23 +17,24 @@ from urllib.parse import urlsplit
 from robotdiffuse.core.errors import InputError
 
 SECRET = "X-RobotDiffuse-Secret"
-LONGEST_HEAD = 32_768
-"""Of a request [bytes]."""
-PATIENCE = 10.0
-"""In which the head of a request has to come [s]."""
-PIECE = 65_536
+MAX_HEAD_SIZE = 32_768
+"""Largest head of a request [bytes]."""
+READ_TIMEOUT = 10.0
+"""Time for the head of a request to arrive [s]."""
+CHUNK_SIZE = 65_536
+"""Bytes that are forwarded at once."""
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach it."""
+    """Whether an address can be reached only from this machine."""
     try:
         return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False
 
 
-def bound(host: str, port: int) -> socket.socket:
-    """A socket that listens there; InputError, one line, where that cannot be."""
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens on an address. Raises InputError if that is not possible."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -50,25 +50,26 @@ def bound(host: str, port: int) -> socket.socket:
         listening.close()
         why = error.strerror or str(error)
         raise InputError(
-            f"port {port} of {host} cannot be used: {why}; choose another by --port, or 0 for any"
+            f"port {port} of {host} cannot be used: {why}; choose another with --port, or 0 for any"
         ) from None
     return listening
 
 
-class Door:
-    """Serves a socket until it is closed."""
+class AccessProxy:
+    """Forwards accepted requests from a listening socket to viser, in a thread, until it is closed."""
 
     def __init__(self, listening: socket.socket, inner_port: int, secret: str, token: str) -> None:
-        """`secret` goes with what is handed on to `inner_port` of this machine; no `token`: none is asked
-        for, and only names of this machine are let in."""
+        """secret: added to requests forwarded to `inner_port` on this machine. token: required in paths; if
+        empty, the Host header must name this machine."""
         self._listening, self._inner, self._secret, self._token = listening, inner_port, secret, token
         self._loop = asyncio.new_event_loop()
         self._ended = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name="door", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="access", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        with suppress(RuntimeError):  # it has ended already
+        """Stop listening and close all connections."""
+        with suppress(RuntimeError):  # the loop has already ended
             self._loop.call_soon_threadsafe(self._ended.set)
         self._thread.join(timeout=5.0)
 
@@ -77,7 +78,7 @@ class Door:
         self._loop.close()
 
     async def _serve(self) -> None:
-        server = await asyncio.start_server(self._enter, sock=self._listening, limit=LONGEST_HEAD)
+        server = await asyncio.start_server(self._handle, sock=self._listening, limit=MAX_HEAD_SIZE)
         await self._ended.wait()
         server.close()
         others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
@@ -85,10 +86,10 @@ class Door:
             task.cancel()
         await asyncio.gather(*others, return_exceptions=True)
 
-    async def _enter(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _handle(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE)
-            passed = admitted(head, self._token)
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), READ_TIMEOUT)
+            passed = accepted_head(head, self._token)
             if passed is None:
                 writer.write(REFUSAL)
                 await writer.drain()
@@ -96,17 +97,17 @@ class Door:
             request, _, fields = passed.partition(b"\r\n")
             inner_reader, inner_writer = await asyncio.open_connection("127.0.0.1", self._inner)
             inner_writer.write(request + f"\r\n{SECRET}: {self._secret}\r\n".encode() + fields)
-            await asyncio.gather(_pour(reader, inner_writer), _pour(inner_reader, writer))
+            await asyncio.gather(_forward(reader, inner_writer), _forward(inner_reader, writer))
         except (OSError, EOFError, TimeoutError, asyncio.LimitOverrunError, asyncio.CancelledError):
-            pass  # whoever it was has gone, or speaks no HTTP; or the door is closed
+            pass  # the client disconnected or speaks no HTTP, or the proxy was closed
         finally:
             writer.close()
 
 
-async def _pour(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def _forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     try:
-        while piece := await reader.read(PIECE):
-            writer.write(piece)
+        while chunk := await reader.read(CHUNK_SIZE):
+            writer.write(chunk)
             await writer.drain()
     finally:
         writer.close()
@@ -119,8 +120,8 @@ REFUSAL = (
 )
 
 
-def admitted(head: bytes, token: str) -> bytes | None:
-    """The head of a request as it is handed on, without the token; None if it is not let in."""
+def accepted_head(head: bytes, token: str) -> bytes | None:
+    """The head of a request to forward, without the token; None if the request is refused."""
     lines = head.decode("latin-1").split("\r\n")
     words = lines[0].split(" ")
     if len(words) != 3 or words[0] != "GET":
@@ -149,7 +150,7 @@ def admitted(head: bytes, token: str) -> bytes | None:
 
 
 def _part(url: str, name: str) -> str:
-    """Of what may be no URL; then ""."""
+    """A part of a URL; "" if it is not one."""
     try:
         return getattr(urlsplit(url), name) or ""
     except ValueError:
@@ -157,4 +158,5 @@ def _part(url: str, name: str) -> str:
 
 
 def new_token() -> str:
+    """A random token for the address of a page."""
     return secrets.token_urlsafe(16)

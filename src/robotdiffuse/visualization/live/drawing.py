@@ -1,4 +1,4 @@
-"""The scene in 3D, as viser draws it: arms, obstacles, the trace of the tool, the fan of candidates."""
+"""The 3D scene in viser: arms, obstacles, the trace of the tool, candidates and search trees."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,32 +17,32 @@ from robotdiffuse.robots.scaling import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 from robotdiffuse.visualization import style
-from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, held_at
+from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, moved_to
 from robotdiffuse.visualization.style import GOAL, START, Surface
 
-RATE = 30.0
-"""Poses of a motion that are worked out for each second."""
+POSE_RATE = 30.0
+"""Poses of a motion that are precomputed per second."""
 RED, AMBER = (0xD6, 0x3B, 0x3B), (0xE0, 0x9A, 0x2F)
 GAMMA = 2.2
-COMFORT = 0.05
-"""Candidates with so much clearance are wholly green [m]."""
+SAFE_CLEARANCE = 0.05
+"""Candidates with at least this clearance are green [m]."""
 TRACE_POINTS = 120
-EDGE_POINTS, MOST_EDGES = 6, 4000
-"""Of the tool's way along each edge of a tree; edges of each tree that are drawn, the first ones."""
+EDGE_POINTS, MAX_EDGES = 6, 4000
+"""Points of the tool's trace along an edge of a tree; most edges drawn per tree, the first ones."""
 TREES = ("/trees/start", "/trees/goal")
-COAT = 0.002
-"""How far what is seen through stands out, so that it lies over the arm where both are in one place [m]; the
-less that is seen through it, the further."""
-TRACE_WIDTH, FAN_WIDTH, TREE_WIDTH = 0.0094, 0.0035, 0.0028
-"""Of lines, as shares of the arm's reach."""
-GHOST = 0.3
-"""Opacity of start and goal."""
-SELECTED = 0.35
-"""How much lighter the obstacle is that was clicked on."""
+GHOST_OFFSET = 0.002
+"""Offset of a see-through arm along its normals, so that it covers the solid arm at the same place [m];
+scaled by its opacity over GHOST_OPACITY."""
+TRACE_WIDTH, CANDIDATE_WIDTH, TREE_WIDTH = 0.0094, 0.0035, 0.0028
+"""Line widths, as fractions of the arm's reach."""
+GHOST_OPACITY = 0.3
+"""Opacity of the start and goal arms."""
+HIGHLIGHT = 0.35
+"""Amount of white in the colour of the selected obstacle."""
 
 
 def _colored(surface: Surface) -> list[tuple[tuple[int, int, int], Surface]]:
-    """The surface in parts of one colour each."""
+    """The surface split by colour."""
     rows, index = np.unique(np.round(255 * surface.colors).astype(int), axis=0, return_inverse=True)
     of_face = index.reshape(-1)[surface.faces[:, 0]]
     return [((r, g, b), _faces_of(surface, of_face == i)) for i, (r, g, b) in enumerate(rows.tolist())]
@@ -66,7 +66,7 @@ def _add(
 
 
 class Arm:
-    """A robot in one configuration at a time."""
+    """A robot in the 3D scene."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class Arm:
         color: tuple[int, int, int] | None = None,
         opacity: float | None = None,
     ) -> None:
-        """In one colour, and seen through, where these are given; then without its base."""
+        """Draw in the robot's own colours, or in one colour, see-through and without the base."""
         self._server = server
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, visible=False)
         self._frames = []
@@ -88,11 +88,13 @@ class Arm:
             parts = _colored(surface) if color is None else [(color, surface)]
             for k, (own, part) in enumerate(parts):
                 if opacity is not None:
-                    part = replace(part, vertices=part.vertices + opacity / GHOST * COAT * part.normals)
+                    part = replace(
+                        part, vertices=part.vertices + opacity / GHOST_OPACITY * GHOST_OFFSET * part.normals
+                    )
                 _add(server, f"/{name}/{i}/{k}", part, own, opacity)
 
     def show(self, poses: "Poses | None", at: int = 0) -> None:
-        """In one of several poses; hidden without any."""
+        """Show the arm in row `at` of the poses; hide it for None."""
         if poses is not None:
             with self._server.atomic():
                 for i, frame in enumerate(self._frames):
@@ -101,26 +103,28 @@ class Arm:
             self.root.visible = poses is not None
 
     def remove(self) -> None:
+        """Remove the arm from the scene."""
         self.root.remove()
 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Of all frames of a robot, at one configuration after the other."""
+    """Poses of all frames of a robot in a sequence of configurations."""
 
     xyz: Float[ndarray, "n frames 3"]
     wxyz: Float[ndarray, "n frames 4"]
 
     @classmethod
     def of(cls, robot: Robot, q: Float[ndarray, "n dof"]) -> "Poses":
+        """The poses in these configurations."""
         T = style.frames(robot, q)
         rotations = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
         return cls(T[..., :3, 3], rotations.reshape(*T.shape[:2], 4))
 
 
-def film(robot: Robot, motion: Trajectory) -> Poses:
-    """RATE poses a second, and the last one."""
-    at = np.append(np.arange(0.0, motion.duration, 1 / RATE), motion.duration)
+def sampled_poses(robot: Robot, motion: Trajectory) -> Poses:
+    """Poses of a motion, POSE_RATE per second, and the last one."""
+    at = np.append(np.arange(0.0, motion.duration, 1 / POSE_RATE), motion.duration)
     q = np.stack([np.interp(at, motion.times, column) for column in motion.positions.T], axis=1)
     return Poses.of(robot, q)
 
@@ -129,19 +133,20 @@ Drawn = viser.MeshHandle | viser.PointCloudHandle
 
 
 class Obstacles:
-    """The shapes of a scene. One that moves is moved, one that changes is drawn anew."""
+    """The obstacles in the 3D scene. Moved obstacles are moved; changed ones are drawn again."""
 
     def __init__(self, server: viser.ViserServer, clicked: Callable[[str], None]) -> None:
         self._server, self._clicked = server, clicked
         self._drawn: dict[str, tuple[object, Drawn]] = {}
 
     def show(self, scene: Scene, selected: str) -> None:
+        """Update the obstacles to a scene, and highlight the selected one."""
         colors = style.obstacle_colors(scene)
         wanted = {shape.name: (shape, color) for shape, color in zip(scene.shapes, colors, strict=True)}
         for name in [name for name in self._drawn if name not in wanted]:
             self._drawn.pop(name)[1].remove()
         for name, (shape, color) in wanted.items():
-            key = _looks(shape), color, name == selected
+            key = _appearance(shape), color, name == selected
             known = self._drawn.get(name)
             if known is None or known[0] != key:
                 if known is not None:
@@ -155,10 +160,10 @@ class Obstacles:
 
     def _draw(self, shape: Shape, color: tuple[int, int, int], selected: bool) -> Drawn:
         if selected:
-            r, g, b = (round(c + SELECTED * (255 - c)) for c in color)
+            r, g, b = (round(c + HIGHLIGHT * (255 - c)) for c in color)
             color = r, g, b
-        name, at_origin = shape.name, held_at(shape, np.eye(4))
-        node = f"/obstacles/{name.encode().hex()}"  # names may hold slashes, which would be a tree to viser
+        name, at_origin = shape.name, moved_to(shape, np.eye(4))
+        node = f"/obstacles/{name.encode().hex()}"  # viser takes slashes in names for a tree
         if isinstance(at_origin, PointCloud):
             points, size = style.thinned(at_origin.points).astype(np.float32), 2 * at_origin.point_radius
             return self._server.scene.add_point_cloud(node, points, color, point_size=size)
@@ -167,12 +172,12 @@ class Obstacles:
         return handle
 
 
-def _looks(shape: Shape) -> object:
-    """What is the same for shapes that differ by where they stand alone."""
+def _appearance(shape: Shape) -> object:
+    """A key of the shape's geometry without its pose."""
     if isinstance(shape, Mesh):
         return "mesh", shape.vertices.tobytes(), shape.faces.tobytes()
     if isinstance(shape, PointCloud):
-        points = held_at(shape, np.eye(4)).points  # type: ignore[attr-defined]
+        points = moved_to(shape, np.eye(4)).points  # type: ignore[attr-defined]
         return "points", shape.point_radius, np.round(points, 6).tobytes()
     known = dimensions(shape)
     return (shape.kind, *known.items()) if known else id(shape)
@@ -181,30 +186,30 @@ def _looks(shape: Shape) -> object:
 def draw_trace(
     server: viser.ViserServer, robot: Robot, tool: tuple[int, ndarray], motion: Trajectory
 ) -> None:
-    """The way of the tool, from the colour of the start to that of the goal."""
+    """Draw the trace of the tool, coloured from start to goal."""
     points = style.trace(robot, tool, style.dense(motion.positions, TRACE_POINTS))
     share = np.linspace(0, 1, len(points))[:, None]
     colors = (1 - share) * np.array(START) + share * np.array(GOAL)
     _lines(server, "/trace", [points], [colors], TRACE_WIDTH * reach(robot))
 
 
-def draw_fan(
+def draw_candidates(
     server: viser.ViserServer, robot: Robot, tool: tuple[int, ndarray], candidates: Candidates | None
 ) -> None:
-    """The ways of the tool of all candidates: red where the spheres touch, through amber to green."""
+    """Draw the tool traces of all candidates: red in collision, else amber to green by clearance."""
     if candidates is None:
-        server.scene.remove_by_name("/fan")
+        server.scene.remove_by_name("/candidates")
         return
     ways = [style.trace(robot, tool, q) for q in candidates.positions]
     of = zip(ways, candidates.clearances, strict=True)
-    colors = [np.tile(fan_color(clearance), (len(way), 1)) for way, clearance in of]
-    _lines(server, "/fan", ways, colors, FAN_WIDTH * reach(robot))
+    colors = [np.tile(candidate_color(clearance), (len(way), 1)) for way, clearance in of]
+    _lines(server, "/candidates", ways, colors, CANDIDATE_WIDTH * reach(robot))
 
 
 def draw_trees(
     server: viser.ViserServer, robot: Robot, tool: tuple[int, ndarray], trees: tuple[Tree, ...]
 ) -> None:
-    """The ways of the tool along all edges, in the colours of start and goal; nothing of none."""
+    """Draw the tool traces along the edges of both search trees, in the colours of start and goal."""
     for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
         ways = [] if tree is None else _edges(robot, tool, tree)
         if len(ways):
@@ -216,7 +221,7 @@ def draw_trees(
 
 
 def _edges(robot: Robot, tool: tuple[int, ndarray], tree: Tree) -> list[Float[ndarray, "points 3"]]:
-    children = np.flatnonzero(tree.parents >= 0)[:MOST_EDGES]
+    children = np.flatnonzero(tree.parents >= 0)[:MAX_EDGES]
     begin, end = tree.nodes[tree.parents[children]], tree.nodes[children]
     share = np.linspace(0, 1, EDGE_POINTS)[:, None]
     q = (begin[:, None] + share * (end - begin)[:, None]).astype(np.float64)
@@ -224,18 +229,18 @@ def _edges(robot: Robot, tool: tuple[int, ndarray], tree: Tree) -> list[Float[nd
     return list(points.reshape(-1, EDGE_POINTS, 3))
 
 
-def fan_color(clearance: float) -> Float[ndarray, "3"]:
-    """sRGB, 0 to 255."""
+def candidate_color(clearance: float) -> Float[ndarray, "3"]:
+    """Colour of a candidate by its clearance [m]; sRGB, 0 to 255."""
     if clearance <= 0:
         return np.array(RED, float)
-    share = min(clearance / COMFORT, 1.0)
+    share = min(clearance / SAFE_CLEARANCE, 1.0)
     return (1 - share) * np.array(AMBER) + share * np.array(GOAL)
 
 
 def _lines(
     server: viser.ViserServer, name: str, ways: list[ndarray], colors: list[ndarray], width: float
 ) -> None:
-    """Polylines as segments; `width` [m], colours in sRGB, which viser takes for linear ones."""
+    """Draw polylines; `width` [m], colours in sRGB, converted because viser expects linear ones."""
     points = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways])
     ends = np.concatenate([np.stack([color[:-1], color[1:]], axis=1) for color in colors])
     linear = np.round(255 * (ends / 255) ** GAMMA).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Problems and replays as the page opens and hands them out, and what it begins with."""
+"""Problems that the page opens, uploads and saves, and replays that it saves."""
 
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -19,20 +19,20 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify
 from robotdiffuse.visualization.replay_page import write_replay
 
-DEMO = "shelf.yaml"
+DEMO_FILE = "shelf.yaml"
 FAMILY = "shelf"
-LARGEST_UPLOAD = 5_000_000
-"""Of a problem file [bytes]."""
-ON_DISK = ("file", "request", "views")
-"""Fields that name files of the machine that the page runs on."""
-TRIES = 1000
-"""Random configurations among which a free start and goal are looked for."""
+MAX_UPLOAD_SIZE = 5_000_000
+"""Largest problem file [bytes]."""
+FILE_FIELDS = ("file", "request", "views")
+"""Fields of a problem that name files on the server."""
+MAX_SAMPLES = 1000
+"""Most random configurations that are tried for a free start and goal."""
 
 
 def first_problem(file: str | None, robot: str | None) -> Problem:
-    """What the page begins with: a problem file, a robot's first problem, or the demo.
+    """The first problem of the page: from a file, for a robot, or the demo.
 
-    Raises InputError for both at once, and for whatever is wrong with either.
+    Raises InputError if both are given, and for a bad file or robot.
     """
     if file is not None and robot is not None:
         raise InputError(f"{file} names its robot; give a problem or --robot {robot}, not both")
@@ -40,12 +40,13 @@ def first_problem(file: str | None, robot: str | None) -> Problem:
         return load_problem(file)
     if robot is not None:
         return problem_for(load_robot(robot))
-    with as_file(files("robotdiffuse") / "examples" / DEMO) as demo:
+    with as_file(files("robotdiffuse") / "examples" / DEMO_FILE) as demo:
         return load_problem(demo)
 
 
 def problem_for(robot: Robot) -> Problem:
-    """Between shelves that are drawn for the arm; where none suit it, between two free configurations."""
+    """A problem of the family shelf for the arm; if there is none, between two free configurations in an
+    empty scene."""
     rng = np.random.default_rng(0)
     try:
         return load_family(FAMILY).draw(robot, rng).problem(robot)
@@ -53,27 +54,27 @@ def problem_for(robot: Robot) -> Problem:
         pass
     lower, upper = (np.clip(limit, -np.pi, np.pi) for limit in (robot.lower, robot.upper))
     free: list[np.ndarray] = []
-    for q in rng.uniform(lower, upper, (TRIES, robot.dof)):
+    for q in rng.uniform(lower, upper, (MAX_SAMPLES, robot.dof)):
         alone = Problem(robot, Scene(), q, JointGoal(q))
         if verify(alone, JointPath(robot.joint_names, q[None])).valid:
             free.append(q)
         if len(free) == 2:
             return Problem(robot, Scene(), free[0], JointGoal(free[1]))
-    raise InputError(f"of {TRIES} random configurations of {robot.name} fewer than 2 are free")
+    raise InputError(f"of {MAX_SAMPLES} random configurations of {robot.name} fewer than 2 are free")
 
 
 def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
-    """The problem of a file that a browser sent.
+    """The problem in an uploaded file.
 
-    It may name robots that are known and the one on the page, and nothing else of this machine. Raises
-    InputError, one line that begins with the name of the file.
+    It may name known robots and the one on the page, but no files on the server. Raises InputError, which
+    begins with the name of the file.
     """
-    if len(content) > LARGEST_UPLOAD:
-        raise InputError(f"{name} has {len(content)} bytes; at most {LARGEST_UPLOAD} are read")
+    if len(content) > MAX_UPLOAD_SIZE:
+        raise InputError(f"{name} has {len(content)} bytes; at most {MAX_UPLOAD_SIZE} are read")
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
-        raise InputError(f"{name} is not a text in UTF-8") from None
+        raise InputError(f"{name} is not UTF-8 text") from None
     data = parse_json(text, name) if name.lower().endswith(".json") else parse_yaml(text, name)
     try:
         _check_contained(data, robot)
@@ -85,29 +86,29 @@ def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
 def _check_contained(data: object, robot: Robot) -> None:
     """Raises InputError if the data of a problem file names files."""
     if not isinstance(data, dict):
-        return  # refused by the reader of problems
+        return  # the problem reader rejects it
     given, known = data.get("robot"), known_robots()
     if isinstance(given, str) and given not in known and given != robot.source:
         raise unknown_name("robot", given, known)
     if isinstance(data.get("scene"), str):
-        raise InputError(f"scene is {shown(data['scene'])}; {_OPEN}")
+        raise InputError(f"scene is {shown(data['scene'])}; {_NO_FILES}")
     parts: list[object] = [data]
     while parts:
         part = parts.pop()
         if isinstance(part, dict):
-            for field in ON_DISK:
+            for field in FILE_FIELDS:
                 if field in part:
-                    raise InputError(f"{field} is {shown(part[field])}; {_OPEN}")
+                    raise InputError(f"{field} is {shown(part[field])}; {_NO_FILES}")
             parts += part.values()
         elif isinstance(part, list):
             parts += part
 
 
-_OPEN = "the page reads no other files: open such a problem by `robotdiffuse live PROBLEM`"
+_NO_FILES = "the page reads no other files; open this problem with `robotdiffuse live PROBLEM`"
 
 
 def problem_text(problem: Problem) -> bytes:
-    """The problem as a file in YAML."""
+    """The problem as a YAML file."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "problem.yaml"
         save_problem(problem, file)
@@ -115,7 +116,7 @@ def problem_text(problem: Problem) -> bytes:
 
 
 def replay_page(problem: Problem, result: PlanResult, candidates: tuple[JointPath, ...] = ()) -> bytes:
-    """The motion of a solved result in its scene, as an HTML page that holds all that it needs."""
+    """The replay of a solved result as a self-contained HTML page."""
     motion = result.trajectory or result.path
     assert motion is not None
     robot, scene = problem.standing()

@@ -1,4 +1,4 @@
-"""Obstacles as hands change them: new ones, moved ones, resized ones."""
+"""Adding, moving and resizing obstacles on the page."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,29 +11,29 @@ from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.transforms import inverse, rotation_from_quaternion, transform
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere, pose
 
-NEW: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
+NEW_OBSTACLES: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
     "sphere": lambda center, size: Sphere(center, size),
     "box": lambda center, size: Box(center, (2 * size, 2 * size, 2 * size)),
     "cylinder": lambda center, size: Cylinder(center, 0.75 * size, 3 * size),
     "capsule": lambda center, size: Capsule(center, 0.75 * size, 2.5 * size),
 }
-"""Obstacles that can be added, as they are at first, by where they stand and by a ball's radius [m]."""
-LEAST, MOST = 0.01, 2.0
-"""Of a dimension [m]."""
+"""Makers of new obstacles, by kind, from their centre and the radius of a sphere of similar size [m]."""
+MIN_DIMENSION, MAX_DIMENSION = 0.01, 2.0
+"""Bounds of a dimension [m]."""
 AXES = ("x", "y", "z")
 ORIENTED = (Box, Cylinder, Capsule, Mesh)
-"""Others are turned by nothing: balls, and points, which a pose of their own would have to be kept for."""
+"""Shapes that can be rotated. Rotating a sphere has no effect, and point clouds store no pose."""
 
 
 def new_obstacle(kind: str, center: Float[ndarray, "3"], size: float) -> Shape:
-    """An obstacle of a kind in NEW; InputError for another kind."""
-    if kind not in NEW:
-        raise unknown_name("kind of obstacle", kind, NEW)
-    return NEW[kind](center, size)
+    """A new obstacle of a kind in NEW_OBSTACLES. Raises InputError for another kind."""
+    if kind not in NEW_OBSTACLES:
+        raise unknown_name("kind of obstacle", kind, NEW_OBSTACLES)
+    return NEW_OBSTACLES[kind](center, size)
 
 
 def handle_pose(shape: Shape) -> Float[ndarray, "4 4"]:
-    """T_base_handle of what a shape is held by: its own frame, or the middle of its bounds."""
+    """T_base_handle of the frame that a shape is dragged by: its own, or the middle of its bounds."""
     if isinstance(shape, Box | Cylinder | Capsule):
         return pose(shape)
     if isinstance(shape, Sphere):
@@ -43,15 +43,15 @@ def handle_pose(shape: Shape) -> Float[ndarray, "4 4"]:
     return transform(shape.bounds.mean(axis=0))
 
 
-def held_at(shape: Shape, T_base_handle: Float[ndarray, "4 4"]) -> Shape:
-    """The shape with its handle at a pose; those without an orientation of their own are not turned."""
+def moved_to(shape: Shape, T_base_handle: Float[ndarray, "4 4"]) -> Shape:
+    """The shape with its handle at a pose; shapes without an orientation are not rotated."""
     if not isinstance(shape, ORIENTED):
         T_base_handle = transform(T_base_handle[:3, 3])
     return shape.moved(T_base_handle @ inverse(handle_pose(shape)))
 
 
 def dimensions(shape: Shape) -> dict[str, float]:
-    """What can be changed about its size, by name [m]; nothing of meshes and point clouds."""
+    """The adjustable dimensions of a shape by name [m]; none for meshes and point clouds."""
     if isinstance(shape, Box):
         return {f"size {axis}": float(value) for axis, value in zip(AXES, shape.size, strict=True)}
     if isinstance(shape, Sphere):
@@ -62,12 +62,15 @@ def dimensions(shape: Shape) -> dict[str, float]:
 
 
 def resized(shape: Shape, dimension: str, value: float) -> Shape:
-    """The shape with one of its `dimensions` changed; InputError for another name, and beyond bounds."""
+    """The shape with one of its `dimensions` changed. Raises InputError for another name and values out of
+    bounds."""
     known = dimensions(shape)
     if dimension not in known:
         raise unknown_name(f"dimension of {shape.name}:", dimension, known)
-    if not LEAST <= value <= MOST:
-        raise InputError(f"{dimension} of {shape.name} is {value:g} m; it must be {LEAST:g} to {MOST:g} m")
+    if not MIN_DIMENSION <= value <= MAX_DIMENSION:
+        raise InputError(
+            f"{dimension} of {shape.name} is {value:g} m; it must be {MIN_DIMENSION:g} to {MAX_DIMENSION:g} m"
+        )
     if isinstance(shape, Box):
         size = np.array([value if name == dimension else old for name, old in known.items()])
         return replace(shape, size=size)

@@ -1,4 +1,4 @@
-"""The page: a session's view in browsers, by viser, behind a door of its own."""
+"""The page: shows a session in browsers with viser, behind an access proxy."""
 
 import contextlib
 import io
@@ -21,98 +21,99 @@ from robotdiffuse.robots.scaling import reach
 from robotdiffuse.validation.validator import Violation
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
-from robotdiffuse.visualization.live.access import SECRET, Door
-from robotdiffuse.visualization.live.certificate import certificate
+from robotdiffuse.visualization.live.access import SECRET, AccessProxy
 from robotdiffuse.visualization.live.drawing import (
-    GHOST,
+    GHOST_OPACITY,
+    POSE_RATE,
     RED,
     Arm,
     Obstacles,
     Poses,
-    draw_fan,
+    draw_candidates,
     draw_trace,
     draw_trees,
-    film,
+    sampled_poses,
 )
-from robotdiffuse.visualization.live.drawing import RATE as FILM_RATE
-from robotdiffuse.visualization.live.latest_task import Latest
-from robotdiffuse.visualization.live.panel import Deeds, Panel
+from robotdiffuse.visualization.live.latest_task import LatestTask
+from robotdiffuse.visualization.live.panel import Panel, PanelCallbacks
 from robotdiffuse.visualization.live.player import Player
 from robotdiffuse.visualization.live.session import Session, State
+from robotdiffuse.visualization.live.validity import validity
 from robotdiffuse.visualization.style import GOAL, START, Surface
 
-GIZMO, SMALL_GIZMO = 0.23, 0.16
-"""Sizes, as shares of the arm's reach."""
-FLOOR = 4.7
-"""Side, in the same."""
-FRAME, FREE = (900, 800), (0.06, 0.06)
-"""What the first view is made for [pixels], and the shares of its height that stay free."""
-SUNS = (2.0, (-2.0, -3.0, 5.0)), (1.1, (3.0, 2.0, 3.0)), (0.7, (-3.0, 3.0, 1.0))
-"""Lights: how bright, and from where."""
-BESIDE_PANEL = 0.2
-"""Of the window's height, how far what is looked at stands to the left."""
+GIZMO_SIZE, SMALL_GIZMO_SIZE = 0.23, 0.16
+"""Sizes of gizmos, as fractions of the arm's reach."""
+FLOOR_SIZE = 4.7
+"""Edge length of the floor, as a multiple of the arm's reach."""
+VIEW_SIZE, VIEW_MARGINS = (900, 800), (0.06, 0.06)
+"""Window size for which the first view is chosen [pixels], and the fractions of its height left free."""
+LIGHTS = (2.0, (-2.0, -3.0, 5.0)), (1.1, (3.0, 2.0, 3.0)), (0.7, (-3.0, 3.0, 1.0))
+"""Intensity and position of each light."""
+PANEL_OFFSET = 0.2
+"""Shift of the view to the left of the control panel, as a fraction of the window's height."""
 
 
 class _Server(viser.ViserServer):
-    """viser's, which publishes nothing."""
+    """viser's server without its public share URLs."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """A browser may ask for a tunnel from the internet to the page: it gets none."""
+        """None: a browser must not open a tunnel from the internet to the page."""
         return None
 
 
 class Page:
-    """Shows a session to all who come through the door on `listening`, until it is closed."""
+    """Shows a session to all browsers that pass the access proxy on `listening`, until it is closed."""
 
     def __init__(self, session: Session, listening: socket.socket, token: str = "") -> None:
         self.session = session
         self._selected, self._drawn = "", dict[str, Any]()
         secret = secrets.token_urlsafe(32)
-        with contextlib.redirect_stdout(io.StringIO()):  # it would print its own address
-            self._server = _Server("127.0.0.1", 0, verbose=False)
-        _only_with(secret, self._server)
-        self._furnish()
-        deeds = Deeds(self.select, self._seek, self._set_playing)
-        self._panel = Panel(self._server, session, deeds)
-        self._obstacles = Obstacles(self._server, self.select)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints its own address
+            self.server = _Server("127.0.0.1", 0, verbose=False)
+        _require_secret(secret, self.server)
+        self._add_static_scene()
+        callbacks = PanelCallbacks(self.select, self._seek, self._set_playing)
+        self._panel = Panel(self.server, session, callbacks)
+        self._obstacles = Obstacles(self.server, self.select)
         self._arms: dict[str, Arm] = {}
-        self._film: Poses | None = None
+        self._poses: Poses | None = None
         self._lock = threading.Lock()
-        self._player = Player(self._show_time)
-        self._drawing = Latest[None](lambda _: self._draw(), "draw")
-        session.tell = self._redraw
-        self._door = Door(listening, self._server.get_port(), secret, token)
+        self.player = Player(self._show_time)
+        self._drawing = LatestTask[None](lambda _: self._draw(), "draw")
+        session.on_change = self._redraw
+        self._proxy = AccessProxy(listening, self.server.get_port(), secret, token)
         self._redraw()
-        session.begin()
+        session.start()
 
     def select(self, name: str) -> None:
-        """Of the obstacles; "" for none."""
+        """Select an obstacle by name; "" for none."""
         self._selected = name
         self._redraw()
 
     def close(self) -> None:
+        """Stop serving and end all threads."""
         self.session.close()
-        self._door.close()
-        self._player.close()
+        self._proxy.close()
+        self.player.close()
         for gizmo in self._gizmos:
             gizmo.close()
         self._drawing.close()
         with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+            self.server.stop()
 
-    def _furnish(self) -> None:
-        """What stays as it is: light, floor, the view."""
-        server = self._server
+    def _add_static_scene(self) -> None:
+        """Add lights, floor and gizmos."""
+        server = self.server
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.set_panel_label("RobotDiffuse")
-        # viser's own light, an image of surroundings with shadows, is a hundred times as slow without a
+        # viser's default lighting, an environment map with shadows, is a hundred times slower without a
         # graphics card
         server.scene.configure_environment_map(None)
         server.scene.configure_default_lights(enabled=False)
         server.scene.add_light_ambient("/light/sky", intensity=1.1)
-        for i, (intensity, at) in enumerate(SUNS):
+        for i, (intensity, at) in enumerate(LIGHTS):
             server.scene.add_light_directional(f"/light/{i}", intensity=intensity, position=at)
-        side = FLOOR * reach(self.session.state.problem.robot)
+        side = FLOOR_SIZE * reach(self.session.state.problem.robot)
         server.scene.add_grid(
             "/floor",
             side,
@@ -122,24 +123,24 @@ class Page:
             section_size=side / 8,
             section_color=(214, 218, 224),
         )
-        self._goal_gizmo = _Gizmo(server, "/drag/goal", GIZMO, self.session.move_goal)
-        self._start_gizmo = _Gizmo(server, "/drag/start", SMALL_GIZMO, self.session.move_start)
-        self._obstacle_gizmo = _Gizmo(server, "/drag/obstacle", GIZMO, self._move_selected)
-        self._gizmos = self._goal_gizmo, self._start_gizmo, self._obstacle_gizmo
+        self.goal_gizmo = _Gizmo(server, "/drag/goal", GIZMO_SIZE, self.session.move_goal)
+        self._start_gizmo = _Gizmo(server, "/drag/start", SMALL_GIZMO_SIZE, self.session.move_start)
+        self._obstacle_gizmo = _Gizmo(server, "/drag/obstacle", GIZMO_SIZE, self._move_selected)
+        self._gizmos = self.goal_gizmo, self._start_gizmo, self._obstacle_gizmo
 
     def _move_selected(self, T_base_handle: Float[ndarray, "4 4"]) -> None:
         if self._selected:
             self.session.move_obstacle(self._selected, T_base_handle)
 
     def _redraw(self) -> None:
-        self._drawing.ask(None)
+        self._drawing.submit(None)
 
     def _draw(self) -> None:
-        """What has changed since the last time; the only caller of what draws, but for the player."""
+        """Draw what has changed; only this task and the player draw."""
         state, selected = self.session.state, self._selected
         problem, robot = state.problem, state.problem.robot
-        with self._server.atomic():
-            self._panel.show(state, certificate(state), selected)
+        with self.server.atomic():
+            self._panel.show(state, validity(state), selected)
             if self._new("robot", robot):
                 self._new_robot(robot)
             if self._new("scene", problem.scene) | self._new("selected", selected):
@@ -148,24 +149,24 @@ class Page:
                 T = self.session.obstacle_pose(selected) if selected in names else None
                 self._obstacle_gizmo.show(T)
             self._start_gizmo.show(link_pose(robot, problem.start, robot.tip))
-            if self._new("start", problem.start) | self._new("motion begins", state.motion):
-                self._ghost("start", None if _begins_there(state) else problem.start)
+            if self._new("start", problem.start) | self._new("motion start", state.motion):
+                self._ghost("start", None if _starts_at_start(state) else problem.start)
             if self._new("goal", state.goal_configuration):
                 self._ghost("goal", state.goal_configuration)
-            self._goal_gizmo.show(state.goal_pose)
+            self.goal_gizmo.show(state.goal_pose)
             if self._new("motion", state.motion):
                 self._new_motion(state)
-            if self._new("verdict", state.verdict):
+            if self._new("validation", state.validation):
                 self._show_violation(state)
             if self._new("candidates", state.candidates):
-                draw_fan(self._server, robot, self._tool, state.candidates)
+                draw_candidates(self.server, robot, self._tool, state.candidates)
             answer = state.answer
-            trees = answer.trees if state.choice.trees and answer is not None else ()
-            if (answer is not None or not state.choice.trees) and self._new("trees", trees):
-                draw_trees(self._server, robot, self._tool, trees)
+            trees = answer.trees if state.options.trees and answer is not None else ()
+            if (answer is not None or not state.options.trees) and self._new("trees", trees):
+                draw_trees(self.server, robot, self._tool, trees)
 
     def _new(self, what: str, value: object) -> bool:
-        """Whether it is another than at the last drawing."""
+        """Whether a value has changed since the last drawing."""
         known = what in self._drawn and self._drawn[what] is value
         self._drawn[what] = value
         return not known
@@ -176,27 +177,27 @@ class Page:
         surfaces = style.robot_surfaces(robot)
         self._tool = style.tool_point(robot, surfaces)
         self._arms = {
-            "arm": Arm(self._server, "arm", surfaces),
-            "start": Arm(self._server, "start", surfaces, START, GHOST),
-            "goal": Arm(self._server, "goal", surfaces, GOAL, GHOST),
-            "contact": Arm(self._server, "contact", surfaces, RED, 2 * GHOST),
+            "arm": Arm(self.server, "arm", surfaces),
+            "start": Arm(self.server, "start", surfaces, START, GHOST_OPACITY),
+            "goal": Arm(self.server, "goal", surfaces, GOAL, GHOST_OPACITY),
+            "contact": Arm(self.server, "contact", surfaces, RED, 2 * GHOST_OPACITY),
         }
         for gizmo in self._gizmos:
             gizmo.fit(reach(robot))
-        self._look_at_all(surfaces)
-        draw_trees(self._server, robot, self._tool, ())
-        for what in ("start", "goal", "motion", "verdict", "scene", "trees"):
+        self._set_first_view(surfaces)
+        draw_trees(self.server, robot, self._tool, ())
+        for what in ("start", "goal", "motion", "validation", "scene", "trees"):
             self._drawn.pop(what, None)
 
-    def _look_at_all(self, surfaces: list[Surface]) -> None:
-        """Where browsers that come look from: so that most is seen of start, goal and what lies between."""
+    def _set_first_view(self, surfaces: list[Surface]) -> None:
+        """Set the view of new browsers so that most of start and goal is visible."""
         state = self.session.state
         problem, goal = state.problem, state.goal_configuration
         q = np.stack([problem.start, problem.start if goal is None else goal])
-        view = view_of_motion(problem.robot, problem.scene, surfaces, self._tool, q, *FRAME, FREE)
+        view = view_of_motion(problem.robot, problem.scene, surfaces, self._tool, q, *VIEW_SIZE, VIEW_MARGINS)
         height = 2 * np.tan(VERTICAL_FIELD / 2) * np.linalg.norm(view.target - view.eye)
-        aside = BESIDE_PANEL * height * view.rotation[0]
-        camera = self._server.initial_camera
+        aside = PANEL_OFFSET * height * view.rotation[0]
+        camera = self.server.initial_camera
         camera.fov = VERTICAL_FIELD
         camera.position, camera.look_at = tuple(view.eye + aside), tuple(view.target + aside)
 
@@ -208,19 +209,19 @@ class Page:
         motion = None if state.motion is None else state.motion.trajectory
         if motion is None:
             with self._lock:
-                self._film = None
-            self._server.scene.remove_by_name("/trace")
+                self._poses = None
+            self.server.scene.remove_by_name("/trace")
             self._arms["arm"].show(Poses.of(state.problem.robot, state.problem.start[None]))
             return
-        poses = film(state.problem.robot, motion)
+        poses = sampled_poses(state.problem.robot, motion)
         with self._lock:
-            self._film = poses
-        draw_trace(self._server, state.problem.robot, self._tool, motion)
-        self._player.load(motion.duration)
+            self._poses = poses
+        draw_trace(self.server, state.problem.robot, self._tool, motion)
+        self.player.load(motion.duration)
 
     def _show_violation(self, state: State) -> None:
-        """The arm in red where the motion shown is wrong first."""
-        violation = None if state.verdict is None else state.verdict.report.violation
+        """Show the arm in red at the first collision of the motion."""
+        violation = None if state.validation is None else state.validation.report.violation
         motion = None if state.motion is None else state.motion.trajectory
         if violation is None or motion is None or not _is_collision(violation):
             self._arms["contact"].show(None)
@@ -230,61 +231,62 @@ class Page:
 
     def _show_time(self, at: float) -> None:
         with self._lock:
-            if self._film is None or "arm" not in self._arms:
+            if self._poses is None or "arm" not in self._arms:
                 return
-            row = min(round(at * FILM_RATE), len(self._film.xyz) - 1)
-            self._arms["arm"].show(self._film, row)
-        self._panel.show_time(at, self._player.duration)
+            row = min(round(at * POSE_RATE), len(self._poses.xyz) - 1)
+            self._arms["arm"].show(self._poses, row)
+        self._panel.show_time(at, self.player.duration)
 
     def _seek(self, at: float) -> None:
         self._set_playing(False)
-        self._player.seek(at)
+        self.player.seek(at)
 
     def _set_playing(self, playing: bool) -> None:
-        (self._player.play if playing else self._player.pause)()
+        (self.player.play if playing else self.player.pause)()
         self._panel.show_playing(playing)
 
 
 class _Gizmo:
-    """Arrows and rings that a pose is dragged by; `moved` is called with the pose as it goes."""
+    """A transform control; `moved` is called with its pose while it is dragged."""
 
     def __init__(self, server: viser.ViserServer, name: str, size: float, moved: Any) -> None:
-        """`size`: as a share of the arm's reach."""
-        self._handle = server.scene.add_transform_controls(name, depth_test=False, visible=False)
+        """size: as a fraction of the arm's reach."""
+        self.handle = server.scene.add_transform_controls(name, depth_test=False, visible=False)
         self._held, self._size, self._moved = False, size, moved
-        self._moving = Latest(self._move, name)
+        self._moving = LatestTask(self._move, name)
 
-        @self._handle.on_update
+        @self.handle.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
             self._held = event.phase != "end"
             if event.phase != "start":
                 rotation = rotation_from_quaternion(np.array(event.target.wxyz))
-                self._moving.ask(transform(np.array(event.target.position), rotation))
+                self._moving.submit(transform(np.array(event.target.position), rotation))
 
     def _move(self, T: Float[ndarray, "4 4"]) -> None:
-        with contextlib.suppress(InputError):  # it has been taken away by someone else
+        with contextlib.suppress(InputError):  # another visitor has deleted the obstacle
             self._moved(T)
 
     def close(self) -> None:
+        """End its thread."""
         self._moving.close()
 
     def fit(self, reach: float) -> None:
-        """To an arm that reaches so far [m]."""
-        self._handle.scale = self._size * reach
+        """Scale to an arm of this reach [m]."""
+        self.handle.scale = self._size * reach
 
     def show(self, T: Float[ndarray, "4 4"] | None) -> None:
-        """At a pose, unless it is being dragged; hidden without."""
+        """Move to a pose, unless it is being dragged; hide for None."""
         if T is not None and not self._held:
             wxyz = quaternion_from_rotation(T[:3, :3])
-            handle = self._handle
+            handle = self.handle
             if not (np.allclose(handle.position, T[:3, 3]) and np.allclose(handle.wxyz, wxyz)):
                 handle.position, handle.wxyz = T[:3, 3], wxyz
-        if self._handle.visible is not (T is not None):
-            self._handle.visible = T is not None
+        if self.handle.visible is not (T is not None):
+            self.handle.visible = T is not None
 
 
-def _begins_there(state: State) -> bool:
-    """Whether the motion shown begins at the start, so that the arm itself shows where that is."""
+def _starts_at_start(state: State) -> bool:
+    """Whether the motion shown starts at the problem's start, so that no start arm is needed."""
     motion = None if state.motion is None else state.motion.trajectory
     return motion is None or np.allclose(motion.positions[0], state.problem.start)
 
@@ -293,9 +295,9 @@ def _is_collision(violation: Violation) -> bool:
     return violation.kind in ("scene_collision", "self_collision")
 
 
-def _only_with(secret: str, server: viser.ViserServer) -> None:
-    """Close connections that did not come through the door: viser itself lets in any page of any browser of
-    this machine that finds its port. Raises AttributeError for a viser that is built otherwise."""
+def _require_secret(secret: str, server: viser.ViserServer) -> None:
+    """Close connections that bypass the access proxy: viser accepts any page in any browser on this machine
+    that finds its port. Raises AttributeError for a version of viser with other internals."""
     inner = server._websock_server
     connections = inner._live_connections
 

@@ -1,4 +1,4 @@
-"""The widgets of the page: what they show of a session's state, and what they ask of it."""
+"""The control panel of the page: widgets that show and change a session."""
 
 import html
 from collections.abc import Callable
@@ -14,25 +14,24 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.visualization.live.certificate import FREE, NONE, WAITING, WRONG, Certificate
 from robotdiffuse.visualization.live.files import problem_text, replay_page, uploaded_problem
-from robotdiffuse.visualization.live.obstacles import LEAST, MOST, NEW, dimensions
-from robotdiffuse.visualization.live.session import KEEP_TREES, Session, State
+from robotdiffuse.visualization.live.obstacles import MAX_DIMENSION, MIN_DIMENSION, NEW_OBSTACLES, dimensions
+from robotdiffuse.visualization.live.session import TREE_SETTINGS, Session, State
+from robotdiffuse.visualization.live.validity import INVALID, NO_MOTION, PENDING, VALID, Validity
 
-COLORS = {FREE: "#0f8f6f", WRONG: "#c92f2f", NONE: "#b26a00", WAITING: "#6b7684"}
-"""Of certificates."""
-SERIES = ("#4f7fd9", "#10a37f", "#d97b5c", "#8a63d2", "#c2a23a", "#4fa3b8", "#c96a9a", "#7a8794")
-"""Of joints in the plot."""
-NOTHING = "(none)"
-"""Selected where no obstacle is."""
+BADGE_COLORS = {VALID: "#0f8f6f", INVALID: "#c92f2f", NO_MOTION: "#b26a00", PENDING: "#6b7684"}
+JOINT_COLORS = ("#4f7fd9", "#10a37f", "#d97b5c", "#8a63d2", "#c2a23a", "#4fa3b8", "#c96a9a", "#7a8794")
+"""Colours of joints in the plot."""
+NO_OBSTACLE = "(none)"
+"""Option of the dropdown for no selected obstacle."""
 PLOTS = ("position", "velocity", "acceleration")
-SHORT = 8.0
-"""Notifications go after this [s]."""
+NOTIFICATION_TIME = 8.0
+"""Time that notifications stay [s]."""
 
 
 @dataclass(frozen=True)
-class Deeds:
-    """What the panel asks of the page rather than of the session."""
+class PanelCallbacks:
+    """Functions of the page that the panel calls."""
 
     select: Callable[[str], None]
     seek: Callable[[float], None]
@@ -40,13 +39,13 @@ class Deeds:
 
 
 class Panel:
-    """See the head of this file."""
+    """The widgets of the control panel."""
 
-    def __init__(self, server: viser.ViserServer, session: Session, deeds: Deeds) -> None:
-        self._server, self._session, self._deeds = server, session, deeds
+    def __init__(self, server: viser.ViserServer, session: Session, callbacks: PanelCallbacks) -> None:
+        self._server, self._session, self._callbacks = server, session, callbacks
         gui = server.gui
         self._shown: dict[str, Any] = {}
-        self._certificate = gui.add_html("")
+        self._badge = gui.add_html("")
         self._slider = gui.add_slider("Time", min=0.0, max=1.0, step=0.01, initial_value=0.0)
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
         tabs = gui.add_tab_group()
@@ -59,11 +58,11 @@ class Panel:
             self._joints: list[viser.GuiInputHandle[float]] = []
         with tabs.add_tab("Files"):
             self._files_tab()
-        self._on(self._slider, lambda event: deeds.seek(event.target.value))
-        self._play.on_click(lambda _event: deeds.play(self._play.label == "Play"))
+        self._on(self._slider, lambda event: callbacks.seek(event.target.value))
+        self._play.on_click(lambda _event: callbacks.play(self._play.label == "Play"))
 
     def _on(self, widget: Any, do: Callable[[Any], object]) -> None:
-        """Call `do` when someone changes a widget; what it refuses becomes a note on the page."""
+        """Call `do` when a visitor changes a widget; show its InputError as a notification."""
 
         @widget.on_update
         def _(event: viser.GuiEvent) -> None:
@@ -71,66 +70,67 @@ class Panel:
                 self.guarded(event, lambda: do(event))
 
     def guarded(self, event: viser.GuiEvent, do: Callable[[], object]) -> None:
-        """Call `do`; InputError becomes a note to who asked."""
+        """Call `do`; show its InputError as a notification to the visitor."""
         try:
             do()
         except InputError as error:
             if event.client is not None:
                 event.client.add_notification(
-                    "That cannot be", str(error), auto_close_seconds=SHORT, color="red"
+                    "Not possible", str(error), auto_close_seconds=NOTIFICATION_TIME, color="red"
                 )
 
     # tabs
 
     def _plan_tab(self) -> None:
-        gui, session, choice = self._server.gui, self._session, self._session.state.choice
-        self._planner = gui.add_dropdown("Planner", tuple(PLANNERS), initial_value=choice.planner)
+        gui, session, options = self._server.gui, self._session, self._session.state.options
+        self._planner = gui.add_dropdown("Planner", tuple(PLANNERS), initial_value=options.planner)
         self._limit = gui.add_slider(
-            "Time limit [s]", min=0.05, max=10.0, step=0.05, initial_value=min(choice.time_limit, 10.0)
+            "Time limit [s]", min=0.05, max=10.0, step=0.05, initial_value=min(options.time_limit, 10.0)
         )
         self._follow = gui.add_checkbox(
-            "Keep planning", initial_value=choice.follow, hint="Plan anew after each change"
+            "Plan automatically", initial_value=options.follow, hint="Plan again after each change"
         )
         self._candidates = gui.add_checkbox(
             "Candidates",
-            initial_value=choice.candidates,
-            hint="What the network proposes: red where it touches, green with 5 cm of clearance",
+            initial_value=options.candidates,
+            hint="Motions proposed by the network: red in collision, green from 5 cm clearance",
         )
         self._trees = gui.add_checkbox(
             "Search trees",
-            initial_value=choice.trees,
-            hint="From the start (blue) and the goal (green), of " + ", ".join(KEEP_TREES),
+            initial_value=options.trees,
+            hint="Search trees from the start (blue) and the goal (green); planners: "
+            + ", ".join(TREE_SETTINGS),
         )
         self._now = gui.add_button("Plan now", icon=viser.Icon.ROUTE)
         self._stages = gui.add_html("")
         self._kind = gui.add_dropdown("Plot", PLOTS, initial_value=PLOTS[0])
-        self._plot_box = gui.add_folder("Joints against their limits")
+        self._plot_box = gui.add_folder("Joint values relative to limits")
         self._plot: viser.GuiUplotHandle | None = None
-        self._on(self._planner, lambda event: session.choose(planner=event.target.value))
-        self._on(self._limit, lambda event: session.choose(time_limit=event.target.value))
-        self._on(self._follow, lambda event: session.choose(follow=event.target.value))
-        self._on(self._candidates, lambda event: session.choose(candidates=event.target.value))
-        self._on(self._trees, lambda event: session.choose(trees=event.target.value))
+        self._on(self._planner, lambda event: session.set_options(planner=event.target.value))
+        self._on(self._limit, lambda event: session.set_options(time_limit=event.target.value))
+        self._on(self._follow, lambda event: session.set_options(follow=event.target.value))
+        self._on(self._candidates, lambda event: session.set_options(candidates=event.target.value))
+        self._on(self._trees, lambda event: session.set_options(trees=event.target.value))
         self._on(self._kind, lambda _event: self._show_plot(session.state))
         self._now.on_click(lambda event: self.guarded(event, session.plan_now))
 
     def _obstacles_tab(self) -> None:
         gui = self._server.gui
-        nothing: tuple[str, ...] = (NOTHING,)
-        self._selected: Any = gui.add_dropdown("Obstacle", nothing, initial_value=NOTHING)
+        names: tuple[str, ...] = (NO_OBSTACLE,)
+        self._selected: Any = gui.add_dropdown("Obstacle", names, initial_value=NO_OBSTACLE)
         self._sizes_box = gui.add_folder("Size [m]", visible=False)
         self._sizes: dict[str, Any] = {}
         self._delete = gui.add_button("Delete", icon=viser.Icon.TRASH, visible=False)
-        self._new = gui.add_dropdown("New obstacle", tuple(NEW), initial_value="sphere")
+        self._new = gui.add_dropdown("New obstacle", tuple(NEW_OBSTACLES), initial_value="sphere")
         self._add = gui.add_button("Add", icon=viser.Icon.PLUS)
-        self._on(self._selected, lambda event: self._deeds.select(_name(event.target.value)))
+        self._on(self._selected, lambda event: self._callbacks.select(_name(event.target.value)))
         self._delete.on_click(
             lambda event: self.guarded(event, lambda: self._session.delete_obstacle(self._selected.value))
         )
         self._add.on_click(lambda event: self.guarded(event, self._add_obstacle))
 
     def _add_obstacle(self) -> None:
-        self._deeds.select(self._session.add_obstacle(self._new.value))
+        self._callbacks.select(self._session.add_obstacle(self._new.value))
 
     def _files_tab(self) -> None:
         gui, session = self._server.gui, self._session
@@ -163,19 +163,19 @@ class Panel:
 
             self.guarded(event, send)
 
-    # what is shown
+    # display
 
-    def show(self, state: State, certificate: Certificate, selected: str) -> None:
-        """All of a state that has changed."""
-        if self._new_value("certificate", (certificate, state.planning)):
-            self._certificate.content = _certificate_html(certificate, state.planning)
+    def show(self, state: State, validity: Validity, selected: str) -> None:
+        """Update the widgets to a state."""
+        if self._new_value("validity", (validity, state.planning)):
+            self._badge.content = _badge_html(validity, state.planning)
         if self._new_value("seconds", state.seconds):
             self._stages.content = _stages_html(state.seconds)
         for widget, value in (
-            (self._planner, state.choice.planner),
-            (self._follow, state.choice.follow),
-            (self._candidates, state.choice.candidates),
-            (self._trees, state.choice.trees),
+            (self._planner, state.options.planner),
+            (self._follow, state.options.follow),
+            (self._candidates, state.options.candidates),
+            (self._trees, state.options.trees),
         ):
             _set(widget, value)
         if self._new_value("motion", state.motion):
@@ -188,7 +188,7 @@ class Panel:
         self._show_obstacle(state, selected)
 
     def _new_value(self, what: str, value: object) -> bool:
-        """Whether it is another than the last time."""
+        """Whether a value has changed since the last call."""
         known = self._shown.get(what)
         if known is value or (isinstance(value, tuple) and known == value):
             return False
@@ -197,10 +197,10 @@ class Panel:
 
     def _show_obstacle(self, state: State, selected: str) -> None:
         shapes = {shape.name: shape for shape in state.problem.known_scene.shapes}
-        options: tuple[str, ...] = (NOTHING, *shapes)
+        options: tuple[str, ...] = (NO_OBSTACLE, *shapes)
         if self._new_value("options", options):
             self._selected.options = options
-        name = selected if selected in shapes else NOTHING
+        name = selected if selected in shapes else NO_OBSTACLE
         _set(self._selected, name)
         shape = shapes.get(selected)
         self._delete.visible = shape is not None
@@ -215,9 +215,9 @@ class Panel:
             _set(self._sizes[of], value)
 
     def _size_slider(self, name: str, dimension: str, value: float) -> Any:
-        most = max(MOST, value)
+        most = max(MAX_DIMENSION, value)
         slider = self._server.gui.add_slider(
-            dimension, min=min(LEAST, value), max=most, step=0.005, initial_value=value
+            dimension, min=min(MIN_DIMENSION, value), max=most, step=0.005, initial_value=value
         )
         self._on(slider, lambda event: self._session.resize_obstacle(name, dimension, event.target.value))
         return slider
@@ -242,13 +242,14 @@ class Panel:
         self._session.set_start(q)
 
     def show_time(self, at: float, duration: float) -> None:
-        """Where the slider stands."""
+        """Set the time slider [s]."""
         most = max(np.ceil(100 * duration) / 100, 0.01)
         if self._slider.max != most:
             self._slider.max = most
         self._slider.value = round(at, 2)
 
     def show_playing(self, playing: bool) -> None:
+        """Set the play button."""
         self._play.label = "Pause" if playing else "Play"
         self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
 
@@ -266,7 +267,7 @@ class Panel:
             return
         self._shown["joints of the plot"] = names
         joints = [
-            uplot.Series(label=name, stroke=SERIES[i % len(SERIES)], width=1.5)
+            uplot.Series(label=name, stroke=JOINT_COLORS[i % len(JOINT_COLORS)], width=1.5)
             for i, name in enumerate(names)
         ]
         limit = uplot.Series(label="limit", stroke="#c92f2f", width=1, dash=(6, 4))
@@ -282,8 +283,10 @@ class Panel:
 
 
 def plotted(robot: Robot, motion: Trajectory, kind: str) -> tuple[np.ndarray, ...]:
-    """Times, each joint in % of its limits, and the limits: -100 and 100. Of a position, 0 is the middle of
-    the range; for continuous joints, half a turn counts as the limit."""
+    """Plot data: times, each joint in % of its limits, and the limits 100 and -100.
+
+    Position 0 % is the middle of the range; the limit of a continuous joint is half a turn.
+    """
     if kind == "velocity":
         values = motion.velocities / robot.velocity
     elif kind == "acceleration":
@@ -297,13 +300,13 @@ def plotted(robot: Robot, motion: Trajectory, kind: str) -> tuple[np.ndarray, ..
 
 
 def _set(widget: Any, value: object) -> None:
-    """Without a message where it has the value already."""
+    """Set a widget, without a message to browsers if it already has the value."""
     if widget.value != value:
         widget.value = value
 
 
 def _name(option: str) -> str:
-    return "" if option == NOTHING else option
+    return "" if option == NO_OBSTACLE else option
 
 
 def _send(event: viser.GuiEvent, name: str, content: bytes) -> None:
@@ -311,14 +314,14 @@ def _send(event: viser.GuiEvent, name: str, content: bytes) -> None:
         event.client.send_file_download(name, content, save_immediately=True)
 
 
-def _certificate_html(certificate: Certificate, planning: bool) -> str:
-    lines = "".join(f"<div>{html.escape(line)}</div>" for line in certificate.lines)
-    busy = " · planning" if planning and certificate.kind != WAITING else ""
+def _badge_html(validity: Validity, planning: bool) -> str:
+    lines = "".join(f"<div>{html.escape(line)}</div>" for line in validity.lines)
+    busy = " · planning" if planning and validity.kind != PENDING else ""
     return (
-        f'<div data-certificate="{certificate.kind}" style="margin: 0 0.8em 0.8em; padding: 0.7em 0.9em; '
+        f'<div data-validity="{validity.kind}" style="margin: 0 0.8em 0.8em; padding: 0.7em 0.9em; '
         f"border-radius: 8px; color: white; font-size: 0.85em; line-height: 1.4; "
-        f'background: {COLORS[certificate.kind]}; overflow-wrap: anywhere">'
-        f"<b>{html.escape(certificate.headline)}</b>{busy}{lines}</div>"
+        f'background: {BADGE_COLORS[validity.kind]}; overflow-wrap: anywhere">'
+        f"<b>{html.escape(validity.headline)}</b>{busy}{lines}</div>"
     )
 
 

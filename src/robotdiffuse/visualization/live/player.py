@@ -1,17 +1,17 @@
-"""Playing a motion: a clock that goes round and round, and stands where it is put."""
+"""Playback clock of a motion: play in a loop, pause and seek."""
 
 import threading
 import time
 from collections.abc import Callable
 
-RATE = 30.0
-"""Times a second."""
-PAUSE = 0.7
-"""At the end of the motion, before it begins again [s]."""
+FRAME_RATE = 30.0
+"""Calls of `show` per second while playing."""
+END_PAUSE = 0.7
+"""Pause at the end of the motion before it repeats [s]."""
 
 
 class Player:
-    """Calls `show` with the time within the motion, from a thread of its own while it plays."""
+    """Calls `show` with the time in the motion [s]; while playing, from a thread of its own."""
 
     def __init__(self, show: Callable[[float], None]) -> None:
         self._show = show
@@ -22,29 +22,33 @@ class Player:
 
     @property
     def playing(self) -> bool:
+        """Whether the motion is playing."""
         return self._playing.is_set()
 
     def play(self) -> None:
+        """Start or resume playing."""
         self._playing.set()
 
     def pause(self) -> None:
+        """Stop at the current time."""
         with self._lock:
             self._playing.clear()
 
     def load(self, duration: float) -> None:
-        """Another motion of this length [s]; the same share of it has gone by."""
+        """Switch to a motion of this duration [s], at the same fraction of it."""
         with self._lock:
             share = self.time / self.duration if self.duration else 0.0
             self.duration = duration
             self.seek(min(share, 1.0) * duration)
 
     def seek(self, at: float) -> None:
-        """[s]"""
+        """Go to a time [s], clipped to the motion."""
         with self._lock:
             self.time = min(max(at, 0.0), self.duration)
             self._show(self.time)
 
     def close(self) -> None:
+        """End the thread."""
         self._ended = True
         self._playing.set()
 
@@ -58,7 +62,7 @@ class Player:
             with self._lock:
                 if self._playing.is_set():
                     at = self.time + now - last
-                    self.time = at if at <= self.duration + PAUSE else 0.0
+                    self.time = at if at <= self.duration + END_PAUSE else 0.0
                     self._show(min(self.time, self.duration))
             last = now
-            time.sleep(1 / RATE)
+            time.sleep(1 / FRAME_RATE)

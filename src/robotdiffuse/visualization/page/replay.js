@@ -1,5 +1,5 @@
 "use strict";
-// The replay page. It reads everything from the JSON in #data, written by html.py; units m, rad, s; z is up.
+// The replay page. It reads everything from the JSON in #data, written by replay_page.py; units m, rad, s; z is up.
 const data = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
 const dof = data.robot.offsets.length;
@@ -42,7 +42,7 @@ try {
   renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
 } catch (error) {
   $("problem").hidden = false;
-  $("problem").textContent = "This replay needs WebGL, which this browser does not offer or has switched off.";
+  $("problem").textContent = "This replay needs WebGL, which this browser does not support or has disabled.";
   throw error;
 }
 renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
@@ -406,8 +406,8 @@ function drawPlot(time) {
 
 // --- Time
 
-let time = 0, playing = false, rest = 0, last = null;
-const HOLD = 0.9; // seconds that the arm rests at the end before it starts again
+let time = 0, playing = false, rest = 0, last = null; // rest: time spent at the end [s]
+const END_PAUSE = 0.9; // pause at the end of the motion before it repeats [s]
 const ICONS = { play: "M8 5.2v13.6L19 12z", pause: "M7 5h3.6v14H7zm6.4 0H17v14h-3.6z" };
 
 function setPlaying(on) {
@@ -478,7 +478,7 @@ function tick(now) {
   if (playing) {
     if (time >= duration) {
       rest += dt;
-      if (rest > HOLD) { rest = 0; setTime(0); }
+      if (rest > END_PAUSE) { rest = 0; setTime(0); }
     } else {
       setTime(time + dt * Number($("speed").value));
     }

@@ -1,0 +1,443 @@
+"""Unknown space: motions planned on depth views, validated in the true scene; and where to look next.
+
+    python benchmarks/cameras.py [--problems 300] [--views 1] [--noise] [--records FILE]
+    python benchmarks/cameras.py --weights FOLDER ... --families shelf clutter
+    python benchmarks/cameras.py --report [--odd] --records FILE
+    python benchmarks/cameras.py --next-view [--problems 210] --records FILE
+    python benchmarks/cameras.py --next-view --report --records FILE
+    python benchmarks/cameras.py --fit --records FILE
+    python benchmarks/cameras.py --times
+
+Prints benchmarks/results/unseen.txt. Problems are held-out ones of the families that the straight line does
+not solve and a search in the true scene does. Cameras stand where a person would place them, 1.4 to 1.8 m
+away, in front more often than behind; the floor is known, all else must be seen. Every method plans with
+AORRTC, but for `hybrid`, and has the same CPU time. A motion is free if the validator accepts path and timed
+motion in the true scene. Records are kept in FILE and not made again; --report prints their tables.
+
+--weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
+`train completion`; methods are named by the folder. Those of a training that left families out are tried on
+these families. --fit prints the constants of perception/confidence.py, from problems with even numbers;
+settings were chosen on these too, and --odd leaves them out of the report. --times prints the CPU time of the
+network.
+
+--next-view plans a motion from one view, and plans again with a second view: from the pose that `next_view`
+proposes, from a random one of the poses that it chooses among, and from the first camera's pose turned by
+half a turn about the base.
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_processor_time
+from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.evaluation.statistics import compare, wilson_interval
+from robotdiffuse.learning.checkpoint import load_completion
+from robotdiffuse.learning.completion import bundled, predict
+from robotdiffuse.learning.completion.network import CompletionNetwork
+from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
+from robotdiffuse.perception.confidence import LEAST_RISK, confidence
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.observed_volume import observe
+from robotdiffuse.perception.ray_caster import DepthNoise, ray_cast
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.context import Request
+from robotdiffuse.planning.next_view import next_view, poses_around
+from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
+from robotdiffuse.problems.problem import PREDICTED, Problem
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.validation.validator import verify, verify_trajectory
+
+LIMIT = 1.0
+"""CPU time of every method on every problem [s]."""
+SEARCH_LIMIT = 1.0
+"""CPU time of the search that says whether a problem can be solved in the true scene [s]."""
+CAMERAS = CameraPlaces(distance=(1.4, 1.8), height=(0.5, 1.4), target_spread=0.1, roll=0.0)
+SIZE = (640, 480)
+HYBRID = "hybrid"
+"""As `predicted`, with `robotdiffuse` in place of AORRTC."""
+METHODS = {
+    "as seen": "optimistic",
+    "occupied": "occupied",
+    "padded": "padded",
+    "predicted": PREDICTED,
+    HYBRID: PREDICTED,
+}
+TRUE = "true voxels"
+"""As `predicted`, with the voxels of 2 cm that obstacles fill in truth."""
+BY = "predicted by "
+"""As `predicted`, with the weights of the folder of this name."""
+TIMED_CALLS, WARM_UP_CALLS = 140, 7
+"""Of the network."""
+SECOND_VIEWS = ("next_view", "random", "opposite")
+UNSURE = 0.9
+"""Another view is most wanted if the motion of one view has a stated confidence below this."""
+PLANNER, HYBRID_PLANNER = load_planner("aorrtc"), load_planner("robotdiffuse")
+Row = dict[str, Any]
+
+
+def problems(family: str, count: int, known: set[int]) -> Iterator[tuple[int, Problem]]:
+    """Held-out problems, with their numbers, that are neither trivial nor unsolved in the true scene. Up to
+    the largest of the `known` numbers, these are all."""
+    number = 0
+    while count:
+        if number in known or (number > max(known, default=-1) and _hard(held_out_problem(family, number))):
+            yield number, held_out_problem(family, number)
+            count -= 1
+        number += 1
+
+
+def _hard(problem: Problem) -> bool:
+    trivial = line_length(problem, lambda of, path: verify(of, path).valid) is not None
+    return not trivial and PLANNER.plan(problem, time_limit=SEARCH_LIMIT, until=FIRST).solved
+
+
+def views(problem: Problem, family: str, number: int, count: int, noisy: bool) -> list[DepthView]:
+    """Depth views of the problem's scene from random cameras, with the arm at its start."""
+    rng = np.random.default_rng([SEED, list(FAMILIES).index(family), number, 14])
+    taken = []
+    for _ in range(count):
+        T, angle = CAMERAS.draw(problem.scene, rng)
+        focal = SIZE[1] / 2 / np.tan(angle / 2)
+        intrinsics = (focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+        view = ray_cast(problem.scene, T, intrinsics, SIZE, problem.robot, problem.start)
+        taken.append(DepthNoise().applied(view, rng) if noisy else view)
+    return taken
+
+
+def plan(problem: Problem, partial: Problem, method: str, network: CompletionNetwork | None = None) -> Row:
+    """A record of a method that plans on `partial`, what was seen, and is validated in the true scene.
+
+    `network` predicts in place of the bundled one.
+    """
+    voxels = true_voxels(Scene(problem.scene.shapes[1:])).astype(np.float32) if method == TRUE else None
+    began = time.process_time()
+    if network is not None:
+        voxels = predict(observe(partial.views, partial.robot, partial.start), network)
+    asked = replace(partial, unknown=METHODS.get(method, PREDICTED))
+    left = LIMIT if network is None else LIMIT - (time.process_time() - began)
+    planner = HYBRID_PLANNER if method == HYBRID else PLANNER
+    result = plan_with_unknown_space(planner, asked, left, 0, Request(), voxels)
+    spent = time.process_time() - began
+    return {
+        "method": method,
+        "solved": result.solved,
+        "free": is_free(problem, result),
+        "assumption": result.assumption,
+        "confidence": result.confidence,
+        "risk": result.swept_probability,
+        "time": spent,
+        "reason": result.reason,
+    }
+
+
+def is_free(problem: Problem, result: PlanResult) -> bool:
+    """Whether the motion is valid in the true scene."""
+    if result.path is None or result.trajectory is None:
+        return False
+    return verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Make the records that are missing."""
+    networks = {BY + Path(folder).name: load_completion(folder) for folder in arguments.weights}
+    methods = [*arguments.methods, *networks]
+    kept = JsonLines(Path(arguments.records))
+    place = {"views": arguments.views, "noise": arguments.noise}
+    done = {(r["family"], r["number"], r["method"]) for r in kept.rows if place.items() <= r.items()}
+    each = arguments.problems // len(arguments.families)
+    warm = True
+    for family in arguments.families:
+        known = {row["number"] for row in kept.rows if row["family"] == family}
+        for number, problem in progress(list(problems(family, each, known)), family):
+            missing = [method for method in methods if (family, number, method) not in done]
+            if not missing:
+                continue
+            taken = views(problem, family, number, arguments.views, arguments.noise)
+            known = Scene(problem.scene.shapes[:1])
+            began = time.process_time()
+            partial = Problem(problem.robot, known, problem.start, problem.goal, views=taken)
+            spent = time.process_time() - began
+            if warm:
+                HYBRID_PLANNER.warm_up(problem, TIME_LIMIT)
+                plan(problem, partial, PREDICTED if PREDICTED in missing else "padded")
+                warm = False
+            for method in missing:
+                row = plan(problem, partial, method, networks.get(method))
+                kept.append({"family": family, "number": number, **place, "view_time": spent, **row})
+
+
+def table(rows: list[Row], title: str) -> None:
+    """Print the methods on the same problems: free in truth, plans, first assumption, times, each family."""
+    families = list(dict.fromkeys(row["family"] for row in rows))
+    lines = []
+    others = dict.fromkeys(row["method"] for row in rows if row["method"].startswith(BY))
+    for method in [*METHODS, *others, TRUE]:
+        mine = [row for row in rows if row["method"] == method]
+        if not mine:
+            continue
+        free, solved = sum(row["free"] for row in mine), sum(row["solved"] for row in mine)
+        low, high = wilson_interval(free, len(mine))
+        first = [row for row in mine if row["assumption"] == FIRST_ASSUMPTIONS.get(method, FIRST_PREDICTED)]
+        shares = [np.mean([row["free"] for row in mine if row["family"] == family]) for family in families]
+        lines.append(
+            (
+                method,
+                len(mine),
+                f"{100 * free / len(mine):.1f} ({100 * low:.0f} to {100 * high:.0f})",
+                f"{100 * solved / len(mine):.0f}",
+                f"{100 * free / max(solved, 1):.0f}",
+                f"{100 * len(first) / len(mine):.0f}" if first else "",
+                f"{100 * np.mean([row['free'] for row in first]):.0f}" if first else "",
+                f"{1e3 * np.median([row['time'] for row in mine]):.0f}",
+                *(f"{100 * share:.0f}" for share in shares),
+            )
+        )
+    columns = ["%", "problems", "free in truth", "plans", "of them free"]
+    columns += ["first assumption", "of it free", "ms", *families]
+    print_table(title, columns, lines)
+    base = {name: _free(rows, name) for name in [*METHODS, *others, TRUE]}
+    pairs = [("padded", "as seen"), ("predicted", "as seen"), ("predicted", "padded"), (TRUE, "predicted")]
+    pairs += [(HYBRID, "predicted")]
+    pairs += [(other, of) for other in others for of in ("as seen", "padded", "predicted")]
+    for a, b in pairs:
+        both = base[a].keys() & base[b].keys()
+        if both:
+            pair = compare(*(np.array([1.0 if base[m][k] else np.nan for k in sorted(both)]) for m in (a, b)))
+            gain = 100 * (pair.a_only - pair.b_only) / len(both)
+            print(f"{a} over {b}: {gain:+.1f} points, p = {pair.p_success:.2g} (McNemar, exact)")
+    print()
+
+
+FIRST_PREDICTED = "predicted, p > 0.1"
+FIRST_ASSUMPTIONS = {"as seen": None, "occupied": None, "padded": "points padded by 9 cm"}
+"""Of the methods that do not predict; of the others FIRST_PREDICTED."""
+
+
+def _free(rows: list[Row], method: str) -> dict[tuple[str, int], bool]:
+    return {(row["family"], row["number"]): row["free"] for row in rows if row["method"] == method}
+
+
+def calibration(rows: list[Row]) -> None:
+    """Print the stated confidence against the share that is free, on problems that it was not fitted on."""
+    for method in METHODS:
+        mine = [r for r in rows if r["method"] == method and r["solved"] and r["number"] % 2]
+        if not mine:
+            continue
+        stated = np.array([confidence(row["assumption"], row["risk"]) for row in mine])
+        free = np.array([row["free"] for row in mine], float)
+        lines, error = [], 0.0
+        for low in np.arange(0, 1, 0.2):
+            part = (stated >= low) & (stated < low + 0.2 + 1e-9 * (low > 0.7))
+            if part.any():
+                lines.append(
+                    (
+                        f"{low:.1f} to {low + 0.2:.1f}",
+                        int(part.sum()),
+                        f"{stated[part].mean():.2f}",
+                        f"{free[part].mean():.2f}",
+                    )
+                )
+                error += part.mean() * abs(stated[part].mean() - free[part].mean())
+        print_table(
+            f"Confidence of {method}, on problems with odd numbers",
+            ["stated", "motions", "mean", "free"],
+            lines,
+        )
+        print(f"expected error {error:.3f}\n")
+
+
+def report(rows: list[Row]) -> None:
+    """Print the tables of each number of views, with noise and without."""
+    places = dict.fromkeys((row["views"], row["noise"]) for row in rows)
+    for count, noisy in places:
+        some = [row for row in rows if (row["views"], row["noise"]) == (count, noisy)]
+        table(some, f"{count} {'noisy ' if noisy else ''}view{'s' if count > 1 else ''}")
+        if (count, noisy) == (1, False):
+            calibration(some)
+    spent = [row["view_time"] for row in rows]
+    print(f"From views to the problem's scene: {1e3 * np.median(spent):.0f} ms of CPU time (median)")
+
+
+def times(families: list[str]) -> None:
+    """Print the CPU time of the completion network, from a packed volume to probabilities, on one thread."""
+    volumes = []
+    for family in families:
+        problem = held_out_problem(family, 0)
+        seen = observe(views(problem, family, 0, 1, False), problem.robot, problem.start)
+        volumes.append([torch.from_numpy(array)[None] for array in pack(seen)])
+    torch.set_num_threads(1)
+    spent = {"fp32": list[float](), "bf16": list[float]()}
+    for i in range(TIMED_CALLS + WARM_UP_CALLS):
+        for name, taken in spent.items():
+            with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=name == "bf16"):
+                began = time.process_time()
+                bundled().probabilities(*volumes[i % len(volumes)])
+                taken.append(time.process_time() - began)
+    for name, taken in spent.items():
+        least, median = 1e3 * min(taken[WARM_UP_CALLS:]), 1e3 * np.median(taken[WARM_UP_CALLS:])
+        print(
+            f"network in {name}: {median:.1f} ms of CPU time (median), {least:.1f} least, {TIMED_CALLS} calls"
+        )
+
+
+def fit(rows: list[Row]) -> None:
+    """Print the constants RATES and BY_RISK of perception/confidence.py."""
+    rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1 and not r["noise"]]
+    plain = [row for row in rows if row["risk"] is None]
+    for assumption in dict.fromkeys(row["assumption"] for row in plain):
+        free = [row["free"] for row in plain if row["assumption"] == assumption]
+        print(f'RATES "{assumption}": {(sum(free) + 1) / (len(free) + 2):.2f} of {len(free)}')
+    for seen in (False, True):
+        some = [r for r in rows if r["method"] == "predicted" and (r["assumption"] == "as seen") == seen]
+        if some:
+            free, risk = (np.array([row[name] for row in some], float) for name in ("free", "risk"))
+            print(
+                "BY_RISK",
+                "as seen" if seen else "predicted",
+                _logistic(np.log(np.maximum(risk, LEAST_RISK)), free),
+            )
+
+
+def _logistic(x: Float[ndarray, "n"], y: Float[ndarray, "n"]) -> tuple[float, float]:
+    """Log odds at 0 and their slope, at most 0, fitted with a prior of one motion of either kind."""
+    from scipy.optimize import minimize
+
+    def loss(w: ndarray) -> float:
+        odds = w[0] + w[1] * x
+        prior = np.logaddexp(0, -w[0]) + np.logaddexp(0, w[0])
+        return float(np.logaddexp(0, np.where(y > 0, -odds, odds)).sum() + prior)
+
+    found = minimize(loss, np.zeros(2), bounds=[(None, None), (None, 0.0)]).x
+    return round(float(found[0]), 2), round(float(found[1]), 2)
+
+
+def run_next_view(records: str, families: list[str], count: int) -> None:
+    """Make the missing records of second views."""
+    kept = JsonLines(Path(records))
+    done = {(row["family"], row["number"]) for row in kept.rows}
+    for family in families:
+        known = {number for of, number in done if of == family}
+        some = list(problems(family, count // len(families), known))
+        for number, problem in progress(some, family):
+            if (family, number) not in done:
+                row = {"family": family, "number": number}
+                kept.append(row | plan_with_second_views(problem, family, number))
+
+
+def plan_with_second_views(problem: Problem, family: str, number: int) -> Row:
+    """A record of the motion from one view, and of those from each second view."""
+    [view] = views(problem, family, number, 1, False)
+    one = _plan_on(problem, view)
+    row: Row = {"one": is_free(problem, one[1]), "confidence": one[1].confidence}
+    if one[1].path is None:
+        return row
+    rng = np.random.default_rng([SEED, number, 15])
+    poses = poses_around()
+    chosen = {
+        "next_view": next_view(*one, poses).T_base_camera,
+        "random": poses[rng.integers(len(poses))],
+        "opposite": np.diag([-1.0, -1.0, 1.0, 1.0]) @ view.T_base_camera,
+    }
+    for name, T in chosen.items():
+        second = ray_cast(problem.scene, T, view.intrinsics, SIZE, problem.robot, problem.start)
+        result = _plan_on(problem, view, second)[1]
+        row |= {name: is_free(problem, result), f"{name} confidence": result.confidence or 0.0}
+    return row
+
+
+def _plan_on(problem: Problem, *seen: DepthView) -> tuple[Problem, PlanResult]:
+    known = Scene(problem.scene.shapes[:1])
+    partial = Problem(problem.robot, known, problem.start, problem.goal, views=seen, unknown=PREDICTED)
+    return partial, plan_with_unknown_space(PLANNER, partial, LIMIT, 0, Request())
+
+
+def report_next_view(rows: list[Row]) -> None:
+    """Print the shares free in truth, of all motions and of those that one view leaves unsure."""
+    rows = [row for row in rows if SECOND_VIEWS[0] in row]
+    unsure = [row for row in rows if row["confidence"] < UNSURE]
+    for title, some in (("All", rows), (f"Stated confidence of one view below {UNSURE}", unsure)):
+        if not some:
+            continue
+
+        def share(name: str, some: list[Row] = some) -> str:
+            return f"{100 * np.mean([row[name] for row in some]):.1f}"
+
+        lines = [("one view", len(some), share("one"), share("confidence"))]
+        lines += [(name, len(some), share(name), share(f"{name} confidence")) for name in SECOND_VIEWS]
+        print_table(title, ["second view", "problems", "free in truth, %", "stated, %"], lines)
+        proposed = np.array([1.0 if row[SECOND_VIEWS[0]] else np.nan for row in some])
+        for other in SECOND_VIEWS[1:]:
+            pair = compare(proposed, np.array([1.0 if row[other] else np.nan for row in some]))
+            print(
+                f"next_view alone free {pair.a_only}, {other} alone {pair.b_only}, p = {pair.p_success:.2g}"
+            )
+        print()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Planning on depth views, validated in the true scene.")
+    parser.add_argument("--problems", type=int, default=300, help="of all families together (300)")
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
+    every = [*METHODS, TRUE]
+    parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
+    parser.add_argument("--views", type=int, default=1, help="(1)")
+    parser.add_argument("--noise", action="store_true", help="of depth cameras")
+    parser.add_argument("--weights", nargs="*", default=[], metavar="FOLDER", help="of completion networks")
+    parser.add_argument("--records", default="unknown_space.jsonl", help="(unknown_space.jsonl)")
+    parser.add_argument("--next-view", action="store_true", help="second views")
+    parser.add_argument("--report", action="store_true", help="print the tables of the records")
+    parser.add_argument("--odd", action="store_true", help="report problems with odd numbers alone")
+    parser.add_argument("--fit", action="store_true", help="print the constants of the confidence")
+    parser.add_argument("--times", action="store_true", help="print the time of the network")
+    arguments = parse(parser, problems=1, families=["rop"], methods=["as seen", "predicted"])
+    if arguments.smoke:
+        smoke(arguments)
+    elif arguments.times:
+        print(header("torch"))
+        times(arguments.families)
+    elif arguments.fit:
+        fit(JsonLines(Path(arguments.records)).rows)
+    elif arguments.report:
+        print(header("numba", "numpy", "torch"))
+        rows = JsonLines(Path(arguments.records)).rows
+        if arguments.next_view:
+            report_next_view(rows)
+        else:
+            report([row for row in rows if row["number"] % 2 or not arguments.odd])
+    else:
+        use_processor_time()
+        if arguments.next_view:
+            run_next_view(arguments.records, arguments.families, arguments.problems)
+        else:
+            run(arguments)
+
+
+def smoke(arguments: argparse.Namespace) -> None:
+    """Run every part on one problem."""
+    use_processor_time()
+    with TemporaryDirectory() as folder:
+        arguments.records = f"{folder}/records.jsonl"
+        run(arguments)
+        rows = JsonLines(Path(arguments.records)).rows
+        report(rows)
+        fit([row | {"number": 0} for row in rows])
+        run_next_view(f"{folder}/second.jsonl", arguments.families, 1)
+        report_next_view(JsonLines(Path(folder) / "second.jsonl").rows)
+    times(arguments.families)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,282 @@
+"""Search and the hybrid: time to the first motion, path lengths at equal time, overrun, timing, collisions.
+
+    python benchmarks/planners.py [--parts first,lengths,limits,timing,collisions] [--each 25]
+        [--problems FOLDER --lengths FILE] [--limits 0.01,0.05,0.1,1] [--seeds 1] [--motions 400] [--cpu]
+
+Prints benchmarks/results/core.txt. FOLDER holds MotionBenchMaker families (scene and request files), FILE the
+reference lengths {"length": {"family/number": {"best_known": ...}}}; without one, the best known length of a
+problem is the shortest of all rows here. One thread; times are CPU times of the process unless wall time is
+said; with --cpu time limits are of CPU time too. Clearance 0, so that lengths compare with those of planners
+that keep none.
+"""
+
+import argparse
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+from common import (
+    FIRST,
+    TIME_LIMIT,
+    contacts_on_meshes,
+    dense,
+    header,
+    parse,
+    parts_of,
+    print_table,
+    progress,
+    use_processor_time,
+)
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.evaluation.methods import planned
+from robotdiffuse.evaluation.problem_sets import gather_cases
+from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.runs import Clock, run_all
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.problems.families import FAMILIES, load_family
+from robotdiffuse.problems.held_out import Case, goal_of
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Cylinder
+from robotdiffuse.trajectories.timing import TimingSettings, time_parameterize
+
+PANDA = load_robot("panda")
+SEED = 20261122
+PLANNERS = ("aorrtc", "robotdiffuse", "rrt_connect")
+JERK = 100.0
+"""[rad/s³]"""
+OVERRUN_LIMITS = (0.001, 0.01, 0.05, 0.1, 1.0)
+"""Time limits whose overrun is measured [s]."""
+TIMED_PATHS = 500
+MESH_STEP = 0.005
+"""Most motion of a joint between two configurations that are checked on meshes [rad]."""
+
+
+def gather(folder: Path | None, families: Sequence[str], each: int) -> list[Case]:
+    """So many problems of each family; those of MotionBenchMaker are spread evenly over its families."""
+    with TemporaryDirectory() as kept:
+        own = gather_cases([f"{name}_nontrivial" for name in families], each, Path(kept), print)
+        given = [] if folder is None else gather_cases([str(folder)], None, Path(kept), print)
+    for family in dict.fromkeys(case.family for case in given):
+        of = [case for case in given if case.family == family]
+        own += of[:: max(len(of) // each, 1)][:each]
+    return own
+
+
+def best_known(cases: Sequence[Case], lengths: dict, found: Sequence[Record]) -> dict[str, float]:
+    """The shortest known length of each problem, by its name [rad]: the given one, else the shortest
+    found."""
+    best: dict[str, float] = {}
+    for case in cases:
+        name = f"{case.family.removesuffix('_panda')}/{case.name[-4:]}"
+        if name in lengths:
+            best[case.name] = lengths[name]["best_known"]
+    for record in found:
+        if record.solved and record.name not in best:
+            best[record.name] = min(
+                r.measures["joint_length"] for r in found if r.solved and r.name == record.name
+            )
+    return best
+
+
+def warm(name: str, cases: Sequence[Case]) -> Planner:
+    """A planner that has loaded its compiled code, Coal and network."""
+    planner = load_planner(name)
+    planner.warm_up(cases[0].problem, TIME_LIMIT)
+    return planner
+
+
+def by_family(cases: Sequence[Case]) -> Iterator[tuple[str, list[Case]]]:
+    for family in dict.fromkeys(case.family for case in cases):
+        yield family, [case for case in cases if case.family == family]
+    yield "all", list(cases)
+
+
+def first(cases: Sequence[Case]) -> None:
+    """Print when aorrtc has its first path, and when its call returns."""
+    method = {"aorrtc": planned(warm("aorrtc", cases), until=FIRST, clearance=0.0)}
+    found = {r.name: r for r in run_all(cases, method, limit=5.0, title="first")["aorrtc"]}
+    rows = []
+    for family, of in by_family(cases):
+        records = [found[case.name] for case in of]
+        paths = [1e3 * r.progress[0][0] for r in records if r.progress]
+        cpu = np.percentile([1e3 * (r.cpu or np.nan) for r in records], (50, 95))
+        rows.append((family, sum(r.solved for r in records), len(of), np.median(paths), *cpu))
+    columns = ["family", "solved", "of", "first path ms", "whole call ms", "p95"]
+    print_table(
+        "aorrtc until the first motion",
+        columns,
+        [[r[0], r[1], r[2], *(f"{x:.2f}" for x in r[3:])] for r in rows],
+    )
+
+
+def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: int) -> None:
+    """Print path lengths at equal time limits, over the best known ones."""
+    found: dict[tuple[str, float], list[Record]] = {}
+    for limit in limits:
+        methods = {name: planned(warm(name, cases), until=TIME_LIMIT, clearance=0.0) for name in PLANNERS}
+        for name, records in run_all(cases, methods, range(seeds), limit, title=f"{limit:g} s").items():
+            found[name, limit] = records
+    best = best_known(cases, known, [record for records in found.values() for record in records])
+    rows = []
+    for family, of in by_family(cases):
+        inside = {case.name for case in of}
+        for name in PLANNERS:
+            row = [f"{family} ({len(of)})", name]
+            for limit in limits:
+                records = [r for r in found[name, limit] if r.name in inside]
+                ratios = [r.measures["joint_length"] / best[r.name] for r in records if r.solved]
+                missing = len(records) - len(ratios)
+                row.append(f"{np.mean(ratios):.4f}" + (f" ({missing} unsolved)" if missing else ""))
+            stages = [r.stage for r in found[name, limits[-1]] if r.name in inside and r.solved]
+            share = sum(stage in ("network", "refinement") for stage in stages) / max(len(stages), 1)
+            rows.append([*row, f"{100 * share:.0f} %"])
+    columns = ["family", "planner", *(f"{limit:g} s" for limit in limits), "network's in the last"]
+    notes = ("mean of lengths over the best known one of the solved; rrt_connect: restarts",)
+    print_table("Length over best known at equal time", columns, rows, notes)
+
+
+def limits(cases: Sequence[Case]) -> None:
+    """Print how much longer calls take than their time limits."""
+    rows = []
+    for name in ("aorrtc", "robotdiffuse"):
+        planner = warm(name, cases)
+        for limit in OVERRUN_LIMITS:
+            over = []
+            for case in progress(cases, f"{name} {limit:g} s"):
+                with Clock() as clock:
+                    result = planner.plan(case.problem, limit, until=TIME_LIMIT, clearance=0.0)
+                over.append((1e3 * (clock.wall - limit), result.solved))
+            late = np.array([o for o, _ in over])
+            solved = sum(s for _, s in over)
+            p50, p99 = np.percentile(late, (50, 99))
+            rows.append((name, f"{1e3 * limit:g}", f"{solved} of {len(cases)}", f"{p50:.1f}", f"{p99:.1f}"))
+    columns = ["planner", "limit ms", "solved", "overrun ms, median", "p99"]
+    print_table("Wall time beyond the limit, validation and timing of the answer included", columns, rows)
+
+
+def timing(cases: Sequence[Case], count: int = TIMED_PATHS) -> None:
+    """Print how the compiled time parameterization compares with toppra, and what limits it keeps."""
+    planner, ratios, worst, times = load_planner("aorrtc"), [], [0.0, 0.0], [[], []]
+    longer, jerk = [], 0.0
+    rng = np.random.default_rng(SEED)
+    paths: list[JointPath] = []
+    for case in progress(cases, "paths"):
+        for seed in range(count // len(cases) + 1):
+            result = planner.plan(case.problem, 1.0, seed, until=FIRST, clearance=0.0)
+            if result.path is not None:
+                paths.append(result.path)
+    always: Callable[[object], bool] = lambda _: True  # noqa: E731
+    for path in progress([paths[i] for i in rng.permutation(len(paths))[:count]], "timing"):
+        made = []
+        for i, solver in enumerate(("compiled", "toppra")):
+            with Clock() as clock:
+                made.append(time_parameterize(PANDA, path, always, always, TimingSettings(solver=solver)))
+            times[i].append(1e3 * clock.cpu)
+        ratios.append(made[0].duration / made[1].duration)
+        fine = time_parameterize(PANDA, path, always, always, TimingSettings(sample_time=0.001))
+        worst[0] = max(worst[0], float((np.abs(fine.velocities) / PANDA.velocity).max()))
+        worst[1] = max(worst[1], float((np.abs(fine.accelerations) / PANDA.acceleration).max()))
+        limited = TimingSettings(sample_time=0.001, jerk=JERK)
+        gentle = time_parameterize(PANDA, path, always, always, limited)
+        rates = np.diff(gentle.accelerations, axis=0) / np.diff(gentle.times)[:, None]
+        jerk = max(jerk, float(np.abs(rates).max()) / JERK)
+        longer.append(gentle.duration / fine.duration)
+    rows = [
+        ("duration over toppra's, least to most", f"{min(ratios):.5f} to {max(ratios):.5f}"),
+        ("CPU time, ms, median: compiled, toppra", f"{np.median(times[0]):.2f}, {np.median(times[1]):.2f}"),
+        ("greatest share of a velocity limit at 1 ms", f"{worst[0]:.6f}"),
+        ("greatest share of an acceleration limit at 1 ms", f"{worst[1]:.6f}"),
+        (f"greatest share of a jerk limit of {JERK:g} rad/s³ at 1 ms", f"{jerk:.6f}"),
+        ("duration with it over that without, median, most", f"{np.median(longer):.3f}, {max(longer):.3f}"),
+    ]
+    print_table(f"Timing of {len(ratios)} paths", ["", ""], rows)
+
+
+def with_thin_obstacles(problem: Problem, rng: np.random.Generator) -> Problem:
+    """The problem with plates of 1 mm and rods of 2 mm across at random places that leave start and goal
+    free."""
+    shapes = list(problem.scene.shapes)
+    ends = np.stack([problem.start, goal_of(problem)])
+    for _ in range(6):
+        at, wxyz = rng.uniform([-0.7, -0.7, 0.1], [0.7, 0.7, 1.1]), rng.normal(size=4)
+        wxyz /= np.linalg.norm(wxyz)
+        shape = Box(at, [0.3, 0.3, 0.001], wxyz) if rng.random() < 0.5 else Cylinder(at, 0.001, 0.5, wxyz)
+        scene = Scene([*shapes, shape])
+        if CollisionChecker(PANDA, scene).free(ends).all():
+            shapes.append(shape)
+    return Problem(PANDA, Scene(shapes), problem.start, problem.goal)
+
+
+def collisions(motions: int, seed: int) -> None:
+    """Print how many returned motions collide on meshes, half of them in scenes with thin obstacles."""
+    rng, rows = np.random.default_rng(seed), []
+    families = [load_family(name) for name in FAMILIES]
+    for name in ("aorrtc", "robotdiffuse"):
+        planner, hits, checked, configurations = load_planner(name), [0, 0], 0, 0
+        for i in progress(range(motions // 2), name):
+            problem = families[i % len(families)].draw(PANDA, np.random.default_rng([seed, i])).problem(PANDA)
+            problem = with_thin_obstacles(problem, rng) if i % 2 else problem
+            result = planner.plan(problem, 0.05, seed=i, clearance=0.0)
+            if result.trajectory is None:
+                continue
+            q = dense(result.trajectory.positions, MESH_STEP)
+            checked, configurations = checked + 1, configurations + len(q)
+            contacts = contacts_on_meshes(problem, q, tolerance=0.0)
+            hits[0] += contacts.coal > 0
+            hits[1] += contacts.pybullet
+        rows.append((name, checked, configurations, *hits))
+    columns = ["planner", "motions", "configurations", "in collision by Coal", "by PyBullet"]
+    print_table("Returned motions on meshes", columns, rows)
+
+
+PARTS = ("first", "lengths", "limits", "timing", "collisions")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Search and the hybrid: times, lengths, limits, collisions.")
+    parser.add_argument("--problems", type=Path, help="folder with MotionBenchMaker families")
+    parser.add_argument("--lengths", type=Path, help="reference lengths (JSON)")
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
+    parser.add_argument("--each", type=int, default=25, help="problems of each family (25)")
+    parser.add_argument("--parts", default=",".join(PARTS), help="of the report, separated by commas (all)")
+    parser.add_argument("--limits", default="0.01,0.05,0.1,1", help="for lengths [s], separated by commas")
+    parser.add_argument("--seeds", type=int, default=1, help="of each problem, for lengths (1)")
+    parser.add_argument("--paths", type=int, default=TIMED_PATHS, help=f"that are timed ({TIMED_PATHS})")
+    parser.add_argument("--motions", type=int, default=400, help="that are checked on meshes (400)")
+    parser.add_argument("--seed", type=int, default=SEED, help=f"of the scenes of these ({SEED})")
+    parser.add_argument("--cpu", action="store_true", help="time limits of CPU time, beside other work")
+    arguments = parse(parser, families=["rop"], each=2, limits="0.05", paths=3, motions=4)
+    parts = parts_of(arguments.parts, PARTS)
+    known = json.loads(arguments.lengths.read_text())["length"] if arguments.lengths else {}
+    print(header("numpy", "numba", "coal", "toppra"))
+    print(f"limits of {'CPU' if arguments.cpu else 'wall'} time")
+    if arguments.cpu:
+        use_processor_time()
+    cases = gather(arguments.problems, arguments.families, arguments.each)
+    for name in PLANNERS:
+        load_planner(name).warm_up(cases[0].problem)  # compiles
+    limits_of_lengths = [float(limit) for limit in arguments.limits.split(",")]
+    calls: Mapping[str, Callable[[], None]] = {
+        "first": partial(first, cases),
+        "lengths": partial(lengths, cases, known, limits_of_lengths, arguments.seeds),
+        "limits": partial(limits, cases),
+        "timing": partial(timing, cases, arguments.paths),
+        "collisions": partial(collisions, arguments.motions, arguments.seed),
+    }
+    for part in parts:
+        calls[part]()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,226 @@
+"""The robots that come with the package: problems of furniture and clutter, and inverse kinematics.
+
+    python benchmarks/robots.py [--robots ur5e fr3 ...] [--problems 200] [--out FILE] [--cpu]
+    python benchmarks/robots.py --inverse-kinematics [--poses 1000]
+
+The first prints benchmarks/results/shipped_arms.txt; --out is written anew as each robot ends, and --cpu
+makes time limits those of CPU time. First motions of `robotdiffuse` with a limit of 1 s, and with 10 s where
+that is not enough. On every tenth problem its path is compared with that of `aorrtc` after the same time: for
+robots without weights this is what batches of smooth noise add to search. Coal and PyBullet check the
+returned motions every 5 mrad on the robots' meshes. 200 problems take a robot about a minute of one core, and
+11 s more for each that is not solved.
+
+The second prints inverse_kinematics.txt: poses of panda_hand at uniform random configurations; NumPy
+kinematics measure the errors.
+"""
+
+import argparse
+import time
+from contextlib import redirect_stdout, suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from common import FIRST, TIME_LIMIT, dense, header, parse, print_table, progress, use_processor_time
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.transforms import rotation_angle, transform
+from robotdiffuse.planning import load_planner
+from robotdiffuse.problems.families.scaled import family_for
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.simulation.validator import PyBulletOracle
+
+FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
+SEED = 11
+"""Of the problems; no setting was chosen on them."""
+SHORT, LONG = 1.0, 10.0
+"""Time limits [s]."""
+COMPARED_EVERY = 10
+"""Of so many problems, one is planned for all of SHORT by both planners."""
+STEP = 0.005
+"""Largest joint motion between two checked configurations [rad]."""
+FRAME = "panda_hand"
+"""Of inverse kinematics."""
+
+
+@dataclass
+class Tally:
+    """Counts of one robot."""
+
+    problems: int = 0
+    short: int = 0
+    """Problems solved within SHORT, ..."""
+    long: int = 0
+    """... and within LONG."""
+    times: list[float] = field(default_factory=list)
+    ratios: list[float] = field(default_factory=list)
+    noise: int = 0
+    hard: list[str] = field(default_factory=list)
+    """Problems not solved within SHORT, and when they were."""
+    configurations: int = 0
+    by_coal: int = 0
+    by_pybullet: int = 0
+
+
+def check(problem: Problem, result: PlanResult, oracle: PyBulletOracle, tally: Tally) -> None:
+    """Check the timed motion on the meshes."""
+    assert result.trajectory is not None
+    q = dense(result.trajectory.positions, STEP)
+    tally.configurations += len(q)
+    tally.by_coal += bool(ExactCollision(problem.robot, problem.scene).collides(q).any())
+    oracle.set_scene(problem.scene)
+    tally.by_pybullet += oracle.check_frames(q, tolerance=0.0) is not None
+
+
+def draw(family: str, robot: Robot, count: int) -> list[tuple[str, Problem]]:
+    """Problems of a family with their names; fewer than `count` if its furniture rarely suits the arm."""
+    rng, found = np.random.default_rng(SEED), list[tuple[str, Problem]]()
+    for _ in range(2 * count):
+        with suppress(InputError):  # no free ends in many scenes
+            problem = family_for(family, robot).draw(robot, rng).problem(robot)
+            found.append((f"{family} {len(found)}", problem))
+        if len(found) == count:
+            break
+    return found
+
+
+def measure(name: str, problems: int) -> Tally:
+    """Plan the problems of one robot."""
+    robot, tally = load_robot(name), Tally()
+    hybrid, search = load_planner("robotdiffuse"), load_planner("aorrtc")
+    drawn = [problem for family in FAMILIES for problem in draw(family, robot, problems // len(FAMILIES))]
+    if not drawn:
+        return tally
+    for planner in (hybrid, search):
+        planner.warm_up(drawn[0][1], TIME_LIMIT)
+    with PyBulletOracle(robot, drawn[0][1].scene) as oracle:
+        for i, (what, problem) in enumerate(progress(drawn, name)):
+            tally.problems += 1
+            result = hybrid.plan(problem, SHORT, seed=i, until=FIRST)
+            tally.short += result.solved
+            if result.solved:
+                tally.times.append(1e3 * result.planning_time)
+            else:
+                result = hybrid.plan(problem, LONG, seed=i, until=FIRST)
+                tally.hard.append(f"{what} {f'{result.planning_time:.1f} s' if result.solved else 'never'}")
+            tally.long += result.solved
+            if result.solved:
+                check(problem, result, oracle, tally)
+            if i % COMPARED_EVERY == 0 and result.solved and result.stage != "straight_line":
+                ours, theirs = (
+                    p.plan(problem, SHORT, seed=i, until=TIME_LIMIT, clearance=0.0) for p in (hybrid, search)
+                )
+                if ours.path is not None and theirs.path is not None:
+                    tally.ratios.append(ours.path.length / theirs.path.length)
+                    tally.noise += ours.stage in ("smooth_noise", "network", "refinement")
+    return tally
+
+
+def report(head: str, tallies: dict[str, Tally]) -> None:
+    """Print the tables of the robots measured so far."""
+    rows, notes = [], []
+    for name, of in tallies.items():
+        if of.problems == 0:
+            rows.append([name, "0", *["-"] * 9])
+            continue
+        p50, p95 = np.percentile(of.times, (50, 95))
+        lengths = (
+            [f"{np.mean(of.ratios):.4f}", f"{of.noise} of {len(of.ratios)}"] if of.ratios else ["-", "-"]
+        )
+        found = [f"{of.problems}", f"{of.short}", f"{of.long}", f"{p50:.1f}", f"{p95:.1f}", *lengths]
+        rows.append([name, *found, f"{of.configurations}", f"{of.by_coal}", f"{of.by_pybullet}"])
+        if of.hard:
+            notes.append(f"{name}, not within a second: {', '.join(of.hard)}")
+    columns = (
+        "robot",
+        "problems",
+        "solved in 1 s",
+        "in 10 s",
+        "first ms, median",
+        "p95",
+        "length",
+        "batches'",
+    )
+    notes.append(
+        "length: of the hybrid over that of search alone at the same second, mean; batches': how many of "
+        "those answers come from batches (smooth noise; of the Panda, the network)",
+    )
+    print(head)
+    print_table("Furniture and clutter", (*columns, "checked", "Coal", "PyBullet"), rows, notes)
+
+
+def measure_inverse_kinematics(poses: int) -> None:
+    """Print the share solved, errors and times of inverse kinematics of the Panda."""
+    robot, rng = load_robot("panda"), np.random.default_rng(0)
+    start = time.perf_counter()
+    inverse_kinematics(robot, FRAME, transform(np.array([0.4, 0.0, 0.4])), rng=rng)
+    print(f"first call (compiled, or read from the cache): {time.perf_counter() - start:.2f} s")
+    targets = [link_pose(robot, rng.uniform(robot.lower, robot.upper), FRAME) for _ in range(poses)]
+    for what, count, settings in (
+        ("pose, 1 solution", 1, InverseKinematicsSettings()),
+        ("pose, 10 distinct solutions", 10, InverseKinematicsSettings()),
+        ("position only, 10 distinct solutions", 10, InverseKinematicsSettings(position_only=True)),
+    ):
+        milliseconds, found, position, rotation, gap = [], [], 0.0, 0.0, np.inf
+        for T in targets:
+            start = time.perf_counter()
+            solutions = inverse_kinematics(robot, FRAME, T, count, rng=rng, settings=settings)
+            milliseconds.append(1e3 * (time.perf_counter() - start))
+            found.append(len(solutions))
+            assert ((solutions > robot.lower) & (solutions < robot.upper)).all()
+            for i, q in enumerate(solutions):
+                reached = link_pose(robot, q, FRAME)
+                position = max(position, float(np.linalg.norm(reached[:3, 3] - T[:3, 3])))
+                rotation = max(rotation, rotation_angle(reached[:3, :3] @ T[:3, :3].T))
+                gap = min(gap, np.abs(solutions[:i] - q).max(-1).min(initial=np.inf))
+        counts, times = np.array(found), np.array(milliseconds)
+        print(
+            f"{what}: {(counts > 0).mean():.2%} of {poses} solved, all {count} found for"
+            f" {(counts == count).mean():.1%}; median {np.median(times):.3f} ms, p95"
+            f" {np.percentile(times, 95):.3f} ms, max {times.max():.2f} ms; largest error {position:.1e} m"
+            + ("" if settings.position_only else f", {rotation:.1e} rad")
+            + (f"; least difference {gap:.3f} rad" if count > 1 else "")
+        )
+    for what, xyz in (("far", (2.0, 0.0, 0.5)), ("just out of reach", (0.9, 0.0, 0.6))):
+        start = time.perf_counter()
+        found = len(inverse_kinematics(robot, FRAME, transform(np.array(xyz)), rng=rng))
+        print(
+            f"unreachable ({what}): {found} found, given up in {1e3 * (time.perf_counter() - start):.1f} ms"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Robots of the package: problems, inverse kinematics.")
+    parser.add_argument(
+        "--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS), metavar="ROBOT", help="(all)"
+    )
+    parser.add_argument("--problems", type=int, default=200, help="for each robot (200)")
+    parser.add_argument("--out", metavar="FILE", help="for the tables so far")
+    parser.add_argument("--cpu", action="store_true", help="time limits of CPU time, beside other work")
+    parser.add_argument("--inverse-kinematics", action="store_true", help="of the Panda, not problems")
+    parser.add_argument("--poses", type=int, default=1000, help="for inverse kinematics (1000)")
+    arguments = parse(parser, robots=["panda"], problems=5, poses=5)
+    head, tallies = header("numpy", "numba", "coal", "pybullet"), {}
+    if arguments.inverse_kinematics or arguments.smoke:
+        print(header("numpy", "numba"))
+        measure_inverse_kinematics(arguments.poses)
+        if arguments.inverse_kinematics:
+            return
+    if arguments.cpu:
+        head += "; times of the processor"
+        use_processor_time()
+    for name in arguments.robots:
+        tallies[name] = measure(name, arguments.problems)
+        if arguments.out:
+            with open(arguments.out, "w", encoding="utf-8") as file, redirect_stdout(file):
+                report(head, tallies)
+    report(head, tallies)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""A server under load: answers lost or mixed up, memory, and throughput beside the planner alone.
+
+    python benchmarks/server.py [--seconds 600] [--clients 8] [--workers 1] [--kills 5]
+
+Prints benchmarks/results/serve.txt. The planner plans held-out problems of four families in this process, a
+quarter of them with a box of their own in the hand, each with two seeds. Then clients ask the server for them
+at random and compare every answer with the planner's path, bit for bit. At last workers are killed while
+clients ask. With one core more than workers, the workers have their cores to themselves; CPU times need no
+quiet machine.
+"""
+
+import argparse
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+import robotdiffuse as rd
+from common import CONVERGED, header, parse, print_table
+from robotdiffuse.problems.files import problem_from_record, problem_record
+from robotdiffuse.problems.held_out import SEED, held_out_problem
+
+FAMILIES = ("rop", "shelf", "crate", "table")
+SEEDS = (0, 1)
+TIME_LIMIT = 10.0
+"""Long enough that no answer depends on the clock [s]."""
+ROUNDS = 3
+"""Of the planner alone, before and after the load."""
+
+
+@dataclass
+class Asked:
+    """A request, and the answer of the planner alone."""
+
+    body: bytes
+    problem: rd.Problem
+    seed: int
+    expected: list[list[float]] | None = None
+
+
+@dataclass
+class Seen:
+    """What the clients saw."""
+
+    answers: Counter = field(default_factory=Counter)
+    wrong: int = 0
+    lost: int = 0
+    seconds: list[float] = field(default_factory=list)
+
+
+def requests(planner: str, count: int) -> list[Asked]:
+    """Requests for `count` problems of each family."""
+    asked, rng = [], np.random.default_rng(SEED)
+    for number in range(count):
+        for family in FAMILIES:
+            record: dict[str, Any] = problem_record(held_out_problem(family, number))
+            if number % 4 == 0:
+                box = {"center": [0.0, 0.0, 0.13], "size": rng.uniform(0.02, 0.05, 3).tolist(), "name": "box"}
+                record["attached"] = [{"link": "panda_hand", "box": box}]
+            for seed in SEEDS:
+                body = {"problem": record, "planner": planner, "seed": seed, "time_limit": TIME_LIMIT}
+                asked.append(Asked(json.dumps(body).encode(), problem_from_record(record), seed))
+    return asked
+
+
+def bare(asked: list[Asked], planner: str) -> tuple[float, float]:
+    """Wall and CPU time of the planner alone for all requests [s]; keeps its answers in these."""
+    loaded = rd.load_planner(planner)
+    loaded.warm_up(asked[0].problem, CONVERGED)
+    for one in asked:
+        result = loaded.plan(one.problem, TIME_LIMIT, one.seed)
+        waypoints = None if result.path is None else result.path.positions.tolist()
+        assert one.expected is None or one.expected == waypoints, "the planner contradicts itself"
+        one.expected = waypoints
+    wall, spent = time.perf_counter(), time.process_time()
+    for _ in range(ROUNDS):
+        for one in asked:
+            loaded.plan(one.problem, TIME_LIMIT, one.seed)
+    return (time.perf_counter() - wall) / ROUNDS, (time.process_time() - spent) / ROUNDS
+
+
+def run_client(
+    url: str, asked: list[Asked], seed: int, until: float, seen: Seen, lock: threading.Lock
+) -> None:
+    import orjson
+
+    rng, kind = random.Random(seed), {"Content-Type": "application/json"}
+    with httpx.Client(base_url=url, timeout=60.0) as http:
+        while time.monotonic() < until:
+            one, begun = rng.choice(asked), time.monotonic()
+            try:
+                answer = http.post("/plan", content=one.body, headers=kind)
+            except httpx.HTTPError:
+                with lock:
+                    seen.lost += 1
+                continue
+            record = orjson.loads(answer.content)
+            right = record.get("waypoints") == one.expected and record.get("seed") == one.seed
+            with lock:
+                seen.answers[answer.status_code] += 1
+                seen.wrong += answer.status_code == 200 and not right
+                seen.seconds.append(time.monotonic() - begun)
+
+
+def load(url: str, asked: list[Asked], clients: int, seconds: float, meanwhile: Any) -> Seen:
+    """What clients see in this time; `meanwhile` is called every second with the seconds since the start."""
+    seen, lock, begun = Seen(), threading.Lock(), time.monotonic()
+    threads = [
+        threading.Thread(target=run_client, args=(url, asked, i, begun + seconds, seen, lock))
+        for i in range(clients)
+    ]
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        meanwhile(time.monotonic() - begun)
+        time.sleep(1.0)
+    return seen
+
+
+def private_memory(process: int) -> float:
+    """Private memory of a process [MB]."""
+    try:
+        rows = Path(f"/proc/{process}/smaps_rollup").read_text()
+    except (OSError, ValueError):
+        return 0.0
+    return sum(int(row.split()[1]) for row in rows.splitlines() if row.startswith("Private")) / 1024
+
+
+def cpu_time(process: int) -> float:
+    """CPU time of a process [s]."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def workers_of(process: int) -> list[int]:
+    """The server's worker processes."""
+    found = subprocess.run(["pgrep", "-P", str(process), "-f", "spawn_main"], capture_output=True, text=True)
+    return [int(line) for line in found.stdout.split()]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="A server under load.")
+    parser.add_argument("--seconds", type=float, default=600.0, help="of load (600)")
+    parser.add_argument("--clients", type=int, default=8, help="(8)")
+    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1), help="(cores - 1)")
+    parser.add_argument("--kills", type=int, default=5, help="of workers (5)")
+    parser.add_argument("--problems", type=int, default=10, help="of each family (10)")
+    parser.add_argument("--planner", default="robotdiffuse", help="(robotdiffuse)")
+    small = {"seconds": 4.0, "clients": 2, "workers": 1, "kills": 1, "problems": 1, "planner": "rrt_connect"}
+    arguments = parse(parser, **small)
+    print(header("numpy", "numba", "fastapi", "uvicorn"), "\n")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    asked = requests(arguments.planner, arguments.problems)
+    before = bare(asked, arguments.planner)
+    command = ["serve", "--port", "0", "--workers", str(arguments.workers), "--queue", str(arguments.clients)]
+    with subprocess.Popen(
+        [sys.executable, "-m", "robotdiffuse", *command], stdout=subprocess.PIPE, text=True
+    ) as server:
+        assert server.stdout is not None
+        found = re.search(r"http://[^;]+", server.stdout.readline())
+        assert found is not None
+        url = found.group()
+        while httpx.get(f"{url}/health").json()["workers_ready"] < arguments.workers:
+            time.sleep(0.2)
+        load(url, asked, arguments.clients, min(20.0, arguments.seconds / 4), lambda _: None)
+        workers = workers_of(server.pid)
+        rows: list[tuple[float, float, float]] = []
+        at_first = {process: cpu_time(process) for process in (server.pid, *workers)}
+
+        def watch(since: float) -> None:
+            rows.append((since, private_memory(server.pid), max(map(private_memory, workers))))
+
+        seen = load(url, asked, arguments.clients, arguments.seconds, watch)
+        used = {process: cpu_time(process) - at_first[process] for process in at_first}
+        kills: list[float] = []
+
+        def kill(since: float) -> None:
+            if len(kills) < arguments.kills and since > 4.0 * (len(kills) + 1):
+                ready = httpx.get(f"{url}/health").json()["workers_ready"]
+                if ready == arguments.workers:
+                    os.kill(random.choice(workers_of(server.pid)), signal.SIGKILL)
+                    kills.append(since)
+
+        killed = load(url, asked, arguments.clients, 6.0 * arguments.kills + 10.0, kill)
+        server.send_signal(signal.SIGTERM)
+        status = server.wait(30)
+    after = bare(asked, arguments.planner)
+    alone = len(asked) / min(before[0], after[0]), len(asked) / min(before[1], after[1])
+    count = sum(seen.answers.values())
+    worked = sum(used[process] for process in workers)
+    rates = {
+        "planner alone": alone,
+        "served, a worker": (count / arguments.seconds / arguments.workers, count / worked),
+        "served, with the process that listens": (None, count / (worked + used[server.pid])),
+    }
+    print_table(
+        f"Plans a second, {arguments.planner}, {arguments.workers} workers, {arguments.clients} clients",
+        ("", "of wall time", "of alone, %", "of CPU time", "of alone, %"),
+        [
+            (
+                name,
+                *(
+                    part
+                    for rate, base in zip(rate_of, alone, strict=True)
+                    for part in ((f"{rate:.1f}", f"{100 * rate / base:.0f}") if rate else ("", ""))
+                ),
+            )
+            for name, rate_of in rates.items()
+        ],
+    )
+    times = 1e3 * np.array(seen.seconds)
+    print_table(
+        f"What {arguments.clients} clients saw in {arguments.seconds:.0f} s",
+        ("", "undisturbed", f"{len(kills)} workers killed"),
+        [
+            ("answers", *(str(sum(of.answers.values())) for of in (seen, killed))),
+            ("by code", *(_codes(of) for of in (seen, killed))),
+            ("lost, without an answer", str(seen.lost), str(killed.lost)),
+            ("not the planner's path", str(seen.wrong), str(killed.wrong)),
+            (
+                "seconds to an answer, median / 99 % / most",
+                " / ".join(f"{x / 1e3:.3f}" for x in (*np.percentile(times, (50, 99)), times.max())),
+                "",
+            ),
+        ],
+    )
+    marks = [rows[int(share * (len(rows) - 1))] for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    print_table(
+        "Private memory, MB",
+        ("after, s", "process that listens", "largest worker"),
+        [tuple(f"{value:.0f}" for value in row) for row in marks],
+    )
+    print(f"\nExit status after SIGTERM: {status}.")
+    failed = seen.lost or seen.wrong or killed.lost or killed.wrong or set(seen.answers) != {200}
+    if failed or killed.answers[500] > len(kills) or status:
+        sys.exit(1)
+
+
+def _codes(seen: Seen) -> str:
+    return ", ".join(f"{code}: {count}" for code, count in sorted(seen.answers.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""Compiled code from a cold cache, from a warm one, and loaded in another order: whether results are the same
+bits.
+
+    python benchmarks/startup.py [--seed 0] [--only clearances,gradients]
+
+Prints benchmarks/results/cold_cache.txt. Each part runs in a process of its own: first with an empty cache,
+which compiles; then twice with the cache that this left, in the same order and in reverse. Every number that
+a part returns is compared.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray
+
+RUNS = ("cold", "warm", "warm, in the other order")
+ROWS = 2000
+"""Configurations that each part gets."""
+
+
+def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
+    """Calls of compiled code that return numbers, by name."""
+    import robotdiffuse as rd
+    from robotdiffuse.collision.batched_clearances import (
+        packed_clearances_and_gradients,
+        packed_link_clearances,
+    )
+    from robotdiffuse.collision.checker import CollisionChecker
+    from robotdiffuse.collision.kernel_arrays import compile_robot
+    from robotdiffuse.learning.guidance import CollisionGuidance
+    from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
+    from robotdiffuse.robots.kinematics import link_pose
+    from robotdiffuse.scenes.scene_arrays import PackedScenes
+    from robotdiffuse.validation.validator import Verifier
+
+    rng, robot = np.random.default_rng(seed), rd.load_robot("panda")
+    q = rng.uniform(robot.lower, robot.upper, (ROWS, robot.dof))
+    solids = [
+        rd.Sphere([0.5, 0.3, 0.6], 0.15),
+        rd.Box([0.45, 0.0, 0.2], [0.3, 0.05, 0.4]),
+        rd.Cylinder([0.4, -0.4, 0.3], 0.05, 0.4),
+        rd.Capsule([0.3, 0.5, 0.5], 0.05, 0.3),
+    ]
+    cloud = rd.PointCloud(rng.normal(size=(500, 3)) * 0.1 + [0.6, -0.3, 0.7], 0.01)
+    checker = CollisionChecker(robot, rd.Scene([*solids, cloud]))
+    packed = PackedScenes.pack([rd.Scene(solids[:2])] * (ROWS // 20), 4)
+    batch = q.reshape(ROWS // 20, 20, robot.dof).astype(np.float32)
+    left = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+    right = left * [-1, 1, 1, 1, 1, 1, 1]
+    problem = rd.Problem(robot, rd.Scene(solids[1:2]), left, right)
+
+    def planned(name: str) -> ndarray:
+        result = rd.load_planner(name).plan(problem, time_limit=60.0, seed=seed)
+        assert result.path is not None and result.trajectory is not None
+        return np.concatenate([result.path.positions.ravel(), result.trajectory.positions.ravel()])
+
+    def validated() -> ndarray:
+        rows = np.linspace(left, left + np.eye(7)[0] * 0.2, 5)
+        short = rd.Problem(robot, problem.scene, left, rows[-1])
+        report = Verifier(short).path(rd.Path(robot.joint_names, rows))
+        assert report.valid
+        return np.array([report.scene_clearance, report.self_clearance], np.float64)
+
+    def reached() -> ndarray:
+        goal = link_pose(robot, left, robot.tip)
+        return np.asarray(inverse_kinematics(robot, robot.tip, goal, rng=np.random.default_rng(0)))
+
+    arm = compile_robot(robot)
+    return {
+        "clearances": lambda: checker.link_clearances(q),
+        "gradients": lambda: np.concatenate(checker.clearances_and_gradients(q, 0.3, 0.1), axis=1),
+        "costs": lambda: checker.cost_gradients(q, 0.1)[1],
+        "pairs of links": lambda: checker.pair_clearances(q),
+        "guidance": lambda: CollisionGuidance(checker)(batch, 8)[0],
+        "clearances in training": lambda: packed_link_clearances(arm, packed, batch, 0.3),
+        "gradients in training": lambda: np.concatenate(
+            packed_clearances_and_gradients(arm, packed, batch, 0.3, 0.1), axis=-1
+        ),
+        "the validator": validated,
+        "inverse kinematics": reached,
+        "rrt_connect": lambda: planned("rrt_connect"),
+        "aorrtc": lambda: planned("aorrtc"),
+    }
+
+
+def work(file: str, seed: int, names: list[str]) -> None:
+    """Call the parts in this order and save what they return."""
+    from robotdiffuse.collision.kernels.compiled import compile_seconds
+
+    known = parts(seed)
+    arrays = {name: np.asarray(known[name]()) for name in names}
+    np.savez(file, **arrays, seconds=np.array(compile_seconds()))  # type: ignore[arg-type]
+
+
+def main() -> None:
+    from common import header, parse, parts_of, print_table
+
+    known = parts(0)
+    parser = argparse.ArgumentParser(description="The same bits from a cold and from a warm cache.")
+    parser.add_argument("--seed", type=int, default=0, help="(0)")
+    parser.add_argument("--only", default=",".join(known), help="some of the parts (all)")
+    parser.add_argument("--work", help=argparse.SUPPRESS)
+    arguments = parse(parser, only="pairs of links")
+    names = parts_of(arguments.only, known)
+    if arguments.work:
+        work(arguments.work, arguments.seed, names)
+        return
+    print(header("numpy", "numba", "llvmlite"), "\n")
+    kept: dict[str, dict[str, ndarray]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for i, run in enumerate(RUNS):
+            file, order = str(Path(folder, f"{i}.npz")), names[::-1] if i == 2 else names
+            subprocess.run(
+                [
+                    sys.executable,
+                    __file__,
+                    "--work",
+                    file,
+                    "--seed",
+                    f"{arguments.seed}",
+                    "--only",
+                    ",".join(order),
+                ],
+                env=os.environ | {"NUMBA_CACHE_DIR": str(Path(folder, "cache"))},
+                check=True,
+            )
+            with np.load(file) as found:
+                kept[run] = dict(found)
+    rows = []
+    for name in names:
+        first = kept[RUNS[0]][name]
+        row = [name, f"{first.size:,}"]
+        for run in RUNS[1:]:
+            other = kept[run][name]
+            changed = first != other if first.shape == other.shape else np.ones(1, bool)
+            most = np.abs(first - other).max() if first.shape == other.shape else np.inf
+            row.append(
+                "the same" if not changed.any() else f"{changed.sum():,} differ, by {most:.1e} at most"
+            )
+        rows.append(row)
+    print_table("Against the run that compiled", ["part", "numbers", *RUNS[1:]], rows)
+    compiled = ", ".join(f"{run} {float(kept[run]['seconds']):.0f} s" for run in RUNS)
+    print(f"\nCompiling took: {compiled}.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""The command `robotdiffuse certificate check`."""
+
+import argparse
+
+HOLDS, FAILS = 0, 1
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "certificate",
+        help="re-check a certificate of a motion",
+        description="Re-check the certificate of a motion.",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    check = actions.add_parser(
+        "check",
+        help="re-check a certificate, without search",
+        description="Re-check a certificate with code that shares nothing with the validator. Exit status: "
+        "0 if it holds, 1 if not, 2 for bad input.",
+    )
+    check.add_argument("file", metavar="FILE", help="certificate of `robotdiffuse verify --certificate`")
+    check.add_argument(
+        "--problem",
+        metavar="FILE",
+        help="problem file to check it for (default: the problem in the certificate)",
+    )
+    check.set_defaults(run=run_check)
+
+
+def run_check(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.certificates.proof import load_certificate
+    from robotdiffuse.problems.files import load_problem
+
+    certificate = load_certificate(arguments.file)
+    problem = None if arguments.problem is None else load_problem(arguments.problem)
+    found = certificate.check(problem).differences
+    for line in found:
+        print(line)
+    if not found:
+        scene, itself = 1e3 * certificate.scene_clearance, 1e3 * certificate.self_clearance
+        print(f"holds: at least {scene:.1f} mm to the scene, {itself:.1f} mm between links")
+    return FAILS if found else HOLDS

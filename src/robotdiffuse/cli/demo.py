@@ -1,0 +1,101 @@
+"""The command `robotdiffuse demo`."""
+
+import argparse
+from dataclasses import replace
+from importlib.resources import as_file, files
+from typing import TYPE_CHECKING
+
+from robotdiffuse.cli.console import print_result
+from robotdiffuse.cli.drawing import ENDINGS, draw
+from robotdiffuse.cli.plan import load_and_plan
+
+if TYPE_CHECKING:
+    from robotdiffuse.problems.problem import Problem
+
+PROBLEM_FILE, FAMILY = "shelf.yaml", "shelf"
+TIME_LIMIT = 10.0
+"""Time limit for planning [s]."""
+CAMERA_POSITION, CAMERA_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
+"""Position and target of the camera of `demo --camera` [m]."""
+IMAGE_SIZE, FOCAL_LENGTH = (640, 480), 460.0
+"""Width, height and focal length of its images [pixels]."""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "demo",
+        help="plan a bundled problem and draw the motion",
+        description="Plan a bundled problem with obstacles, and write demo.png and demo.html to the current "
+        "folder.",
+    )
+    parser.add_argument(
+        "--camera",
+        action="store_true",
+        help="plan with the view of one depth camera instead of the scene; demo_true.png shows the motion in "
+        "the true scene",
+    )
+    parser.add_argument(
+        "--robot",
+        metavar="NAME",
+        help="plan with another arm, between shelves of its size; see `robotdiffuse robot list`",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.planning import DEFAULT_PLANNER
+    from robotdiffuse.problems.files import load_problem
+
+    outputs = [check_output(file, ENDINGS) for file in ("demo.png", "demo.html")]
+    if arguments.robot is None:
+        with as_file(files("robotdiffuse") / "examples" / PROBLEM_FILE) as file:
+            problem = load_problem(file)
+    else:
+        problem = shelf_problem(arguments.robot)
+    true = problem
+    if arguments.camera:
+        outputs.append(check_output("demo_true.png", ENDINGS))
+        problem = seen_by_camera(true)
+    result = load_and_plan(problem, DEFAULT_PLANNER, time_limit=TIME_LIMIT)
+    print_result(result)
+    if result.trajectory is None or result.path is None:
+        return 1
+    if arguments.camera:
+        from robotdiffuse.validation.validator import verify
+
+        violation = verify(true, result.path).violation
+        print("in the true scene:", "free" if violation is None else violation.message)
+    for file in outputs:
+        draw(true if file.name == "demo_true.png" else problem, result, file)
+        print(f"wrote {file.resolve()}")
+    return 0
+
+
+def shelf_problem(robot: str) -> "Problem":
+    """A problem of the family shelf for another arm. Raises InputError if none can be drawn for it."""
+    import numpy as np
+
+    from robotdiffuse.problems.families import load_family
+    from robotdiffuse.robots import load_robot
+
+    arm = load_robot(robot)
+    return load_family(FAMILY).draw(arm, np.random.default_rng(0)).problem(arm)
+
+
+def seen_by_camera(problem: "Problem") -> "Problem":
+    """The problem with one depth view, from behind the arm's shoulder, in place of its scene; the floor stays
+    known."""
+    import numpy as np
+
+    from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+    from robotdiffuse.problems.families.furniture import FLOOR
+    from robotdiffuse.problems.problem import PREDICTED
+    from robotdiffuse.scenes.scene import Scene
+
+    T_base_camera = looking_at(np.array(CAMERA_POSITION), np.array(CAMERA_TARGET))
+    width, height = IMAGE_SIZE
+    intrinsics = (FOCAL_LENGTH, FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)
+    true_scene = Scene([FLOOR, *problem.scene.shapes])
+    view = ray_cast(true_scene, T_base_camera, intrinsics, IMAGE_SIZE, problem.robot, problem.start)
+    return replace(problem, scene=Scene([FLOOR]), views=(view,), unknown=PREDICTED)

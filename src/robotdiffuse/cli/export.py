@@ -1,0 +1,54 @@
+"""The command `robotdiffuse export`."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from robotdiffuse.core.errors import InputError
+
+if TYPE_CHECKING:
+    from robotdiffuse.core.types import Trajectory
+    from robotdiffuse.problems.problem import Problem
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "export",
+        help="write a result for ROS 2, Foxglove or Rerun",
+        description="Validate the motion of a result file again, and write it for other programs: .mcap (a "
+        "scene that Foxglove opens, with ROS 2 messages), .rosbag2 (a ROS 2 bag, a folder), .rrd (Rerun), "
+        ".yaml (a ROS 2 JointTrajectory), .csv and .json.",
+    )
+    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
+    parser.add_argument(
+        "--out", action="append", required=True, metavar="FILE", help="file to write; repeatable"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.interop import check_export, write_motion
+
+    outputs = [check_export(file) for file in arguments.out]
+    problem, trajectory = validated_motion(arguments.result)
+    for file in outputs:
+        write_motion(problem, trajectory, file)
+        print(f"wrote {file}")
+    return 0
+
+
+def validated_motion(file: str) -> "tuple[Problem, Trajectory]":
+    """The problem and the motion of a result file.
+
+    Raises InputError if it holds no timed motion, and if the validator rejects the motion, because other
+    programs may execute it.
+    """
+    from robotdiffuse.cli.view import read_solved
+    from robotdiffuse.validation.validator import verify_trajectory
+
+    result, problem = read_solved(file)
+    if result.trajectory is None:
+        raise InputError(f"{file} holds a path without times; plan again to get a trajectory")
+    violation = verify_trajectory(problem, result.trajectory).violation
+    if violation is not None:
+        raise InputError(f"{file} is not exported: its motion is not valid: {violation.message}")
+    return problem, result.trajectory

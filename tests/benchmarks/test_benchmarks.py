@@ -1,0 +1,57 @@
+"""Every benchmark runs, at its smallest size. Times are not asserted."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+SCRIPTS = sorted(file.stem for file in FOLDER.glob("*.py") if file.stem != "common")
+NEEDS = {
+    "certificates": ("ompl",),
+    "constraints": ("pybullet",),
+    "learning": ("matplotlib", "pybullet"),
+    "moving_obstacles": ("pybullet",),
+    "planning_requests": ("pybullet", "pinocchio"),
+    "robots": ("pybullet",),
+    "server": ("fastapi", "httpx"),
+}
+"""Packages of extras that a script needs."""
+REPORTS = FOLDER / "results"
+NO_SCRIPT = "no longer kept"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_script_runs(script: str, tmp_path: Path) -> None:
+    for package in NEEDS.get(script, ()):
+        pytest.importorskip(package)
+    command = [sys.executable, str(FOLDER / f"{script}.py"), "--smoke"]
+    done = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "Python 3" in done.stdout, "no head with machine and versions"
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_usage_names_the_script(script: str) -> None:
+    assert f"python benchmarks/{script}.py" in (FOLDER / f"{script}.py").read_text()
+
+
+@pytest.mark.parametrize("report", sorted(REPORTS.glob("*.txt")), ids=lambda file: file.name)
+def test_every_report_is_of_a_script(report: Path) -> None:
+    """Its first lines name the script that prints it, or say that this is no longer kept."""
+    first = report.read_text().partition("\n")[0]
+    made_by = [name for name in SCRIPTS if f"benchmarks/{name}.py" in first]
+    assert made_by or NO_SCRIPT in first, first
+
+
+def test_the_list_names_every_script_and_every_report() -> None:
+    listed = (FOLDER / "README.md").read_text()
+    assert not [name for name in SCRIPTS if f"`{name}.py`" not in listed]
+    ends = (".csv", ".png", ".txt", ".md")
+    names = [file.name for file in REPORTS.iterdir() if file.suffix in ends]
+    missing = [n for n in names if n not in listed and Path(n).stem not in listed and "baseline_" not in n]
+    assert not missing

@@ -1,0 +1,126 @@
+"""The commands `data info`, `check`, `view`, `export` and `import`."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.commands import run
+from helpers.motion_stores import line, random_motions, record, write_motions
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.visualization import gallery
+from robotdiffuse.visualization.picture import PictureSettings
+
+PANDA = load_robot("panda")
+START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+GOAL = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+BALL = Scene([Sphere([0.5, 0.0, 0.5], 0.15)])
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("COLUMNS", "200")
+    write_motions(tmp_path / "set", PANDA, random_motions(PANDA, 5), shard=3)
+    return tmp_path / "set"
+
+
+def test_info_prints_figures_and_writes_the_page(folder, capsys):
+    assert run("data", "info", folder) == 0
+    printed = capsys.readouterr().out
+    for text in (
+        "panda: 5 motions",
+        "waypoints, evenly spaced in length",
+        "71.4 %",
+        "of 9 problems",
+        "rop_dense",
+        "length [rad]",
+        "clearance [cm]",
+    ):
+        assert text in printed, text
+    assert (folder / "report.html").read_text().startswith("<!doctype html>")
+    assert run("data", "info", folder, "--page", folder.parent / "page.html") == 0
+    assert (folder.parent / "page.html").is_file()
+
+
+def test_check_of_clean_data(folder, capsys):
+    assert run("data", "check", folder, "--workers", 1, "--no-pybullet", "--count", 4) == 0
+    printed = capsys.readouterr().out
+    assert "panda: clean" in printed and re.search("validated .* 4 in", printed) and "not asked" in printed
+
+
+def test_check_finds_a_collision(folder, capsys):
+    pytest.importorskip("pybullet")
+    write_motions(folder, PANDA, [*random_motions(PANDA, 2), record(PANDA, BALL, line(START, GOAL))])
+    assert run("data", "check", folder, "--workers", 1) == 1
+    printed = capsys.readouterr().out
+    assert "violations found" in printed and printed.count("shard 0, row 2") == 2
+    assert re.search(r"found by PyBullet +1\b", printed) and "inside sphere" in printed
+
+
+def test_view_shows_samples_in_one_page(folder, capsys, monkeypatch):
+    monkeypatch.setattr(gallery, "THUMBNAIL", PictureSettings(64, 40, ghosts=1))
+    out = folder.parent / "samples.html"
+    assert run("data", "view", folder, "--count", 2, "--seed", 3, "--out", out) == 0
+    assert f"wrote {out}" in capsys.readouterr().out.replace("\n", "")
+    page = out.read_text("utf-8")
+    titles = re.findall("<b>(.*?)</b>", page)
+    assert len(titles) == 2 and all(
+        re.fullmatch(r"rop(_dense)? · shard \d, row \d", title) for title in titles
+    )
+    stored = json.loads(page.split('id="replays">')[1].split("</script>")[0])
+    replays = ["".join(stored["parts"][i] for i in parts) for parts in stored["pages"]]
+    assert len(replays) == 2
+    assert len(set(stored["parts"])) == len(stored["parts"])  # what replays share is kept once
+    for replay, title in zip(replays, titles, strict=True):
+        assert replay.startswith("<!doctype html>") and f"<h1>{title}</h1>" in replay
+
+
+def test_export(folder, capsys):
+    two = Scene([Sphere([2.0, 0.0, 0.5], 0.25), Sphere([2.0, 1.0, 0.5], 0.25)])
+    folder = folder.parent / "spheres"
+    write_motions(folder, PANDA, [record(PANDA, two, line(START, GOAL, 254))], waypoints=254)
+    file = folder.parent / "robot.npz"
+    assert run("data", "export", folder, file) == 0
+    assert "1 motions" in capsys.readouterr().out
+    with np.load(file) as arrays:
+        assert arrays["x_train"].shape == (1, 254, 7) and arrays["y_train"].shape == (1, 23)
+    again = folder.parent / "again"
+    assert run("data", "import", file, "--out", again, "--radius", 0.2) == 0
+    assert f"1 motions in {again}" in capsys.readouterr().out
+    assert run("data", "check", again, "--no-pybullet", "--workers", 1) == 0
+
+
+BAD = {
+    "info without data": (["info", "."], "no data set"),
+    "check without data": (["check", "."], "no data set"),
+    "view without data": (["view", "."], "no data set"),
+    "export without data": (["export", ".", "x.npz"], "no data set"),
+    "import without a file": (["import", "x.npz", "--out", "y"], "cannot read x.npz"),
+    "unknown robot": (["check", "set", "--robot", "pandaa"], "pandaa"),
+    "unknown ending": (["view", "set", "--out", "x.png"], "unknown ending '.png'"),
+    "page in no folder": (["info", "set", "--page", "no/x.html"], "the folder no does not exist"),
+    "no count": (["check", "set", "--count", "0"], "'0'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_status_2_in_one_line(case, folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder.parent)
+    argv, named = BAD[case]
+    assert run("data", *argv) == 2
+    error = capsys.readouterr().err
+    assert named in error and error.count("\n") == 1
+
+
+def test_missing_pybullet_is_status_2(folder, capsys, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("robotdiffuse.simulation")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    assert run("data", "check", folder, "--workers", 1) == 2
+    error = capsys.readouterr().err
+    assert "--no-pybullet" in error and "pip install" in error and error.count("\n") == 1

@@ -1,0 +1,190 @@
+"""The commands `plan` and `demo`: exit status, one line for bad input, and written files."""
+
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.commands import GOAL, PROBLEM, START, run, write_problem
+from robotdiffuse.core.results import PlanResult, load_result
+from robotdiffuse.core.types import Status
+from robotdiffuse.planning import planner_settings
+
+ROOT = Path(__file__).parents[2]
+
+
+EXAMPLES = sorted(ROOT.glob("examples/*.yaml")) + sorted(ROOT.glob("src/robotdiffuse/examples/*.yaml"))
+
+
+@pytest.fixture(autouse=True)
+def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_plan_writes_files_that_view_and_verify_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = write_problem(tmp_path)
+    status = run(
+        "plan", problem, "--planner", "rrt_connect", "--time-limit", 5, "--seed", 1,
+        "--out", "r.json", "--out", "r.csv", "--out", "replay.html",
+    )  # fmt: skip
+    printed = capsys.readouterr().out
+    assert status == 0 and "solved" in printed and "rrt_connect" in printed
+    saved = load_result("r.json")
+    assert saved.result.seed == 1 and saved.result.trajectory is not None
+    assert np.array_equal(saved.result.trajectory.positions[0], START)
+    assert np.allclose(saved.result.trajectory.positions[-1], GOAL)
+    assert saved.problem is not None and saved.problem["scene"][0]["sphere"]["radius"] == 0.15
+    assert (tmp_path / "r.csv").read_text().startswith("time,panda_joint1_position,")
+    assert "<html" in (tmp_path / "replay.html").read_text()[:200]
+
+    assert run("verify", "r.json") == 0
+    assert capsys.readouterr().out.count("valid") == 2
+    assert run("view", "r.json", "--out", "again.html") == 0
+    assert (tmp_path / "again.html").stat().st_size > 10_000
+
+
+def test_verify_finds_a_motion_that_was_tampered_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = write_problem(tmp_path)
+    assert run("plan", problem, "--planner", "rrt_connect", "--time-limit", 5, "--out", "r.json") == 0
+    record = json.loads(Path("r.json").read_text())
+    record["waypoints"] = [START, GOAL]  # straight through the ball
+    Path("r.json").write_text(json.dumps(record))
+    capsys.readouterr()
+    assert run("verify", "r.json") == 1
+    printed = capsys.readouterr().out
+    assert "path: not valid" in printed and "inside sphere" in printed and "trajectory: valid" in printed
+
+
+def test_same_seed_same_motion(tmp_path: Path) -> None:
+    problem = write_problem(tmp_path)
+    for file in ("a.json", "b.json"):
+        assert run("plan", problem, "--planner", "rrt_connect", "--time-limit", 5, "--out", file) == 0
+    a, b = (load_result(file).result.path for file in ("a.json", "b.json"))
+    assert a is not None and b is not None and np.array_equal(a.positions, b.positions)
+
+
+NO_PLAN = {
+    "start in collision": (
+        {"scene": [{"sphere": {"center": [0.3, -0.45, 0.5], "radius": 0.2, "name": "melon"}}]},
+        "invalid_start",
+        "melon",
+    ),
+    "goal in collision": (
+        {"scene": [{"sphere": {"center": [0.3, 0.45, 0.5], "radius": 0.2, "name": "melon"}}]},
+        "invalid_goal",
+        "melon",
+    ),
+    "pose out of reach": (
+        {"goal": {"pose": {"frame": "panda_hand", "xyz": [2.0, 0.0, 0.5], "wxyz": [1, 0, 0, 0]}}},
+        "unreachable_goal",
+        "panda_hand",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", NO_PLAN)
+def test_no_plan_is_status_1_with_the_reason(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes, status, named = NO_PLAN[case]
+    assert run("plan", write_problem(tmp_path, **changes), "--planner", "rrt_connect", "--out", "r.json") == 1
+    printed = capsys.readouterr().out
+    assert status in printed and named in printed
+    saved = load_result("r.json")
+    assert saved.result.status.value == status and saved.result.path is None
+    assert run("view", "r.json") == 2
+    assert f"its status is {status}" in capsys.readouterr().err
+
+
+BAD_PROBLEM = {
+    "unknown robot": ({"robot": "pandaa"}, "pandaa"),
+    "unknown field": ({"obstacles": []}, "obstacles"),
+    "unknown shape": ({"scene": [{"blob": {"center": [0, 0, 0]}}]}, "blob"),
+    "wrong length": ({"start": [0.0, 0.0]}, "start has 2 values"),
+    "not a number": ({"start": [float("nan")] * 7}, "nan"),
+    "out of limits": ({"start": [4.0, *START[1:]]}, "panda_joint1 is 4 rad"),
+    "unknown link": ({"goal": {"pose": {"frame": "hand", "xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}}}, "hand"),
+    "unknown goal": ({"goal": {"place": GOAL}}, "place"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PROBLEM)
+def test_bad_problem_is_status_2_in_one_line(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes, named = BAD_PROBLEM[case]
+    assert run("plan", write_problem(tmp_path, **changes), "--planner", "rrt_connect") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("robotdiffuse: error: ") and named in error and error.count("\n") == 1
+
+
+def test_problem_of_a_jsonl_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "problems.jsonl"
+    blocked = PROBLEM | {"scene": NO_PLAN["start in collision"][0]["scene"]}
+    file.write_text(f"{json.dumps(PROBLEM)}\n{json.dumps(blocked)}\n")
+    assert run("plan", file, "--planner", "rrt_connect", "--time-limit", 5) == 0
+    assert run("plan", file, "--planner", "rrt_connect", "--index", 1) == 1
+    assert "invalid_start" in capsys.readouterr().out
+
+
+def test_ctrl_c(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", interrupted)
+    assert run("plan", write_problem(tmp_path), "--planner", "rrt_connect") == 130
+    assert capsys.readouterr().err == "robotdiffuse: stopped\n"
+
+
+def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[object] = []
+
+    def solve(_problem: object, planner: str, *rest: object, **_request: object) -> PlanResult:
+        given.extend(rest)
+        return PlanResult(Status.NO_PATH, "none", planner, "panda", 0.1, 0)
+
+    monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", solve)
+    sets = ("--set", "search.range=0.5", "--set", "samples=4")
+    assert run("plan", write_problem(tmp_path), *sets) == 1
+    settings = planner_settings("robotdiffuse", ["samples=4", "search.range=0.5"])
+    assert settings in given and settings != planner_settings("robotdiffuse", [])
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("rangee=0.5", "has no setting 'rangee'; it has range=0.7, resolution=0.05, "),
+        ("range=0", "rrt_connect.range is 0.0; it must be positive"),
+        ("range", "'range' is not NAME=VALUE; rrt_connect has range=0.7, "),
+    ],
+)
+def test_wrong_settings_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], value: str, message: str
+) -> None:
+    assert run("plan", write_problem(tmp_path), "--planner", "rrt_connect", "--set", value) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("demo") == 0
+    printed = capsys.readouterr().out
+    assert "solved" in printed and "verified" in printed
+    assert (tmp_path / "demo.png").read_bytes()[:4] == b"\x89PNG"
+    assert "<html" in (tmp_path / "demo.html").read_text()[:200]
+
+
+@pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.name)
+def test_examples_are_solved(file: Path) -> None:
+    assert run("plan", file, "--planner", "rrt_connect", "--time-limit", 5) == 0
+
+
+def test_example_in_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(ROOT / "examples" / "plan.py"))
+    assert capsys.readouterr().out.startswith("solved")
+    assert (tmp_path / "motion.csv").exists()

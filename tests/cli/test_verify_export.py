@@ -1,0 +1,105 @@
+"""The commands `verify`, `certificate check`, `export` and `publish`."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from helpers.commands import run
+
+START, GOAL = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+BALL = {"sphere": {"center": [0.5, 0.0, 0.5], "radius": 0.15, "name": "ball"}}
+PROBLEM = {"robot": "panda", "scene": [BALL], "start": START, "goal": {"joints": GOAL}}
+SCENE = {
+    "world": {
+        "collision_objects": [
+            {
+                "header": {"frame_id": "panda_link0"},
+                "id": "ball",
+                "primitives": [{"type": "sphere", "dimensions": [0.15]}],
+                "primitive_poses": [{"position": [0.5, 0.0, 0.5], "orientation": [0, 0, 0, 1]}],
+            }
+        ]
+    }
+}
+
+
+@pytest.fixture(autouse=True)
+def planned(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a result, its motion in formats of other programs, and scenes."""
+    folder = tmp_path_factory.getbasetemp() / "handed"
+    monkeypatch.chdir(tmp_path_factory.mktemp("here"))
+    if not folder.exists():
+        folder.mkdir()
+        (folder / "problem.json").write_text(json.dumps(PROBLEM))
+        beside = [BALL, {"sphere": {"center": [0.3, 0.45, 0.5], "radius": 0.1, "name": "new"}}]
+        (folder / "other.json").write_text(json.dumps(PROBLEM | {"scene": beside}))
+        (folder / "scene.yaml").write_text(yaml.safe_dump(SCENE))
+        out = [word for file in ("r.json", "m.rosbag2", "m.yaml") for word in ("--out", folder / file)]
+        assert run("plan", folder / "problem.json", "--planner", "rrt_connect", "--time-limit", 5, *out) == 0
+    return folder
+
+
+def test_a_certificate_is_written_and_checked(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("verify", planned / "r.json", "--certificate", "c.json") == 0
+    assert "wrote c.json" in capsys.readouterr().out
+    assert run("certificate", "check", "c.json") == 0
+    assert capsys.readouterr().out.startswith("holds: at least")
+    assert run("certificate", "check", "c.json", "--problem", planned / "problem.json") == 0
+    assert run("certificate", "check", "c.json", "--problem", planned / "other.json") == 1
+    assert "scene: new was not there" in capsys.readouterr().out
+    assert run("certificate", "check", planned / "r.json") == 2
+    assert "is not a certificate" in capsys.readouterr().err
+
+
+def test_motions_from_other_programs(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for file in ("m.rosbag2", "m.yaml", "r.json"):
+        assert run("verify", planned / file, "--problem", planned / "problem.json") == 0
+        assert "trajectory: valid" in capsys.readouterr().out
+    assert run("verify", planned / "m.yaml", "--scene", planned / "scene.yaml", "--robot", "panda") == 0
+    assert run("export", planned / "r.json", "--out", "m.mcap") == 0
+    assert run("verify", "m.mcap") == 0  # the problem is in it
+    assert run("verify", planned / "m.yaml") == 2
+    assert "holds no problem; give --problem FILE, or --scene FILE" in capsys.readouterr().err
+    assert run("verify", planned / "m.yaml", "--scene", planned / "scene.yaml") == 2
+    assert "--scene and --robot belong together" in capsys.readouterr().err
+
+
+def test_scene_of_another_robot(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    state = "robot_state: {joint_state: {name: [gripper], position: [0.1]}}"
+    Path("stranger.yaml").write_text(state)
+    asked = ("verify", planned / "m.yaml", "--scene", "stranger.yaml", "--robot", "panda")
+    assert run(*asked) == 2
+    assert "has values of gripper, movable joints that panda lacks" in capsys.readouterr().err
+    assert run(*asked, "--ignore-joints") == 0
+    assert "note: robot_state.joint_state: ignored gripper" in capsys.readouterr().out
+
+
+def test_all_violations_are_listed(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ("verify", planned / "m.yaml", "--problem", planned / "other.json")
+    assert run(*asked, "--certificate", "c.json") == 1
+    first = capsys.readouterr().out
+    assert first.count("not valid") == 1 and "inside new" in first
+    assert not Path("c.json").exists()
+    assert run(*asked, "--all") == 1
+    every = capsys.readouterr().out.splitlines()
+    assert len(every) > 1
+    assert all("new" in line for line in every)
+    times = [float(line.rpartition("(at ")[2].rstrip(")")) for line in every]
+    assert times == sorted(times)
+
+
+def test_only_valid_motions_are_exported(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("export", planned / "r.json", "--out", "a.csv", "--out", "a.rrd") == 0
+    record = json.loads((planned / "r.json").read_text())
+    record["problem"] = json.loads((planned / "other.json").read_text())
+    Path("bad.json").write_text(json.dumps(record))
+    for command in (("export", "bad.json", "--out", "b.yaml"), ("publish", "bad.json", "--to", "localhost")):
+        assert run(*command) == 2
+        assert "is not exported: its motion is not valid" in capsys.readouterr().err
+    assert not Path("b.yaml").exists()
+    assert run("publish", planned / "r.json", "--to", "host:0") == 2
+    assert "'host:0' is not HOST or HOST:PORT" in capsys.readouterr().err
+    assert run("export", planned / "r.json", "--out", "a.foo") == 2
+    assert "known: .mcap, .rosbag2, .rrd, .yaml" in capsys.readouterr().err

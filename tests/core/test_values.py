@@ -1,0 +1,192 @@
+"""Values hold arrays that nobody can write to: verdicts, and what is prepared, are kept by identity."""
+
+import copy
+import pickle
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+import pytest
+from numba.core.dispatcher import Dispatcher
+from numba.core.types import Array
+from numpy import ndarray
+
+import robotdiffuse as rd
+from helpers.box_arm import box_arm
+from robotdiffuse.core.bounds import Value, for_kernels, read_only
+from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
+from robotdiffuse.robots.bodies import Attached, ConvexMesh
+from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.visual_meshes import VisualMesh
+from robotdiffuse.validation.validator import verify, verify_trajectory
+
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+UP, HALF, ROWS = np.array([0.0, 0.0, 1.0]), np.full(3, 0.5), np.array([[0.0, 0.1, 0.2], [0.3, 0.2, 0.1]])
+POSE, TIMES, IMAGE = np.eye(4), np.array([0.0, 1.0]), np.ones((2, 3), np.float32)
+GIVEN = (CORNERS, FACES, UP, HALF, ROWS, POSE, TIMES, IMAGE)
+
+
+def sphere() -> rd.Sphere:
+    return rd.Sphere(HALF, 0.1)
+
+
+def pose_goal() -> rd.PoseGoal:
+    return rd.PoseGoal("l3", POSE, HALF, HALF)
+
+
+def problem() -> rd.Problem:
+    more = {"T_world_base": POSE, "start_velocity": HALF}
+    return rd.Problem(box_arm(), rd.Scene([sphere()]), ROWS[0], ROWS, **more)
+
+
+def robot() -> Robot:
+    spheres = {link: np.array(rows) for link, rows in box_arm().spheres.items()}
+    joints = tuple(Joint(j.name, j.kind, j.parent, j.child, POSE, UP) for j in box_arm().joints)
+    return Robot("arm", box_arm().base, box_arm().tip, joints, spheres, above={"root": POSE})
+
+
+VALUES: dict[type[Value], Callable[[], Value]] = {
+    rd.Sphere: sphere,
+    rd.Box: lambda: rd.Box(HALF, HALF, [1, 0, 0, 0]),
+    rd.Cylinder: lambda: rd.Cylinder(HALF, 0.1, 0.2),
+    rd.Capsule: lambda: rd.Capsule(HALF, 0.1, 0.2),
+    rd.Mesh: lambda: rd.Mesh(CORNERS, FACES, UP),
+    rd.PointCloud: lambda: rd.PointCloud(CORNERS),
+    SeenPoints: lambda: SeenPoints(CORNERS),
+    AssumedPoints: lambda: AssumedPoints(CORNERS),
+    rd.Scene: lambda: rd.Scene([sphere()]),
+    rd.MovingObstacle: lambda: rd.MovingObstacle(rd.Box([0, 0, 0], HALF), times=TIMES, poses=[POSE, POSE]),
+    rd.DepthView: lambda: rd.DepthView(IMAGE, (1.0, 1.0, 0.0, 0.0), POSE, ROWS[0], CORNERS),
+    rd.NextView: lambda: rd.NextView(POSE, 0.5),
+    Joint: lambda: Joint("j", "revolute", "a", "b", POSE, UP),
+    Robot: robot,
+    ConvexMesh: lambda: ConvexMesh(CORNERS, FACES),
+    VisualMesh: lambda: VisualMesh(CORNERS, FACES, np.zeros((4, 3), np.uint8)),
+    Attached: lambda: Attached("tool", "l3", POSE, (sphere(),)),
+    JointTable: lambda: JointTable(("a", "b"), ("j",), (0.0,), (1.0,), np.ones(4, bool)),
+    rd.Payload: lambda: rd.Payload(1.0, HALF, None, HALF),
+    rd.JointGoal: lambda: rd.JointGoal(ROWS),
+    rd.PoseGoal: pose_goal,
+    rd.PosesGoal: lambda: rd.PosesGoal([pose_goal()]),
+    rd.AnyGoal: lambda: rd.AnyGoal((rd.JointGoal(ROWS), pose_goal())),
+    rd.AxisCone: lambda: rd.AxisCone("l3", UP, UP, 0.1),
+    rd.PositionBox: lambda: rd.PositionBox("l3", -HALF, HALF, POSE),
+    rd.OnPlane: lambda: rd.OnPlane("l3", HALF, UP, 0.1),
+    rd.OnLine: lambda: rd.OnLine("l3", HALF, UP, 0.1),
+    rd.CartesianLine: lambda: rd.CartesianLine("l3"),
+    rd.Problem: problem,
+    rd.Path: lambda: rd.Path(("a", "b", "c"), ROWS),
+    rd.Trajectory: lambda: rd.Trajectory(("a", "b", "c"), TIMES, ROWS, ROWS, ROWS),
+}
+
+
+def kinds(base: type[Value] = Value) -> Iterator[type[Value]]:
+    """Of values, that are no mere bases of others."""
+    for kind in base.__subclasses__():
+        if kind.__module__.startswith("robotdiffuse."):
+            yield from kinds(kind)
+            if "__dataclass_fields__" in kind.__dict__ and not kind.__name__.startswith("_"):
+                yield kind
+
+
+def arrays(value: object, name: str = "") -> Iterator[tuple[str, ndarray]]:
+    """All that a value holds, with what it derives from itself."""
+    if isinstance(value, ndarray):
+        yield name, value
+    elif isinstance(value, Value):
+        derived = (key for key in dir(type(value)) if not key.startswith("_") and key != "solid")
+        for key in {*derived, *(field.name for field in fields(value))}:  # type: ignore[arg-type]
+            held = getattr(value, key)
+            if not callable(held) and not isinstance(getattr(type(value), key, None), property):
+                yield from arrays(held, f"{name}.{key}")
+    elif isinstance(value, tuple | dict):
+        for key, held in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from arrays(held, f"{name}[{key}]")
+
+
+def test_every_kind_of_value_is_tried() -> None:
+    public = [getattr(rd, name) for name in rd.__all__]
+    with_arrays = {
+        kind
+        for kind in public
+        if isinstance(kind, type) and is_dataclass(kind) and any("Float" in str(f.type) for f in fields(kind))
+    }
+    assert {*kinds()} | {SeenPoints, AssumedPoints} == {*VALUES}
+    assert with_arrays - {*VALUES} == {rd.Certificate}  # nothing is kept of one: each check begins anew
+
+
+@pytest.mark.parametrize("kind", VALUES, ids=lambda kind: kind.__name__)
+def test_nobody_can_write_to_the_arrays_of_a_value(kind: type[Value]) -> None:
+    before = [array.copy() for array in GIVEN]
+    value = VALUES[kind]()
+    again = pickle.loads(pickle.dumps(value)), copy.deepcopy(value), copy.copy(value)
+    for one in (value, *again):
+        for name, array in arrays(one):
+            assert not array.flags.writeable, name
+            if array.size:
+                with pytest.raises(ValueError, match="read-only"):
+                    array[...] = 1
+            assert not any(np.shares_memory(array, given) for given in GIVEN), name
+    assert all(given.flags.writeable for given in GIVEN)
+    assert all(np.array_equal(*pair) for pair in zip(before, GIVEN, strict=True))
+
+
+def test_views_of_what_can_be_written_to_are_copied() -> None:
+    mine = np.zeros((2, 3))
+    view = mine[:1]
+    view.setflags(write=False)
+    kept = read_only(view)
+    mine[:] = 1
+    assert (kept == 0).all()
+    assert read_only(kept) is kept
+    assert read_only(kept[0]).base is kept
+    assert read_only(np.frombuffer(bytes(8))).base is not None
+    buffer = np.frombuffer(bytearray(8))
+    buffer.setflags(write=False)
+    assert not np.shares_memory(buffer, read_only(buffer))
+
+
+def test_a_value_of_read_only_arrays_keeps_them() -> None:
+    path = VALUES[rd.Path]()
+    assert isinstance(path, rd.Path)
+    assert rd.Path(path.joint_names, path.positions).positions is path.positions
+
+
+def test_compiled_code_gets_arrays_of_one_type() -> None:
+    mine, kept = np.zeros(3), read_only(np.zeros(3))
+    assert for_kernels(mine) is mine
+    assert for_kernels(kept).flags.writeable
+    assert not np.shares_memory(for_kernels(kept), kept)
+
+
+def test_a_verdict_is_of_the_scene_as_it_is() -> None:
+    """A sphere cannot be moved into the way of a motion that was found free."""
+    path = rd.Path(box_arm().joint_names, ROWS)
+    task = rd.Problem(box_arm(), rd.Scene([rd.Sphere([-1, 0, 0], 0.1)]), ROWS[0], ROWS[1])
+    assert verify(task, path).valid
+    with pytest.raises(ValueError, match="read-only"):
+        task.scene.shapes[0].center[:] = 0.5, 0.1, 0.0  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="read-only"):
+        rd.load_robot("panda").lower[0] = 0.0
+    assert rd.load_robot("panda").lower[0] < -2
+
+
+def test_nothing_is_compiled_for_read_only_arrays() -> None:
+    """All that a plan and its check need would be compiled twice."""
+    task = rd.Problem(
+        rd.load_robot("panda"),
+        rd.Scene([rd.Sphere([0.5, 0.0, 0.5], 0.2), rd.Box([0.5, 0, -0.06], [2, 2, 0.1])]),
+        [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
+        [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
+    )
+    result = rd.load_planner("aorrtc").plan(task, 5.0, until="first")
+    assert result.trajectory is not None
+    assert verify_trajectory(task, result.trajectory).valid
+    modules = [module for name, module in sys.modules.items() if name.startswith("robotdiffuse.")]
+    compiled = {one for module in modules for one in vars(module).values() if isinstance(one, Dispatcher)}
+    signatures = [signature for one in compiled for signature in one.signatures]
+    assert signatures
+    assert all(of.mutable for signature in signatures for of in signature if isinstance(of, Array))

@@ -1,0 +1,118 @@
+"""The data factory and the bench on Ray: nodes come and go, the data stay the same."""
+
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from helpers.factory_runs import contents, in_this_process
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
+from robotdiffuse.evaluation.records import read_records
+from robotdiffuse.generation import GenerationSettings, factory, generate
+
+# read when ray is imported: no telemetry, and no pages of logs when a node is lost
+os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = "Raylet is terminated"
+ray: Any = pytest.importorskip("ray", reason="the extra `cluster` (ray) is not installed")
+cluster_utils: Any = pytest.importorskip("ray.cluster_utils")
+
+SETTINGS = GenerationSettings(trajectories=24, shard=2, waypoints=16)
+STORE = 80 * 2**20
+"""Smallest object store of a node, about [bytes]."""
+HEALTH_CHECKS = {"health_check_period_ms": 500, "health_check_timeout_ms": 3000}
+"""A node that is gone is missed at once, not after some times 3 seconds."""
+
+
+@pytest.fixture(scope="module")
+def head() -> Iterator[Any]:
+    """A cluster of one node with one core."""
+    of_head = {"num_cpus": 1, "include_dashboard": False, "_system_config": HEALTH_CHECKS}
+    made = cluster_utils.Cluster(
+        initialize_head=True, head_node_args=of_head | {"object_store_memory": STORE}
+    )
+    yield made
+    made.shutdown()
+
+
+@pytest.fixture
+def cluster(head: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """RAY_ADDRESS names it."""
+    monkeypatch.setenv("RAY_ADDRESS", head.address)
+    return head
+
+
+def test_a_node_killed_midway_changes_nothing(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = cluster.add_node(num_cpus=1, object_store_memory=STORE)
+    cluster.wait_for_nodes()
+    begun, seen = threading.Event(), []
+
+    def kill() -> None:
+        begun.wait()
+        cluster.remove_node(node, allow_graceful=False)
+
+    def progress(done: int, _total: int) -> None:
+        seen.append(done)
+        if done:
+            begun.set()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        assert generate(SETTINGS, tmp_path / "ray", cluster="ray", progress=progress) == 24
+    finally:
+        begun.set()
+        killer.join()
+    assert seen == list(range(0, 25, 2))
+    assert not ray.is_initialized()
+    assert len(cluster.list_all_nodes()) == 1
+
+    # nodes that make other data are refused, by what differs
+    older = factory.versions() | {"numba": "0.1"}
+    monkeypatch.setattr(factory, "versions", lambda: older)
+    with pytest.raises(InputError, match=r"node of the Ray cluster has numba .*, this machine 0\.1"):
+        generate(SETTINGS, tmp_path / "other", cluster="ray")
+    monkeypatch.undo()
+
+    monkeypatch.setattr(factory, "on_this_machine", in_this_process)
+    generate(SETTINGS, tmp_path / "here")
+    assert contents(tmp_path / "ray") == contents(tmp_path / "here")
+
+
+@pytest.mark.parametrize("address", ["nonsense", "127.0.0.1:70000"])
+def test_addresses_that_are_none_are_refused(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(InputError, match="no Ray cluster"):
+        generate(SETTINGS, tmp_path, cluster="ray")
+
+
+def test_a_cluster_that_nobody_listens_at_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        monkeypatch.setenv("RAY_ADDRESS", address)
+        with pytest.raises(InputError, match=f"no Ray cluster at {address}, the value of RAY_ADDRESS"):
+            generate(SETTINGS, tmp_path, cluster="ray")
+
+
+def test_bench_on_a_cluster_is_as_on_this_machine(cluster: Any, tmp_path: Path) -> None:
+    def quiet(*_: object) -> None: ...
+
+    asked = BenchSettings(("rrt_connect",), ("rop",), tmp_path, time_limit=5.0, count=2, cluster="ray")
+    assert run_bench(asked, quiet, quiet) == 2
+    assert run_bench(replace(asked, cluster=None), quiet, quiet) == 0
+    there = read_records(tmp_path)["rrt_connect"]
+    assert run_bench(replace(asked, cluster=None, out=tmp_path / "here"), quiet, quiet) == 2
+    here = read_records(tmp_path / "here")["rrt_connect"]
+    assert [record.positions for record in sorted(there, key=lambda r: r.name)] == [r.positions for r in here]

@@ -1,0 +1,27 @@
+"""Runs commands in this process, and the problem of their tests."""
+
+import json
+from pathlib import Path
+
+from robotdiffuse.cli import main
+
+START = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+GOAL = [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+BALL = {"sphere": {"center": [0.5, 0.0, 0.5], "radius": 0.15}}
+PROBLEM = {"robot": "panda", "scene": [BALL], "start": START, "goal": {"joints": GOAL}}
+
+
+def run(*argv: object) -> int:
+    """The exit status of a command."""
+    try:
+        return main([str(value) for value in argv])
+    except SystemExit as end:
+        assert isinstance(end.code, int)
+        return end.code
+
+
+def write_problem(folder: Path, name: str = "problem.json", **changes: object) -> Path:
+    """Write PROBLEM, with changes, to a file."""
+    file = folder / name
+    file.write_text(json.dumps(PROBLEM | changes))
+    return file

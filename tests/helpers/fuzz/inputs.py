@@ -1,0 +1,501 @@
+"""Damaged inputs of seventeen kinds: each must give an answer or a one-line error, in bounded time.
+
+An input is a kind and a seed; `outcome_of(kind, seed, folder)` makes the same one again. Texts are changed
+value by value, line by line or byte by byte, all others by bytes. `campaign` runs as many as there is time
+for.
+"""
+
+import copy
+import json
+import traceback
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from helpers.fuzz.examples import (
+    CLOUDS,
+    CONSTRAINED,
+    EQUIPPED,
+    HELD,
+    IN_MOTION,
+    JOINTS,
+    LIMITS,
+    MESHES,
+    MOVEIT,
+    MOVING,
+    POSE,
+    PROBLEM,
+    REQUEST,
+    SRDF,
+    URDF,
+    VIEW,
+)
+from helpers.fuzz.mutation import damaged, mutated, nasty, numbers_changed, text_of
+
+MAX_MESSAGE_LENGTH = 1000
+"""Characters of an error message; names of files and lists of known names make some long."""
+
+Make = Callable[[np.random.Generator, FilePath], Callable[[], object]]
+"""Writes the files of an input to a folder and returns the call that reads them."""
+
+
+def outcome(call: Callable[[], object]) -> tuple[str, str]:
+    """`answer`, `error` or `fault`, and the error message."""
+    from robotdiffuse.core.errors import InputError
+
+    try:
+        call()
+    except InputError as error:
+        text = str(error)
+        good = text and "\n" not in text and len(text) <= MAX_MESSAGE_LENGTH
+        return ("error" if good else "fault"), text[: 2 * MAX_MESSAGE_LENGTH]
+    except BaseException as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        return "fault", f"{type(error).__name__}: {str(error)[:200]} ({place.filename}:{place.lineno})"
+    return "answer", ""
+
+
+def outcome_of(kind: str, seed: int, folder: FilePath) -> tuple[str, str]:
+    """Make an input, whose files are written to the folder, and return its outcome."""
+    rng = np.random.default_rng([seed, *kind.encode()])
+    return outcome(KINDS[kind](rng, folder))
+
+
+def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    data = dict(PROBLEM)
+    if rng.random() < 0.2:
+        data["goal"] = {"pose": POSE}
+    if rng.random() < 0.1:
+        data["views"], data["unknown"] = [VIEW], "optimistic"
+    else:
+        data |= (*({},) * 3, EQUIPPED, CONSTRAINED, MOVING, IN_MOTION)[rng.integers(7)]
+    ending = (".yaml", ".json", ".jsonl")[rng.integers(3)]
+    file = folder / f"problem{ending}"
+    file.write_bytes(text_of(rng, data, ending))
+    return lambda: _validated(file)
+
+
+def _validated(file: FilePath) -> None:
+    """Read a problem and, if its goal is a configuration, validate the straight line to it."""
+    from robotdiffuse.core.types import Path
+    from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
+    from robotdiffuse.problems.problem import JointGoal
+    from robotdiffuse.validation.validator import Verifier
+
+    problem = load_problem(file)
+    problem_from_record(problem_record(problem))
+    if isinstance(problem.goal, JointGoal):
+        rows = np.stack([problem.start, problem.goal.positions[0]])
+        Verifier(problem).path(Path(problem.robot.joint_names, rows))
+
+
+def _moveit(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    from robotdiffuse.problems.files import load_motion_bench_maker
+
+    asked = copy.deepcopy(REQUEST)
+    if rng.random() < 0.3:
+        asked["start_state"]["attached_collision_objects"] = [HELD]
+    scene, request = (yaml_text(rng, data, i) for i, data in enumerate((MOVEIT, asked)))
+    (folder / "scene0001.yaml").write_bytes(scene)
+    (folder / "request0001.yaml").write_bytes(request)
+
+    def read() -> None:
+        [entry] = load_motion_bench_maker(folder)
+        entry.load()
+
+    return read
+
+
+def yaml_text(rng: np.random.Generator, data: Any, other: int) -> bytes:
+    return text_of(rng, data, ".yaml") if rng.random() < 0.6 + 0.1 * other else json.dumps(data).encode()
+
+
+def _cloud(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    import io
+
+    from robotdiffuse.scenes.point_cloud import read_points
+    from robotdiffuse.scenes.shapes import PointCloud
+
+    ending = CLOUDS[rng.integers(len(CLOUDS))]
+    points = rng.normal(size=(5, 3)).astype(np.float32)
+    if rng.random() < 0.2:
+        points[0, 0] = (np.inf, 1e38, 0)[rng.integers(3)]
+    stream = io.BytesIO()
+    if ending in ("xyz", "csv"):
+        np.savetxt(stream, points, delimiter="," if ending == "csv" else " ")
+    elif ending == "npy":
+        np.save(stream, points)
+    elif ending == "npz":
+        np.savez_compressed(stream, points=points)
+    elif ending == "pcd":
+        head = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 5\nDATA "
+        binary = rng.random() < 0.5
+        stream.write(head + (b"binary\n" + points.tobytes() if binary else b"ascii\n"))
+        if not binary:
+            np.savetxt(stream, points)
+    else:
+        import trimesh
+
+        stream.write(trimesh.PointCloud(points).export(file_type="ply"))  # type: ignore[arg-type]
+    file = folder / f"cloud.{ending}"
+    file.write_bytes(damaged(rng, stream.getvalue()))
+    return lambda: PointCloud(read_points(file)[0])
+
+
+def mesh_file(rng: np.random.Generator, folder: FilePath, name: str, ending: str) -> FilePath:
+    """A small mesh with its bytes damaged."""
+    import trimesh
+
+    content = trimesh.creation.box((0.1, 0.2, 0.3)).export(file_type=ending)
+    content = content.encode() if isinstance(content, str) else bytes(content)
+    file = folder / f"{name}.{ending}"
+    file.write_bytes(damaged(rng, content))
+    return file
+
+
+def _mesh(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    file = mesh_file(rng, folder, "part", MESHES[rng.integers(len(MESHES))])
+    problem = PROBLEM | {"scene": [{"mesh": {"file": file.name, "xyz": [2, 2, 2]}}]}
+    (folder / "problem.json").write_text(json.dumps(problem))
+    return lambda: _validated(folder / "problem.json")
+
+
+def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    import trimesh
+
+    from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
+    from robotdiffuse.robots.parsing.srdf import read_srdf
+    from robotdiffuse.robots.parsing.urdf import UrdfTree
+
+    part = bytes(trimesh.creation.box((0.1, 0.05, 0.3)).export(file_type="stl"))  # type: ignore[arg-type]
+    (folder / "part.stl").write_bytes(damaged(rng, part) if rng.random() < 0.2 else part)
+    files = {name: folder / name for name in ("two.urdf", "two.srdf", "limits.yaml")}
+    which = rng.integers(4)
+    files["two.urdf"].write_bytes(numbers_changed(rng, URDF) if which < 2 else URDF)
+    files["two.srdf"].write_bytes(numbers_changed(rng, SRDF) if which == 2 else SRDF)
+    files["limits.yaml"].write_bytes(
+        text_of(rng, LIMITS, ".yaml") if which == 3 else json.dumps(LIMITS).encode()
+    )
+
+    def read() -> None:
+        srdf = read_srdf(files["two.srdf"])
+        tree = UrdfTree(files["two.urdf"], {})
+        robot = tree.robot(None, "lower", None, None, srdf)
+        assert tree.digest
+        with_limits(robot, read_limits(files["limits.yaml"]))
+
+    return read
+
+
+def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    from robotdiffuse.core.results import load_result
+    from robotdiffuse.problems.files import problem_from_record
+    from robotdiffuse.validation.validator import Verifier
+
+    rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
+    record = {
+        "status": "solved",
+        "reason": "solved by hand",
+        "planner": "hand",
+        "robot": "panda",
+        "joint_names": JOINTS,
+        "planning_time": 0.1,
+        "verified": True,
+        "seed": 0,
+        "waypoints": rows,
+        "times": [0.0, 1.0, 2.0],
+        "positions": rows,
+        "velocities": [[0.0] * 7, [0.3] + [0.0] * 6, [0.0] * 7],
+        "accelerations": [[0.0] * 7] * 3,
+        "progress": [[0.1, 0.4]],
+        "problem": PROBLEM | {"scene": PROBLEM["scene"][:1]},
+    }
+    file = folder / "result.json"
+    file.write_bytes(text_of(rng, record, ".json"))
+
+    def read() -> None:
+        saved = load_result(file)
+        if saved.problem is not None and saved.result.path is not None:
+            validator = Verifier(problem_from_record(saved.problem))
+            validator.path(saved.result.path)
+            if saved.result.trajectory is not None:
+                validator.trajectory(saved.result.trajectory)
+
+    return read
+
+
+def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    from robotdiffuse.robots import DATA, read_bundle
+    from robotdiffuse.robots.kinematics import link_pose
+
+    source = DATA / "panda"
+    text, meshes = (source / "robot.json").read_text(), (source / "meshes.npz").read_bytes()
+    damage = rng.random() < 0.7
+    content = text_of(rng, json.loads(text), ".json") if damage else text.encode()
+    (folder / "robot.json").write_bytes(content)
+    if not damage and rng.random() < 0.7:
+        import io
+
+        stream, arrays = io.BytesIO(), dict(np.load(source / "meshes.npz"))
+        name = ("sizes", "vertices", "faces")[rng.integers(3)]
+        flat = arrays[name] = arrays[name].copy()
+        row = rng.integers(len(flat))
+        wrong = (np.nan, 1e30, np.inf) if name == "vertices" else (-1, 10**7, 10**12)
+        flat[row, 0] = wrong[rng.integers(3)]
+        np.savez(stream, **arrays)
+        meshes = stream.getvalue()
+    elif not damage:
+        meshes = damaged(rng, meshes)
+    (folder / "meshes.npz").write_bytes(meshes)
+
+    def read() -> None:
+        robot = read_bundle(folder)
+        link_pose(robot, (robot.lower + robot.upper) / 2, robot.tip)
+
+    return read
+
+
+def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
+    """The endpoint of a request over HTTP, and its body; with probability `right` it is not damaged."""
+    rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
+    problem = (
+        PROBLEM | {"scene": PROBLEM["scene"][: rng.integers(7)]} | (EQUIPPED if rng.random() < 0.1 else {})
+    )
+    plan = {"problem": problem, "planner": "rrt_connect", "time_limit": 0.05, "seed": 1, "until": "first"}
+    plan |= {"velocity_scaling": 0.5, "acceleration_scaling": 0.5, "clearance": 0.01}
+    motion = {"joint_names": JOINTS, "positions": rows}
+    rates = {"velocities": [[0.0] * 7] * 3, "accelerations": [[0.0] * 7] * 3}
+    validated = {
+        "problem": problem,
+        "path": motion,
+        "trajectory": motion | {"times": [0.0, 1.0, 2.0]} | rates,
+    }
+    what = "verify" if rng.random() < 0.5 else "plan"
+    body = validated if what == "verify" else plan
+    if right and rng.random() < right:
+        return what, json.dumps(body).encode()
+    return what, text_of(rng, body, ".json")
+
+
+def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Request bodies, answered as a worker of `robotdiffuse serve` answers them."""
+    from robotdiffuse.core.errors import InputError
+    from robotdiffuse.robots import load_robot
+    from robotdiffuse.server import worker
+
+    what, body = asked(rng)
+
+    def ask() -> None:
+        worker.accept({"panda": load_robot("panda")}, 0.1, worker.Shared())
+        answer = worker.respond(1, what, body)
+        if answer.code == 400:
+            raise InputError(json.loads(answer.body)["error"])
+        assert answer.code == 200, answer.body.decode()
+
+    return ask
+
+
+def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Requests to a running `robotdiffuse serve`, which is itself checked now and then."""
+    from helpers.fuzz import server
+    from robotdiffuse.core.errors import InputError
+
+    (what, body), (_, other) = asked(rng, 0.5), asked(rng, 0.5)
+    sent = server.sent(rng, server.draft(rng, what, body, other), damaged)
+    looks = rng.random() < 1 / server.INPUTS_BETWEEN_CHECKS
+
+    def ask() -> None:
+        running = server.running_server()
+        said = server.exchange(running.address, sent)
+        if looks:
+            running.check()
+        if said:
+            raise InputError(said)
+
+    return ask
+
+
+def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    from robotdiffuse.core.types import Trajectory
+    from robotdiffuse.interop import read_motion, write_motion
+    from robotdiffuse.interop.plain_messages import joint_trajectory
+    from robotdiffuse.interop.recorded_motion import motion_of_robot
+    from robotdiffuse.problems.files import problem_from_record
+    from robotdiffuse.validation.validator import Verifier
+
+    problem = problem_from_record(PROBLEM | {"scene": PROBLEM["scene"][:1]})
+    rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3)
+    times, still = np.array([0.0, 10.0, 20.0]), np.zeros_like(rows)
+    trajectory = Trajectory(problem.robot.joint_names, times, rows, still, still)
+    ending = (".json", ".yaml", ".csv", ".mcap", ".rosbag2")[rng.integers(5)]
+    file = folder / f"motion{ending}"
+    if ending == ".json" and rng.random() < 0.3:
+        trajectory.save(file)
+        file.write_bytes(text_of(rng, json.loads(file.read_text()), ending))
+    elif ending in (".json", ".yaml"):
+        forms = (
+            lambda r: r,
+            lambda r: {"joint_trajectory": r},
+            lambda r: {"trajectory": [{"joint_trajectory": r}]},
+        )
+        record = forms[rng.integers(3)](joint_trajectory(trajectory.joint_names, trajectory))
+        file.write_bytes(text_of(rng, record, ending))
+    else:
+        write_motion(problem, trajectory, file)
+        part = file if ending != ".rosbag2" else sorted(file.iterdir())[rng.integers(2)]
+        part.write_bytes(damaged(rng, part.read_bytes()))
+
+    def read() -> None:
+        motion = motion_of_robot(read_motion(file), problem.robot).motion
+        validator = Verifier(problem)
+        validator.trajectory(motion) if isinstance(motion, Trajectory) else validator.path(motion)
+
+    return read
+
+
+@cache
+def _certificate_record() -> dict[str, Any]:
+    import tempfile
+
+    from robotdiffuse.certificates.search import certify
+    from robotdiffuse.core.types import Path
+    from robotdiffuse.problems.files import problem_from_record
+
+    start = PROBLEM["start"]
+    rows = np.array([start, start])
+    rows[1, 0] += 0.05
+    problem = problem_from_record(PROBLEM | {"scene": [], "goal": {"joints": rows[1].tolist()}})
+    with tempfile.TemporaryDirectory() as folder:
+        certify(problem, Path(problem.robot.joint_names, rows)).save(f"{folder}/c.json")
+        return json.loads(FilePath(f"{folder}/c.json").read_text())
+
+
+def _certificate(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    from robotdiffuse.certificates.proof import load_certificate
+
+    file = folder / "certificate.json"
+    file.write_bytes(text_of(rng, _certificate_record(), ".json"))
+    return lambda: load_certificate(file).check()
+
+
+def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Depth images, and the views that name them."""
+    from PIL import Image
+
+    ending, image = (".png", ".npy", ".npz")[rng.integers(3)], rng.integers(0, 3000, (6, 8)).astype(np.uint16)
+    file = folder / f"depth{ending}"
+    if ending == ".png":
+        Image.fromarray(image).save(file)
+    else:
+        (np.save if ending == ".npy" else np.savez)(file, image if rng.random() < 0.5 else image / 1000)
+    if rng.random() < 0.6:
+        file.write_bytes(damaged(rng, file.read_bytes()))
+    view = VIEW | {"depth": file.name, "intrinsics": [6.0, 6.0, 4, 3], "scale": 0.001}
+    del view["cloud"]
+    problem = PROBLEM | {"scene": PROBLEM["scene"][:1], "views": [view], "unknown": "padded"}
+    (folder / "problem.json").write_bytes(
+        text_of(rng, problem, ".json") if rng.random() < 0.5 else json.dumps(problem).encode()
+    )
+    return lambda: _validated(folder / "problem.json")
+
+
+def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Problem files that browsers send to the live page."""
+    from robotdiffuse.robots import load_robot
+    from robotdiffuse.visualization.live.files import problem_text, uploaded_problem
+    from robotdiffuse.visualization.live.session import Session
+
+    problem = PROBLEM | ({}, EQUIPPED, CONSTRAINED, MOVING)[rng.integers(4)]
+    ending = (".yaml", ".json")[rng.integers(2)]
+    content = text_of(rng, problem, ending)
+
+    def read() -> None:
+        problem = uploaded_problem(content, f"p{ending}", load_robot("panda"))
+        Session(problem).close()
+        problem_text(problem)
+
+    return read
+
+
+def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Heads of requests to the live page, which accepts them or not and never raises."""
+    from robotdiffuse.visualization.live.access import accepted_head
+
+    token = ("", "abc")[rng.integers(2)]
+    host = (b"localhost:8080", b"[::1]:1", b"a.example")[rng.integers(3)]
+    head = b"GET /abc/?x=1 HTTP/1.1\r\nHost: %s\r\nOrigin: http://%s\r\nUpgrade: websocket" % (host, host)
+    head = damaged(rng, head)
+    return lambda: accepted_head(head, token)
+
+
+def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Values of `--set` for planners, and settings of training runs."""
+    from robotdiffuse.learning.training.config import PlannerTraining
+    from robotdiffuse.planning import PLANNERS, planner_settings
+
+    if rng.random() < 0.5:
+        data = mutated(rng, PlannerTraining(data="d", encoder="e").to_json())
+        return lambda: PlannerTraining.from_json(data, "settings")
+    names = [*PLANNERS]
+    name = names[rng.integers(len(names))]
+    fields = ("range", "guidance.margin", "search.iterations", "samples", "weights", "", "a.b.c")
+    value = str(nasty(rng))
+    said = f"{fields[rng.integers(len(fields))]}={value}" if rng.random() < 0.8 else value
+    return lambda: planner_settings(name, [said])
+
+
+def _weights(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Folders with the weights of a network."""
+    from robotdiffuse.learning.checkpoint import BUNDLED, load_network
+    from robotdiffuse.robots import load_robot
+
+    about, tensors = (BUNDLED / "panda" / f"mpinets.{ending}" for ending in ("json", "safetensors"))
+    whole = rng.random() < 0.8
+    text = text_of(rng, json.loads(about.read_text()), ".json") if whole else about.read_bytes()
+    (folder / about.name).write_bytes(text)
+    if whole:
+        (folder / tensors.name).symlink_to(tensors)
+    else:
+        (folder / tensors.name).write_bytes(damaged(rng, tensors.read_bytes()[: 10 ** rng.integers(2, 7)]))
+    return lambda: load_network("mpinets", folder, load_robot("panda"))
+
+
+def _npz(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """The authors' data sets."""
+    import io
+
+    from robotdiffuse.datasets.robot_npz import import_npz
+
+    stream, x = io.BytesIO(), np.zeros((2, 254, 7), np.float32)
+    x += np.array(PROBLEM["start"], np.float32)
+    y = np.concatenate([x[:, 0], x[:, -1], np.ones((2, 9), np.float32)], axis=1)
+    if rng.random() < 0.3:
+        y[0, rng.integers(y.shape[1])] = (np.nan, 1e30, np.inf)[rng.integers(3)]
+    np.savez(stream, x_train=x, y_train=y)
+    file = folder / "robot.npz"
+    file.write_bytes(damaged(rng, stream.getvalue()) if rng.random() < 0.8 else stream.getvalue())
+    return lambda: import_npz(file, folder / "set")
+
+
+KINDS: dict[str, Make] = {
+    "problem": _problem,
+    "moveit": _moveit,
+    "cloud": _cloud,
+    "mesh": _mesh,
+    "urdf": _urdf,
+    "result": _result,
+    "bundle": _bundle,
+    "http": _http,
+    "socket": _socket,
+    "motion": _motion,
+    "certificate": _certificate,
+    "depth": _depth,
+    "upload": _upload,
+    "head": _head,
+    "settings": _settings,
+    "weights": _weights,
+    "npz": _npz,
+}

@@ -1,0 +1,30 @@
+"""A robot of three bars, and the mesh of a cube."""
+
+import numpy as np
+
+from robotdiffuse.core.transforms import transform
+from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
+
+CORNERS = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)])
+FACES = "013 032 467 475 045 051 237 276 026 064 157 173"
+CUBE = np.array([[int(corner) for corner in face] for face in FACES.split()])
+
+
+def bar(length: float) -> ConvexMesh:
+    """A square bar of 8 cm along z, from the origin."""
+    return ConvexMesh(CORNERS * [0.04, 0.04, length / 2] + [0, 0, length / 2], CUBE)
+
+
+def three_bars() -> Robot:
+    """Three bars: a turning pillar, a hinge with its axis off z, a slide."""
+    quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    z, y = np.array([0.0, 0, 1]), np.array([0.0, 1, 0])
+    limits = (-3.0, 3.0, 2.0, 5.0, 50.0)
+    joints = (
+        Joint("turn", "revolute", "base", "pillar", transform(np.array([0, 0, 0.1])), z, *limits),
+        Joint("hinge", "revolute", "pillar", "arm", transform(np.array([0, 0, 0.4]), quarter), y, *limits),
+        Joint("slide", "prismatic", "arm", "tip", transform(np.array([0, 0, 0.3])), z, *limits),
+    )
+    meshes = {"base": (bar(0.1),), "pillar": (bar(0.4),), "arm": (bar(0.3),), "tip": (bar(0.2),)}
+    spheres = {"tip": np.array([[0, 0, 0.1, 0.12]])}
+    return Robot("three_bars", "base", "tip", joints, spheres, meshes)

@@ -1,0 +1,241 @@
+"""The diffusion model and its parts: encoder, noise, samplers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.box_arm import box_arm
+from helpers.small_model import SMALL_ENCODER, small_model
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
+from robotdiffuse.learning.encoders.point_autoencoder import (
+    PointAutoencoder,
+    chamfer,
+    nearest,
+)
+from robotdiffuse.learning.motion_model import GuideFn, MotionModel, MotionModelSettings
+from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.learning.sampling import SamplingSettings
+from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.robots.normalizer import JointNormalizer
+from robotdiffuse.scenes.surface_points import PANDA_REGION
+
+
+def cloud(n: int, seed: int = 0) -> torch.Tensor:
+    points = np.random.default_rng(seed).uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.8], (1, n, 3))
+    return torch.from_numpy(points.astype(np.float32))
+
+
+def test_encoder_leaves_out_points_out_of_the_region():
+    encoder = PointAutoencoder(SMALL_ENCODER)
+    points = cloud(20)
+    out = torch.tensor([[[3.0, 0.0, 0.5], [0.3, 0.0, -0.2]]])
+    torch.testing.assert_close(encoder(torch.cat([points, out], 1)), encoder(points))
+    torch.testing.assert_close(encoder(out), encoder(torch.zeros(1, 0, 3)))
+    assert not torch.allclose(encoder(points), encoder(torch.zeros(1, 0, 3)))
+    both = np.concatenate([points.numpy(), out.numpy()], 1)
+    np.testing.assert_array_equal(encoder.near(torch.from_numpy(both)).numpy(), PANDA_REGION.holds(both))
+
+
+def test_encoder_takes_any_number_of_points():
+    model = small_model().for_inference()
+    for n in (0, 1, 5000):
+        z = model.encode(cloud(n)[0].numpy().astype(np.float64))
+        assert z.shape == (8,)
+        assert np.isfinite(z).all()
+
+
+def test_standardized_codes():
+    encoder = PointAutoencoder(SMALL_ENCODER)
+    clouds = torch.cat([cloud(30, seed) for seed in range(40)])
+    with torch.no_grad():
+        encoder.standardize(encoder.encode(clouds))
+        z = encoder(clouds)
+    torch.testing.assert_close(z.mean(0), torch.zeros(8), atol=1e-3, rtol=0)
+    torch.testing.assert_close(z.std(0), torch.ones(8), atol=1e-3, rtol=0)
+
+
+def test_nearest_and_chamfer_against_all_pairs():
+    a, b = cloud(7, 1), cloud(11, 2)
+    allowed = torch.arange(11)[None] < 9
+    distance = (a[0, :, None] - b[0, None]).norm(dim=-1)
+    forth, back = nearest(a, b, allowed)
+    assert torch.equal(forth[0], distance[:, :9].argmin(1))
+    assert torch.equal(back[0, :9], distance[:, :9].argmin(0))
+    rms = [distance[:, :9].min(i).values.square().mean().sqrt() for i in (0, 1)]
+    torch.testing.assert_close(chamfer(a, b, allowed), sum(rms), atol=1e-4, rtol=1e-4)
+
+
+def test_normalizer():
+    normalizer = JointNormalizer(np.array([-1.0, 0.0]), np.array([3.0, 0.5]))
+    q = np.array([[-1.0, 0.0], [3.0, 0.5], [1.0, 0.25]])
+    np.testing.assert_allclose(normalizer.to_unit(q), [[-1, -1], [1, 1], [0, 0]], atol=1e-7)
+    np.testing.assert_allclose(normalizer.from_unit(normalizer.to_unit(q)), q, atol=1e-7)
+    with pytest.raises(InputError, match="joint 1"):
+        JointNormalizer(np.array([0.0, 1.0]), np.array([1.0, 1.0]))
+
+
+def test_schedule():
+    schedule = NoiseSchedule(ScheduleSettings())
+    np.testing.assert_allclose(schedule.signal**2 + schedule.noise**2, 1.0)
+    assert (np.diff(schedule.signal) <= 0).all()
+    assert schedule.noise[0] == 0
+    assert schedule.signal[-1] ** 2 <= 1.1e-4
+    weight = schedule.weight(np.arange(201), 5.0)
+    assert weight.max() == 5.0
+    assert weight.min() >= 1.0
+    with pytest.raises(InputError, match="sampling steps"):
+        schedule.sampling_levels(0)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_noise_is_zero_at_the_ends_and_has_the_data_s_covariance(smooth):
+    s = np.linspace(0, np.pi, 16)[:, None]
+    residuals = np.random.default_rng(0).standard_normal((500, 1, 2)) * np.sin(s)
+    factor = noise_factor(residuals, smooth)
+    covariance = factor @ factor.T
+    assert not covariance[[0, -1]].any()
+    assert np.trace(covariance) / 14 == pytest.approx(1.0, abs=1e-3)
+    shape = (np.sin(s) @ np.sin(s).T)[1:-1, 1:-1]
+    wanted = shape / (np.trace(shape) / 14) if smooth else np.eye(14)
+    np.testing.assert_allclose(covariance[1:-1, 1:-1], wanted, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("eta", [0.0, 1.0])
+def test_sampler_recovers_a_gaussian(name, eta):
+    """For Gaussian data the best denoiser has a closed form; samples have their mean and deviation."""
+    mean, std, n = 0.7, 0.3, 40_000
+    schedule = NoiseSchedule(ScheduleSettings())
+    rng = np.random.default_rng(1)
+
+    def predict(x, level):
+        a, s = schedule.signal[level], schedule.noise[level]
+        return mean + a * std**2 / (a**2 * std**2 + s**2) * (x - a * mean)
+
+    def deviations(steps):
+        x = SAMPLERS.load(name)(predict, schedule, lambda: rng.standard_normal(n), steps, eta)
+        return abs(x.mean() - mean), abs(x.std() - std)
+
+    few, many = deviations(10), deviations(200)
+    # the standard error is 0.0015 of the mean; of many steps, the discretisation leaves less than 0.005
+    assert max(few[0], many[0]) < 0.008
+    assert many[1] < 0.01
+    assert many[1] < few[1]
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_samples_hold_start_and_goal(guided):
+    model = small_model().for_inference()
+    model.residual_scale.fill_(0.3)
+    start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
+    levels = []
+
+    def guide(q, level):
+        levels.append(level)
+        return q + 0.1
+
+    def sample(seed):
+        return model.sample(
+            start,
+            goal,
+            np.zeros(8, np.float32),
+            clearances=lambda q: np.full((*q.shape[:2], 3), 0.2, np.float32),
+            rng=np.random.default_rng(seed),
+            settings=SamplingSettings(samples=5, sampling_steps=6, eta=0.5),
+            guide=guide if guided else None,
+        )
+
+    q = sample(0)
+    assert q.shape == (5, 16, 3)
+    assert (q[:, 0] == start).all()
+    assert (q[:, -1] == goal).all()
+    assert (q >= box_arm().lower).all()
+    assert (q <= box_arm().upper).all()
+    assert np.abs(q[0] - q[1]).max() > 1e-3
+    assert len(levels) == (3 if guided else 0)
+    assert sorted(levels, reverse=True) == levels
+    np.testing.assert_array_equal(sample(0), q)
+
+
+def test_clearances_are_inputs_of_the_denoiser():
+    model = small_model()
+    reference = model.reference(np.zeros((2, 3)), np.ones((2, 3)))
+    x = np.zeros((2, 16, 3), np.float32)
+    features = model.features(
+        x, reference, lambda q: np.stack([q[..., 0] * 0 + d for d in (-5, 0.15, 9)], -1)
+    )
+    assert features.shape == (2, 16, 9)
+    np.testing.assert_allclose(features[0, 0, 6:], [-1, 0, 1], atol=1e-6)
+
+
+def test_residual_and_joints_are_inverse():
+    model = small_model()
+    q = np.random.default_rng(0).uniform(-2, 2, (4, 16, 3)).astype(np.float32)
+    model.fit_statistics(q, smooth_noise=True)
+    reference = model.reference(q[:, 0], q[:, -1])
+    x = model.normalize(q, reference)
+    np.testing.assert_allclose(model.joints(x, reference), q, atol=1e-5)
+    assert np.sqrt((x[:, 1:-1] ** 2).mean((0, 1))) == pytest.approx([1, 1, 1], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("steps", "share", "guided"),
+    [
+        (6, 0.5, 3),
+        (5, 0.5, 3),
+        (1, 0.5, 1),
+        (6, 0.0, 0),
+        (6, 1.0, 6),
+        (10, 0.3, 3),
+        (30, 0.1, 3),
+        (50, 0.02, 1),
+    ],
+)
+def test_the_last_share_of_the_steps_is_guided(steps: int, share: float, guided: int) -> None:
+    model, levels = small_model(), []
+
+    def guide(q: np.ndarray, level: float) -> np.ndarray:
+        levels.append(level)
+        return q
+
+    sample_with(model, SamplingSettings(samples=1, sampling_steps=steps, guided_share=share), guide)
+    expected = model.schedule.sampling_levels(steps)[:-1] / model.schedule.steps
+    np.testing.assert_allclose(levels, expected[steps - guided :])
+
+
+def test_a_sampler_by_name_is_that_of_a_checkpoint() -> None:
+    for name in SAMPLERS:
+        model = small_model()
+        by_setting = sample_with(model, SamplingSettings(samples=2, sampling_steps=4, sampler=name))
+        model.settings = replace(model.settings, sampler=name)
+        by_default = sample_with(model, SamplingSettings(samples=2, sampling_steps=4))
+        np.testing.assert_array_equal(by_setting, by_default)
+
+
+def test_sampling_settings_are_checked() -> None:
+    with pytest.raises(InputError, match=r"unknown sampling\.sampler 'heun'; known: ddim, ddpm"):
+        SamplingSettings(sampler="heun")
+    with pytest.raises(InputError, match=r"guided_share is 1.5"):
+        SamplingSettings(guided_share=1.5)
+    with pytest.raises(InputError, match="sampling steps is 201; it must be between 1 and 200"):
+        sample_with(small_model(), SamplingSettings(sampling_steps=201))
+
+
+def sample_with(model: MotionModel, settings: SamplingSettings, guide: GuideFn | None = None) -> np.ndarray:
+    def far(q: np.ndarray) -> np.ndarray:
+        return np.full((*q.shape[:2], 3), 0.4, np.float32)
+
+    start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
+    code = np.zeros(8, np.float32)
+    return model.sample(start, goal, code, far, np.random.default_rng(0), settings, guide)
+
+
+def test_numbers_of_waypoints_are_bounded():
+    """Matrices of 10**25 rows were asked for; found by fuzzing."""
+    with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
+        MotionModelSettings.from_json({"waypoints": 10**25}, "model")
+    with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
+        PlannerTraining.from_json({"data": "d", "encoder": "e", "waypoints": 10**25}, "training")

@@ -1,0 +1,56 @@
+"""The data set and the encoder of the tests of training."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.box_arm import box_arm
+from helpers.stores import WAYPOINTS as STORED
+from helpers.stores import manifest_of, random_arrays
+from robotdiffuse.datasets.manifest import write_manifest
+from robotdiffuse.datasets.shards import write_shard
+from robotdiffuse.learning.checkpoint import save_encoder
+from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoder, PointAutoencoderSettings
+from robotdiffuse.learning.training import planner as training
+from robotdiffuse.scenes.scene_arrays import SPHERE
+
+SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
+
+
+@pytest.fixture
+def arm(monkeypatch):
+    robot = box_arm()
+    monkeypatch.setattr(training, "load_robot", lambda name: robot)
+    return robot
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Two shards of motions that bend towards the side of the obstacle, which is too far away to change
+    clearances; and an encoder."""
+    home, arm, rng = tmp_path_factory.mktemp("stored"), box_arm(), np.random.default_rng(0)
+    folder = home / "data"
+    write_manifest(folder, manifest_of(arm))
+    for i, n in enumerate((100, 60)):
+        side = rng.choice([-1.0, 1.0], n)
+        ends = rng.uniform(-1.5, 1.5, (2, n, 1, arm.dof))
+        s = np.linspace(0, 1, STORED)[:, None]
+        q = ends[0] * (1 - s) + ends[1] * s + 0.5 * side[:, None, None] * np.sin(np.pi * s)
+        arrays = random_arrays(arm, n, rng)
+        kinds, params = np.zeros_like(arrays["obstacle_kinds"]), np.zeros_like(arrays["obstacle_params"])
+        kinds[:, 0] = SPHERE
+        params[:, 0, :4] = np.stack([0.01 * rng.random(n), 0.5 * side, 0 * side + 1, 0 * side + 0.2], -1)
+        arrays |= {"trajectories": q, "obstacle_kinds": kinds, "obstacle_params": params}
+        write_shard(folder, i, arrays, {})
+    torch.manual_seed(0)
+    save_encoder(PointAutoencoder(SMALL_ENCODER), home / "encoder", {})
+    return home
+
+
+@pytest.fixture
+def data(tmp_path, arm, stored):
+    """A copy of the data; the encoder is beside the folder."""
+    shutil.copytree(stored, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "data"

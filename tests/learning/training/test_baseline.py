@@ -1,0 +1,148 @@
+"""Training of baselines: learning, checkpoints, weights of other robots, the command."""
+
+import os
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from helpers.motion_stores import random_motions, write_motions
+from robotdiffuse.cli import main
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.registry import Entry
+from robotdiffuse.core.settings import Settings
+from robotdiffuse.learning import checkpoint
+from robotdiffuse.learning.checkpoint import load_network
+from robotdiffuse.learning.networks import NETWORKS
+from robotdiffuse.learning.networks.base import BaselineNetwork
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
+from robotdiffuse.learning.training.batches import TrajectoryData
+from robotdiffuse.learning.training.validation import motions_free
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.shapes import Box, Sphere
+
+
+@dataclass(frozen=True)
+class ReversalSettings(Settings):
+    width: int = 7
+
+
+class Reversal(BaselineNetwork):
+    """A network that learns the middle waypoint of motions."""
+
+    training_defaults: ClassVar[dict] = {"batch": 16, "learning_rate": 0.05}
+
+    def __init__(self, robot: RobotIdentity, settings: ReversalSettings) -> None:
+        super().__init__(robot, settings)
+        self.layer = nn.Linear(2 * self.dof, self.dof)
+
+    def loss(self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator) -> Tensor:
+        q = self.normalizer.to_unit(torch.from_numpy(data.q[rng.integers(0, len(data), count)]))
+        middle = self.layer(torch.cat([q[:, 0], q[:, -1]], -1))
+        return (middle - q[:, q.shape[1] // 2]).square().mean()
+
+    def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float:
+        return float(motions_free(robot, data.scenes[:4], data.q[:4]).mean())
+
+
+@pytest.fixture
+def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setitem(NETWORKS, "reversal", Entry(f"{__name__}:Reversal", "for tests", "ReversalSettings"))
+    robot = load_robot("panda")
+    write_motions(tmp_path / "data", robot, random_motions(robot, 40))
+    return str(tmp_path / "data")
+
+
+def weights(folder: Path) -> dict[str, Tensor]:
+    return load_network("reversal", str(folder), load_robot("panda")).state_dict()
+
+
+def test_training_learns_and_a_stopped_run_ends_the_same(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = baseline_training("reversal", {"data": data, "samples": 6400, "warmup_steps": 5})
+    assert (settings.batch, settings.learning_rate, settings.minutes) == (16, 0.05, None)
+    report = train_baseline(settings, str(tmp_path / "whole"))
+    assert report["validation"] < 1e-3 and report["samples"] == 6400 and report["success"] == 1.0
+
+    original, steps = Reversal.loss, 0
+
+    def interrupted(self, data, count, fraction, rng):
+        nonlocal steps
+        steps += 1
+        if steps == 150:
+            os.kill(os.getpid(), signal.SIGINT)
+        return original(self, data, count, fraction, rng)
+
+    monkeypatch.setattr(Reversal, "loss", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train_baseline(settings, str(tmp_path / "parts"))
+    monkeypatch.setattr(Reversal, "loss", original)
+    train_baseline(settings, str(tmp_path / "parts"))
+    whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_weights_of_another_robot_or_none_are_refused(data: str, tmp_path: Path) -> None:
+    panda = load_robot("panda")
+    with pytest.raises(
+        InputError, match="no weights of the network reversal come with the package for panda; train them"
+    ):
+        load_network("reversal", None, panda)
+    with pytest.raises(
+        InputError, match="holds no reversal; train them: robotdiffuse train baseline reversal"
+    ):
+        load_network("reversal", str(tmp_path), panda)
+    settings = baseline_training("reversal", {"data": data, "samples": 160})
+    train_baseline(settings, str(tmp_path / "out"))
+    narrow = panda.with_locked({"panda_joint7": 0.0})
+    with pytest.raises(InputError, match="was trained for panda with joints"):
+        load_network("reversal", str(tmp_path / "out"), narrow)
+    file = tmp_path / "out" / "reversal.safetensors"
+    file.write_bytes(file.read_bytes()[:-1])
+    checkpoint._loaded.cache_clear()
+    with pytest.raises(InputError, match="damaged"):
+        load_network("reversal", str(tmp_path / "out"), panda)
+
+
+def test_command(data: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    asked = ["train", "baseline", "reversal", "--data", data, "--out", str(tmp_path / "out")]
+    assert main([*asked, "--samples", "320"]) == 0
+    assert "samples: 320" in capfd.readouterr().out
+    assert main([*asked, "--samples", "320", "--batch", "8"]) == 2
+    assert "holds a run with batch = 16" in capfd.readouterr().err
+    assert main(["train", "baseline", "nonsense", "--data", data, "--out", "x"]) == 2
+    assert "unknown network 'nonsense'; known: model, mpinets, mpnet" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+def test_every_network_normalizes_by_the_joint_limits(name: str) -> None:
+    panda = load_robot("panda")
+    network = NETWORKS.load(name)(RobotIdentity.of(panda), NETWORKS.defaults(name))
+    ends = np.stack([panda.lower, panda.upper])
+    np.testing.assert_allclose(network.normalizer.to_unit(ends), [[-1] * 7, [1] * 7])
+    torch.testing.assert_close(
+        network.normalizer.from_unit(network.normalizer.to_unit(torch.from_numpy(ends))),
+        torch.from_numpy(ends),
+    )
+
+
+def test_motion_through_the_floor_or_an_obstacle_is_not_free() -> None:
+    panda = load_robot("panda")
+    start = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+    beside, down = start.copy(), start.copy()
+    beside[0], down[1] = 1.0, 1.7
+    motions = np.linspace([start, start, start], [beside, beside, down], 5, axis=1)
+    floor = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1))
+    scenes = [Scene([floor, *shapes]) for shapes in ([], [Sphere((0.4, 0.2, 0.6), 0.1)], [])]
+    free = motions_free(panda, PackedScenes.pack(scenes, 1, floor=True), motions)
+    assert free.tolist() == [True, False, False]

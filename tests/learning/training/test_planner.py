@@ -1,0 +1,352 @@
+"""Training of the diffusion model: it learns, resumes exactly, and shares its work between processes."""
+
+import json
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.training_log import read_log
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.denoisers.unet import UNetSettings
+from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.objectives import OBJECTIVES
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.sampling import SamplingSettings
+from robotdiffuse.learning.training import loop as training_run
+from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training.batches import (
+    Batch,
+    Batches,
+    fast_bf16,
+    load_data,
+)
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.training.encoder import train_encoder
+from robotdiffuse.learning.training.loop import TrainingRun
+from robotdiffuse.learning.training.losses import LossSettings
+from robotdiffuse.learning.training.planner import train_planner
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.scenes.surface_points import sample_surface
+
+SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
+SMALL_DENOISER = TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8)
+WAYPOINTS = 48
+
+
+def planner_settings(data, **changes) -> PlannerTraining:
+    settings = PlannerTraining(
+        data=str(data),
+        encoder=str(data.parent / "encoder"),
+        minutes=None,
+        samples=160,
+        batch=16,
+        warmup_steps=3,
+        learning_rate=3e-3,
+        turned_copies=0,
+        denoiser_settings=SMALL_DENOISER,
+        validation_problems=1,
+    )
+    return replace(settings, **changes)
+
+
+def stop_at(monkeypatch, step):
+    """Interrupt training after this step, as Ctrl-C would. Returns a function that undoes it."""
+    original = TrainingRun.step
+
+    def interrupted(self, loss):
+        original(self, loss)
+        if self.at.step == step:
+            self.save()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(TrainingRun, "step", interrupted)
+    return lambda: monkeypatch.setattr(TrainingRun, "step", original)
+
+
+def start(kind, settings, out, *launcher):
+    """Start a training of training_processes.py in its own process group."""
+    file = out.parent / f"{out.name}.json"
+    file.write_text(json.dumps(settings.to_json()))
+    script = str(Path(__file__).parents[2] / "helpers" / "training_processes.py")
+    return subprocess.Popen(
+        [sys.executable, *launcher, script, kind, str(file), str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def test_killed_training_ends_the_same(tmp_path, data):
+    """Killed by SIGKILL, at a random moment after the first checkpoint."""
+    settings = planner_settings(data, samples=480)
+    train_planner(settings, str(tmp_path / "whole"))
+    out = tmp_path / "killed"
+    run = start("slow", replace(settings, checkpoint_seconds=0.2), out)
+    while not (out / "training.safetensors").exists():
+        assert run.poll() is None, run.communicate()[0]
+        time.sleep(0.01)
+    time.sleep(random.random())
+    run.kill()
+    run.communicate()
+    assert run.returncode == -signal.SIGKILL and not (out / "model.safetensors").exists()
+    train_planner(settings, str(out))
+    files = [tmp_path / part / "model.safetensors" for part in ("whole", "killed")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
+    """A step of two processes equals one on the union of their batches; they resume and skip together."""
+    out = tmp_path / "two"
+    settings = planner_settings(data, samples=160, gradient_norm=1e6, device="cpu")
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    run = start("two", settings, out, *launcher)
+    said = run.communicate(timeout=500)[0]
+    assert run.returncode == 0, said
+    assert said.count("model: 100.0%, 160 samples") == 2, "the first process alone reports"
+    first, second = json.loads((out / "seen.json").read_text())
+    assert first == second
+    assert first["report"] == first["again"]
+    assert first["skipped"] == 1 and first["samples"] == 20
+    files = [out / part / "model.safetensors" for part in ("whole", "parts")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    with pytest.raises(InputError, match="processes = '2', now it is '1'"):
+        train_planner(settings, str(out / "parts"))
+
+    draw, gradients = Batches.draw, {}
+
+    def both(self, count, rng):
+        if gradients:
+            return draw(self, count, rng)
+        parts = [draw(self, count // 2, np.random.default_rng(seed)) for seed in (0, [0, 1])]
+        fields = ((name, [getattr(part, name) for part in parts]) for name in vars(parts[0]))
+        of: dict[type, Any] = {PackedScenes: PackedScenes.joined, np.ndarray: np.concatenate}
+        joined = {name: None if a is None else of[type(a)]([a, b]) for name, (a, b) in fields}
+        return Batch(**joined)  # type: ignore[arg-type]
+
+    def step(self, loss):
+        original(self, loss)
+        gradients.update(
+            {name: p.grad.clone() for name, p in self.parameters.items()} if not gradients else {}
+        )
+
+    original = TrainingRun.step
+    monkeypatch.setattr(Batches, "draw", both)
+    monkeypatch.setattr(TrainingRun, "step", step)
+    train_planner(replace(settings, samples=32, batch=32), str(tmp_path / "one"))
+    averaged, _ = read_tensors(out / "first_step.safetensors")
+    assert averaged.keys() == gradients.keys()
+    wanted, found = (torch.cat([g[name].flatten() for name in averaged]) for g in (gradients, averaged))
+    # products in bf16 have 8 digits, and are rounded for each batch
+    assert (found - wanted).norm() < (0.01 if fast_bf16() else 1e-5) * wanted.norm()
+
+
+@pytest.mark.parametrize("denoiser", DENOISERS)
+def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
+    """On the meta device, which holds no numbers but refuses tensors of other devices as a GPU does."""
+    losses = LossSettings(point=1.0, collision=1.0)
+    settings = planner_settings(
+        data, denoiser=denoiser, denoiser_settings=None, losses=losses, condition_drop=0.5
+    )
+    encoder = load_encoder(data.parent / "encoder")
+    model = MotionModel(RobotIdentity.of(arm), training.model_settings(settings, encoder))
+    loaded = load_data(str(data), arm, encoder, WAYPOINTS, lambda text: None)
+
+    def far(scenes, q):
+        return np.full((*q.shape[:-1], len(model.robot.links)), 0.4, np.float32)
+
+    rng = np.random.default_rng(0)
+    batch = Batches(loaded, model, far, 0.1, 5.0).draw(4, rng)
+    elsewhere = Processes("cpu")
+    elsewhere.device = torch.device("meta")
+    model = model.to("meta")
+    loss = training.PlannerLoss(model, arm, settings, elsewhere)(batch, 1.0, rng, torch.arange(4) > 1)
+    loss.backward()
+    assert loss.device.type == "meta"
+    assert all(p.grad is not None for p in model.denoiser.parameters())
+
+
+def test_device_is_checked(data, tmp_path, monkeypatch):
+    for name, message in (("tpu", "unknown device 'tpu'; known: cpu, cuda"), ("cuda", "no CUDA device")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        with pytest.raises(InputError, match=message):
+            train_planner(planner_settings(data, device=name), str(tmp_path / "out"))
+    Processes("cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
+    with pytest.raises(InputError, match="has trained on cpu; start a new process"):
+        Processes("cuda")
+
+
+def test_training_without_accelerate_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "accelerate", None)
+    with pytest.raises(InputError, match=r"pip install \"robotdiffuse\[train\]\""):
+        Processes(None)
+
+
+@pytest.mark.parametrize("kind", ["encoder", "planner"])
+def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
+    def train(out):
+        if kind == "encoder":
+            settings = EncoderTraining(minutes=None, samples=96, batch=8, points=32, encoder=SMALL_ENCODER)
+            return train_encoder(settings, str(out))
+        return train_planner(planner_settings(data), str(out))
+
+    whole = train(tmp_path / "whole")
+    resume = stop_at(monkeypatch, 5)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "parts")
+    resume()
+    assert train(tmp_path / "parts") == whole
+    name = "encoder" if kind == "encoder" else "model"
+    files = [tmp_path / part / f"{name}.safetensors" for part in ("whole", "parts")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert train(tmp_path / "parts") == whole, "a finished run is left as it is"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"target": "absolute", "smooth_noise": False},
+        {"objective": "noise"},
+        {"clearance_features": False, "sampler": "ddpm"},
+        {"losses": LossSettings(point=0.1, collision=0.1, waypoints=4)},
+    ],
+    ids=lambda changes: "-".join(map(str, changes)),
+)
+def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch):
+    """Loss falls, start and goal are exact, samples are within limits."""
+    monkeypatch.setattr(training_run, "LOG_EVERY", 10)
+    out = tmp_path / "out"
+    train_planner(planner_settings(data, samples=16 * 60, **changes), str(out))
+    losses = [float(row["loss"]) for row in read_log(out)]
+    assert np.mean(losses[-3:]) < losses[0]
+    model = load_model(out, arm)
+    start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
+    z = model.encode(np.zeros((0, 3)))
+
+    def clearances(q):
+        return np.full((*q.shape[:2], 3), 0.3, np.float32)
+
+    settings = SamplingSettings(samples=3, sampling_steps=8)
+    q = model.sample(start, goal, z, clearances, np.random.default_rng(0), settings)
+    assert q.shape == (3, WAYPOINTS, 3) and np.isfinite(q).all()
+    assert (q[:, 0] == start).all() and (q[:, -1] == goal).all()
+    assert (q >= arm.lower).all() and (q <= arm.upper).all()
+
+
+def test_two_trainings_do_not_share_a_folder(tmp_path, data):
+    out = tmp_path / "out"
+    with lock_folder(out), pytest.raises(InputError, match="another process"):
+        train_planner(planner_settings(data), str(out))
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, arm, objective):
+    """With the weight of the output's error it would be 10,000 times too large for noise at the last
+    level."""
+    encoder = load_encoder(data.parent / "encoder")
+    loaded = load_data(str(data), arm, None, WAYPOINTS, print)
+    settings = planner_settings(data, objective=objective)
+    model = MotionModel(RobotIdentity.of(arm), training.model_settings(settings, encoder))
+    batches = Batches(loaded, model, lambda _, q: np.zeros((*q.shape[:2], 3), np.float32), 0.1, 5.0)
+    levels = np.arange(1, model.schedule.steps + 1)
+    batch = batches.at(np.zeros(len(levels), np.int64), levels, np.random.default_rng(0))
+    of_clean = model.schedule.weight(levels, 5.0)
+    assert (batch.clean_weight > 0).all()
+    assert (batch.clean_weight <= of_clean * (1 + 1e-5)).all()
+    if objective == "clean":
+        np.testing.assert_allclose(batch.clean_weight, of_clean, rtol=1e-6)
+
+
+def test_planner_learns_which_side(tmp_path, data, arm):
+    out = tmp_path / "out"
+    report = train_planner(
+        planner_settings(data, samples=16 * 300, losses=LossSettings(point=0.01)), str(out)
+    )
+    rows = read_log(out)
+    assert float(rows[-1]["loss"]) < 0.3 * float(rows[0]["loss"])
+    assert report["samples"] == 4800
+    assert 0.0 <= report["success"] <= 1.0 and float(rows[-1]["success"]) == pytest.approx(report["success"])
+    assert list((out / "tensorboard").iterdir()), "the extra `train` is installed: a log for TensorBoard"
+    model = load_model(out, arm)
+    about = json.loads((out / "model.json").read_text())
+    assert about["training"]["trajectories"] == len(
+        load_data(str(data), arm, model.encoder, WAYPOINTS, print)
+    )
+    rng = np.random.default_rng(0)
+    start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
+    for side in (-1.0, 1.0):
+        scene = Scene([Box([0, 0, -0.05], [2, 2, 0.1]), Sphere([0.0, 0.5 * side, 1.0], 0.2)])
+        z = model.encode(sample_surface(scene, 256, rng))
+        checker = CollisionChecker(arm, scene)
+
+        def clearances(q, checker=checker):
+            return checker.link_clearances(q.reshape(-1, 3)).reshape(*q.shape[:2], 3)
+
+        q = model.sample(start, goal, z, clearances, rng, SamplingSettings(samples=4))
+        bow = q[:, WAYPOINTS // 2] - (start + goal) / 2
+        assert (bow * side > 0.1).all()
+        np.testing.assert_allclose(bow.mean(), 0.5 * side, atol=0.2)
+
+
+def test_other_settings_need_another_folder(tmp_path, data):
+    train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
+    with pytest.raises(InputError, match=r"learning_rate = 0\.003, now it is 0\.1"):
+        train_planner(planner_settings(data, learning_rate=0.1), str(tmp_path / "out"))
+
+
+def test_damaged_checkpoint_is_named(tmp_path, data):
+    train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
+    file = tmp_path / "out" / "training.safetensors"
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"training\.safetensors is damaged"):
+        train_planner(planner_settings(data), str(tmp_path / "out"))
+
+
+def test_length_is_given_once():
+    with pytest.raises(InputError, match="exactly one"):
+        EncoderTraining(minutes=3.0, samples=4)
+
+
+def test_trains_without_some_conditions(data, tmp_path):
+    """The stand-in for a dropped condition is trained, and a guidance scale has an effect afterwards."""
+    small = UNetSettings(width=8, multiples=(1, 2), kernel=3, condition_width=16)
+    settings = planner_settings(data, condition_drop=0.5, denoiser="unet", denoiser_settings=small)
+    assert np.isfinite(train_planner(settings, str(tmp_path / "out"))["validation"])
+    model = load_model(tmp_path / "out")
+    assert model.null_condition is not None and model.null_condition.abs().min() > 0
+    ends = np.full(model.dof, -0.5), np.full(model.dof, 0.5)
+
+    def far(q):
+        return np.full((*q.shape[:-1], len(model.robot.links)), 0.4, np.float32)
+
+    plain, pushed = (
+        model.sample(
+            *ends,
+            model.encode(np.zeros((0, 3))),
+            far,
+            np.random.default_rng(0),
+            SamplingSettings(samples=2, guidance_scale=scale),
+        )
+        for scale in (1.0, 3.0)
+    )
+    assert not np.array_equal(plain, pushed)

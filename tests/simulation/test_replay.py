@@ -1,0 +1,172 @@
+"""Replay of motions in PyBullet, and the command `simulate`."""
+
+import sys
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pybullet")
+
+from dataclasses import replace
+
+from helpers.box_arm import box_arm
+from helpers.example_robots import example_robot
+from robotdiffuse.cli import main
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Status, Trajectory
+from robotdiffuse.problems.files import problem_record
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.simulation import (
+    PyBulletOracle,
+    ReplaySettings,
+    replay,
+)
+from robotdiffuse.simulation.replay import sample
+from robotdiffuse.trajectories.timing import time_parameterize
+
+pytestmark = pytest.mark.sim
+
+
+PANDA_START = np.array([-0.6, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+
+
+def motion(robot: Robot, *waypoints: np.ndarray) -> Trajectory:
+    path = Path(robot.joint_names, np.stack(waypoints))
+    return time_parameterize(robot, path, lambda _: True, lambda _: True)
+
+
+def test_samples_follow_positions_and_velocities() -> None:
+    robot = box_arm()
+    trajectory = motion(robot, np.zeros(3), np.array([1.0, -0.5, 0.3]), np.array([0.2, 0.6, 0.0]))
+    assert np.allclose(sample(trajectory, trajectory.times), trajectory.positions, atol=1e-12)
+    step = 1e-6
+    inner = trajectory.times[1:-1]
+    slopes = (sample(trajectory, inner + step) - sample(trajectory, inner - step)) / (2 * step)
+    assert np.allclose(slopes, trajectory.velocities[1:-1], atol=1e-4)
+    assert np.array_equal(sample(trajectory, np.array([99.0]))[0], trajectory.positions[-1])
+
+
+def test_a_panda_tracks_a_timed_motion_the_better_the_finer_the_step() -> None:
+    robot = load_robot("panda")
+    trajectory = motion(robot, PANDA_START, PANDA_START + 0.4, PANDA_START + np.linspace(0.5, -0.3, 7))
+    coarse = replay(robot, Scene([Sphere([0.0, 0.9, 0.6], 0.1)]), trajectory)
+    fine = replay(robot, Scene(), trajectory, ReplaySettings(time_step=1 / 960))
+    assert coarse.free and fine.free
+    assert coarse.times[-1] >= trajectory.duration + 0.25
+    assert coarse.max_errors.max() < 2e-3 and coarse.tip_errors.max() < 1e-3
+    assert (coarse.rms_errors <= coarse.max_errors).all()
+    assert 1e-7 < fine.max_errors.max() < coarse.max_errors.max() / 4
+    assert coarse.positions[-1] == pytest.approx(trajectory.positions[-1], abs=1e-4)
+    # the error of the tip against our own kinematics
+    k = int(coarse.tip_errors.argmax())
+    ends = [link_pose(robot, q[k], robot.tip)[:3, 3] for q in (coarse.positions, coarse.reference)]
+    assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(coarse.tip_errors[k], abs=1e-6)
+
+
+def test_weak_motors_sag_under_gravity() -> None:
+    robot = load_robot("panda")
+    stay = np.stack([PANDA_START, PANDA_START])
+    trajectory = Trajectory(robot.joint_names, np.array([0.0, 0.5]), stay, 0 * stay, 0 * stay)
+    weak = ReplaySettings(force=5.0)
+    fallen = replay(robot, Scene(), trajectory, weak)
+    assert fallen.tip_errors[-1] > 0.1
+    assert fallen.max_errors[1] > 0.1
+    assert replay(robot, Scene(), trajectory, replace(weak, gravity=0.0)).tip_errors.max() < 1e-6
+    assert replay(robot, Scene(), trajectory).tip_errors.max() < 1e-3
+
+
+def test_contact_is_reported_where_the_motion_runs_into_an_obstacle() -> None:
+    robot, scene = box_arm(), Scene([Sphere([0.9, 0.55, 0], 0.15), Box([-0.9, 0, 0], [0.1, 0.1, 0.1])])
+    trajectory = motion(robot, np.zeros(3), np.array([1.2, 0.0, 0.0]))
+    run = replay(robot, scene, trajectory)
+    with PyBulletOracle(robot, scene) as oracle:
+        first = oracle.check_frames(run.reference, tolerance=0.0)
+    assert first is not None and not run.free
+    contact = run.contacts[0]
+    assert (contact.link, contact.other) == ("l3", "sphere")
+    assert contact.time == pytest.approx(run.times[int(first.at)], abs=0.02)
+    assert -0.001 <= contact.depth < 0.05
+    assert run.max_errors[0] > 0.1
+    apart = Scene([Sphere([0.9, 0.55, 0.25], 0.15)])
+    assert replay(robot, apart, trajectory).free
+
+
+def test_links_that_touch_each_other_are_reported() -> None:
+    robot = replace(
+        box_arm(), allowed_collisions=frozenset({frozenset(("l1", "l2")), frozenset(("l2", "l3"))})
+    )
+    run = replay(robot, Scene(), motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0])))
+    assert {(contact.link, contact.other) for contact in run.contacts} <= {("l1", "l3"), ("l3", "l1")}
+    assert not run.free
+    allowed = replace(robot, allowed_collisions=robot.allowed_collisions | {frozenset(("l1", "l3"))})
+    assert replay(allowed, Scene(), motion(robot, np.zeros(3), np.array([0.0, 2.7, 2.0]))).free
+
+
+def test_skew_axes_sliding_joints_and_a_branch() -> None:
+    robot = example_robot("awkward")
+    middle = (robot.lower + robot.upper) / 2
+    run = replay(robot, Scene(), motion(robot, middle, middle + 0.2))
+    assert run.free and run.max_errors.max() < 0.01
+
+
+def test_what_cannot_be_replayed() -> None:
+    robot = box_arm()
+    trajectory = motion(robot, np.zeros(3), np.ones(3))
+    with pytest.raises(InputError, match="the trajectory moves a, b, c; planar plans j0, j1, j2"):
+        replay(robot, Scene(), replace(trajectory, joint_names=("a", "b", "c")))
+    for name, value in (("time_step", 0.01), ("position_gain", 0.0), ("force", -1.0), ("settle", -1.0)):
+        with pytest.raises(InputError, match=f"replay.{name} is {value}"):
+            ReplaySettings(**{name: value})
+
+
+def result_file(folder: FilePath, scene: Scene) -> str:
+    robot = load_robot("panda")
+    goal = PANDA_START + 0.2
+    trajectory = motion(robot, PANDA_START, goal)
+    result = PlanResult(
+        Status.SOLVED,
+        "by hand",
+        "none",
+        "panda",
+        0.0,
+        0,
+        path=Path(robot.joint_names, np.stack([PANDA_START, goal])),
+        trajectory=trajectory,
+        min_clearance=0.1,
+    )
+    problem = Problem(robot, scene, PANDA_START, JointGoal(goal[None]))
+    file = folder / "result.json"
+    result.save(file, problem_record(problem))
+    return str(file)
+
+
+def test_command(tmp_path: FilePath, capsys: pytest.CaptureFixture[str]) -> None:
+    file = result_file(tmp_path, Scene([Sphere([0.0, 0.9, 0.6], 0.1)]))
+    assert main(["simulate", file]) == 0
+    printed = capsys.readouterr().out
+    assert "panda: free" in printed and "panda_joint7" in printed and "mrad" in printed
+    assert main(["simulate", file, "--out", str(tmp_path / "film.avi")]) == 2
+    assert "known: .gif, .png" in capsys.readouterr().err
+    end = link_pose(load_robot("panda"), PANDA_START + 0.2, "panda_hand")[:3, 3]
+    file = result_file(tmp_path, Scene([Sphere(end, 0.05)]))
+    assert main(["simulate", file]) == 1
+    printed = capsys.readouterr().out
+    assert "panda: contact" in printed and "panda_hand" in printed and "sphere" in printed
+
+
+def test_command_without_pybullet(
+    tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = result_file(tmp_path, Scene())
+    for name in [name for name in sys.modules if name.startswith("robotdiffuse.simulation")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    assert main(["simulate", file]) == 2
+    assert "pip install 'robotdiffuse[sim]'" in capsys.readouterr().err

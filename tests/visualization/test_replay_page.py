@@ -1,0 +1,126 @@
+"""Replays: content, size, self-containment, and errors for bad output files."""
+
+import base64
+import json
+import re
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Status
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Mesh, PointCloud
+from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
+from robotdiffuse.visualization.style import decimated, robot_surfaces
+
+SMALL = PictureSettings(width=320, height=200, ghosts=2)
+
+
+def page_data(text: str) -> dict:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def test_replay_holds_everything(arm, scene, motion, tmp_path):
+    path = Path(arm.joint_names, motion.positions)
+    result = PlanResult(
+        Status.SOLVED,
+        "",
+        "robotdiffuse",
+        arm.name,
+        0.0123,
+        0,
+        "refinement",
+        path,
+        motion,
+        min_clearance=0.042,
+    )
+    file = tmp_path / "replay.html"
+    write_replay(
+        arm, scene, motion, file, result=result, title="a < b </script> {{data}}", candidates=(path, path)
+    )
+    text = file.read_text("utf-8")
+    data = page_data(text)
+    assert "a &lt; b &lt;/script&gt; {{data}}" in text
+    assert data["robot"]["joints"] == list(arm.joint_names)
+    assert [shape["kind"] for shape in data["scene"]] == [shape.kind for shape in scene.shapes]
+    assert len(data["times"]) == len(data["positions"]) == 121, "60 rows a second and no more"
+    np.testing.assert_allclose(data["positions"][0], motion.positions[0], atol=1e-5)
+    np.testing.assert_allclose(data["positions"][-1], motion.positions[-1], atol=1e-5)
+    assert np.shape(data["candidates"]) == (2, 120, 3)
+    assert dict(data["facts"])["clearance"] == "42.0 mm"
+    assert dict(data["facts"])["planner"] == "robotdiffuse · refinement"
+    assert data["robot"]["spheres"] == [[3, 0.0, 0.0, 0.1, 0.12]]
+    assert file.stat().st_size < 800_000
+
+
+def test_replay_loads_nothing(arm, scene, motion, tmp_path):
+    file = tmp_path / "replay.html"
+    write_replay(arm, scene, motion, file)
+    text = file.read_text("utf-8")
+    # The one address is the name of a namespace, which no browser opens.
+    assert set(re.findall(r"https?://[^\s\"'`)]+", text)) <= {"http://www.w3.org/1999/xhtml"}
+    for loading in (r"<link\b", r"\bsrc\s*=\s*[\"']", r"@import", r"url\((?!#)", r"\bimport\s*\("):
+        assert not re.search(loading, text.split("<script>")[0]), loading
+    assert not re.search(r"<script[^>]+src", text)
+
+
+def test_replay_geometry_decodes_to_the_meshes(arm, scene, motion, tmp_path):
+    write_replay(arm, scene, motion, tmp_path / "replay.html")
+    data = page_data((tmp_path / "replay.html").read_text("utf-8"))
+    for surface, part in zip(robot_surfaces(arm), data["robot"]["frames"], strict=True):
+        raw = np.frombuffer(base64.b64decode(part["vertices"]), "<u2").reshape(-1, 3)
+        np.testing.assert_allclose(part["low"] + raw * part["step"], surface.vertices, atol=1e-5)
+        faces = np.frombuffer(base64.b64decode(part["faces"]), "<u2").reshape(-1, 3)
+        np.testing.assert_array_equal(faces, surface.faces)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_path_that_does_not_move(arm, rows, tmp_path):
+    path = Path(arm.joint_names, np.tile([0.1, 0.2, 0.1], (rows, 1)))
+    write_replay(arm, Scene(), path, tmp_path / "still.html", candidates=[path])
+    write_picture(arm, Scene([PointCloud(np.zeros((0, 3)))]), path, tmp_path / "still.png", settings=SMALL)
+    assert page_data((tmp_path / "still.html").read_text("utf-8"))["times"] == [0.0] * rows
+
+
+def test_large_input_stays_small(arm, tmp_path):
+    rng = np.random.default_rng(5)
+    n = 330
+    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
+    vertices = np.stack([x, y, 0.05 * np.sin(20 * x)], axis=-1).reshape(-1, 3)
+    i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
+    faces = np.concatenate([np.stack([i, i + 1, i + n], 1), np.stack([i + 1, i + n + 1, i + n], 1)])
+    scene = Scene([PointCloud(rng.uniform(-1, 1, (300_000, 3))), Mesh(vertices, faces)])
+    write_replay(arm, scene, Path(arm.joint_names, rng.uniform(0, 0.2, (50_000, 3))), tmp_path / "large.html")
+    assert (tmp_path / "large.html").stat().st_size < 3_000_000
+    fewer, kept = decimated(vertices, faces)
+    assert 10_000 < len(kept) <= 60_000
+    np.testing.assert_allclose(np.ptp(fewer, axis=0), np.ptp(vertices, axis=0), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "name", ["motion.jpg", "motion", "missing/motion.{}", "folder.{}", "folder.{}/motion.{}x"]
+)
+@pytest.mark.parametrize(("write", "ending"), [(write_picture, "png"), (write_replay, "html")])
+def test_bad_output_is_one_line(arm, motion, write, ending, name, tmp_path):
+    (tmp_path / f"folder.{ending}").mkdir()
+    with pytest.raises(InputError) as error:
+        write(arm, Scene(), motion, tmp_path / name.format(ending, ending))
+    assert "\n" not in str(error.value)
+    assert [entry.name for entry in tmp_path.iterdir()] == [f"folder.{ending}"], "nothing is left behind"
+
+
+def test_names_of_obstacles_stay_text_in_a_replay(tmp_path) -> None:
+    panda, name = rd.load_robot("panda"), "</script><script>alert(1)</script>"
+    q = np.zeros((2, panda.dof))
+    motion = rd.Trajectory(panda.joint_names, np.array([0.0, 1.0]), q, 0 * q, 0 * q)
+    file = tmp_path / "replay.html"
+    write_replay(panda, rd.Scene([rd.Sphere([1, 1, 1], 0.1, name=name)]), motion, file)
+    text = file.read_text("utf-8")
+    assert "<script>alert" not in text
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    assert found is not None and name in json.dumps(json.loads(found.group(1)), ensure_ascii=False)

@@ -1,0 +1,82 @@
+"""Surfaces, traces and visual meshes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.three_bars import CORNERS, CUBE
+from helpers.visual_bundles import visual_meshes, write_visual
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.visual_meshes import VisualMesh, load_visual
+from robotdiffuse.visualization.style import creased, dense, robot_surfaces, tool_point, trace
+
+
+def test_trace_follows_the_outer_end_of_the_tip(arm, motion):
+    tool = tool_point(arm, robot_surfaces(arm))
+    points = trace(arm, tool, motion.positions[::100])
+    for q, point in zip(motion.positions[::100], points, strict=True):
+        np.testing.assert_allclose(point, (link_pose(arm, q, "tip") @ [0, 0, 0.2, 1])[:3], atol=1e-12)
+
+
+def test_creases_keep_edges_of_a_box_and_smooth_a_ball():
+    import trimesh
+
+    box = creased(CORNERS, CUBE, np.ones((12, 3)))
+    assert len(box.vertices) == 24
+    assert np.sort(np.abs(box.normals), axis=1)[:, :2].max() < 1e-12
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    smooth = creased(
+        ball.vertices.view(np.ndarray), ball.faces.view(np.ndarray), np.ones((len(ball.faces), 3))
+    )
+    assert len(smooth.vertices) == len(ball.vertices)
+    assert (smooth.normals * smooth.vertices).sum(axis=1).min() > 0.999
+
+
+def test_dense_steps_are_equal():
+    q = dense(np.array([[0.0, 0], [1, 0], [1, 3]]), 41)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(q, axis=0), axis=1), 0.1, atol=1e-12)
+
+
+def test_without_meshes_the_spheres_are_drawn(arm):
+    drawn = load_visual(replace(arm, meshes={}))
+    assert list(drawn) == ["tip"]
+    assert np.linalg.norm(drawn["tip"][0].vertices - [0, 0, 0.1], axis=1).max() == pytest.approx(0.12)
+
+
+def test_visual_meshes_survive_the_file_and_must_agree(arm, tmp_path, monkeypatch):
+    colors = np.tile(np.array([[10, 20, 30], [200, 100, 0]], np.uint8), (6, 1))
+    written = VisualMesh(arm.meshes["tip"][0].vertices, CUBE, colors)
+    elsewhere = VisualMesh(written.vertices + 0.1, CUBE, colors)
+    folder = tmp_path / "data" / arm.name
+    folder.mkdir(parents=True)
+    write_visual({"tip": written, "arm": elsewhere}, folder / "visual.npz")
+    monkeypatch.setattr("robotdiffuse.robots.visual_meshes.files", lambda _: tmp_path)
+    drawn = load_visual(arm)
+    np.testing.assert_allclose(drawn["tip"][0].vertices, written.vertices, atol=2.5e-5)
+    np.testing.assert_array_equal(drawn["tip"][0].faces, CUBE)
+    np.testing.assert_array_equal(drawn["tip"][0].colors, colors)
+    np.testing.assert_array_equal(drawn["arm"][0].vertices, arm.meshes["arm"][0].vertices)
+
+
+def test_visual_meshes_of_a_urdf(tmp_path):
+    import trimesh
+
+    trimesh.Trimesh(CORNERS, CUBE, process=False).export(tmp_path / "cube.stl")
+    urdf = """<robot name="r"><link name="a"><visual><origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/>
+      <geometry><mesh filename="{}" scale="1 2 3"/></geometry></visual></link></robot>"""
+    (tmp_path / "r.urdf").write_text(urdf.format("cube.stl"))
+    meshes = visual_meshes(tmp_path / "r.urdf")
+    assert list(meshes) == ["a"] and len(meshes["a"].vertices) == 8 and len(meshes["a"].faces) == 12
+    np.testing.assert_allclose(meshes["a"].vertices.min(0), [-2, -1, -2], atol=1e-6)
+    np.testing.assert_allclose(meshes["a"].vertices.max(0), [2, 1, 4], atol=1e-6)
+    (tmp_path / "r.urdf").write_text(urdf.format("package://gone/missing.stl"))
+    with pytest.raises(InputError, match=r"package://gone/missing\.stl"):
+        visual_meshes(tmp_path / "r.urdf")
+
+
+@pytest.mark.parametrize("flat", [[[1, 1, 1]] * 3, [[1, 1, 1], [2, 2, 2], [3, 3, 3]]])
+def test_meshes_without_area_are_drawn(flat: list[list[int]]) -> None:
+    surface = creased(np.array(flat, np.float64), np.array([[0, 1, 2]]), np.ones((1, 3)))
+    assert np.isfinite(surface.normals).all()
