@@ -8,7 +8,7 @@ a block say more of it; they show nowhere:
     <!-- test: run -->     commands are run, not only looked at
     <!-- test: parse -->   Python is compiled, not run
 
-Python runs. Problems in YAML are loaded. The parser of the command line checks commands, `make -n` checks targets.
+Python runs. Problems in YAML are loaded. The parser of the command line checks commands, `make -n` targets.
 `text` is output. Anything else is an error, so that no block goes untested in silence.
 """
 

@@ -78,8 +78,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     planner.add_argument(
         "--encoder",
         metavar="FOLDER",
-        help="folder of a trained encoder; or pointnet or dgcnn, which are trained with the planner. Required "
-        "with --data unless the config names one (default: the bundled encoder)",
+        help="folder of a trained encoder; or pointnet or dgcnn, which are trained with the planner. "
+        "Required with --data unless the config names one (default: the bundled encoder)",
     )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (default: panda)")
     planner.add_argument(
