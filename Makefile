@@ -3,14 +3,18 @@
 # make baselines trains the learned baselines on the same data, in runs/panda
 # make table1    every planner on the same problems, in runs/table1; MBM=FOLDER adds MotionBenchMaker's
 # make install   the development environment with all extras in .venv
-# make test      all tests          make lint   ruff and pyright          make bench   all benchmarks
+# make test      the quick tests: at most five minutes on two idle cores
+# make test-all  all tests, those marked slow, browser, sim and cluster too
+# make lint      ruff and pyright
+# make bench     all benchmarks
 # make docs      the documentation in site/; any warning is an error
+# make gallery   the pictures of the gallery anew, by the examples
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: install demo test lint docs bench weights baselines table1 chromium clean
+.PHONY: install demo test test-all lint docs gallery bench weights baselines table1 chromium clean
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
@@ -28,14 +32,18 @@ install: .venv/dev.stamp
 demo: .venv/core.stamp
 	$(BIN)/robotdiffuse demo
 
-# the browser of the page's tests, which are skipped without: root on Debian gets it where there is a network
+# The live page and the search of the docs are tested in a browser. Root on Debian installs it where there is a
+# network; without it these tests are skipped.
 chromium:
 	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && \
 		{ timeout 120 apt-get update -qq; DEBIAN_FRONTEND=noninteractive \
 		timeout 600 apt-get install -qq -y --no-install-recommends chromium; } >/dev/null 2>&1; } || \
-		echo "there is no chromium: the tests of the live page in a browser are skipped"
+		echo "there is no chromium: the tests in a browser are skipped"
 
-test: .venv/dev.stamp chromium
+test: .venv/dev.stamp
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+test-all: .venv/dev.stamp chromium
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: .venv/dev.stamp
@@ -46,6 +54,11 @@ lint: .venv/dev.stamp
 # the variable silences an advertisement of the theme's authors
 docs: .venv/dev.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+gallery: .venv/dev.stamp
+	set -e; work=$$(mktemp -d); here=$$PWD; cd $$work; \
+		for file in $$here/examples/[0-9]*.py; do $$here/$(BIN)/python "$$file"; done; \
+		mkdir -p $$here/docs/images/gallery; cp ./*.png $$here/docs/images/gallery; rm -r $$work
 
 BENCHMARKS := $(filter-out %/common.py,$(wildcard benchmarks/*.py))
 

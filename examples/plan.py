@@ -8,7 +8,7 @@ problem = rd.Problem(
     start=[-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
     goal=[1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
 )
-result = rd.plan(problem, time_limit=2.0)
+result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
 if result.trajectory is not None:
     result.trajectory.save("motion.csv")

@@ -1,4 +1,4 @@
-"""Parts of pages that come from the code, so that they cannot go stale: `<!-- generated: NAME -->`."""
+"""Generates parts of pages from the code, where a page says `<!-- generated: NAME -->`."""
 
 import argparse
 import ast
@@ -6,17 +6,19 @@ import re
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from importlib.resources import files
+from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 READING_ORDER = (
     *("planning", "problems", "robots", "scenes", "perception"),
     *("core", "validation", "certificates", "visualization", "datasets"),
 )
-"""Of the packages that public names come from."""
+"""Order of the packages on the page of public names."""
 TABLES = {
     "Planners": "planning:PLANNERS",
     "Families of random problems": "problems.families:FAMILIES",
@@ -27,7 +29,7 @@ TABLES = {
     "Files that motions are read from": "interop:READERS",
     "Guidance costs": "learning.costs:COSTS",
 }
-"""On the page of parts by name."""
+"""Tables on the page of parts by name: title, and where the table is."""
 MARK = re.compile(r"^<!-- generated: (.+) -->$", re.MULTILINE)
 
 
@@ -116,6 +118,7 @@ def _table(location: str) -> str:
 
 
 def metrics() -> str:
+    """The table of metrics."""
     from robotdiffuse.evaluation.metrics import METRICS
 
     rows = [f"| `{name}` | {metric.unit} | {metric.better} |" for name, metric in METRICS.items()]
@@ -143,8 +146,24 @@ def _settings(kind: type, names: list[str]) -> str:
     return "\n".join([f"### {heading}\n", "| setting | default | meaning |", "|---|---|---|", *rows])
 
 
+def gallery() -> str:
+    """The numbered examples, each with what it does, its picture and its code."""
+    return "\n\n".join(_example(file) for file in sorted(EXAMPLES.glob("[0-9]*.py")))
+
+
+def _example(file: Path) -> str:
+    source = file.read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    text, first = ast.get_docstring(tree) or "", tree.body[0]
+    code = "\n".join(source.splitlines()[first.end_lineno :]).strip()
+    title = file.stem.split("_", 1)[1].replace("_", " ").capitalize().replace("Moveit", "MoveIt")
+    picture = f"![{title}](images/gallery/{file.stem}.png)"
+    return f'## {title}\n\n{text}\n\n{picture}\n\n```python title="examples/{file.name}"\n{code}\n```'
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "commands": commands,
+    "gallery": gallery,
     "metrics": metrics,
     "planner settings": planner_settings,
     "public names": public_names,
@@ -153,6 +172,8 @@ PARTS: dict[str, Callable[[], str]] = {
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Replaces each mark by its part. Raises PluginError for an unknown name."""
+
     def part(match: re.Match[str]) -> str:
         if match.group(1) not in PARTS:
             raise PluginError(f"{page.file.src_uri}: no part {match.group(1)!r}; known: {', '.join(PARTS)}")

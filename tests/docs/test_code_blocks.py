@@ -7,6 +7,8 @@ import pytest
 
 from helpers.code_blocks import PAGES, ROOT, Notebook, code_blocks
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_code_blocks_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,7 @@ from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.simulation import PyBulletOracle
 from robotdiffuse.visualization.replay_page import write_replay
 
+pytestmark = pytest.mark.slow
 TABLES: tuple[dict[str, Any], ...] = (
     *(PLANNERS, FAMILIES, METRICS, SHAPES),
     *(DENOISERS, ENCODERS, SAMPLERS, COSTS),

@@ -6,9 +6,10 @@ a block say more of it; they show nowhere:
     <!-- file: NAME -->    the block is the content of this file, for what comes after it
     <!-- needs: NAME -->   one of PREPARED is put into the folder first
     <!-- test: run -->     commands are run, not only looked at
+    <!-- test: parse -->   Python is compiled, not run
 
-Python runs. Problems in YAML are loaded. Commands are given to the parser of the command line, targets to
-make. `text` is output. Anything else is an error, so that no block goes untested in silence.
+Python runs. Problems in YAML are loaded. The parser of the command line checks commands, `make -n` targets.
+`text` is output. Anything else is an error, so that no block goes untested in silence.
 """
 
 import re
@@ -145,7 +146,7 @@ class Notebook:
 
 
 def _python(page: Notebook, block: Block) -> None:
-    if "file" in block.marks:
+    if "file" in block.marks or block.marks.get("test") == "parse":
         compile(block.code, block.where, "exec")
     else:
         exec(compile("\n" * (block.line - 1) + block.code, block.where, "exec"), page.names)
@@ -188,6 +189,8 @@ def _command(words: list[str], run: bool) -> None:
         subprocess.run(["make", "-n", *words[1:]], cwd=ROOT, check=True, capture_output=True)
     elif program == "pip":
         _pip(words)
+    elif words[1:3] == ["-m", "venv"] or words == ["source", ".venv/bin/activate"]:
+        pass
     elif program == "python":
         assert (ROOT / words[1]).is_file(), f"{words[1]} does not exist"
     else:

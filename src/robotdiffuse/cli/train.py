@@ -78,8 +78,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     planner.add_argument(
         "--encoder",
         metavar="FOLDER",
-        help="folder of a trained encoder; or pointnet or dgcnn, which are trained with the planner. Required "
-        "with --data unless the config names one (default: the bundled encoder)",
+        help="folder of a trained encoder; or pointnet or dgcnn, which are trained with the planner. "
+        "Required with --data unless the config names one (default: the bundled encoder)",
     )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (default: panda)")
     planner.add_argument(
@@ -97,25 +97,14 @@ def add(commands: argparse._SubParsersAction) -> None:
     parts.add_argument(
         "--denoiser", metavar="NAME", help="transformer, encoder_decoder, decoder_only or unet"
     )
-    parts.add_argument("--objective", metavar="NAME", help="what is predicted: clean or noise")
-    parts.add_argument("--sampler", metavar="NAME", help="for planning: ddim or ddpm")
-    parts.add_argument(
-        "--objective", metavar="NAME", help="what the denoiser predicts: clean, noise or velocity"
-    )
+    parts.add_argument("--sampler", metavar="NAME", help="sampler for planning: ddim or ddpm")
+    parts.add_argument("--objective", metavar="NAME", help="what the denoiser predicts: clean or noise")
     parts.add_argument(
         "--target",
         metavar="NAME",
         help="what motions are relative to: residual (the straight line), absolute or limits",
     )
-    parts.add_argument(
-        "--sampler", metavar="NAME", help="sampler for planning: ddim, ddpm, dpm_solver or euler"
-    )
     parts.add_argument("--sampling-steps", type=count, metavar="N", help="denoising steps for planning")
-    parts.add_argument(
-        "--parametrization", metavar="NAME", help="parametrization of motions: waypoints or b_spline"
-    )
-    parts.add_argument("--rows", type=count, metavar="N", help="number of control points of b_spline")
-    parts.add_argument("--target", metavar="NAME", help="residual (to the straight line) or absolute")
     parts.add_argument(
         "--condition-drop",
         type=share,

@@ -102,8 +102,12 @@ def best_view(
     width: int,
     height: int,
     free: tuple[float, float],
+    azimuth: float | None = None,
 ) -> Camera:
-    """The framed view, of AZIMUTHS x ELEVATIONS, that shows most of the arm and its trace."""
+    """The framed view, of AZIMUTHS x ELEVATIONS, that shows most of the arm and its trace.
+
+    azimuth: the only one to look from, from the x axis of the base [rad]; None: the best.
+    """
     moving = np.concatenate([arm.vertices, ghosts.vertices, trace])
     middle = 0.5 * (moving.min(0) + moving.max(0))
     near = np.linalg.norm(obstacles.vertices - middle, axis=1) < MAX_FRAMING_DISTANCE
@@ -111,12 +115,13 @@ def best_view(
     points = points[ConvexHull(points, qhull_options="QJ").vertices]
     small = (160, max(1, 160 * height // width))
     best, best_score = _direction(0.0, ELEVATIONS[0]), -1.0
+    around = np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS) if azimuth is None else np.array([azimuth])
     for elevation in ELEVATIONS:
-        for azimuth in np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS):
-            camera = framed(points, _direction(azimuth, elevation), *small, free)
+        for angle in around:
+            camera = framed(points, _direction(angle, elevation), *small, free)
             score = _score(camera, arm, ghosts, trace, obstacles)
             if score > best_score:
-                best, best_score = _direction(azimuth, elevation), score
+                best, best_score = _direction(angle, elevation), score
     return framed(points, best, width, height, free)
 
 

@@ -51,6 +51,8 @@ class PictureSettings:
     """[pixels]"""
     ghosts: int = 5
     """Number of see-through arms from the start towards the goal."""
+    azimuth: float | None = None
+    """Of the camera, from the x axis of the base [rad]; None: from where most of the motion can be seen."""
 
     def __post_init__(self) -> None:
         if self.width < 16 or self.height < 16:
@@ -85,9 +87,16 @@ def write_picture(
 
 
 def render(
-    robot: Robot, scene: Scene, motion: Path | Trajectory, settings: PictureSettings
+    robot: Robot,
+    scene: Scene,
+    motion: Path | Trajectory,
+    settings: PictureSettings,
+    camera: Camera | None = None,
 ) -> tuple[np.ndarray, Camera]:
-    """The picture without its caption, uint8 [height, width, 3], and the camera that took it."""
+    """The picture without its caption, uint8 [height, width, 3], and the camera that took it.
+
+    camera: where to look from; without one, from where most of the motion can be seen.
+    """
     surfaces = style.robot_surfaces(robot)
     q = style.dense(motion.positions, 240)
     poses = style.frames(robot, q)
@@ -98,7 +107,9 @@ def render(
     steps = np.linspace(0, len(q) - 1, settings.ghosts + 1).round().astype(int)[:-1] if len(q) > 1 else []
     ghosts = [(style.posed(surfaces[1:], poses[i][1:]), i / (len(q) - 1)) for i in steps]
     faint = join([ghost for ghost, _ in ghosts])
-    camera = best_view(goal, faint, trace, obstacles, settings.width, settings.height, MARGINS)
+    if camera is None:
+        size = settings.width, settings.height
+        camera = best_view(goal, faint, trace, obstacles, *size, MARGINS, settings.azimuth)
     big = Camera(camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height)
     image = _paint(big, join([goal, obstacles, _tube(trace)]), ghosts)
     s = SUPERSAMPLING

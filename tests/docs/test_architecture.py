@@ -1,0 +1,23 @@
+"""Every file that the architecture page names exists."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SOURCE = ROOT / "src" / "robotdiffuse"
+PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+FILES = sorted(set(re.findall(r"`([\w/]+\.py)`", PAGE)))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_named_file_exists(name: str) -> None:
+    """Rows name the folder once; further files of the row, and kernels, by a shorter path."""
+    assert (ROOT / name).is_file() or any(SOURCE.rglob(name)), f"docs/architecture.md names {name}"
+
+
+def test_every_package_is_described() -> None:
+    packages = {folder.name for folder in SOURCE.iterdir() if (folder / "__init__.py").is_file()}
+    described = set(re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE))
+    assert packages <= described, f"docs/architecture.md lacks {', '.join(sorted(packages - described))}"

@@ -1,0 +1,53 @@
+"""Each example runs, solves its problem and writes its picture, and the gallery shows it."""
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+from helpers.quick_preparation import QUICK, coarse_grids
+from robotdiffuse.robots.fitting.add import add_robot
+from robotdiffuse.visualization import picture
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+SLOW = {"01_own_robot", "05_depth_camera", "09_two_arms", "12_train_on_own_data"}
+"""They prepare a robot, load networks, compile the code for several arms, or train."""
+
+
+def cases() -> list[object]:
+    return [
+        pytest.param(file, id=file.stem, marks=[pytest.mark.slow] if file.stem in SLOW else [])
+        for file in EXAMPLES
+    ]
+
+
+@pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light and ghosts take seconds to draw; a small picture tells as much to a test."""
+    small = picture.PictureSettings(width=160, height=100, ghosts=1)
+    monkeypatch.setattr(picture, "PictureSettings", lambda **_: small)
+
+
+@pytest.mark.usefixtures("small_pictures")
+@pytest.mark.parametrize("example", cases())
+def test_an_example_runs(
+    example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    if example.stem == "01_own_robot":
+        with coarse_grids():
+            add_robot(str(ROOT / "examples" / "data" / "arm.urdf"), settings=QUICK)
+    runpy.run_path(str(example), run_name="__main__")
+    assert "solved" in (printed := capsys.readouterr().out) or "valid" in printed, printed
+    if example.stem[0].isdigit():
+        assert (tmp_path / f"{example.stem}.png").stat().st_size > 1000
+
+
+def test_the_gallery_has_twelve_short_examples_with_pictures() -> None:
+    numbered = [file for file in EXAMPLES if file.stem[0].isdigit()]
+    assert len(numbered) == 12
+    for file in numbered:
+        assert len(file.read_text(encoding="utf-8").splitlines()) < 40, file.name
+        assert (ROOT / "docs" / "images" / "gallery" / f"{file.stem}.png").is_file(), file.name
