@@ -20,9 +20,9 @@ def print_preparation(report: AddReport) -> None:
     ]
     pairs = [
         (", ".join(of.links), of.colliding, of.by_parts, of.by_spheres)
-        for of in report.refusals.pairs[:MOST_PAIRS]
+        for of in report.false_collisions.pairs[:MOST_PAIRS]
     ]
-    of = report.refusals
+    of = report.false_collisions
     parts = sum(link.parts for link in report.links)
     summary = [
         ("convex parts, spheres", f"{parts}, {report.sphere_count}"),

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.lane_clearance import pair_clearances
 from robotdiffuse.collision.kernels.lane_collision import HEAD, SIDE
-from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.link_pair_tables import LinkPairTable
 
 CELLS = SIDE - 2
 """Cells along each joint's range; around them is a ring that stands for values beyond it."""
@@ -35,7 +35,7 @@ def tabulate(
     lower: Float[ndarray, "dof"],
     upper: Float[ndarray, "dof"],
     levers: Float[ndarray, "groups dof"],
-    known: Mapping[int, JointTable],
+    known: Mapping[int, LinkPairTable],
 ) -> tuple[Int32[ndarray, "pairs 4"], Float32[ndarray, "tables width"]]:
     """The robot's pairs with table and bit of those that depend on one or two joints, and the tables.
 

@@ -178,7 +178,7 @@ def ever_finer(context: PlanningContext, settings: Own) -> Iterator[tuple[Own, i
 
 def compiles_first(robot: Robot) -> str:
     """What to say while a first call keeps people waiting: code for trees of joints is compiled apart."""
-    who = "a new machine" if robot.branching is None else "the first robot of several arms"
+    who = "a new machine" if robot.kernel_parents is None else "the first robot of several arms"
     return f"{who} compiles first, for about a minute"
 
 

@@ -215,7 +215,7 @@ class Problem(Value):
         """Robot and scene as they stand in the world, for pictures and simulators: the robot's base is the
         world then."""
         T = self.T_world_base
-        return (self.robot, self.scene) if T is None else (self.robot.standing(T), self.scene.moved(T))
+        return (self.robot, self.scene) if T is None else (self.robot.placed_in_world(T), self.scene.moved(T))
 
     @property
     def known_scene(self) -> Scene:

@@ -6,8 +6,10 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.input_files import is_file
-from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
-from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, read_bundle, read_source
+from robotdiffuse.robots.bodies import ConvexMesh
+from robotdiffuse.robots.joints import Joint
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, read_robot_folder, read_source
 from robotdiffuse.robots.user_data_dir import user_robots
 
 __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
@@ -60,7 +62,7 @@ def _state(file: Path) -> tuple[int, int, int] | None:
 
 @lru_cache
 def _read_state(folder: Path, source: str | None, *_states: tuple[int, int, int] | None) -> Robot:
-    return replace(read_bundle(folder), source=source)
+    return replace(read_robot_folder(folder), source=source)
 
 
 @lru_cache

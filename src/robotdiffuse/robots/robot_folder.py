@@ -14,9 +14,11 @@ from robotdiffuse.core.bounds import LARGEST, SLOWEST, unit_quaternion, within
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import read_arrays, read_json
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.inertias import inertia_of
-from robotdiffuse.robots.joint_tables import JointTable
-from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
+from robotdiffuse.robots.joints import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic
+from robotdiffuse.robots.link_pair_tables import LinkPairTable
+from robotdiffuse.robots.robot import Robot
 
 FORMAT = 2
 """2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""
@@ -28,7 +30,7 @@ ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
-def write_bundle(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
+def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
     """Write robot.json and meshes.npz into a folder, each whole or not at all; other files in it stay.
 
     `source` says where the robot comes from: urdf, sha256, licence, and, where preparation measured them, the
@@ -56,7 +58,7 @@ def _replace(file: Path, content: bytes) -> None:
         fresh.unlink(missing_ok=True)
 
 
-def read_bundle(folder: str | Path) -> Robot:
+def read_robot_folder(folder: str | Path) -> Robot:
     """The robot in a folder; raises InputError naming the file if one is missing or damaged."""
     data = _read_json(Path(folder) / ROBOT_FILE)
     meshes = _unpack(Path(folder) / MESH_FILE)
@@ -97,7 +99,7 @@ def _check_tree(robot: Robot) -> None:
 
 
 def read_source(folder: str | Path) -> dict[str, Any]:
-    """Where the robot in a folder comes from, as `write_bundle` got it."""
+    """Where the robot in a folder comes from, as `write_robot_folder` got it."""
     source = _read_json(Path(folder) / ROBOT_FILE).get("source", {})
     return source if isinstance(source, dict) else {}
 
@@ -125,7 +127,7 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
     }
 
 
-def _table_to_json(table: JointTable) -> dict:
+def _table_to_json(table: LinkPairTable) -> dict:
     """Cells by eight, each a bit, along the last joint."""
     rows = np.packbits(np.atleast_2d(table.apart), axis=1)
     return {
@@ -137,7 +139,7 @@ def _table_to_json(table: JointTable) -> dict:
     }
 
 
-def _table_from_json(data: dict) -> JointTable:
+def _table_from_json(data: dict) -> LinkPairTable:
     joints = tuple(map(str, data["joints"]))
     apart = np.array([np.frombuffer(bytes.fromhex(row), np.uint8) for row in data["apart"]])
     apart = np.unpackbits(apart, axis=1).astype(bool)
@@ -147,7 +149,7 @@ def _table_from_json(data: dict) -> JointTable:
     if ends != (len(joints),) * 3 or not all(spans):
         raise ValueError("a table over one or two joints expected, lower below upper")
     a, b = map(str, data["links"])
-    return JointTable((a, b), joints, lower, upper, apart[0] if len(joints) == 1 else apart)
+    return LinkPairTable((a, b), joints, lower, upper, apart[0] if len(joints) == 1 else apart)
 
 
 def _joint_to_json(joint: Joint) -> dict:
@@ -241,7 +243,7 @@ def _joint_from_json(data: dict) -> Joint:
     if kind == "continuous" and upper - lower < WHOLE_TURN:
         kind = "revolute"
     elif kind == "continuous":
-        lower, upper = -TURNS, TURNS
+        lower, upper = -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT
     mimic = None
     if "mimic" in data:
         master, multiplier, offset = data["mimic"]

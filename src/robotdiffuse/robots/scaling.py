@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.robots.joints import Joint
 from robotdiffuse.robots.kinematics import link_origins
-from robotdiffuse.robots.robot import Joint, Robot, once_per_robot
+from robotdiffuse.robots.robot import Robot, once_per_robot
 
 SAMPLES = 4096
 """Configurations that a reach is taken of."""

@@ -75,7 +75,7 @@ def test_an_arm_with_bellows_on_a_held_joint_can_move(tmp_path: Path) -> None:
             on_a_lift(tmp_path, 1), base="base", tip="j3_link", out=tmp_path / "robot", settings=QUICK
         )
     reasons = {frozenset(pair.links): pair.reason for pair in report.pairs}
-    assert reasons[frozenset(("column", "bellows1_link"))] == "default" and report.refusals.free > 0.2
+    assert reasons[frozenset(("column", "bellows1_link"))] == "default" and report.false_collisions.free > 0.2
 
 
 def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
     assert f"--allow {pair[0]} {pair[1]}" in text and text.count("--allow") == 1
     assert not (tmp_path / "robot").exists()
     with coarse_grids():
-        assert add_robot(on_a_lift(tmp_path, 2), allow=[pair], **how).refusals.free > 0.2
+        assert add_robot(on_a_lift(tmp_path, 2), allow=[pair], **how).false_collisions.free > 0.2
 
 
 def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
             if not finer:
                 patch.setattr(preparation, "_closer", lambda *_: None)
             report = add_robot(urdf, tip="j3_link", out=tmp_path / str(finer), settings=settings)
-        refused.append(report.refusals.by_parts)
+        refused.append(report.false_collisions.by_parts)
         assert all(made.covered for made in report.links)
     assert refused[1] < 0.5 * refused[0]
 

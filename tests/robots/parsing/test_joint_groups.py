@@ -9,7 +9,7 @@ from helpers.made_arms import chain, joint, link, row, written
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
 from robotdiffuse.robots.parsing.urdf import read_urdf
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 
 ARM = chain("base", row("j", 6))
 
@@ -133,8 +133,8 @@ def test_mimic_joints_follow(tmp_path: Path) -> None:
     )
     robot = read_urdf(written(tmp_path, ARM, parts))
     assert robot.locked == {"grip": 0.0, "other": 0.1, "third": 0.2}
-    write_bundle(robot, tmp_path / "kept", {})
-    for arm in (robot, read_bundle(tmp_path / "kept")):
+    write_robot_folder(robot, tmp_path / "kept", {})
+    for arm in (robot, read_robot_folder(tmp_path / "kept")):
         arm = arm.with_locked({"grip": 0.4})
         assert arm.locked == pytest.approx({"grip": 0.4, "other": -0.1, "third": -0.2})
         assert arm.with_locked({"grip": 0.4, "third": -0.2}).locked == arm.locked

@@ -67,7 +67,7 @@ class Drawn:
 
     def problem(self, robot: Robot) -> Problem:
         """Any of the goals will do, and any of whole turns of their joints."""
-        goals = np.concatenate([robot.same_stance(goal, self.start) for goal in self.goals])
+        goals = np.concatenate([robot.equivalent_configurations(goal, self.start) for goal in self.goals])
         return Problem(robot, self.scene, self.start, JointGoal(goals))
 
 
@@ -125,7 +125,7 @@ def uniform_configurations(
     and have the origin of the tip link in the region; fewer where a number of draws found no more."""
     found = np.zeros((0, robot.dof))
     for _ in range(BATCHES):
-        q = robot.least_turns(rng.uniform(robot.lower, robot.upper, (BATCH, robot.dof)))
+        q = robot.unwound(rng.uniform(robot.lower, robot.upper, (BATCH, robot.dof)))
         xyz = link_origins(robot, q, robot.tip)
         q = q[((xyz >= region[0]) & (xyz <= region[1])).all(axis=1)]
         found = np.concatenate([found, q[checker.free(q)] if len(q) else q])
@@ -154,7 +154,7 @@ def reaching_configurations(
 
     settings = replace(settings, position_only=True) if robot.dof < POSE_JOINTS else settings
     q = inverse_kinematics(robot, robot.tip, T_base_tip, count, rng=rng, accept=accept, settings=settings)
-    return robot.least_turns(q).astype(np.float32)
+    return robot.unwound(q).astype(np.float32)
 
 
 def base_spheres(robot: Robot) -> Float[ndarray, "m 4"]:

@@ -9,13 +9,13 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.robots.fitting.allowed_collisions import BY_SRDF, CHECKED, LIMITS, NAMED, POSE, PairReport
-from robotdiffuse.robots.fitting.false_collisions import PairRefusals, Refusals
+from robotdiffuse.robots.fitting.false_collisions import FalseCollisions, PairFalseCollisions
 from robotdiffuse.robots.fitting.preparation import LinkReport, PreparationSettings, Progress, prepare
 from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.robots.user_data_dir import user_robots
 
 LITTLE, REFUSED = 0.2, 0.08
@@ -52,7 +52,7 @@ class AddReport:
     folder: Path
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
-    refusals: Refusals
+    refusals: FalseCollisions
     seconds: float
     """Processor time."""
     memory: int
@@ -69,7 +69,7 @@ class AddReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What will keep this robot from moving, and pairs that are taken for safe though they meet."""
-        found, of = [], self.refusals
+        found, of = [], self.false_collisions
         worst = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in of.pairs[:3])
         if of.free < LITTLE:
             often = sorted(of.pairs, key=lambda pair: -pair.colliding)[:3]
@@ -93,16 +93,16 @@ class AddReport:
         return (*found, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
-def never_free(refusals: Refusals) -> bool:
+def never_free(refusals: FalseCollisions) -> bool:
     """Whether every configuration that was looked at collides with itself, so that nothing can be planned."""
     return refusals.free == 0 or refusals.by_parts == 1
 
 
-def never_free_error(urdf: str | Path, refusals: Refusals) -> InputError:
+def never_free_error(urdf: str | Path, refusals: FalseCollisions) -> InputError:
     """The error for a robot that is never free; it proposes the pairs of links that always collide, or else
     those that collide most often."""
 
-    def colliding(pair: PairRefusals) -> float:
+    def colliding(pair: PairFalseCollisions) -> float:
         return max(pair.colliding, pair.by_parts)
 
     often = sorted(refusals.pairs, key=lambda pair: -colliding(pair))
@@ -165,8 +165,8 @@ def add_robot(
     allowed |= {frozenset(pair): NAMED for pair in allow}
     surfaces = {link: tree.surfaces(link) for link in robot.meshes}
     made = prepare(robot, surfaces, settings or PreparationSettings(), seed, progress, allowed)
-    if never_free(made.refusals):
-        raise never_free_error(urdf, made.refusals)
+    if never_free(made.false_collisions):
+        raise never_free_error(urdf, made.false_collisions)
     differences = tuple(
         PairDifference(pair.links, pair.reason, pair.colliding, known.get(frozenset(pair.links), CHECKED))
         for pair in made.sampled
@@ -174,12 +174,15 @@ def add_robot(
     )
     folder = user_robots() / name if out is None else Path(out)
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": licence}
-    shares = {"free": round(made.refusals.free, 4), "refused": round(made.refusals.by_spheres, 4)}
+    shares = {
+        "free": round(made.false_collisions.free, 4),
+        "refused": round(made.false_collisions.by_spheres, 4),
+    }
     note = (
-        f"{made.refusals.free:.1%} of the configurations are free of self-collision; convex parts refuse "
-        f"{made.refusals.by_parts:.1%} of these, spheres {made.refusals.by_spheres:.1%}"
+        f"{made.false_collisions.free:.1%} of the configurations are free of self-collision; convex parts refuse "
+        f"{made.false_collisions.by_parts:.1%} of these, spheres {made.false_collisions.by_spheres:.1%}"
     )
-    write_bundle(replace(made.robot, notes=(*robot.notes, note)), folder, source | shares)
+    write_robot_folder(replace(made.robot, notes=(*robot.notes, note)), folder, source | shares)
     seconds, memory = time.process_time() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KILO
-    shown = (made.links, made.pairs, made.refusals, seconds, memory, found, differences)
-    return AddReport(read_bundle(folder), folder, *shown)
+    shown = (made.links, made.pairs, made.false_collisions, seconds, memory, found, differences)
+    return AddReport(read_robot_folder(folder), folder, *shown)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.robots.fitting.allowed_collisions import Links
-from robotdiffuse.robots.joint_tables import TURN, JointTable
+from robotdiffuse.robots.link_pair_tables import TURN, LinkPairTable
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
 
@@ -21,7 +21,7 @@ SLACK = 1e-5
 """More than what rounding does to a distance [m]."""
 
 
-def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float) -> JointTable:
+def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float) -> LinkPairTable:
     """Where the convex parts of two links are apart that have one or two joints between them.
 
     Cells within which they move no further than `finest` [m] are not split.
@@ -61,7 +61,7 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
             is_open = apart[tuple(_cells(low, size)[0].T)]
             low, parts = low[is_open], parts[:, is_open]
     names = tuple(robot.joint_names[joint] for joint in joints)
-    return JointTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), apart)
+    return LinkPairTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), apart)
 
 
 def _cells(low: Float[ndarray, "n joints"], size: Float[ndarray, "joints"]) -> tuple[ndarray, ndarray]:

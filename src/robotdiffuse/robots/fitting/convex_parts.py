@@ -18,7 +18,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.robot import ConvexMesh
+from robotdiffuse.robots.bodies import ConvexMesh
 
 THIN = 1e-3
 """Least thickness of a hull [m]: of a sheet, spheres and distances would have none to go by."""

@@ -30,7 +30,7 @@ FORGIVEN = 0.003
 
 
 @dataclass(frozen=True)
-class PairRefusals:
+class PairFalseCollisions:
     """A pair of links that is checked."""
 
     links: tuple[str, str]
@@ -51,7 +51,7 @@ class PairRefusals:
 
 
 @dataclass(frozen=True)
-class Refusals:
+class FalseCollisions:
     """What of the free configurations is refused, for touching itself where its true meshes do not."""
 
     free: float
@@ -60,13 +60,13 @@ class Refusals:
     """Share of those that convex parts refuse."""
     by_spheres: float
     """Share of those that covering spheres refuse."""
-    pairs: tuple[PairRefusals, ...]
+    pairs: tuple[PairFalseCollisions, ...]
     """Those that refuse most first."""
 
 
-def measure_refusals(
+def measure_false_collisions(
     robot: Robot, surfaces: Mapping[str, tuple[Surface, ...]], samples: int, rng: np.random.Generator
-) -> Refusals:
+) -> FalseCollisions:
     """Of configurations uniform within the limits of the planned joints, others held as they are.
 
     `surfaces` are the true meshes of the links; they are asked only where convex parts collide, and those
@@ -98,7 +98,7 @@ def measure_refusals(
                 meshes[i] = _collide(trees[a], trees[b], poses[a][i], poses[b][i])
         found.append((spheres, parts, meshes, middle))
     if not found:
-        return Refusals(1.0, 0.0, 0.0, ())
+        return FalseCollisions(1.0, 0.0, 0.0, ())
     free = ~np.any([meshes for _, _, meshes, _ in found], axis=0)
     count = max(int(free.sum()), 1)
     pairs = []
@@ -118,10 +118,10 @@ def measure_refusals(
         vain = np.flatnonzero(parts & ~meshes & free)[:FEW_PLACES]
         coarse = _sticking_out(links, trees, poses, (a, b), vain)
         shares = (float((parts & free).sum() / count), float((spheres & free).sum() / count))
-        pairs.append(PairRefusals((a, b), float(meshes.mean()), *shares, every, places, coarse))
+        pairs.append(PairFalseCollisions((a, b), float(meshes.mean()), *shares, every, places, coarse))
     by_parts = np.any([parts for _, parts, _, _ in found], axis=0)
     by_spheres = np.any([spheres for spheres, _, _, _ in found], axis=0)
-    return Refusals(
+    return FalseCollisions(
         float(free.mean()),
         float((by_parts & free).sum() / count),
         float((by_spheres & free).sum() / count),

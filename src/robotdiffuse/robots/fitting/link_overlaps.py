@@ -10,7 +10,8 @@ from numpy import ndarray
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import within
 from robotdiffuse.robots.fitting.sphere_size_grid import Planes, stacked_planes
-from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.robots.joints import MOVING_KINDS
+from robotdiffuse.robots.robot import Robot
 
 ANGLES = 9
 """Values of the joint between two links at which hiding is tested."""

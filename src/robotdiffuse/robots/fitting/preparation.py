@@ -24,7 +24,11 @@ from robotdiffuse.robots.fitting.allowed_collisions import (
 )
 from robotdiffuse.robots.fitting.convex_pair_tables import joint_table
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_parts
-from robotdiffuse.robots.fitting.false_collisions import PairRefusals, Refusals, measure_refusals
+from robotdiffuse.robots.fitting.false_collisions import (
+    FalseCollisions,
+    PairFalseCollisions,
+    measure_false_collisions,
+)
 from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
 from robotdiffuse.robots.fitting.sphere_size_grid import FLOOR, Bounds, Solid
@@ -100,7 +104,7 @@ class Prepared:
     pairs: tuple[PairReport, ...]
     sampled: tuple[PairReport, ...]
     """The pairs by sampling alone."""
-    refusals: Refusals
+    refusals: FalseCollisions
 
 
 @dataclass(eq=False)
@@ -125,8 +129,9 @@ class _Link:
         """The robot with this link's spheres; `tight` places that were found stay."""
         if self.solid is None:
             meshes = robot.meshes[self.name]
-            self.solid = Solid.of(meshes, settings.tolerance(robot, self.name, np.inf))
-            tolerance = settings.tolerance(robot, self.name, self.solid.depth)
+            frame = robot.link_frame(self.name)
+            self.solid = Solid.of(meshes, settings.tolerance(frame, robot.dof, np.inf))
+            tolerance = settings.tolerance(frame, robot.dof, self.solid.depth)
             hidden = hidden_by_neighbours(robot, self.name)
             self.bounds = Bounds(tolerance, hidden, self.bounds.tight, _floor(robot, self.name))
         fit = fit_spheres(self.solid, self.bounds, np.random.default_rng(seed), settings)
@@ -169,7 +174,7 @@ def prepare(
     tried = []
     for k in range(settings.rounds + 1):
         progress("configurations refused", 2 * len(links) + 1 + k, steps)
-        refusals = measure_refusals(robot, surfaces, settings.samples, np.random.default_rng(seed))
+        refusals = measure_false_collisions(robot, surfaces, settings.samples, np.random.default_rng(seed))
         tried.append((refusals.by_spheres, k, robot, refusals))
         if refusals.by_spheres <= settings.refused or k == settings.rounds:
             break
@@ -177,7 +182,7 @@ def prepare(
     _, _, robot, refusals = min(tried, key=lambda one: one[:2])  # finer is not always better
     closer = _closer(robot, links, refusals, settings, seed)
     if closer is not None:
-        again = measure_refusals(closer, surfaces, settings.samples, np.random.default_rng(seed))
+        again = measure_false_collisions(closer, surfaces, settings.samples, np.random.default_rng(seed))
         worst = max(refusals.by_spheres, settings.refused)
         if again.by_parts < refusals.by_parts and again.by_spheres <= worst:
             robot, refusals = closer, again
@@ -200,7 +205,7 @@ def _report(robot: Robot, link: str) -> LinkReport:
 def _refined(
     robot: Robot,
     links: dict[str, _Link],
-    refusals: Refusals,
+    refusals: FalseCollisions,
     k: int,
     settings: PreparationSettings,
     seed: int,
@@ -240,7 +245,7 @@ def _refined(
 
 
 def _closer(
-    robot: Robot, links: dict[str, _Link], refusals: Refusals, settings: PreparationSettings, seed: int
+    robot: Robot, links: dict[str, _Link], refusals: FalseCollisions, settings: PreparationSettings, seed: int
 ) -> Robot | None:
     """The robot with finer parts where pairs of links overlap by parts alone; None if none were found to.
 
@@ -270,14 +275,14 @@ def _with_tables(robot: Robot, pairs: set[tuple[str, str]], settings: Preparatio
     return replace(robot, tables=tuple(tables.values()))
 
 
-def _beyond_spheres(robot: Robot, pair: PairRefusals, settings: PreparationSettings) -> bool:
+def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: PreparationSettings) -> bool:
     """Whether the finest spheres refuse a pair too much, and a table over one or two joints can tell more."""
     narrow = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
     hopeless = narrow * (pair.by_spheres - pair.by_parts) > settings.refused / 3
     return bool(hopeless) and len(robot.joints_between(*pair.links)) in (1, 2)
 
 
-def _shared(pair: PairRefusals, link: str) -> Float[ndarray, "n 4"]:
+def _shared(pair: PairFalseCollisions, link: str) -> Float[ndarray, "n 4"]:
     """Places on one of two links, and what of the gap its spheres may fill [m].
 
     Spheres that stick out by t over an area A are about A / t in number: of both links together they are
@@ -287,7 +292,7 @@ def _shared(pair: PairRefusals, link: str) -> Float[ndarray, "n 4"]:
     return pair.places[link] * (1, 1, 1, 2 * areas[0] / max(areas[1:].sum(), 1))
 
 
-def _worst(refusals: Refusals, refused: float) -> list[PairRefusals]:
+def _worst(refusals: FalseCollisions, refused: float) -> list[PairFalseCollisions]:
     """As few pairs as leave the others well within what may be refused."""
     left = sum(pair.by_spheres for pair in refusals.pairs)
     worst = []

@@ -7,7 +7,7 @@ surface, not just samples of it.
 How large a sphere may be about a place is told by a grid (see sphere_room.py). For the cells given to one
 sphere, its best centre p is the minimum of max |corner - p| - room(p). Like Lloyd's algorithm, the fit
 alternates between giving each cell to the sphere that holds it with most room to spare and moving each sphere
-to its best centre. It starts from a greedy set cover and drops spheres as long as all have room.
+to its best centre. It starts from a greedy set cover and drops spheres as long as all have sizes.
 """
 
 from dataclasses import dataclass, replace
@@ -19,6 +19,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import split
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     DIRECTIONS,
@@ -29,8 +30,7 @@ from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     relax,
     within,
 )
-from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Room, Solid, stacked_planes
-from robotdiffuse.robots.robot import ConvexMesh, Robot
+from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Solid, SphereSizeGrid, stacked_planes
 
 MARGIN = 1e-5
 """Added to the radii [m]: covers rounding in files and in single-precision kernels."""
@@ -81,10 +81,10 @@ class SphereSettings:
         lengths = ("first_half", "second_half", "fixed", "finest")
         return replace(self, **{name: size * getattr(self, name) for name in lengths})
 
-    def tolerance(self, robot: Robot, link: str, inradius: float) -> float:
-        """How far the spheres of a link may stick out [m] whose largest inner sphere has this radius [m]."""
-        frame = robot.link_frame(link)
-        wanted = self.first_half if frame <= (robot.dof + 1) // 2 else self.second_half
+    def tolerance(self, frame: int, dof: int, inradius: float) -> float:
+        """How far the spheres of a link may stick out [m]: a link on a frame (see `Robot.link_frame`) of a robot
+        with `dof` planned joints, whose largest inscribed sphere has the radius `inradius` [m]."""
+        wanted = self.first_half if frame <= (dof + 1) // 2 else self.second_half
         if frame == 0:
             wanted = max(wanted, self.fixed)
         return float(max(min(wanted, self.relative * inradius), self.finest))
@@ -97,23 +97,23 @@ def fit_spheres(
     settings: SphereSettings = SphereSettings(),
 ) -> Float[ndarray, "n 4"]:
     """Spheres [x y z radius, m] that cover convex meshes, inside and surface, and keep within bounds."""
-    room = solid.room(bounds)
+    sizes = solid.sphere_sizes(bounds)
     inside = solid.inside
     # sticking out of a flat face by e, a sphere covers a disc of radius sqrt(2 r e); cells are much smaller
     coarse, fine = (_Cells.of(solid, bounds, *size) for size in (COARSE, FINE))
     covers = []
     for _ in range(settings.starts):
         places = rng.permutation(inside)[: settings.candidates] + rng.uniform(-0.5, 0.5, 3) * solid.spacing
-        centers = _thin_out(room, coarse, _first_cover(room, coarse, places, settings), settings)
+        centers = _thin_out(sizes, coarse, _first_cover(sizes, coarse, places, settings), settings)
         covers.append(centers)
-    centers = _with_enough(room, fine, min(covers, key=len), settings)
-    centers, _ = _relax(room, fine, centers, settings.rounds, -np.inf)  # as little as so many can
-    return _without_holes(solid, inside, _with_radii(room, fine, centers))
+    centers = _with_enough(sizes, fine, min(covers, key=len), settings)
+    centers, _ = _relax(sizes, fine, centers, settings.rounds, -np.inf)  # as little as so many can
+    return _without_holes(solid, inside, _with_radii(sizes, fine, centers))
 
 
 def stick_out(solid: Solid, spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n"]:
     """How far each sphere reaches out of the meshes [m]."""
-    return spheres[:, 3] - solid.as_room().at(spheres[:, :3])
+    return spheres[:, 3] - solid.inscribed_sizes().at(spheres[:, :3])
 
 
 def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], finest: float = 2e-6) -> bool:
@@ -194,11 +194,11 @@ class _Cells:
         sharp |= left_out
         return _Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
 
-    def assigned(self, room: Room, centers: Float[ndarray, "n 3"]) -> "_Assignment":
+    def assigned(self, sizes: SphereSizeGrid, centers: Float[ndarray, "n 3"]) -> "_Assignment":
         count = len(self.corners)
         owner, heir = np.empty(count, np.int64), np.empty(count, np.int64)
         least, second = np.empty(count), np.empty(count)
-        assign(self.points, self.corners, centers, room.at(centers), owner, least, heir, second)
+        assign(self.points, self.corners, centers, sizes.at(centers), owner, least, heir, second)
         return _Assignment(owner, least, heir, second)
 
     def part(self, mine: Bool[ndarray, "c"]) -> "_Cells":
@@ -223,30 +223,30 @@ class _Assignment(NamedTuple):
 
 
 def _relax(
-    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
+    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
 ) -> tuple[Float[ndarray, "n 3"], float]:
     """Better centres, and how much room the worst sphere lacks [m]; ends early at `enough`."""
-    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *room.arrays, DIRECTIONS)
+    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *sizes.arrays, DIRECTIONS)
 
 
 def _first_cover(
-    room: Room, cells: _Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
+    sizes: SphereSizeGrid, cells: _Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "k 3"]:
     """Centres from a greedy set cover."""
-    chosen = greedy_cover(cells.points, cells.corners, places, room.at(places))
-    return _with_enough(room, cells, places[chosen], settings)
+    chosen = greedy_cover(cells.points, cells.corners, places, sizes.at(places))
+    return _with_enough(sizes, cells, places[chosen], settings)
 
 
 def _with_enough(
-    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
+    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "m 3"]:
     """Centres moved, with more until all spheres have the room that they need."""
-    enough = room.spacing * SLACK
-    centers, worst = _relax(room, cells, centers, settings.rounds, enough)
+    enough = sizes.spacing * SLACK
+    centers, worst = _relax(sizes, cells, centers, settings.rounds, enough)
     while worst > enough and len(centers) < settings.most:
-        lacking = cells.assigned(room, centers).least
+        lacking = cells.assigned(sizes, centers).least
         extra = _apart(cells.points[cells.corners].mean(1), lacking, len(centers) // 20 + 1)
-        centers, worst = _relax(room, cells, np.concatenate([centers, extra]), settings.rounds, enough)
+        centers, worst = _relax(sizes, cells, np.concatenate([centers, extra]), settings.rounds, enough)
     return centers
 
 
@@ -261,16 +261,16 @@ def _apart(points: Float[ndarray, "c 3"], lacking: Float[ndarray, "c"], count: i
 
 
 def _thin_out(
-    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
+    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "m 3"]:
-    """Drop spheres, those first whose cells the others take over best, as long as there is room.
+    """Drop spheres, those first whose cells the others take over best, as long as there is sizes.
 
     Only those that take over cells are moved for it.
     """
-    enough = room.spacing * SLACK
+    enough = sizes.spacing * SLACK
     centers, kept = centers.copy(), np.zeros(len(centers), dtype=bool)
     while len(centers) > 1:
-        given = cells.assigned(room, centers)
+        given = cells.assigned(sizes, centers)
         loss = np.full(len(centers), -np.inf)
         np.maximum.at(loss, given.owner, given.second)
         dropped, moved, failures = np.zeros_like(kept), np.zeros_like(kept), 0
@@ -284,7 +284,7 @@ def _thin_out(
             among = np.zeros(len(centers), dtype=bool)
             among[i] = among[heirs] = True
             part = cells.part(among[given.owner])
-            rest, worst = _relax(room, part, centers[heirs], settings.rounds, enough)
+            rest, worst = _relax(sizes, part, centers[heirs], settings.rounds, enough)
             if worst > enough:
                 kept[i], failures = True, failures + 1
                 if failures == settings.tries:
@@ -299,9 +299,11 @@ def _thin_out(
     return centers
 
 
-def _with_radii(room: Room, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "m 4"]:
+def _with_radii(
+    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"]
+) -> Float[ndarray, "m 4"]:
     """Least radii with which each sphere holds its own cells; spheres without any are dropped."""
-    owner = cells.assigned(room, centers).owner
+    owner = cells.assigned(sizes, centers).owner
     radii = np.zeros(len(centers))
     far = np.linalg.norm(cells.points[cells.corners] - centers[owner][:, None], axis=2).max(1)
     np.maximum.at(radii, owner, far + MARGIN)
@@ -312,7 +314,7 @@ def _without_holes(
     solid: Solid, inside: Float[ndarray, "g 3"], spheres: Float[ndarray, "n 4"]
 ) -> Float[ndarray, "m 4"]:
     """Fill holes inside the meshes, where a small obstacle could hide, from the deepest place on."""
-    depth = solid.as_room().at(inside)
+    depth = solid.inscribed_sizes().at(inside)
     gap = gaps(inside, spheres)
     # nothing between the grid's points is further from them than half of a cube's diagonal
     half = np.sqrt(0.75) * solid.spacing

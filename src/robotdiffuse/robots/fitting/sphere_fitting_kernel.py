@@ -11,7 +11,7 @@ FIRST_STEP, LAST_STEP, SHRINK = 0.004, 0.0005, 0.8
 FINEST_STEP = 2e-4
 """[m]; smaller steps than this end the search for one centre."""
 OUTSIDE = -1.0
-"""Room outside the grid [m]."""
+"""SphereSizeGrid outside the grid [m]."""
 GAIN = 1e-7
 """Steps that gain less than this are not taken [m]."""
 
@@ -57,7 +57,7 @@ def within(points, normals, offsets, starts, depth):
 
 
 @njit(cache=True, fastmath=True)
-def room_at(x, y, z, grid, origin, spacing):
+def max_radius_at(x, y, z, grid, origin, spacing):
     """Value of a grid between its points; outside the grid a low one, the lower the further."""
     u, v, w = (x - origin[0]) / spacing, (y - origin[1]) / spacing, (z - origin[2]) / spacing
     beyond = 0.0
@@ -75,10 +75,10 @@ def room_at(x, y, z, grid, origin, spacing):
 
 
 @njit(cache=True, fastmath=True)
-def rooms_at(centers, grid, origin, spacing):
+def max_radii_at(centers, grid, origin, spacing):
     rooms = np.empty(len(centers))
     for i in range(len(centers)):
-        rooms[i] = room_at(centers[i, 0], centers[i, 1], centers[i, 2], grid, origin, spacing)
+        rooms[i] = max_radius_at(centers[i, 0], centers[i, 1], centers[i, 2], grid, origin, spacing)
     return rooms
 
 
@@ -267,7 +267,7 @@ def stick_out_at(x, y, z, own, count, grid, origin, spacing):
     for k in range(count):
         dx, dy, dz = own[k, 0] - x, own[k, 1] - y, own[k, 2] - z
         far = max(far, dx * dx + dy * dy + dz * dz)
-    return math.sqrt(far) - room_at(x, y, z, grid, origin, spacing)
+    return math.sqrt(far) - max_radius_at(x, y, z, grid, origin, spacing)
 
 
 @njit(cache=True, fastmath=True)
@@ -307,7 +307,9 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
     best, best_value = centers.copy(), 1e9
     step = FIRST_STEP
     for r in range(rounds + 1):
-        assign(points, corners, centers, rooms_at(centers, grid, origin, spacing), owner, least, heir, second)
+        assign(
+            points, corners, centers, max_radii_at(centers, grid, origin, spacing), owner, least, heir, second
+        )
         value = least.max()
         if value < best_value:
             best, best_value = centers.copy(), value

@@ -15,9 +15,9 @@ from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import planes_of
-from robotdiffuse.robots.fitting.sphere_fitting_kernel import plane_depths, rooms_at
-from robotdiffuse.robots.robot import ConvexMesh
+from robotdiffuse.robots.fitting.sphere_fitting_kernel import max_radii_at, plane_depths
 
 GRID_POINTS = 200_000
 """Of a grid around a link, about."""
@@ -74,7 +74,7 @@ class Bounds:
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class SphereSizeGrid:
     """How large a sphere may be about each place: negative where none may be [m], linear between points."""
 
     grid: Float[ndarray, "nx ny nz"]
@@ -86,7 +86,7 @@ class Room:
         return self.grid, self.origin, self.spacing
 
     def at(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        return rooms_at(np.ascontiguousarray(points), *self.arrays)
+        return max_radii_at(np.ascontiguousarray(points), *self.arrays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +130,12 @@ class Solid:
         distance = self.distance.ravel()
         return self.points[distance < max(0.0, float(distance.min()) + self.spacing / 2)]
 
-    def as_room(self) -> Room:
-        """Room for spheres that do not stick out at all."""
-        return Room(-self.distance, self.origin, self.spacing)
+    def inscribed_sizes(self) -> SphereSizeGrid:
+        """SphereSizeGrid for spheres that do not stick out at all."""
+        return SphereSizeGrid(-self.distance, self.origin, self.spacing)
 
-    def room(self, bounds: Bounds) -> Room:
-        """Room for the spheres of a link."""
+    def sphere_sizes(self, bounds: Bounds) -> SphereSizeGrid:
+        """SphereSizeGrid for the spheres of a link."""
         points, distance = self.points, self.distance.ravel()
         allowed = np.full(len(points), bounds.tolerance)
         near = (distance > -bounds.tolerance) & (distance < 2 * bounds.tolerance)
@@ -151,7 +151,7 @@ class Solid:
         beyond = beyond.reshape(self.distance.shape)
         outside = beyond > 0
         grid = _carried(~outside, self.spacing, np.maximum(beyond, 0.0))
-        return Room(np.where(outside, -beyond, grid), self.origin, self.spacing)
+        return SphereSizeGrid(np.where(outside, -beyond, grid), self.origin, self.spacing)
 
 
 def _carried(

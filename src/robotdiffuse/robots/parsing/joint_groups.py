@@ -6,8 +6,9 @@ from itertools import takewhile
 from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 from robotdiffuse.robots.parsing.srdf import Srdf
-from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
+from robotdiffuse.robots.robot import Robot
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """In the name of a joint: it is a gripper's, if few joints follow it."""

@@ -7,8 +7,9 @@ from pathlib import Path
 from robotdiffuse.core.bounds import FASTEST, LARGEST, SLOWEST
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 from robotdiffuse.robots.parsing.urdf import ACCELERATION_PER_VELOCITY, JERK_PER_ACCELERATION
-from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
+from robotdiffuse.robots.robot import Robot
 
 FIELDS = {
     "min_position": "lower",

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from robotdiffuse.robots.robot import Joint
+from robotdiffuse.robots.joints import Joint
 
 SLIDE, TURN = "prismatic", ("revolute", "continuous")
 STRAIGHT = 1e-3

@@ -11,7 +11,7 @@ from pathlib import Path
 from robotdiffuse.core.bounds import LARGEST
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import is_file, parse_xml, read_bytes
-from robotdiffuse.robots.robot import MOVING_KINDS, Joint
+from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 
 FOLDERS = (".", "../srdf", "../config", "srdf", "config")
 """Where the SRDF of a URDF is looked for, from the URDF's folder."""

@@ -14,13 +14,15 @@ from robotdiffuse.core.bounds import FASTEST, LARGEST, SLOWEST, SMALLEST, points
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import parse_xml, read_triangles
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull
 from robotdiffuse.robots.inertias import Inertia, inertia_of
+from robotdiffuse.robots.joints import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
 from robotdiffuse.robots.parsing.joint_groups import passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.parsing.mobile_bases import moves_in_a_plane
 from robotdiffuse.robots.parsing.packages import Packages, urdf_text
 from robotdiffuse.robots.parsing.srdf import Srdf
-from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
+from robotdiffuse.robots.robot import Robot
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 KINDS = (*MOVING_KINDS, "fixed")
@@ -149,7 +151,7 @@ class UrdfTree:
             for joint in joints
             if joint.kind in MOVING_KINDS and (joint.name not in planned or joint.lower == joint.upper)
         }
-        robot = replace(robot, locked=following(robot.joints, rest)).with_locked(locked or {})
+        robot = replace(robot, locked=with_mimics(robot.joints, rest)).with_locked(locked or {})
         if robot.dof == 0:
             raise InputError(
                 f"{self.path}: no movable joint between {base} and {ends[0]}; choose another --base or --tip"
@@ -297,7 +299,7 @@ class UrdfTree:
                 text, most = limit.get(what, ""), FASTEST if what == "velocity" else LARGEST
                 given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit", most)[0])
         if joint.kind == "continuous":
-            given["lower"], given["upper"] = -TURNS, TURNS
+            given["lower"], given["upper"] = -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT
         if "lower" not in given and "upper" not in given:
             raise InputError(
                 f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"

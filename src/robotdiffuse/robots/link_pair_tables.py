@@ -14,7 +14,7 @@ ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class JointTable(Value):
+class LinkPairTable(Value):
     """Where the convex parts of two links are apart, by the one or two joints between them."""
 
     links: tuple[str, str]
