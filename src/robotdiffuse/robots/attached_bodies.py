@@ -1,8 +1,8 @@
 """Collision geometry of tools and held objects.
 
-`Robot.attach` and `Robot.with_tool` add a body as one more link: with convex meshes for the validator, spheres
-that cover them for planning, and pairs of links to check. The joints stay the same, so weights trained for the
-bare arm apply.
+`Robot.attach` and `Robot.with_tool` add a body as one more link: with convex meshes for the validator,
+spheres that cover them for planning, and pairs of links to check. The joints stay the same, so weights
+trained for the bare arm apply.
 """
 
 import numpy as np

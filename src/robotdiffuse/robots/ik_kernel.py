@@ -27,8 +27,8 @@ REQUIRED_PROGRESS = 0.5
 def forward(q, offsets, tool, kinds, frame, T, axes, origins):
     """Write the axes and origins of the first `frame` joints, and the pose of the tool into T [3, 4].
 
-    q [dof] is the configuration, offsets [dof, 4, 4], tool [4, 4] and kinds [dof] are as in `IKChain`; axes and
-    origins are [dof, 3], in the base frame.
+    q [dof] is the configuration, offsets [dof, 4, 4], tool [4, 4] and kinds [dof] are as in `IKChain`; axes
+    and origins are [dof, 3], in the base frame.
     """
     for i in range(3):
         for k in range(4):
@@ -147,7 +147,8 @@ def damped_step(J, error, damping, rows, frame, held, A, y, step):
 
 @njit(cache=True)
 def _is_new(q, others, count, kinds, min_distance):
-    """Whether q is further than min_distance from the first `count` others: max norm, continuous joints wrapped."""
+    """Whether q is further than min_distance from the first `count` others: max norm, continuous joints
+    wrapped."""
     for n in range(count):
         far = False
         for j in range(len(q)):
@@ -163,8 +164,8 @@ def _is_new(q, others, count, kinds, min_distance):
 
 
 class IKChain(NamedTuple):
-    """A chain of joints with a tool frame at its end. Arrays cover `dof` joints: those of the chain come first,
-    then joints after the tool, which keep their seed's values."""
+    """A chain of joints with a tool frame at its end. Arrays cover `dof` joints: those of the chain come
+    first, then joints after the tool, which keep their seed's values."""
 
     offsets: ndarray
     """[dof, 4, 4] `Robot.frame_offsets` of the joints."""
@@ -194,8 +195,9 @@ class IKParameters(NamedTuple):
 def solve_seeds(seeds, known, wanted, chain, target, parameters):
     """Solve seed after seed until `wanted` configurations are found that differ from `known` and each other.
 
-    seeds [n, dof] and known [m, dof] are configurations, chain an `IKChain`, target [4, 4] the pose wanted for
-    the tool, parameters `IKParameters`. Returns the new configurations [k, dof] and the number of seeds used.
+    seeds [n, dof] and known [m, dof] are configurations, chain an `IKChain`, target [4, 4] the pose wanted
+    for the tool, parameters `IKParameters`. Returns the new configurations [k, dof] and the number of seeds
+    used.
     """
     offsets, tool, kinds, frame, lower, upper = chain
     position_only, rotation_weight, position_tolerance, rotation_tolerance, max_iterations, min_distance = (

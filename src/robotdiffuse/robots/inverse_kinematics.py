@@ -70,17 +70,14 @@ def inverse_kinematics(
 ) -> Float[ndarray, "k dof"]:
     """Up to `count` distinct configurations that bring link `frame` to the pose, inside the joint limits.
 
-    Damped Newton steps (Levenberg-Marquardt) start from uniformly random seeds. Steps are clipped to the limits,
-    and joints pushed against a limit are held while the others move. Joints after the link keep random values.
-    The result depends only on the arguments and the state of `rng`.
+    Damped Newton steps (Levenberg-Marquardt) start from uniformly random seeds. Steps are clipped to the
+    limits, and joints pushed against a limit are held while the others move. Joints after the link keep
+    random values. The result depends only on the arguments and the state of `rng`.
 
     Args:
-        robot: The robot.
-        frame: Name of the link.
-        T_base_frame: Wanted pose of the link [m].
-        count: Largest number of configurations.
-        rng: Source of the seeds.
-        accept: Called with batches of solutions; returns which to keep, e.g. those free of collision. A rejected
+        robot: The robot. frame: Name of the link. T_base_frame: Wanted pose of the link [m]. count: Largest
+        number of configurations. rng: Source of the seeds. accept: Called with batches of solutions; returns
+        which to keep, e.g. those free of collision. A rejected
             solution does not block solutions close to it.
         settings: Tolerances and effort.
         near: First seed: if the pose moves slightly, so does the first solution.
@@ -90,7 +87,8 @@ def inverse_kinematics(
         Configurations, one per row; no rows if the pose was not reached.
 
     Raises:
-        InputError: For an unknown link, a link that no planned joint moves, a count below 1, or a matrix that is
+        InputError: For an unknown link, a link that no planned joint moves, a count below 1, or a matrix that
+        is
             not a finite rigid transform.
     """
     settings = settings or InverseKinematicsSettings()

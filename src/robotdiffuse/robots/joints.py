@@ -12,8 +12,8 @@ from robotdiffuse.core.transforms import rotation_about, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
 CONTINUOUS_LIMIT = 3 * np.pi
-"""Position limits of continuous joints in planning, plus and minus [rad]: a start lies within half a turn, and
-a goal at most one turn from the start. The joints themselves have no limits."""
+"""Position limits of continuous joints in planning, plus and minus [rad]: a start lies within half a turn,
+and a goal at most one turn from the start. The joints themselves have no limits."""
 MIMIC_SLACK = 1e-6
 """Largest difference between a value given for a mimic joint and the value that its leader implies."""
 

@@ -31,9 +31,9 @@ class Robot(Value):
 
     Planned joints are the movable, unlocked joints between the base and the tips.
 
-    Frames: frame 0 is the base link; frame j + 1 moves with planned joint j, and
-    T_base_frame[j + 1] = T_base_frame[parents[j]] @ frame_offsets[j] @ M(q_j), where M rotates about z, or
-    translates along z for a prismatic joint. For a serial arm, parents[j] is j. Every link is fixed to one frame.
+    Frames: frame 0 is the base link; frame j + 1 moves with planned joint j, and T_base_frame[j + 1] =
+    T_base_frame[parents[j]] @ frame_offsets[j] @ M(q_j), where M rotates about z, or translates along z for a
+    prismatic joint. For a serial arm, parents[j] is j. Every link is fixed to one frame.
     """
 
     name: str
@@ -55,8 +55,8 @@ class Robot(Value):
     root: str = ""
     """Root link of the URDF; if empty, the base is the root."""
     above: dict[str, Float[ndarray, "4 4"]] = field(default_factory=dict)
-    """T_base_link of the links above the base that only fixed joints connect to it. The root is among them unless
-    a movable joint lies between."""
+    """T_base_link of the links above the base that only fixed joints connect to it. The root is among them
+    unless a movable joint lies between."""
     poses: dict[str, dict[str, float]] = field(default_factory=dict)
     """Named poses of the SRDF: joint values by name [rad] or [m]."""
     source: str | None = None
@@ -70,7 +70,8 @@ class Robot(Value):
     other_tips: tuple[str, ...] = ()
     """Tips of further arms whose joints are planned too."""
     tables: tuple[LinkPairTable, ...] = ()
-    """For pairs of links that pass closer than spheres can resolve: the joint values at which they do not collide."""
+    """For pairs of links that pass closer than spheres can resolve: the joint values at which they do not
+    collide."""
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
@@ -177,11 +178,11 @@ class Robot(Value):
     def equivalent_configurations(
         self, q: Float[ndarray, "dof"], start: Float[ndarray, "dof"]
     ) -> Float[ndarray, "k dof"]:
-        """Configurations within the limits that differ from `q` by whole turns of joints that have limits and a
-        range above one turn.
+        """Configurations within the limits that differ from `q` by whole turns of joints that have limits and
+        a range above one turn.
 
-        In the first one, all of these joints are as close to `start` as possible. In each further one, one joint
-        turns the other way, since obstacles may block the short way.
+        In the first one, all of these joints are as close to `start` as possible. In each further one, one
+        joint turns the other way, since obstacles may block the short way.
         """
         many = self._turns_twice & ~self.continuous
         nearest = np.where(many, q - TURN * np.round((q - start) / TURN), q)
@@ -283,7 +284,8 @@ class Robot(Value):
         return self._frames[0][link]
 
     def checked_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of links that are checked against each other: with geometry, on different frames, not allowed."""
+        """Pairs of links that are checked against each other: with geometry, on different frames, not
+        allowed."""
         links = [link for link in self.link_names if link in self.spheres]
         return tuple(
             (a, b)
@@ -296,8 +298,8 @@ class Robot(Value):
         """The robot with joints locked at values [rad] or [m], by name; planned joints can be locked too.
 
         Mimic joints follow. Values beyond the URDF's limits are accepted, since gripper openings in published
-        problems exceed them. Equal values give the same object. Raises InputError for an unknown or fixed joint,
-        a value that is not finite, or a value of a mimic joint that contradicts its leader.
+        problems exceed them. Equal values give the same object. Raises InputError for an unknown or fixed
+        joint, a value that is not finite, or a value of a mimic joint that contradicts its leader.
         """
         movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
@@ -327,9 +329,9 @@ class Robot(Value):
     def attach(self, shape: RigidShape, link: str, touch_links: Sequence[str] = ()) -> "Robot":
         """The robot holding a shape, whose pose is given in the frame of the link.
 
-        The shape becomes a link with the shape's name, so goals may name it. Collision checks keep it clear of
-        obstacles and of all links, except links that move with it and `touch_links`. A curved shape is replaced
-        by a polyhedron around it that exceeds it by at most 2 % of its radius.
+        The shape becomes a link with the shape's name, so goals may name it. Collision checks keep it clear
+        of obstacles and of all links, except links that move with it and `touch_links`. A curved shape is
+        replaced by a polyhedron around it that exceeds it by at most 2 % of its radius.
 
         Raises InputError for unknown links, a link that no planned joint moves, a name that is taken, and a
         point cloud.
@@ -349,8 +351,8 @@ class Robot(Value):
     ) -> "Robot":
         """The robot with a tool on a link: a frame that goals may name, and shapes in the frame of the link.
 
-        The tool becomes the tip if no planned joint comes after its link. Shapes, `touch_links` and errors are
-        as in `attach`; InputError too if the robot has a tool already.
+        The tool becomes the tip if no planned joint comes after its link. Shapes, `touch_links` and errors
+        are as in `attach`; InputError too if the robot has a tool already.
         """
         tools = [body.name for body in self.attached if body.tool]
         if tools:
@@ -400,7 +402,8 @@ class Robot(Value):
         return reduce(Robot.with_body, left, self.arm)
 
     def placed_in_world(self, T_world_base: Float[ndarray, "4 4"]) -> "Robot":
-        """The robot with a new base link, the world, that carries the old one: for pictures and simulators."""
+        """The robot with a new base link, the world, that carries the old one: for pictures and
+        simulators."""
         name = "world"
         while name in self.link_names:
             name += "_"

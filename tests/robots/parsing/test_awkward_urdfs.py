@@ -16,7 +16,7 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.add import add_robot
-from robotdiffuse.robots.fitting.preparation import LARGE, PreparationSettings
+from robotdiffuse.robots.fitting.preparation import LARGE_REACH, PreparationSettings
 from robotdiffuse.robots.scaling import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify
@@ -130,7 +130,7 @@ def test_an_arm_four_times_as_large_takes_no_more_spheres(tmp_path: Path) -> Non
         )
         parts = chain("base", row("j", 4), xyz=f"0 0 {length}").replace(BALL, box)
         report = add_robot(written(tmp_path, parts), out=tmp_path / f"{size}", settings=QUICK)
-        assert all(part.covered for part in report.links) and reach(report.robot) > LARGE
+        assert all(part.covered for part in report.links) and reach(report.robot) > LARGE_REACH
         counts.append(report.sphere_count)
     assert counts[1] == pytest.approx(counts[0], rel=0.2) and min(counts) > 10
 
@@ -147,6 +147,6 @@ def test_an_arm_on_a_long_rail_is_no_larger(tmp_path: Path) -> None:
 def test_settings_are_those_of_arms_of_up_to_a_metre_and_a_half() -> None:
     settings = PreparationSettings()
     assert settings.for_reach(0.9) == settings
-    twice = settings.for_reach(2 * LARGE)
+    twice = settings.for_reach(2 * LARGE_REACH)
     assert twice.spheres.first_half == 2 * settings.spheres.first_half and twice.finest == 2 * settings.finest
     assert twice.parts.concavity == 2 * settings.parts.concavity and twice.parts.most == settings.parts.most

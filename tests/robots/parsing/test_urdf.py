@@ -15,7 +15,7 @@ from robotdiffuse.core.transforms import rotation_from_rpy
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.fitting.add import add_robot
 from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.fitting.convex_parts import THIN, convex_hull
+from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, convex_hull
 from robotdiffuse.robots.fitting.preparation import PreparationSettings
 from robotdiffuse.robots.fitting.sphere_fitting import covered
 from robotdiffuse.robots.joints import CONTINUOUS_LIMIT
@@ -118,7 +118,7 @@ def test_what_has_no_thickness_is_given_some(corners: list[list[float]], thin: i
     hull = convex_hull(turned)
     solid = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
     size = np.sort(solid.bounding_box_oriented.primitive.extents)
-    np.testing.assert_allclose(size[:thin], THIN, rtol=0.01)
+    np.testing.assert_allclose(size[:thin], MIN_THICKNESS, rtol=0.01)
     assert solid.is_watertight and solid.volume > 0 and solid.contains(turned.mean(0)[None]).all()
 
 

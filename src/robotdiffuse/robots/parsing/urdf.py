@@ -111,8 +111,8 @@ class UrdfTree:
         that are given there, while links above it are left out. `group` names a group of the SRDF, or an arm
         by what the names of its joints begin with, or is "both" or "all"; `tip` a link. A group of several
         chains, as of two arms, is one robot with several tips. Without both, the robot must have one arm:
-        from the base as far as the link where a gripper or a hand begins (`robots.parsing.joint_groups` tells how these are
-        known), else to the deepest link. So it is panda_hand for a Panda with fingers.
+        from the base as far as the link where a gripper or a hand begins (`robots.parsing.joint_groups` tells
+        how these are known), else to the deepest link. So it is panda_hand for a Panda with fingers.
 
         Planned are the movable joints of the group, or all from base to tip; less passive ones and those that
         mimic others. All other joints are locked: at what `locked` says, in a pose of the SRDF, or at zero
