@@ -1,4 +1,4 @@
-"""Rigid bodies: convex meshes, and what is fixed to a link of a robot."""
+"""Convex meshes, and bodies that are attached to links of a robot."""
 
 from dataclasses import dataclass, fields
 from typing import Any, Protocol, runtime_checkable
@@ -9,7 +9,7 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import Value
 
 TOOL = "tool"
-"""Name of a tool that is given none."""
+"""Default name of a tool."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,29 +22,31 @@ class ConvexMesh(Value):
 
 @runtime_checkable
 class RigidShape(Protocol):
-    """What a robot can hold: the shapes of scenes."""
+    """Interface of shapes that a robot can hold; the shapes of scenes implement it."""
 
     @property
     def name(self) -> str: ...
 
     def solid(self) -> tuple[Float[ndarray, "4 4"], tuple[ConvexMesh, ...]]:
-        """Where it stands in the frame that it is given in, and convex meshes in its own that hold it."""
+        """The shape's pose in the frame in which it is given, and convex meshes in its own frame that contain
+        it."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class AttachedBody(Value):
-    """A body that is fixed to a link of a robot, itself a link of the name."""
+    """A tool or held object: a body that is fixed to a link of a robot and becomes a link itself."""
 
     name: str
     link: str
-    """The link that it is fixed to."""
+    """Link to which the body is fixed."""
     T_link_body: Float[ndarray, "4 4"]
     shapes: tuple[RigidShape, ...] = ()
-    """In the frame of `link`. None: the body is a mere frame."""
+    """Shapes, posed in the frame of `link`. Without any, the body is only a frame."""
     touch_links: tuple[str, ...] = ()
-    """Links that it may touch, beside those that move with it anyway."""
+    """Links that the body may touch, besides those that move with it."""
     tool: bool = False
+    """Whether the body is a tool, which may become the tip."""
 
 
 class BodyContent:

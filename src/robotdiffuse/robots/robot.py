@@ -372,7 +372,8 @@ class Robot(Value):
             raise unknown_name(f"link in {what}.link:", str(body.link), moved)
         if body.link not in moved:
             raise InputError(
-                f"{what}.link is {body.link}, which no planned joint moves; these are moved: {', '.join(moved)}"
+                f"{what}.link is {body.link}, which no planned joint moves; these are moved: "
+                f"{', '.join(moved)}"
             )
         if body.name in self.link_names:
             raise InputError(

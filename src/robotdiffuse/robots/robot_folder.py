@@ -1,4 +1,4 @@
-"""A robot as a folder: robot.json (human-readable) and meshes.npz (convex collision meshes)."""
+"""Reads and writes robot folders: robot.json (human-readable) and meshes.npz (convex collision meshes)."""
 
 import io
 import json
@@ -21,21 +21,19 @@ from robotdiffuse.robots.link_pair_tables import LinkPairTable
 from robotdiffuse.robots.robot import Robot
 
 FORMAT = 2
-"""2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""
-AXIS_SLACK = 1e-3
-"""Of a joint axis's length."""
-WHOLE_TURN = 6.283
-"""A continuous joint whose limits are narrower than this is revolute [rad]: older files may hold some."""
+"""Version of the format."""
+AXIS_LENGTH_TOLERANCE = 1e-3
+"""Largest difference between the length of a joint axis and 1."""
 ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
 def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
-    """Write robot.json and meshes.npz into a folder, each whole or not at all; other files in it stay.
+    """Write robot.json and meshes.npz into a folder, each file atomically; other files in the folder stay.
 
-    `source` says where the robot comes from: urdf, sha256, licence, and, where preparation measured them, the
-    shares of free configurations and of those that spheres refuse, free and refused. Raises InputError if the
-    folder cannot be written.
+    `source` describes the origin: urdf, sha256, licence, and, if preparation measured them, `free`, the
+    fraction of free configurations, and `refused`, the fraction of these with false collisions of spheres.
+    Raises InputError if the folder cannot be written.
     """
     folder = Path(folder)
     meshes = io.BytesIO()
@@ -50,6 +48,7 @@ def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any])
 
 
 def _replace(file: Path, content: bytes) -> None:
+    """Write a file atomically."""
     fresh = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         fresh.write_bytes(content)
@@ -59,7 +58,7 @@ def _replace(file: Path, content: bytes) -> None:
 
 
 def read_robot_folder(folder: str | Path) -> Robot:
-    """The robot in a folder; raises InputError naming the file if one is missing or damaged."""
+    """Read the robot in a folder; raises InputError that names the file if one is missing or damaged."""
     data = _read_json(Path(folder) / ROBOT_FILE)
     meshes = _unpack(Path(folder) / MESH_FILE)
     try:
@@ -77,11 +76,11 @@ def read_robot_folder(folder: str | Path) -> Robot:
 
 
 def _check_tree(robot: Robot) -> None:
-    """Raises ValueError unless each joint hangs from the base or from a link of a joint before it."""
+    """Raise ValueError if the joints do not form a tree, or if other entries are inconsistent with it."""
     links = {robot.base}
     for joint in robot.joints:
         if joint.parent not in links or joint.child in links:
-            raise ValueError(f"joint {joint.name} is not part of a tree, parents before children")
+            raise ValueError(f"joint {joint.name} is not part of a tree with parents before children")
         links.add(joint.child)
     leaders = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
     for name in leaders:
@@ -99,7 +98,7 @@ def _check_tree(robot: Robot) -> None:
 
 
 def read_source(folder: str | Path) -> dict[str, Any]:
-    """Where the robot in a folder comes from, as `write_robot_folder` got it."""
+    """The `source` of a robot folder, as given to `write_robot_folder`."""
     source = _read_json(Path(folder) / ROBOT_FILE).get("source", {})
     return source if isinstance(source, dict) else {}
 
@@ -128,7 +127,7 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
 
 
 def _table_to_json(table: LinkPairTable) -> dict:
-    """Cells by eight, each a bit, along the last joint."""
+    """Entry of a table; cells along the last joint are packed as bits into hexadecimal rows."""
     rows = np.packbits(np.atleast_2d(table.apart), axis=1)
     return {
         "links": list(table.links),
@@ -170,7 +169,7 @@ def _joint_to_json(joint: Joint) -> dict:
 
 
 def _dump(data: dict) -> str:
-    """JSON with one joint, sphere or pair to a line."""
+    """JSON text with one joint, sphere or pair per line."""
 
     def compact(value: object) -> str:
         return json.dumps(value, allow_nan=False)
@@ -198,7 +197,7 @@ def _read_json(file: Path) -> dict:
     data = read_json(file)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise InputError(
-            f"{file} is not a robot of format {FORMAT}; make it again with: robotdiffuse robot add"
+            f"{file} is not a robot of format {FORMAT}; create it again with: robotdiffuse robot add"
         )
     return data
 
@@ -238,11 +237,9 @@ def _joint_from_json(data: dict) -> Joint:
     rates = (velocity, acceleration, jerk)
     if not -LARGEST <= lower <= upper <= LARGEST or not min(rates) >= SLOWEST or not max(rates) < np.inf:
         raise ValueError(f"joint {name}: limits")
-    if not abs(np.linalg.norm(axis) - 1) < AXIS_SLACK:
+    if not abs(np.linalg.norm(axis) - 1) < AXIS_LENGTH_TOLERANCE:
         raise ValueError(f"joint {name}: an axis of length 1 expected")
-    if kind == "continuous" and upper - lower < WHOLE_TURN:
-        kind = "revolute"
-    elif kind == "continuous":
+    if kind == "continuous":
         lower, upper = -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT
     mimic = None
     if "mimic" in data:
@@ -269,7 +266,7 @@ def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
 
 
 def _pack(robot: Robot) -> dict[str, ndarray]:
-    """All meshes in four arrays: reading many small ones would take longer."""
+    """All meshes in four arrays, since reading many small ones would take longer."""
     parts = [(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes]
     return {
         "links": np.array([link for link, _ in parts], dtype=np.str_),
@@ -280,6 +277,7 @@ def _pack(robot: Robot) -> dict[str, ndarray]:
 
 
 def _unpack(file: Path) -> dict[str, tuple[ConvexMesh, ...]]:
+    """Meshes by link from the arrays that `_pack` made."""
     arrays = read_arrays(file)
     try:
         links, sizes, vertices, faces = (arrays[key] for key in ("links", "sizes", "vertices", "faces"))

@@ -145,14 +145,14 @@ def test_mimic_joints_follow(tmp_path: Path) -> None:
 def test_linkages_of_planned_joints_are_refused_unless_they_are_held(tmp_path: Path) -> None:
     follow = '<mimic joint="j2" multiplier="-1"/>'
     bar = link("bar") + joint("rod", "j1_link", "bar", more=follow)
-    with pytest.raises(InputError, match=r"rod follows j2, which is planned; .*--lock j2=VALUE"):
+    with pytest.raises(InputError, match=r"rod mimics j2, which is planned; .*--lock j2=VALUE"):
         read_urdf(written(tmp_path, ARM, bar))
     held = read_urdf(written(tmp_path, ARM, bar), locked={"j2": 0.5})
     assert held.locked == {"rod": -0.5, "j2": 0.5} and held.dof == 5
     bare = bar.replace(link("bar"), link("bar", ""))
     assert read_urdf(written(tmp_path, ARM, bare)).dof == 6
     inside = link("end") + joint("last", "j6_link", "end", more='<mimic joint="j5"/>')
-    with pytest.raises(InputError, match="last follows j5"):
+    with pytest.raises(InputError, match="last mimics j5"):
         read_urdf(written(tmp_path, ARM, inside), tip="end")
 
 
@@ -164,7 +164,7 @@ def test_mimic_of_nothing_or_in_a_circle(followed: str, tmp_path: Path) -> None:
         + link("end")
         + joint("other", "base", "end", more='<mimic joint="rod"/>')
     )
-    with pytest.raises(InputError, match="joint of the file that does not follow it"):
+    with pytest.raises(InputError, match="joint of the file that does not mimic it"):
         read_urdf(written(tmp_path, ARM, parts))
 
 

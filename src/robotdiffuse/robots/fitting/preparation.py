@@ -71,7 +71,8 @@ class PreparationSettings:
     def __post_init__(self) -> None:
         if not 0 < self.max_false_collisions < 1 or self.samples < 100 or self.rounds < 0:
             raise InputError(
-                f"preparation: max_false_collisions is {self.max_false_collisions} (must be between 0 and 1), samples {self.samples} "
+                f"preparation: max_false_collisions is {self.max_false_collisions} (must be between 0 "
+                f"and 1), samples {self.samples} "
                 f"(at least 100), rounds {self.rounds} (at least 0)"
             )
 

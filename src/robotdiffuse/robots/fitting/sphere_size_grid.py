@@ -115,7 +115,7 @@ class Solid:
         planes = stacked_planes(meshes)
         depth = plane_depths(_grid_points(shape, low, spacing), *planes).reshape(shape)
         inside = depth > 0
-        # inside several meshes, the planes between them are not surface: measure from the outer surface instead
+        # planes between overlapping meshes are not surface: measure from the outer surface instead
         deep = depth if len(meshes) == 1 else _distance_inside(inside, spacing, np.maximum(-depth, 0.0))
         return Solid(meshes, np.where(inside, -deep, -depth), low, spacing)
 

@@ -18,11 +18,11 @@ PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
 
 @dataclass(frozen=True)
 class Packages:
-    """Where the packages that a URDF names are looked for.
+    """Finds the ROS packages of a URDF.
 
-    A package's folder is taken from `folders`, then from ROS_PACKAGE_PATH and AMENT_NAMESPACE_PREFIX_PATH,
-    then it is any folder from the URDF's upwards that has the file, with the package's name before it or
-    without.
+    The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH.
+    Otherwise, files are searched relative to the URDF's folder and all folders above, with or without the
+    package's name.
     """
 
     urdf: Path
@@ -33,7 +33,7 @@ class Packages:
         none."""
         if name in self.folders:
             return Path(self.folders[name])
-        ros, ament = _folders("ROS_PACKAGE_PATH"), _folders("AMENT_NAMESPACE_PREFIX_PATH")
+        ros, ament = _folders("ROS_PACKAGE_PATH"), _folders("AMENT_PREFIX_PATH")
         start = self.urdf.resolve().parent
         candidates = [
             *(root for root in ros if root.name == name),
@@ -63,8 +63,8 @@ class Packages:
             if is_file(candidate):
                 return candidate
         raise InputError(
-            f"{self.urdf}: mesh file {shown(filename)} does not exist (searched from {start} upwards); give the "
-            f"package's folder: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
+            f"{self.urdf}: mesh file {shown(filename)} does not exist (searched from {start} upwards); give "
+            f"the package's folder: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
         )
 
 
