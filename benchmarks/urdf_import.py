@@ -165,8 +165,8 @@ def outcome(urdf: Path, found: Urdf | None, samples: int, problems: int) -> Outc
             return Outcome(seconds, mebibytes, str(error).replace(f"{urdf.parent}/", ""))
         of = Outcome(time.process_time(), _peak_mebibytes(), "", tuple(report.warnings), report.robot.dof)
         of.parts, of.spheres = sum(link.parts for link in report.links), report.sphere_count
-        of.free, of.refused_by_parts = report.refusals.free, report.refusals.by_parts
-        of.refused_by_spheres = report.refusals.by_spheres
+        of.free, of.refused_by_parts = report.false_collisions.free, report.false_collisions.by_parts
+        of.refused_by_spheres = report.false_collisions.by_spheres
         of.points_outside = points_outside(urdf, report)
         of.free_on_table, of.refused_on_table = on_table(report.robot, samples)
         of.empty, of.past_box = planned(report.robot)

@@ -141,7 +141,7 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
     )
     posture = convex_bounds.make_posture(arm, arrays, robot.dof)
     slides = np.array(robot.prismatic, np.bool_)
-    offsets, parents = robot.frame_offsets.copy(), robot.branching
+    offsets, parents = robot.frame_offsets.copy(), robot.kernel_parents
     convex_bounds.pose(offsets, parents, slides, q, np.zeros(robot.dof), posture)
     for found in exact.link_distances(q):
         guess = rng.normal(size=3)

@@ -16,8 +16,8 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.core.bounds import Value, for_kernels, read_only
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
-from robotdiffuse.robots.bodies import Attached, ConvexMesh
-from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh
+from robotdiffuse.robots.link_pair_tables import LinkPairTable
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.robots.visual_meshes import VisualMesh
 from robotdiffuse.validation.validator import verify, verify_trajectory
@@ -65,8 +65,8 @@ VALUES: dict[type[Value], Callable[[], Value]] = {
     Robot: robot,
     ConvexMesh: lambda: ConvexMesh(CORNERS, FACES),
     VisualMesh: lambda: VisualMesh(CORNERS, FACES, np.zeros((4, 3), np.uint8)),
-    Attached: lambda: Attached("tool", "l3", POSE, (sphere(),)),
-    JointTable: lambda: JointTable(("a", "b"), ("j",), (0.0,), (1.0,), np.ones(4, bool)),
+    AttachedBody: lambda: AttachedBody("tool", "l3", POSE, (sphere(),)),
+    LinkPairTable: lambda: LinkPairTable(("a", "b"), ("j",), (0.0,), (1.0,), np.ones(4, bool)),
     rd.Payload: lambda: rd.Payload(1.0, HALF, None, HALF),
     rd.JointGoal: lambda: rd.JointGoal(ROWS),
     rd.PoseGoal: pose_goal,

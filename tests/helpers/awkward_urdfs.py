@@ -128,7 +128,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
             link("end", '<collision><geometry><mesh filename="a.stl"/></geometry></collision>')
             + joint("last", "j6_link", "end"),
         ),
-        "mesh file 'a.stl' is not there; put it there",
+        "mesh file 'a.stl' does not exist; add it",
     ),
     "a mesh in a package that is not there": (
         arm(
@@ -138,16 +138,16 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         ),
         "--package p=FOLDER",
     ),
-    "no geometry": (text(robot(ARM).replace(BALL, "")), "give its links <collision> elements"),
+    "no geometry": (text(robot(ARM).replace(BALL, "")), "add <collision> elements"),
     "a floating base": (
         arm(link("body"), joint("free", "base", "body", "floating"), chain("body", row("j", 6))),
-        "has type 'floating'; .*--base body plans",
+        "has type 'floating'; .*--base body to plan",
     ),
     "a planar base": (
         arm(link("body"), joint("drive", "base", "body", "planar"), chain("body", row("j", 6))),
-        "--base body plans",
+        "--base body to plan",
     ),
-    "a closed chain": (arm(ARM, joint("close", "base", "j6_link")), "two parent joints .*leave one out"),
+    "a closed chain": (arm(ARM, joint("close", "base", "j6_link")), "two parent joints .*remove one"),
     "a linkage of planned joints": (
         arm(ARM, link("bar"), joint("rod", "j1_link", "bar", more='<mimic joint="j2"/>')),
         "hold it with --lock j2=VALUE",
@@ -163,12 +163,12 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "limits that are no numbers": (arm(chain("base", ["j"], limits='lower="nan" upper="1"')), "is 'nan'"),
     "a triangle": (
         solid(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])),
-        "holds no triangle mesh",
+        "has no triangle mesh",
     ),
     "a point": (solid(b"v 0 0 0\nv 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\nf 2 3 4\n", "part.obj"), "holds no"),
     "a mesh with corners that are no numbers": (
         solid(b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n", "part.obj"),
-        "holds no triangle mesh",
+        "has no triangle mesh",
     ),
     "a damaged mesh": (solid(b"this is no mesh", "part.dae"), "cannot be read"),
     "a name that is a path": (arm(ARM, name="../made"), "give --name NAME"),

@@ -13,10 +13,10 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.start_goal import images
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import Robot
+from robotdiffuse.robots.joints import CONTINUOUS_LIMIT
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.joint_limits import with_limits
-from robotdiffuse.robots.robot import TURNS
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.validation.validator import verify, verify_trajectory
@@ -26,7 +26,7 @@ def turning_arm() -> Robot:
     """The arm of boxes, whose first and last joints turn without end."""
     arm = box_arm()
     joints = tuple(
-        replace(joint, kind="continuous", lower=-TURNS, upper=TURNS) if joint.name in ("j0", "j2") else joint
+        replace(joint, kind="continuous", lower=-CONTINUOUS_LIMIT, upper=CONTINUOUS_LIMIT) if joint.name in ("j0", "j2") else joint
         for joint in arm.joints
     )
     return replace(arm, joints=joints)
@@ -79,7 +79,7 @@ def test_images_of_a_goal() -> None:
     np.testing.assert_allclose(first, [-3.0, -1.0, 0.2])
     np.testing.assert_allclose(last, [2 * np.pi - 3, -1.0, 0.2 - 2 * np.pi])
     assert len(images(box_arm(), start, start)) == 1
-    assert (np.abs([nearest, first, last]) <= TURNS).all()
+    assert (np.abs([nearest, first, last]) <= CONTINUOUS_LIMIT).all()
 
 
 def test_limits_of_a_continuous_joint() -> None:
@@ -91,11 +91,11 @@ def test_limits_of_a_continuous_joint() -> None:
         Problem(narrow, Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize("half, kind", [(np.pi, "continuous"), (1.0, "revolute"), (TURNS, "continuous")])
+@pytest.mark.parametrize("half, kind", [(np.pi, "continuous"), (1.0, "revolute"), (CONTINUOUS_LIMIT, "continuous")])
 def test_continuous_joints_of_robot_folders(half: float, kind: str, tmp_path: FilePath) -> None:
     """Older ones hold half a turn either way, or what a limits file said."""
     joints = tuple(replace(j, lower=-half, upper=half) if j.name == "j0" else j for j in ARM.joints)
-    write_bundle(replace(ARM, joints=joints), tmp_path, {})
-    robot = read_bundle(tmp_path)
+    write_robot_folder(replace(ARM, joints=joints), tmp_path, {})
+    robot = read_robot_folder(tmp_path)
     assert robot.planned_joints[0].kind == kind
-    assert robot.upper[0] == (TURNS if kind == "continuous" else half)
+    assert robot.upper[0] == (CONTINUOUS_LIMIT if kind == "continuous" else half)

@@ -15,7 +15,7 @@ from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.fitting.convex_parts import convex_hull, planes_of
-from robotdiffuse.robots.fitting.covering_spheres import MOST, cover
+from robotdiffuse.robots.fitting.covering_spheres import MAX_SPHERES, cover
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
@@ -56,7 +56,7 @@ def test_spheres_cover_surface_and_inside(mesh: ConvexMesh) -> None:
     for x, y, z, r in spheres:
         held |= np.linalg.norm(points - [x, y, z], axis=1) <= r
     assert held.all()
-    assert len(spheres) <= MOST
+    assert len(spheres) <= MAX_SPHERES
 
 
 def surface_points(shape: Shape) -> ndarray:

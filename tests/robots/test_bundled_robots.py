@@ -54,7 +54,7 @@ def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
     blocks."""
     robot = load_robot("ur5e")
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, 6))
-    least = robot.least_turns(q)
+    least = robot.unwound(q)
     assert (np.abs(least) <= np.pi + 1e-9).all() and (least != q).any()
     for one, other in zip(q[:5], least[:5], strict=True):
         np.testing.assert_allclose(
@@ -62,7 +62,7 @@ def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
         )
     panda = load_robot("panda")
     middle = 0.5 * (panda.lower + panda.upper)
-    assert np.array_equal(panda.least_turns(middle), middle)
+    assert np.array_equal(panda.unwound(middle), middle)
 
 
 def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
@@ -70,7 +70,7 @@ def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
     the base, from where the goal can be reached over the top, a turn further."""
     robot, home = load_robot("ur5e"), np.array([0, -1.57, 1.57, -1.57, -1.57, 0])
     start = np.array([0.5, 2.9, 0.7, 0.4, 2.7, 0.2])
-    goals = robot.same_stance(home, start)
+    goals = robot.equivalent_configurations(home, start)
     assert np.allclose(goals[0], home + 2 * np.pi * np.array([0, 1, 0, 0, 1, 0])) and len(goals) == 6
     assert ((goals >= robot.lower) & (goals <= robot.upper)).all()
     T = link_pose(robot, home, "tool0")
@@ -80,4 +80,4 @@ def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
     result = load_planner("aorrtc").plan(pose, time_limit=10.0, until="first")
     assert result.solved, result.reason
     panda = load_robot("panda")
-    assert np.array_equal(panda.same_stance(panda.upper, panda.lower), panda.upper[None])
+    assert np.array_equal(panda.equivalent_configurations(panda.upper, panda.lower), panda.upper[None])

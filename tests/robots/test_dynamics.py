@@ -17,7 +17,7 @@ from robotdiffuse.problems.files import load_problem, problem_from_record, probl
 from robotdiffuse.robots.dynamics import GRAVITY, Dynamics
 from robotdiffuse.robots.inertias import Payload, inertia_of
 from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 pinocchio: Any = pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
@@ -62,8 +62,8 @@ def test_torques_are_those_of_the_urdf(name: str, tmp_path: Path) -> None:
 
 def test_bundles_keep_inertias_and_effort_limits(tmp_path: Path) -> None:
     robot = pendulum()
-    write_bundle(robot, tmp_path, {})
-    again = read_bundle(tmp_path)
+    write_robot_folder(robot, tmp_path, {})
+    again = read_robot_folder(tmp_path)
     assert again.inertias["rod"].values == robot.inertias["rod"].values and again.effort == robot.effort
 
 

@@ -13,8 +13,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import VARIANTS, once_per_robot
-from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, write_bundle
+from robotdiffuse.robots.robot import LOCKED_CACHE, once_per_robot
+from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, write_robot_folder
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
 
@@ -49,7 +49,7 @@ def test_equal_locked_values_are_one_robot() -> None:
 def test_more_robots_than_a_cache_of_sixteen() -> None:
     panda = load_robot("panda")
     robots = [panda.with_locked({LEFT: 0.001 * i}) for i in range(20)]
-    assert len(set(robots)) == 20 < VARIANTS
+    assert len(set(robots)) == 20 < LOCKED_CACHE
     compiled = [compile_robot(robot) for robot in robots]
     assert all(compile_robot(robot) is arrays for robot, arrays in zip(robots, compiled, strict=True))
     assert [panda.with_locked({LEFT: 0.001 * i}) for i in range(20)] == robots
@@ -65,11 +65,11 @@ def test_a_function_of_a_robot_works_once() -> None:
 
 def test_a_folder_that_changes_is_read_again(tmp_path: Path) -> None:
     arm = box_arm()
-    write_bundle(arm, tmp_path / "arm", {"urdf": "arm.urdf"})
+    write_robot_folder(arm, tmp_path / "arm", {"urdf": "arm.urdf"})
     first = load_robot(tmp_path / "arm")
     assert load_robot(str(tmp_path / "arm")) is first and first.name == arm.name
     longer = replace(arm, spheres={link: rows * 1.5 for link, rows in arm.spheres.items()})
-    write_bundle(longer, tmp_path / "arm", {"urdf": "arm.urdf"})
+    write_robot_folder(longer, tmp_path / "arm", {"urdf": "arm.urdf"})
     second = load_robot(tmp_path / "arm")
     assert second is not first and load_robot(tmp_path / "arm") is second
     link = next(iter(arm.spheres))

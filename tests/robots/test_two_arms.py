@@ -32,7 +32,7 @@ from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.robots.parsing.srdf import read_srdf
 from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.robots.scaling import reach
 
 PARTS = chain("base", ["waist"]), chain("waist_link", row("left_", 4)), chain("waist_link", row("right_", 4))
@@ -55,14 +55,14 @@ def test_both_arms_and_the_joint_that_they_share_are_planned(tmp_path: Path) -> 
         robot = read_urdf(written(tmp_path, *PARTS), group=group)
         assert robot.joint_names == ("waist", *row("left_", 4), *row("right_", 4))
         assert robot.tips == ("left_4_link", "right_4_link") and not robot.locked
-        assert robot.parents.tolist() == [0, 1, 2, 3, 4, 1, 6, 7, 8] and robot.branching is not None
+        assert robot.parents.tolist() == [0, 1, 2, 3, 4, 1, 6, 7, 8] and robot.kernel_parents is not None
         assert robot.chain("right_2_link") == (0, 5, 6) and robot.at_end("left_4_link")
     with pytest.raises(InputError, match="choose one, or both as one robot"):
         read_urdf(written(tmp_path, *PARTS))
     left = read_urdf(written(tmp_path, *PARTS), group="left")
-    assert left.branching is None and left.tips == ("left_4_link",)
+    assert left.kernel_parents is None and left.tips == ("left_4_link",)
     held = robot.with_locked({name: 0.1 for name in row("right_", 4)})
-    assert held.joint_names == left.joint_names and held.branching is None
+    assert held.joint_names == left.joint_names and held.kernel_parents is None
 
 
 def test_groups_of_an_srdf_may_have_several_chains(tmp_path: Path) -> None:
@@ -88,8 +88,8 @@ def test_groups_of_an_srdf_may_have_several_chains(tmp_path: Path) -> None:
 
 def test_files_keep_all_tips(tmp_path: Path) -> None:
     robot = two_arms()
-    write_bundle(robot, tmp_path / "kept", {})
-    again = read_bundle(tmp_path / "kept")
+    write_robot_folder(robot, tmp_path / "kept", {})
+    again = read_robot_folder(tmp_path / "kept")
     assert again.tips == robot.tips and again.joint_names == robot.joint_names
     assert robot_fingerprint(robot) != robot_fingerprint(replace(robot, other_tips=()))
 
@@ -244,7 +244,7 @@ def test_the_first_robot_of_several_arms_compiles_which_is_said_and_takes_no_tim
     assert "the first robot of several arms compiles first" in shown[0]
     began, call = time.perf_counter(), PlanningContext("test", problem, PlanRequest(time_limit=20.0))
     before = call.elapsed
-    njit(lambda parents: parent_of(parents, 3))(robot.branching)
+    njit(lambda parents: parent_of(parents, 3))(robot.kernel_parents)
     waited = time.perf_counter() - began
     assert call.elapsed - before < 0.5 * waited
     assert any("compiled for" in note for note in call.unsolved().notes)

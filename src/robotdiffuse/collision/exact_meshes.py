@@ -80,7 +80,7 @@ class _Obstacle(NamedTuple):
 def forward_frames(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n frames 4 4"]:
     """T_base_frame of frames 0 to dof, in float64 and independent of the PyTorch kinematics."""
     slides = np.array(robot.prismatic, np.bool_)
-    return kernel.forward(for_kernels(robot.frame_offsets), robot.branching, slides, for_kernels(q))
+    return kernel.forward(for_kernels(robot.frame_offsets), robot.kernel_parents, slides, for_kernels(q))
 
 
 def _piece(part: Part) -> _Piece:

@@ -21,7 +21,7 @@ from robotdiffuse.collision.point_cloud_grid import (
 )
 from robotdiffuse.collision.sphere_pair_tables import build_pair_tables, no_tables
 from robotdiffuse.core.deadline import check_time
-from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.link_pair_tables import LinkPairTable
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
@@ -134,7 +134,7 @@ def compile_robot(robot: Robot) -> RobotArrays:
         bounds=np.array([group.bounds for group in placed], np.float32).reshape(-1, 4),
         pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
         pair_tables=no_tables(),
-        parents=robot.branching,
+        parents=robot.kernel_parents,
     )
     if not pairs:
         return arrays
@@ -148,7 +148,7 @@ def compile_robot(robot: Robot) -> RobotArrays:
 
 def _known_tables(
     robot: Robot, pairs: list[tuple[int, int]], groups: tuple[str, ...]
-) -> dict[int, JointTable]:
+) -> dict[int, LinkPairTable]:
     """The robot's tables by index of the pair, for pairs that still have exactly the table's joints between
     them."""
     number = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}

@@ -223,7 +223,7 @@ def _groups(robot: Robot) -> tuple[dict[str, int], dict[frozenset[str | None], i
 def _arm(robot: Robot) -> Arm:
     slides = np.array(robot.prismatic, np.bool_)
     offsets = for_kernels(robot.frame_offsets)
-    return Arm(compile_robot(robot), hulls_of(robot)[0], offsets, robot.branching, slides)
+    return Arm(compile_robot(robot), hulls_of(robot)[0], offsets, robot.kernel_parents, slides)
 
 
 @once_per_robot

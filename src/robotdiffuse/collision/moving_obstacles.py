@@ -199,7 +199,7 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
         bounds[i, 3] = far.max()
     links = Links(
         for_kernels(robot.frame_offsets),
-        robot.branching,
+        robot.kernel_parents,
         np.array(robot.prismatic, np.bool_),
         np.array([whole.link_frame(link) for link in names], np.int64),
         bounds,

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.lane_clearance import pair_clearances
 from robotdiffuse.collision.kernels.lane_collision import TABLE_HEADER, TABLE_SIDE
-from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.link_pair_tables import LinkPairTable
 
 CELLS_PER_JOINT = TABLE_SIDE - 2
 """Cells along each joint's range; a ring of cells around them stands for values beyond the range."""
@@ -35,7 +35,7 @@ def build_pair_tables(
     lower: Float[ndarray, "dof"],
     upper: Float[ndarray, "dof"],
     radii: Float[ndarray, "groups dof"],
-    known: Mapping[int, JointTable],
+    known: Mapping[int, LinkPairTable],
 ) -> tuple[Int32[ndarray, "pairs 4"], Float32[ndarray, "tables width"]]:
     """The rows of `RobotArrays.pairs`, with table and bit of pairs that depend on one or two joints, and the
     tables.

@@ -157,7 +157,7 @@ def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[
 def compiles_first(robot: Robot) -> str:
     """A message for people who wait for a first call. Kernels for robots with several arms are compiled
     separately."""
-    who = "a new machine" if robot.branching is None else "the first robot of several arms"
+    who = "a new machine" if robot.kernel_parents is None else "the first robot of several arms"
     return f"{who} compiles first, for about a minute"
 
 

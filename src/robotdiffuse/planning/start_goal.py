@@ -50,7 +50,7 @@ class StartGoal:
     ) -> None:
         robot = self._robot = checker.robot
         self.checker = checker
-        self._turns = robot.turns(start)
+        self._turns = robot.whole_turns(start)
         self.start = start - self._turns
         ways = [image for goal in goals for image in images(robot, self.start, goal)]
         every = [self.start, *ways]
@@ -119,7 +119,7 @@ def images(
     First the image nearest to the start, then those with one continuous joint turned the other way: an
     obstacle may block the short way.
     """
-    nearest = goal - robot.turns(goal - start)
+    nearest = goal - robot.whole_turns(goal - start)
     found = [nearest]
     for j in np.flatnonzero(robot.continuous):
         other = nearest.copy()
@@ -307,7 +307,7 @@ def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Float[nda
     """The goals and their copies with whole turns: a pose does not say how often a continuous joint has
     turned."""
     robot, start = context.problem.robot, context.problem.start
-    return np.concatenate([robot.same_stance(q, start) for q in goals])
+    return np.concatenate([robot.equivalent_configurations(q, start) for q in goals])
 
 
 def _explained(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:

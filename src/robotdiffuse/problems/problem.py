@@ -186,7 +186,7 @@ class Problem(Value):
     def standing(self) -> tuple[Robot, Scene]:
         """The robot and the scene in the world's frame, for pictures and simulators."""
         T = self.T_world_base
-        return (self.robot, self.scene) if T is None else (self.robot.standing(T), self.scene.moved(T))
+        return (self.robot, self.scene) if T is None else (self.robot.placed_in_world(T), self.scene.moved(T))
 
     @property
     def known_scene(self) -> Scene:

@@ -1,4 +1,4 @@
-"""Robots: joints, limits, kinematics, collision spheres; bundled ones by name, any serial arm by its URDF."""
+"""Robots: joints, limits, kinematics and collision models, loaded by bundled name or from a URDF."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -7,8 +7,10 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, check_type, unknown_name
 from robotdiffuse.core.input_files import is_file
-from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
-from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, read_bundle, read_source
+from robotdiffuse.robots.bodies import ConvexMesh
+from robotdiffuse.robots.joints import Joint
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, read_robot_folder, read_source
 from robotdiffuse.robots.user_data_dir import user_robots
 
 __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
@@ -19,12 +21,18 @@ ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}"))
 
 
 def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robot:
-    """A robot by its bundled name, the name that `robotdiffuse robot add` gave it, its folder, or its URDF.
+    """Load a robot by its bundled name, a name given to `robotdiffuse robot add`, its folder, or its URDF.
 
-    A URDF is looked up by its content among the robots that were added; a new or changed one is fitted with
-    spheres first, which takes about a minute, and kept. `locked` holds joints at values (see
-    Robot.with_locked). The same robot is the same object, as long as its files stay as they are. Raises
-    InputError for an unknown name or bad input.
+    A URDF is looked up by content among the added robots. A new or changed one is prepared first, which takes
+    about a minute, and stored. As long as its files are unchanged, the same robot is returned as the same
+    object.
+
+    Args:
+        name: Name, robot folder, or URDF or xacro file.
+        locked: Values at which joints are locked [rad] or [m] (see `Robot.with_locked`).
+
+    Raises:
+        InputError: For an unknown name or bad input.
     """
     check_type("robot", name, (str, PathLike), "its name, or the path of its folder or URDF")
     text = str(name)
@@ -49,12 +57,12 @@ def _by_name(name: str) -> Robot:
 
 
 def _read(folder: Path, source: str | None) -> Robot:
-    """The robot in a folder; the one of the last time if its files are the same."""
+    """The robot in a folder; a cached one if its files are unchanged."""
     return _read_state(folder.resolve(), source, _state(folder / ROBOT_FILE), _state(folder / MESH_FILE))
 
 
 def _state(file: Path) -> tuple[int, int, int] | None:
-    """What changes when a file is written; None if there is none."""
+    """Modification time, size and inode of a file, to detect changes; None if it does not exist."""
     try:
         found = file.stat()
     except (OSError, ValueError):
@@ -64,25 +72,27 @@ def _state(file: Path) -> tuple[int, int, int] | None:
 
 @lru_cache
 def _read_state(folder: Path, source: str | None, *_states: tuple[int, int, int] | None) -> Robot:
-    return replace(read_bundle(folder), source=source)
+    return replace(read_robot_folder(folder), source=source)
 
 
 @lru_cache
 def _digest(folder: Path, _state: tuple[int, int, int] | None) -> str | None:
-    """Of the URDF that the robot in a folder was made from."""
+    """SHA-256 of the URDF from which the robot in a folder was made; None if unknown."""
     return read_source(folder).get("sha256")
 
 
 def known_robots() -> dict[str, Path]:
-    """Folders of the bundled robots and of those that were added, by the names that problems use."""
+    """Folders of bundled and added robots, by the names that problems use."""
     return _added() | {name: DATA / name for name in ROBOTS}
 
 
 def _added() -> dict[str, Path]:
+    """Folders of added robots by name."""
     return {file.parent.name: file.parent for file in sorted(user_robots().glob(f"*/{ROBOT_FILE}"))}
 
 
 def _from_urdf(urdf: Path) -> Robot:
+    """The added robot with the content of a URDF; prepared and added if there is none."""
     from robotdiffuse.robots.fitting.add import add_robot
     from robotdiffuse.robots.parsing.urdf import UrdfTree
 
@@ -94,13 +104,13 @@ def _from_urdf(urdf: Path) -> Robot:
             if _digest(folder, _state(folder / ROBOT_FILE)) == digest:
                 made[name] = _read(folder, source)
         except InputError:
-            continue  # a damaged folder of another robot is no reason to fail
+            continue  # the damaged folder of another robot must not matter here
     if len({(robot.base, robot.joint_names) for robot in made.values()}) > 1:
         raise InputError(
-            f"{urdf} is the robots {', '.join(made)}, which plan different joints; name one of them instead"
+            f"{urdf} was added as {', '.join(made)}, which plan different joints; use one of these names instead"
         )
     if made:
         return next(iter(made.values()))
     report = add_robot(urdf, out=user_robots() / f"{tree.name}-{digest[:8]}")
-    note = f"spheres were fitted to {urdf.name} ({report.sphere_count}) and kept in {report.folder}"
+    note = f"spheres were fitted to {urdf.name} ({report.sphere_count}) and stored in {report.folder}"
     return replace(report.robot, notes=(*report.robot.notes, note), source=source)

@@ -1,4 +1,4 @@
-"""Poses and meshes as Coal has them."""
+"""Converts poses and meshes to Coal's types."""
 
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
@@ -10,11 +10,12 @@ from numpy import ndarray
 
 
 def coal_pose(T: Float[ndarray, "4 4"]) -> coal.Transform3s:
+    """A pose as a Coal transform."""
     return coal.Transform3s(T[:3, :3], T[:3, 3])
 
 
 def coal_convex(vertices: Float[ndarray, "v 3"], faces: Integer[ndarray, "f 3"]) -> coal.Convex:
-    """A solid, whose vertices and triangles are those of its hull."""
+    """A convex solid from the vertices and triangles of its hull."""
     points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     for vertex in vertices:
         points.append(vertex)
@@ -24,7 +25,7 @@ def coal_convex(vertices: Float[ndarray, "v 3"], faces: Integer[ndarray, "f 3"])
 
 
 def coal_surface(vertices: Float[ndarray, "v 3"], faces: Integer[ndarray, "f 3"]) -> coal.BVHModelOBBRSS:
-    """Triangles that need enclose nothing, in a tree."""
+    """A triangle mesh, possibly open, in a bounding volume hierarchy."""
     model = coal.BVHModelOBBRSS()
     model.beginModel(len(faces), len(vertices))
     model.addVertices(np.ascontiguousarray(vertices))

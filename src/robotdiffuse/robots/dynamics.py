@@ -1,4 +1,4 @@
-"""Torques of a robot's joints, by Pinocchio; see `inertias.py` for what they come from."""
+"""Joint torques by Pinocchio's inverse dynamics, from the inertias in `inertias.py`."""
 
 from typing import Any
 
@@ -12,17 +12,20 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.torque_bounds import Body, Stretches, bend
 
 GRAVITY = 9.81
-"""Along -z of the world [m/s²]."""
-MASSLESS = 1e-9
-"""Links of less hang in the air [kg]."""
+"""Gravitational acceleration along -z of the world [m/s²]."""
+MIN_MASS = 1e-9
+"""Payloads up to this mass are ignored [kg]."""
 
 
 class Dynamics:
-    """Inverse dynamics of a robot with a payload; joints' friction and motors' inertia are not known."""
+    """Inverse dynamics of a robot with a payload, without joint friction and motor inertia."""
 
     def __init__(self, robot: Robot, payload: Payload, T_world_base: ndarray | None = None) -> None:
-        """Raises InputError for a robot without inertias or effort limits, an unknown link, and where
-        Pinocchio is not installed."""
+        """Build the model; the base is upright unless T_world_base is given.
+
+        Raises InputError for a robot without inertias or effort limits, for an unknown link, and if Pinocchio
+        is not installed.
+        """
         try:
             import pinocchio as installed
         except ImportError:
@@ -39,7 +42,7 @@ class Dynamics:
             parent = int(robot.parents[j])
             model.addJoint(parent, kind, pinocchio.SE3(T[:3, :3], T[:3, 3]), robot.joint_names[j])
         moments = np.diag(payload.moments)
-        carried = [(link, Inertia(payload.mass, payload.com, moments))] if payload.mass > MASSLESS else []
+        carried = [(link, Inertia(payload.mass, payload.com, moments))] if payload.mass > MIN_MASS else []
         for name, inertia in (*robot.inertias.items(), *carried):
             T, frame = robot.T_frame_link(name), robot.link_frame(name)
             body = pinocchio.Inertia(inertia.mass, inertia.com, inertia.moments)
@@ -63,41 +66,41 @@ class Dynamics:
     def torques(
         self, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
     ) -> Float[ndarray, "n dof"]:
-        """Of motions through configurations at velocities and accelerations [N m] or [N]."""
+        """Joint torques at configurations with velocities and accelerations, row by row [N m] or [N]."""
         out = np.empty(q.shape)
         for i in range(len(q)):
             out[i] = self._rnea(self._model, self._data, q[i], v[i], a[i])
         return out
 
     def bends(self, along: Stretches) -> Float[ndarray, "n dof"]:
-        """Second derivatives of torques along stretches at most, by what theirs are by."""
+        """Bounds on the second derivatives of torques along stretches, by the parameter of the stretches."""
         return bend(self._bodies, GRAVITY, along)
 
     def holding(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
-        """Torques of standing still."""
+        """Torques at rest [N m] or [N]."""
         still = np.zeros_like(q)
         return self.torques(q, still, still)
 
     def too_much(self, q: Float[ndarray, "dof"]) -> str | None:
-        """In words, which joint's torque is beyond its limit at rest, the worst; None if none is."""
+        """A message about the joint whose torque at rest exceeds its limit most; None if none does."""
         torques = np.abs(self.holding(q[None])[0])
         j = int((torques / self.limits).argmax())
         return None if torques[j] <= self.limits[j] else self.words(j, torques[j])
 
     def words(self, j: int, torque: float) -> str:
-        """A torque beyond its limit."""
+        """A message about a torque above its limit."""
         unit = "N" if self.robot.prismatic[j] else "N m"
         name, limit = self.robot.joint_names[j], self.limits[j]
         return f"{name} needs {torque:.3g} {unit}, its effort limit is {limit:.3g} {unit}"
 
 
 def check_dynamics(robot: Robot) -> None:
-    """InputError for a robot whose URDF gave no inertias or effort limits."""
+    """Raise InputError for a robot whose URDF gives no inertias or effort limits."""
     heavy = {robot.link_frame(link) for link in robot.inertias}
     for j, name in enumerate(robot.joint_names):
         lacks = "inertia of what moves with" if j + 1 not in heavy else "effort limit of"
         if not robot.effort[j] > 0 or j + 1 not in heavy:
             raise InputError(
                 f"payload: {robot.name} has no {lacks} joint {name}; its URDF must give inertias and "
-                f"effort limits, and the robot be made from it by: robotdiffuse robot add"
+                f"effort limits; then create the robot again with: robotdiffuse robot add"
             )

@@ -1,4 +1,4 @@
-"""A short name for what a robot is: data made with one robot must not be used with another."""
+"""Fingerprints of robots, so that data made with one robot is not used with another."""
 
 import hashlib
 import json
@@ -9,12 +9,15 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import LIMITS
 
 DIGITS = 9
-"""Numbers count up to this decimal: rotations from quaternions differ in the last bits by machine."""
+"""Numbers are rounded to this many decimals, since rotations from quaternions differ by machine in the last
+bits."""
 
 
 def robot_fingerprint(robot: Robot) -> str:
-    """SHA-256, the first 16 hex digits, of joints, limits, spheres, meshes, locked joints and allowed
-    collisions; not of the robot's name. The same in every process."""
+    """The first 16 hexadecimal digits of a SHA-256, the same in every process.
+
+    It covers joints, limits, spheres, meshes, locked joints and allowed collisions, but not the robot's name.
+    """
     digest = hashlib.sha256()
 
     def add(names: object, *numbers: object) -> None:

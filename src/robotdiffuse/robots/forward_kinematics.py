@@ -11,11 +11,11 @@ from robotdiffuse.robots.robot import Robot
 
 
 class ForwardKinematics:
-    """Poses of a robot's frames and links at batches of configurations, differentiable twice and more.
+    """Poses of a robot's frames and links at batches of configurations; differentiable any number of times.
 
-    Configurations `q` are in [rad], [m] for prismatic joints, of any batch shape; they are converted to the
-    dtype and device given here, and so are the results. Every call raises InputError if the last axis of q
-    is not as long as the robot has planned joints, or if the robot does not have the link.
+    Configurations `q` [rad], or [m] for prismatic joints, have any batch shape. They are converted to the
+    dtype and device given here, which the results have too. Calls raise InputError if the last axis of q does
+    not have the number of planned joints, or if the link is unknown.
 
     Each step is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C, so it takes
     one small matrix product and two multiply-adds over the batch.
@@ -84,7 +84,7 @@ class ForwardKinematics:
         batch = q.shape[:-1]
         q = q.to(self.device, self.dtype).reshape(-1, self.robot.dof).t()
         cosines, sines = q.cos(), q.sin()
-        # The batch is the last axis in here, so that every operation runs along contiguous numbers.
+        # the batch is the last axis here, so that every operation runs along contiguous numbers
         T = torch.eye(4, dtype=self.dtype, device=self.device)[:3, :, None].expand(3, 4, q.shape[1])
         frames = [T]
         for j in range(last):

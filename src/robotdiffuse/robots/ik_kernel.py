@@ -1,25 +1,35 @@
 """Compiled part of inverse kinematics: damped Newton iterations from many seeds.
 
-Kept free of jaxtyping: numba compiles these functions. Arrays are float64, C-contiguous.
-A continuous joint turns without end while solving and is wrapped to [-pi, pi] when solved.
+Without jaxtyping annotations, since Numba compiles these functions. Arrays are float64 and C-contiguous.
+Continuous joints are unbounded while solving, and wrapped to [-pi, pi] in solutions.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy import ndarray
 
 REVOLUTE, PRISMATIC, CONTINUOUS = 0, 1, 2
 TURN = 2 * np.pi
 
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1.0, 1e-9, 1e3
-RELAX, TIGHTEN = 0.3, 4.0
+INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1.0, 1e-9, 1e3
+"""Levenberg-Marquardt damping, relative to the squared error; a seed is given up above the maximum."""
+DAMPING_DECREASE, DAMPING_INCREASE = 0.3, 4.0
+"""Factors on the damping after a step that reduced the error, and after one that did not."""
 CHECK_EVERY = 8
-"""Iterations between two looks at the progress; a seed that has not halved its error by then is given up."""
-PROGRESS = 0.5
+"""Iterations between checks of the progress."""
+REQUIRED_PROGRESS = 0.5
+"""A seed whose error has not dropped to this fraction since the last check is given up."""
 
 
 @njit(cache=True)
 def forward(q, offsets, tool, kinds, frame, T, axes, origins):
-    """Axes and origins of the joints before `frame`, and into T the pose of the tool."""
+    """Write the axes and origins of the first `frame` joints, and the pose of the tool into T [3, 4].
+
+    q [dof] is the configuration, offsets [dof, 4, 4], tool [4, 4] and kinds [dof] are as in `IKChain`; axes
+    and origins are [dof, 3], in the base frame.
+    """
     for i in range(3):
         for k in range(4):
             T[i, k] = 1.0 if i == k else 0.0
@@ -48,11 +58,15 @@ def forward(q, offsets, tool, kinds, frame, T, axes, origins):
 
 @njit(cache=True)
 def pose_error(T, target, rows, rotation_weight, error):
-    """Into `error`: position, then weighted rotation vector from T to the target. Its squared norm."""
+    """Write the error of pose T into `error` [6] and return its squared norm.
+
+    Entries 0 to 2 are the position difference to the target [m]; 3 to 5, if `rows` is 6, the rotation vector
+    from T to the target [rad] times `rotation_weight` [m/rad].
+    """
     for i in range(3):
         error[i] = target[i, 3] - T[i, 3]
     if rows == 6:
-        # R = target @ T.T; its rotation vector by the sine and cosine of its angle.
+        # R = target @ T.T; the rotation vector from the sine and cosine of its angle
         r01 = r02 = r10 = r12 = r20 = r21 = r00 = r11 = r22 = 0.0
         for k in range(3):
             r00 += target[0, k] * T[0, k]
@@ -70,7 +84,7 @@ def pose_error(T, target, rows, rotation_weight, error):
         scale = 1.0
         if sine > 1e-12:
             scale = np.arctan2(sine, cosine) / sine
-        elif cosine < 0.0:  # half a turn: any axis near the right one serves as a direction of descent
+        elif cosine < 0.0:  # half a turn: an axis close to the right one suffices as a descent direction
             x, y, z = np.sqrt(max(r00 + 1, 0.0)), np.sqrt(max(r11 + 1, 0.0)), np.sqrt(max(r22 + 1, 0.0))
             scale = np.pi / np.sqrt(x * x + y * y + z * z)
         scale *= rotation_weight
@@ -83,6 +97,7 @@ def pose_error(T, target, rows, rotation_weight, error):
 
 @njit(cache=True)
 def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
+    """Write the geometric Jacobian of the tool, rotations weighted, into J [6, dof]."""
     for j in range(frame):
         ax, ay, az = axes[j, 0], axes[j, 1], axes[j, 2]
         if kinds[j] == PRISMATIC:
@@ -98,7 +113,7 @@ def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
 
 @njit(cache=True)
 def damped_step(J, error, damping, rows, frame, held, A, y, step):
-    """step = J^T (J J^T + damping I)^-1 error over the joints that are not held, by Cholesky."""
+    """Write step = J^T (J J^T + damping I)^-1 error for the joints that are not held; solved by Cholesky."""
     for i in range(rows):
         for k in range(i + 1):
             total = damping if i == k else 0.0
@@ -132,7 +147,8 @@ def damped_step(J, error, damping, rows, frame, held, A, y, step):
 
 @njit(cache=True)
 def _is_new(q, others, count, kinds, min_distance):
-    """Whether q is further than min_distance from the others: max norm, across the wrap of endless joints."""
+    """Whether q is further than min_distance from the first `count` others: max norm, continuous joints
+    wrapped."""
     for n in range(count):
         far = False
         for j in range(len(q)):
@@ -147,15 +163,46 @@ def _is_new(q, others, count, kinds, min_distance):
     return True
 
 
+class IKChain(NamedTuple):
+    """A chain of joints with a tool frame at its end. Arrays cover `dof` joints: those of the chain come
+    first, then joints after the tool, which keep their seed's values."""
+
+    offsets: ndarray
+    """[dof, 4, 4] `Robot.frame_offsets` of the joints."""
+    tool: ndarray
+    """[4, 4] pose of the tool in the frame of the chain's last joint."""
+    kinds: ndarray
+    """[dof] REVOLUTE, PRISMATIC or CONTINUOUS."""
+    length: int
+    """Number of joints in the chain."""
+    lower: ndarray
+    """[dof] limits [rad or m]."""
+    upper: ndarray
+
+
+class IKParameters(NamedTuple):
+    """See `InverseKinematicsSettings`."""
+
+    position_only: bool
+    rotation_weight: float
+    position_tolerance: float
+    rotation_tolerance: float
+    max_iterations: int
+    min_distance: float
+
+
 @njit(cache=True)
-def solve_seeds(
-    seeds, known, wanted, offsets, tool, kinds, frame, lower, upper, target,
-    position_only, rotation_weight, position_tolerance, rotation_tolerance, max_iterations, min_distance,
-):  # fmt: skip
+def solve_seeds(seeds, known, wanted, chain, target, parameters):
     """Solve seed after seed until `wanted` configurations are found that differ from `known` and each other.
 
-    Returns the new configurations [k, dof] and the number of seeds used.
+    seeds [n, dof] and known [m, dof] are configurations, chain an `IKChain`, target [4, 4] the pose wanted
+    for the tool, parameters `IKParameters`. Returns the new configurations [k, dof] and the number of seeds
+    used.
     """
+    offsets, tool, kinds, frame, lower, upper = chain
+    position_only, rotation_weight, position_tolerance, rotation_tolerance, max_iterations, min_distance = (
+        parameters
+    )
     dof = seeds.shape[1]
     rows = 3 if position_only else 6
     T, axes, origins = np.empty((3, 4)), np.empty((dof, 3)), np.empty((dof, 3))
@@ -170,21 +217,21 @@ def solve_seeds(
         q = seeds[s].copy()
         forward(q, offsets, tool, kinds, frame, T, axes, origins)
         cost = pose_error(T, target, rows, rotation_weight, error)
-        damping, checked, solved, fresh = FIRST_DAMPING, cost, False, True
+        damping, checked, solved, fresh = INITIAL_DAMPING, cost, False, True
         for iteration in range(max_iterations):
             position = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
             rotation = np.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2) / rotation_weight
             solved = position <= position_tolerance and (position_only or rotation <= rotation_tolerance)
-            if solved or damping > MOST_DAMPING:
+            if solved or damping > MAX_DAMPING:
                 break
             if iteration % CHECK_EVERY == CHECK_EVERY - 1:
-                if cost > PROGRESS * PROGRESS * checked:
+                if cost > REQUIRED_PROGRESS * REQUIRED_PROGRESS * checked:
                     break
                 checked = cost
             if fresh:
                 _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J)
                 fresh = False
-            # Joints that a step would push through their limit are held there, and the rest solved again.
+            # hold joints that the step would push through a limit, and solve for the others again
             held[:] = False
             damped_step(J, error, damping * cost, rows, frame, held, A, y, step)
             again = False
@@ -207,10 +254,10 @@ def solve_seeds(
                 q[:] = trial
                 error[:] = trial_error
                 cost = trial_cost
-                damping = max(damping * RELAX, LEAST_DAMPING)
+                damping = max(damping * DAMPING_DECREASE, MIN_DAMPING)
                 fresh = True
             else:
-                damping *= TIGHTEN
+                damping *= DAMPING_INCREASE
         if not solved:
             continue
         for j in range(dof):

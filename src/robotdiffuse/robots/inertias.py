@@ -1,4 +1,4 @@
-"""Masses and inertias of links, and what is carried besides."""
+"""Masses and inertias of links, and payloads."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, no_type_check
@@ -12,28 +12,30 @@ from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, 
 from robotdiffuse.core.errors import InputError, shown
 
 SLACK = 1e-6
-"""By which share the least moment of a link may be negative, for rounding in files."""
+"""How negative the smallest principal moment of a link may be, relative to the largest entry, for rounding in
+files."""
 
 
 class Inertia(NamedTuple):
-    """Of a link, in its frame."""
+    """Mass and inertia of a link, in its frame."""
 
     mass: float
     """[kg]"""
     com: Float[ndarray, "3"]
     """Centre of mass [m]."""
     moments: Float[ndarray, "3 3"]
-    """About the centre of mass, along the frame's axes [kg m²]."""
+    """Inertia matrix about the centre of mass, along the frame's axes [kg m²]."""
 
     @property
     def values(self) -> list[float]:
-        """As `inertia_of` takes them."""
+        """The ten numbers that `inertia_of` takes."""
         upper = self.moments[np.triu_indices(3)]
         return [self.mass, *self.com.tolist(), *upper.tolist()]
 
 
 def inertia_of(values: ArrayLike) -> Inertia:
-    """From mass, x, y, z, ixx, ixy, ixz, iyy, iyz, izz; ValueError for what no body has."""
+    """An inertia from mass, x, y, z, ixx, ixy, ixz, iyy, iyz, izz; raises ValueError if physically
+    impossible."""
     row = np.array(values, np.float64)
     if row.shape != (10,) or not within(row):
         raise ValueError("ten finite numbers expected")
@@ -48,9 +50,9 @@ def inertia_of(values: ArrayLike) -> Inertia:
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Payload(Value):
-    """A mass that a link carries, whose torques joints must bear beside those of the arm.
+    """A mass that a link carries; joint torques must support it in addition to the arm.
 
-    Raises InputError for numbers that are not finite, a negative mass or negative moments of inertia.
+    Raises InputError for numbers that are not finite, and for negative mass or moments of inertia.
     """
 
     mass: float
@@ -58,9 +60,9 @@ class Payload(Value):
     com: Float[ndarray, "3"] = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
     """Centre of mass, in the frame of the link [m]."""
     link: str | None = None
-    """None: the robot's tip."""
+    """Link that carries the mass; None: the robot's tip."""
     moments: Float[ndarray, "3"] = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
-    """Of inertia about the centre of mass, along the frame's axes [kg m²]; 0: a point."""
+    """Moments of inertia about the centre of mass, along the frame's axes [kg m²]; 0 for a point mass."""
 
     def __post_init__(self) -> None:
         mass = numbers(self.mass)

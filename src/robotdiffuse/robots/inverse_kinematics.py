@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels, rigid_transform
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, solve_seeds
+from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, IKChain, IKParameters, solve_seeds
 from robotdiffuse.robots.robot import Robot
 
 KINDS = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "continuous": CONTINUOUS}
@@ -17,26 +17,28 @@ KINDS = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "continuous": CONTINUOUS}
 
 @dataclass(frozen=True)
 class InverseKinematicsSettings:
+    """Tolerances and effort of `inverse_kinematics`."""
+
     position_only: bool = False
-    """Ignore the orientation of the pose, as the ROP problems of the paper do."""
+    """Ignore the orientation of the pose, as in the paper's ROP problems."""
     position_tolerance: float = 1e-6
-    """Largest distance to the position [m]."""
+    """Largest position error of a solution [m]."""
     rotation_tolerance: float = 1e-6
-    """Largest angle to the orientation [rad]."""
+    """Largest orientation error of a solution [rad]."""
     min_distance: float = 0.1
     """Distinct solutions differ by more than this in at least one joint [rad or m]."""
     limit_margin: float = 1e-6
     """Distance kept from the joint limits [rad or m]."""
     seeds_per_round: int = 64
-    """Random configurations that are drawn at a time."""
+    """Random start configurations drawn per round."""
     max_rounds: int = 64
-    """Rounds of seeds before the search ends with what it has."""
+    """Rounds of seeds after which the search ends in any case."""
     patience: int = 4
-    """Rounds without a new accepted solution after which it ends, once it has one."""
+    """Rounds without a new solution after which the search ends, if it has found one."""
     max_iterations: int = 60
-    """Steps of the damped Newton method per seed."""
+    """Damped Newton steps per seed."""
     rotation_weight: float = 0.3
-    """Metres that one radian of orientation error counts as in the least-squares problem."""
+    """Weight of orientation errors against position errors [m/rad]."""
 
     def __post_init__(self) -> None:
         for name in ("position_tolerance", "rotation_tolerance", "rotation_weight"):
@@ -68,16 +70,26 @@ def inverse_kinematics(
 ) -> Float[ndarray, "k dof"]:
     """Up to `count` distinct configurations that bring link `frame` to the pose, inside the joint limits.
 
-    Damped Newton steps (Levenberg-Marquardt) from uniformly random seeds; steps are clipped to the limits,
-    and joints pushed against a limit are held while the others move. Joints behind the link keep random
-    values. The result is empty if the pose was not reached, and depends on nothing but the arguments and the
-    state of `rng`. `accept` is called with batches of solutions, e.g. to keep those free of collision; what
-    it refuses does not stop a solution nearby from being tried. `near` is the seed that is tried first: for a
-    pose that moves by little, the first solution does too. `rest` says what joints that are neither before
-    nor behind the link keep, those of another arm; without it they have random values as well.
+    Damped Newton steps (Levenberg-Marquardt) start from uniformly random seeds. Steps are clipped to the
+    limits, and joints pushed against a limit are held while the others move. Joints after the link keep
+    random values. The result depends only on the arguments and the state of `rng`.
 
-    Raises InputError for an unknown link, one that no planned joint moves, a count below 1, or a matrix that
-    is no finite rigid transform.
+    Args:
+        robot: The robot. frame: Name of the link. T_base_frame: Wanted pose of the link [m]. count: Largest
+        number of configurations. rng: Source of the seeds. accept: Called with batches of solutions; returns
+        which to keep, e.g. those free of collision. A rejected
+            solution does not block solutions close to it.
+        settings: Tolerances and effort.
+        near: First seed: if the pose moves slightly, so does the first solution.
+        rest: Values for joints that are on another arm, neither before nor after the link; random without it.
+
+    Returns:
+        Configurations, one per row; no rows if the pose was not reached.
+
+    Raises:
+        InputError: For an unknown link, a link that no planned joint moves, a count below 1, or a matrix that
+        is
+            not a finite rigid transform.
     """
     settings = settings or InverseKinematicsSettings()
     last = robot.link_frame(frame)
@@ -96,7 +108,15 @@ def inverse_kinematics(
     target = np.array(T_base_frame, dtype=np.float64)
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
     arm = np.flatnonzero(~beside(robot, frame))
-    chain_offsets = robot.frame_offsets[arm]
+    ik_chain = IKChain(robot.frame_offsets[arm], tool, kinds[arm], len(chain), lower[arm], upper[arm])
+    parameters = IKParameters(
+        settings.position_only,
+        float(settings.rotation_weight),
+        float(settings.position_tolerance),
+        float(settings.rotation_tolerance),
+        settings.max_iterations,
+        float(settings.min_distance),
+    )
     idle = 0
     for i in range(settings.max_rounds):
         seeds = rng.uniform(lower, upper, (settings.seeds_per_round, robot.dof))
@@ -104,24 +124,8 @@ def inverse_kinematics(
             seeds[0] = np.clip(near, lower, upper)
         seeds, before = np.ascontiguousarray(seeds[:, arm]), len(accepted)
         while len(seeds) and len(accepted) < count:
-            new, used = solve_seeds(
-                seeds,
-                np.ascontiguousarray(accepted[:, arm]),
-                count - len(accepted),
-                chain_offsets,
-                tool,
-                kinds[arm],
-                len(chain),
-                lower[arm],
-                upper[arm],
-                target,
-                settings.position_only,
-                settings.rotation_weight,
-                settings.position_tolerance,
-                settings.rotation_tolerance,
-                settings.max_iterations,
-                settings.min_distance,
-            )
+            known = np.ascontiguousarray(accepted[:, arm])
+            new, used = solve_seeds(seeds, known, count - len(accepted), ik_chain, target, parameters)
             seeds = seeds[used:]
             if len(arm) < robot.dof:
                 found, shape = new, (len(new), robot.dof)
@@ -136,7 +140,7 @@ def inverse_kinematics(
 
 
 def beside(robot: Robot, link: str) -> Bool[ndarray, "dof"]:
-    """The planned joints that are neither before nor behind a link: those of another arm."""
+    """Which planned joints are neither before nor after a link: those of another arm."""
     frame = robot.link_frame(link)
     before = robot.moved_by[frame]
     behind = robot.moved_by[1:, frame - 1] if frame else np.ones(robot.dof, bool)
@@ -144,7 +148,7 @@ def beside(robot: Robot, link: str) -> Bool[ndarray, "dof"]:
 
 
 def _longest_reach(robot: Robot, chain: list[int], tool: Float[ndarray, "4 4"]) -> float:
-    """Bound on the tool's distance from the first joint's origin [m], over all configurations."""
+    """Upper bound on the distance of the tool from the first joint's origin over all configurations [m]."""
     lengths = np.linalg.norm(robot.frame_offsets[chain[1:], :3, 3], axis=1).sum()
     lengths += np.linalg.norm(tool[:3, 3])
     slides = np.array(robot.prismatic, float)[chain]

@@ -1,4 +1,4 @@
-"""Poses of links in NumPy: for what needs no gradients, nor the seconds that PyTorch takes to load."""
+"""Link poses in NumPy, for code that needs no gradients and should not load PyTorch."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +11,7 @@ Z = np.array([0.0, 0.0, 1.0])
 
 
 def link_pose(robot: Robot, q: Float[ndarray, "dof"], link: str) -> Float[ndarray, "4 4"]:
-    """T_base_link at one configuration, in NumPy; InputError for an unknown link."""
+    """T_base_link at one configuration; raises InputError for an unknown link."""
     T = np.eye(4)
     for j in robot.chain(link):
         T = T @ robot.frame_offsets[j] @ _motion(robot, j, q[j])
@@ -23,7 +23,7 @@ def _motion(robot: Robot, j: int, q: float) -> Float[ndarray, "4 4"]:
 
 
 def link_poses(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 4 4"]:
-    """T_base_link at many configurations; InputError for an unknown link."""
+    """T_base_link at a batch of configurations; raises InputError for an unknown link."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for j in robot.chain(link):
         motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
@@ -38,13 +38,13 @@ def link_poses(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[nda
 
 
 def link_origins(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 3"]:
-    """Where a link's origin is at many configurations [m]; InputError for an unknown link."""
+    """Positions of a link's origin in the base frame [m]; raises InputError for an unknown link."""
     return link_poses(robot, q, link)[:, :3, 3]
 
 
 @once_per_robot
 def _spheres_by_frame(robot: Robot) -> list[Float[ndarray, "n 4"]]:
-    """Collision spheres in the frames that they are fixed to."""
+    """Collision spheres [x y z radius, m] by frame, in the coordinates of that frame."""
     parts: list[list[ndarray]] = [[np.zeros((0, 4))] for _ in range(robot.dof + 1)]
     for link, spheres in robot.spheres.items():
         T = robot.T_frame_link(link)
@@ -54,7 +54,7 @@ def _spheres_by_frame(robot: Robot) -> list[Float[ndarray, "n 4"]]:
 
 
 def placed_spheres(robot: Robot, q: Float[ndarray, "dof"]) -> Float[ndarray, "n 4"]:
-    """The collision spheres at one configuration, x y z radius in the base frame [m]."""
+    """All collision spheres at one configuration, x y z radius in the base frame [m]."""
     parts, frames = [], [np.eye(4)]
     for j, parent in enumerate(robot.parents):
         frames.append(frames[parent] @ robot.frame_offsets[j] @ _motion(robot, j, q[j]))

@@ -1,4 +1,4 @@
-"""Lever arms: how far a link can be from the axis of a joint, for bounds on motions."""
+"""Bounds on the motion of links: how far a link can be from the axis of a joint."""
 
 from functools import lru_cache
 
@@ -10,9 +10,10 @@ from robotdiffuse.robots.motion_bounds_kernel import carried, turned
 from robotdiffuse.robots.robot import Robot, once_per_robot
 
 COLUMNS = 180
-"""Directions around the axis; the bounds exceed the true maxima by about 0.1 % per joint in between."""
+"""Grid directions around the axis; bounds exceed the true maxima by about 0.1 % per joint in between."""
 LIMIT_SLACK = 1e-3
-"""Joint limits are widened by this [rad] or [m], so that the bounds also hold for clamped configurations."""
+"""Joint limits are widened by this [rad] or [m], so that the bounds also hold for configurations clipped to
+them."""
 
 STEP = 2 * np.pi / COLUMNS
 ROWS = COLUMNS // 2 + 1
@@ -28,23 +29,23 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     configurations within the limits; 1 for a prismatic joint; 0 where the joint does not move the link.
     So when the joints move by dq, no point of link l moves further than radii[l] @ abs(dq). Read-only.
 
-    Method: the set of places that a link can be at, seen from frame j, is described by its support
-    function h(u) = max p.u on a grid of directions u, carried inwards from joint to joint. Turning by an
-    interval of angles is a sliding maximum along a circle of latitude, a rigid offset h(u) -> h(R^T u) + t.u.
-    Between grid directions h is bounded from above by its sublinearity: for weights that sum to one and
-    e = u - sum w_i u_i, h(u) <= sum w_i h(u_i) + |e| max |p|. So each step rounds upwards. Distance from an
-    axis is convex, hence the support function, that of the convex hull, loses nothing.
+    Method: the region that a link can reach, seen from frame j, is described by its support function h(u) =
+    max p.u on a grid of directions u, which is propagated from joint to joint towards the base. Rotating by
+    an interval of angles is a sliding maximum along a circle of latitude; a rigid offset maps h(u) to h(R^T
+    u) + t.u. Sublinearity bounds h between grid directions from above: for weights that sum to one and e = u
+    - sum w_i u_i, h(u) <= sum w_i h(u_i) + |e| max |p|. So each step rounds upwards. The distance from an
+    axis is convex, so using the support function, which is that of the convex hull, loses nothing.
     """
     links = [link for link in robot.link_names if link in robot.spheres]
     known = motion_radii(robot.bare) if robot.bare is not None else np.zeros((0, robot.dof))
-    links = links[len(known) :]  # what is attached comes last
+    links = links[len(known) :]  # attached bodies come last
     frames = np.array([robot.link_frame(link) for link in links], dtype=int)
     radii = np.zeros((len(links), robot.dof))
     directions = _directions()
     by_row = np.ascontiguousarray(directions.transpose(0, 2, 1))
     support = np.full((len(links), ROWS, COLUMNS), -np.inf)
     farthest = np.zeros(len(links))
-    carry_over = lru_cache(_carry)  # joints often turn their frames alike
+    carry_over = lru_cache(_carry)  # many offsets share a rotation
     for j in reversed(range(robot.dof)):
         for i in np.flatnonzero(frames == j + 1):
             spheres = robot.spheres[links[i]]
@@ -95,19 +96,20 @@ _Carry = tuple[Int[ndarray, "4 n"], Float[ndarray, "4 n"], Float[ndarray, "n"]]
 
 
 def _carry(rotation: bytes) -> _Carry:
-    """How support functions are carried inwards over an offset that turns so."""
+    """Interpolation that maps support functions over an offset with a rotation, given as bytes of its
+    matrix."""
     return _interpolation(_directions() @ np.frombuffer(rotation).reshape(3, 3))
 
 
 _kept_carry = lru_cache(maxsize=64)(_carry)
-"""1 MB each; kept only of arms that hold something, for each new object asks for them: the same for an arm
-however its fingers are locked."""
+"""Cache for arms with attached bodies, since each new object needs the same interpolations. About 1 MB
+each."""
 
 
 def _turned(
     support: Float[ndarray, "n rows columns"], lower: float, upper: float
 ) -> Float[ndarray, "n rows columns"]:
-    """Largest grid value among the longitudes that turning by [lower, upper] brings to each longitude."""
+    """Largest grid value among the longitudes that rotations by [lower, upper] map to each longitude."""
     first = -int(np.ceil(upper / STEP))
     width = -int(np.floor(lower / STEP)) - first + 1
     if width >= COLUMNS:
@@ -116,7 +118,8 @@ def _turned(
 
 
 def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Carry:
-    """Grid corners around each direction, weights that sum to one, and the length of what they leave over."""
+    """Grid corners around each direction, their weights, which sum to one, and the lengths of the
+    residuals."""
     u = directions.reshape(-1, 3)
     row = (np.arcsin(np.clip(u[:, 2], -1, 1)) + np.pi / 2) / STEP
     column = np.arctan2(u[:, 1], u[:, 0]) % (2 * np.pi) / STEP

@@ -1,6 +1,6 @@
-"""Support functions on a grid of directions, carried inwards over a joint and its offset; see lever_arms.py.
+"""Propagates support functions on a grid of directions over a joint and its offset; see `motion_bounds.py`.
 
-Sums are in a fixed order and nothing is contracted, so the numbers are those of NumPy.
+Sums have a fixed order and no fused operations, so the results equal those of NumPy.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from numba import njit
 
 @njit(cache=True)
 def turned(support, first, width):
-    """[n, rows, columns] the largest value among `width` longitudes from `first` on, seen from each."""
+    """Largest value [n, rows, columns] among `width` longitudes, beginning `first` after each longitude."""
     n, rows, columns = support.shape
     out, wide, next_wide = np.empty_like(support), np.empty(columns), np.empty(columns)
     for i in range(n):
@@ -17,7 +17,7 @@ def turned(support, first, width):
             for k in range(columns):
                 wide[k] = support[i, row, (k + first) % columns]
             done = 1
-            while done < width:  # the maximum over 2 n neighbours from those over n
+            while done < width:  # maxima over 2 n neighbours from maxima over n
                 shift = min(done, width - done)
                 for k in range(columns - shift):
                     next_wide[k] = max(wide[k], wide[k + shift])
@@ -31,8 +31,8 @@ def turned(support, first, width):
 
 @njit(cache=True)
 def carried(values, corners, weights, residual, reach):
-    """[n, directions] bounds in turned directions: sums of the values at the corners of the grid around each,
-    by their weights [4, directions], and what these leave over of points that are `reach` away."""
+    """Bounds [n, directions] in rotated directions: values interpolated from four grid corners each, with
+    weights [4, directions], plus the residual times the distance `reach` [n] of the farthest point."""
     out = np.empty_like(values)
     for i in range(len(values)):
         for k in range(values.shape[1]):

@@ -1,11 +1,10 @@
-"""Robot: an arm, or several on one body, as plain data, in the form that kinematics and collision checking
-share."""
+"""Robot: one or several arms as plain data, used by kinematics and collision checking alike."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, lru_cache, wraps
+from functools import cached_property, lru_cache, reduce, wraps
 from numbers import Real
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,110 +12,67 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, Value, read_only
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
-from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
+from robotdiffuse.core.transforms import inverse, rotation_z_to, transform
+from robotdiffuse.robots.bodies import TOOL, AttachedBody, BodyContent, ConvexMesh, RigidShape
 from robotdiffuse.robots.inertias import Inertia
-from robotdiffuse.robots.joint_tables import TURN, JointTable
+from robotdiffuse.robots.joints import MIMIC_SLACK, MOVING_KINDS, Joint, with_mimics
+from robotdiffuse.robots.link_pair_tables import TURN, LinkPairTable
 
-MOVING_KINDS = ("revolute", "continuous", "prismatic")
-TURNS = 3 * np.pi
-"""Planners turn continuous joints this far either way [rad]: they begin within half a turn, and end at most a
-turn from there. The joints themselves have no limits."""
-MIMIC_SLACK = 1e-6
-"""How far a value given for a joint that follows another one may be from where that one puts it."""
-VARIANTS = 256
-"""Robots with joints locked at values that are kept, the last ones used: about 0.1 MB each."""
+LOCKED_CACHE = 256
+"""Number of robots with locked joints in the cache, least recently used out first: about 0.1 MB each."""
+ATTACHED_CACHE = 64
+"""Number of robots with attached bodies in the cache."""
 
 T = TypeVar("T")
 
 
-class Mimic(NamedTuple):
-    """How a joint follows another one: its value is multiplier * the other's + offset."""
-
-    joint: str
-    multiplier: float = 1.0
-    offset: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Joint(Value):
-    """One joint of the URDF tree. Limits are meaningless for a fixed joint."""
-
-    name: str
-    kind: str
-    """revolute, continuous, prismatic or fixed."""
-    parent: str
-    child: str
-    T_parent_joint: Float[ndarray, "4 4"]
-    axis: Float[ndarray, "3"]
-    """Unit axis in the joint frame."""
-    lower: float = 0.0
-    """[rad] or [m]; for a continuous joint what planners work within, minus `TURNS`."""
-    upper: float = 0.0
-    velocity: float = 0.0
-    """[rad/s] or [m/s]"""
-    acceleration: float = 0.0
-    jerk: float = 0.0
-    mimic: Mimic | None = None
-    """The joint that this one follows, held as that one is."""
-    effort: float = 0.0
-    """Greatest torque [N m] or force [N]; 0: none is given."""
-
-    def motion(self, q: float) -> Float[ndarray, "4 4"]:
-        """T_joint_child for the joint value q."""
-        if self.kind == "prismatic":
-            return transform(self.axis * q)
-        if self.kind == "fixed":
-            return np.eye(4)
-        return transform(np.zeros(3), rotation_about(self.axis, q))
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot(Value):
-    """A serial arm: the joints between base and tip that are not locked are planned. Or a tree of them: those
-    between the base and any of several tips, as of two arms on one torso.
+    """A serial arm, or several arms on one body, such as two arms on a torso.
 
-    Frames: frame 0 is the base link; frame j + 1 moves with planned joint j, and
-    T_base_frame[j + 1] = T_base_frame[parents[j]] @ frame_offsets[j] @ M(q_j), where M turns about z, or
-    slides along z for a prismatic joint. Of a chain, parents[j] is j. Every link is rigidly fixed to one
-    frame.
+    Planned joints are the movable, unlocked joints between the base and the tips.
+
+    Frames: frame 0 is the base link; frame j + 1 moves with planned joint j, and T_base_frame[j + 1] =
+    T_base_frame[parents[j]] @ frame_offsets[j] @ M(q_j), where M rotates about z, or translates along z for a
+    prismatic joint. For a serial arm, parents[j] is j. Every link is fixed to one frame.
     """
 
     name: str
     base: str
     tip: str
-    """What goals and pictures are about where they name no link; the first of `tips`."""
+    """Default link for goals and pictures; the first of `tips`."""
     joints: tuple[Joint, ...]
-    """All joints of the tree below the base, parents before children."""
+    """All joints below the base, parents before children."""
     spheres: dict[str, Float[ndarray, "n 4"]] = field(default_factory=dict)
-    """Collision spheres by link, x y z radius in the link frame [m]; they cover `meshes`."""
+    """Collision spheres by link, x y z radius in the link frame [m]. They cover `meshes`."""
     meshes: dict[str, tuple[ConvexMesh, ...]] = field(default_factory=dict)
-    """Convex collision meshes by link: the exact geometry of the validator."""
+    """Convex collision meshes by link: the geometry that the validator checks."""
     allowed_collisions: frozenset[frozenset[str]] = frozenset()
     """Pairs of links that are not checked against each other."""
     locked: dict[str, float] = field(default_factory=dict)
-    """Values of the movable joints that planning holds [rad] or [m]."""
+    """Values of the movable joints that are held while planning, by name [rad] or [m]."""
     notes: tuple[str, ...] = ()
-    """What the reader of the URDF changed or ignored."""
+    """What was changed or ignored when the URDF was read."""
     root: str = ""
-    """Root link of the URDF; the base if it is empty."""
+    """Root link of the URDF; if empty, the base is the root."""
     above: dict[str, Float[ndarray, "4 4"]] = field(default_factory=dict)
-    """T_base_link of the links above the base that fixed joints connect with it, the root among them unless a
-    joint moves the base about."""
+    """T_base_link of the links above the base that only fixed joints connect to it. The root is among them
+    unless a movable joint lies between."""
     poses: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Named poses of an SRDF, values by joint [rad] or [m]."""
+    """Named poses of the SRDF: joint values by name [rad] or [m]."""
     source: str | None = None
-    """The file or the name that `load_robot` got, unless bundled: how problem files name the robot."""
-    attached: tuple[Attached, ...] = ()
-    """A tool and objects that are held; each is a link too."""
+    """The file or name given to `load_robot`, by which problem files refer to the robot; None if bundled."""
+    attached: tuple[AttachedBody, ...] = ()
+    """Tool and held objects; each is a link too."""
     bare: "Robot | None" = None
-    """The robot without these; None if there are none. See `arm`."""
+    """The robot without attached bodies; None if there are none. See `arm`."""
     inertias: dict[str, Inertia] = field(default_factory=dict)
-    """Of the links whose URDF gives them."""
+    """Inertias of the links for which the URDF gives them."""
     other_tips: tuple[str, ...] = ()
-    """Where further arms end whose joints are planned too."""
-    tables: tuple[JointTable, ...] = ()
-    """Where pairs of links are apart that come closer to each other than spheres tell."""
+    """Tips of further arms whose joints are planned too."""
+    tables: tuple[LinkPairTable, ...] = ()
+    """For pairs of links that pass closer than spheres can resolve: the joint values at which they do not
+    collide."""
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
@@ -124,12 +80,12 @@ class Robot(Value):
 
     @property
     def T_base_root(self) -> Float[ndarray, "4 4"] | None:
-        """Where the URDF's root is seen from the base; None if a movable joint lies between them."""
+        """Pose of the URDF's root in the base frame; None if a movable joint lies between them."""
         return np.eye(4) if self.root in ("", self.base) else self.above.get(self.root)
 
     @cached_property
-    def fixed_below(self) -> dict[str, Float[ndarray, "4 4"]]:
-        """T_base_link of the base and of the links that fixed joints alone connect with it."""
+    def links_fixed_to_base(self) -> dict[str, Float[ndarray, "4 4"]]:
+        """T_base_link of the base and of the links that only fixed joints connect to it."""
         found = {self.base: np.eye(4)}
         for joint in self.joints:
             if joint.kind == "fixed" and joint.parent in found:
@@ -142,7 +98,7 @@ class Robot(Value):
 
     @cached_property
     def planned_joints(self) -> tuple[Joint, ...]:
-        """Movable, unlocked joints between the base and the tips: depth first, parents before children."""
+        """Movable, unlocked joints between the base and the tips, in depth-first order."""
         by_child = {joint.child: joint for joint in self.joints}
         chains: list[list[Joint]] = []
         for link in self.tips:
@@ -192,7 +148,7 @@ class Robot(Value):
 
     @cached_property
     def effort(self) -> Float[ndarray, "dof"]:
-        """Greatest torques [N m] or forces [N]; 0 where none is given."""
+        """Largest torques [N m] or forces [N]; 0 where the URDF gives none."""
         return self._limit("effort")
 
     @cached_property
@@ -201,30 +157,34 @@ class Robot(Value):
 
     @cached_property
     def continuous(self) -> Bool[ndarray, "dof"]:
-        """Which joints turn without limits, so that values a turn apart are the same."""
+        """Which planned joints rotate without limits, so that values one turn apart are equivalent."""
         return read_only(np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool))
 
-    def turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
-        """The whole turns of continuous joints in configurations [rad]: less these, they are within half a
-        turn."""
-        if not self._turning:
+    def whole_turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
+        """The multiples of 2 pi to subtract so that continuous joints are within [-pi, pi]; 0 for others."""
+        if not self._any_continuous:
             return np.zeros_like(q)
         return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
 
     @cached_property
-    def _turning(self) -> bool:
+    def _any_continuous(self) -> bool:
         return bool(self.continuous.any())
 
-    def least_turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
-        """Configurations with the joints that can turn more than once within half a turn of the middle of
-        their limits: they stand as before, but do not differ by turns that something may block."""
+    def unwound(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
+        """Equivalent configurations in which joints with a range above one turn are within half a turn of the
+        middle of their limits."""
         middle = 0.5 * (self.lower + self.upper)
         return np.where(self._turns_twice, q - TURN * np.round((q - middle) / TURN), q)
 
-    def same_stance(self, q: Float[ndarray, "dof"], start: Float[ndarray, "dof"]) -> Float[ndarray, "k dof"]:
-        """Configurations within the limits that stand as one does but for whole turns of joints that have
-        limits and can turn more than once: first with all of these as near to `start` as can be, then with
-        one after the other turned the other way, for something may block the short way."""
+    def equivalent_configurations(
+        self, q: Float[ndarray, "dof"], start: Float[ndarray, "dof"]
+    ) -> Float[ndarray, "k dof"]:
+        """Configurations within the limits that differ from `q` by whole turns of joints that have limits and
+        a range above one turn.
+
+        In the first one, all of these joints are as close to `start` as possible. In each further one, one
+        joint turns the other way, since obstacles may block the short way.
+        """
         many = self._turns_twice & ~self.continuous
         nearest = np.where(many, q - TURN * np.round((q - start) / TURN), q)
         nearest = np.where(many & (nearest > self.upper), nearest - TURN, nearest)
@@ -265,18 +225,20 @@ class Robot(Value):
 
     @cached_property
     def parents(self) -> Int[ndarray, "dof"]:
-        """The frame that each planned joint hangs from: that of the joint before it, in a chain."""
+        """Index of the frame that each planned joint is mounted on: j for joint j of a serial arm."""
         return self._frames[2]
 
     @cached_property
-    def branching(self) -> Int[ndarray, "dof"] | None:
-        """The same for compiled code, which is compiled for arrays that can be written to: None of a chain,
-        where each planned joint moves all that come after."""
+    def kernel_parents(self) -> Int[ndarray, "dof"] | None:
+        """`parents` for compiled code, as a writable array; None for a serial arm.
+
+        Kernels are compiled for writable arrays, and skip the look-up for serial arms.
+        """
         return None if (self.parents == np.arange(self.dof)).all() else self.parents.copy()
 
     @cached_property
     def moved_by(self) -> Bool[ndarray, "frames dof"]:
-        """Which planned joints move each frame."""
+        """Which planned joints move which frames."""
         rows = np.zeros((self.dof + 1, self.dof), dtype=bool)
         for j, parent in enumerate(self.parents):
             rows[j + 1] = rows[parent]
@@ -284,17 +246,19 @@ class Robot(Value):
         return read_only(rows)
 
     def at_end(self, link: str) -> bool:
-        """Whether planned joints move a link and none comes behind it."""
+        """Whether planned joints move a link, and none comes after it."""
         frame = self.link_frame(link)
         return frame > 0 and not self.moved_by[frame + 1 :, frame - 1].any()
 
     def chain(self, link: str) -> tuple[int, ...]:
-        """The planned joints that move a link, from the base on."""
+        """Indices of the planned joints that move a link, from the base on."""
         return tuple(np.flatnonzero(self.moved_by[self.link_frame(link)]).tolist())
 
     def joints_between(self, a: str, b: str) -> tuple[int, ...]:
-        """The planned joints between two links on a chain; none if another one moves there, or a joint on
-        each side."""
+        """Indices of the planned joints between two links of which one carries the other.
+
+        Empty if neither carries the other, or if a movable joint between them is not planned.
+        """
         by_child = {joint.child: joint for joint in self.joints}
 
         def above(link: str) -> tuple[str, ...]:
@@ -308,10 +272,11 @@ class Robot(Value):
         return tuple(map(self.joint_names.index, between)) if {*between} <= {*self.joint_names} else ()
 
     def link_frame(self, link: str) -> int:
-        """Index of the frame that the link is fixed to: 0 for the base, j + 1 behind planned joint j."""
+        """Index of the frame that the link is fixed to: 0 for the base, j + 1 after planned joint j."""
         return self._link(link)[0]
 
     def T_frame_link(self, link: str) -> Float[ndarray, "4 4"]:
+        """Constant pose of the link in its frame (see `link_frame`); InputError for an unknown link."""
         return self._link(link)[1]
 
     def _link(self, link: str) -> tuple[int, ndarray]:
@@ -320,7 +285,8 @@ class Robot(Value):
         return self._frames[0][link]
 
     def checked_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of links with geometry, on different frames, that are checked against each other."""
+        """Pairs of links that are checked against each other: with geometry, on different frames, not
+        allowed."""
         links = [link for link in self.link_names if link in self.spheres]
         return tuple(
             (a, b)
@@ -330,11 +296,11 @@ class Robot(Value):
         )
 
     def with_locked(self, locked: dict[str, float]) -> "Robot":
-        """The same robot with some joints held at values (a planned joint may be named too).
+        """The robot with joints locked at values [rad] or [m], by name; planned joints can be locked too.
 
-        Joints that mimic others follow them. Raises InputError for an unknown or fixed joint, a value that is
-        not finite, or one of a mimic joint that its master does not say. Values beyond the URDF's limits are
-        accepted: gripper openings in published problems exceed them.
+        Mimic joints follow. Values beyond the URDF's limits are accepted, since gripper openings in published
+        problems exceed them. Equal values give the same object. Raises InputError for an unknown or fixed
+        joint, a value that is not finite, or a value of a mimic joint that contradicts its leader.
         """
         movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
@@ -344,7 +310,7 @@ class Robot(Value):
                 raise InputError(
                     f"locked: {name} is {shown(value)}; it must be a number within ±{MAX_COORDINATE:g}"
                 )
-        held = following(self.joints, self.locked | {name: float(value) for name, value in locked.items()})
+        held = with_mimics(self.joints, self.locked | {name: float(value) for name, value in locked.items()})
         for name, value in locked.items():
             mimic = movable[name].mimic
             if mimic is not None and abs(held[name] - value) > MIMIC_SLACK:
@@ -355,63 +321,104 @@ class Robot(Value):
         if held == self.locked:
             return self
         if self.attached:
-            from robotdiffuse.robots.attached_bodies import attached_again
-
-            return attached_again(self.arm.with_locked(locked), self.attached)
+            return reduce(Robot.with_body, self.attached, self.arm.with_locked(locked))
         return _variant(self.unlocked, tuple(sorted(held.items())))
 
     @property
     def arm(self) -> "Robot":
-        """The robot without tool and held objects."""
+        """The robot without tool and held objects; the robot itself if there are none."""
         return self.bare or self
 
-    def attach(self, shape: Rigid, link: str, touch_links: Sequence[str] = ()) -> "Robot":
+    def attach(self, shape: RigidShape, link: str, touch_links: Sequence[str] = ()) -> "Robot":
         """The robot holding a shape, whose pose is given in the frame of the link.
 
-        It becomes a link of the shape's name, so that goals may name it: with the arm it is kept clear of
-        obstacles and of all links, but for those that move with it and `touch_links`. A curved shape is taken
-        as a polyhedron around it, at most 2 % of its radius larger. Raises InputError for unknown links, a
-        link that no planned joint moves, a name that is taken, and a cloud of points.
+        The shape becomes a link with the shape's name, so goals may name it. Collision checks keep it clear
+        of obstacles and of all links, except links that move with it and `touch_links`. A curved shape is
+        replaced by a polyhedron around it that exceeds it by at most 2 % of its radius.
+
+        Raises InputError for unknown links, a link that no planned joint moves, a name that is taken, and a
+        point cloud.
         """
-        from robotdiffuse.robots.attached_bodies import holding
-
-        return holding(self, shape, link, touch_links)
-
-    def detach(self, name: str) -> "Robot":
-        """The robot without a held object or tool; InputError if it has none of that name."""
-        from robotdiffuse.robots.attached_bodies import detach
-
-        return detach(self, name)
+        if not hasattr(shape, "solid"):
+            raise InputError(f"attached is a {type(shape).__name__}; it must be a shape, e.g. rd.Box")
+        T_link_body = shape.solid()[0]
+        return self.with_body(AttachedBody(shape.name, link, T_link_body, (shape,), tuple(touch_links)))
 
     def with_tool(
         self,
         link: str,
         T_link_tool: Float[ndarray, "4 4"],
-        shapes: Sequence[Rigid] = (),
+        shapes: Sequence[RigidShape] = (),
         touch_links: Sequence[str] = (),
         name: str = TOOL,
     ) -> "Robot":
         """The robot with a tool on a link: a frame that goals may name, and shapes in the frame of the link.
 
-        The tool is the new tip if it is behind all planned joints. Shapes are as in `attach`.
+        The tool becomes the tip if no planned joint comes after its link. Shapes, `touch_links` and errors
+        are as in `attach`; InputError too if the robot has a tool already.
         """
-        from robotdiffuse.robots.attached_bodies import with_tool
+        tools = [body.name for body in self.attached if body.tool]
+        if tools:
+            raise InputError(f"tool: the robot has the tool {tools[0]!r} already; detach it first")
+        T = np.asarray(T_link_tool, np.float64)
+        return self.with_body(AttachedBody(name, link, T, tuple(shapes), tuple(touch_links), tool=True))
 
-        return with_tool(self, link, T_link_tool, shapes, touch_links, name)
+    def with_body(self, body: AttachedBody) -> "Robot":
+        """The robot with a body attached; the same object for bodies of equal content.
 
-    def standing(self, T_world_base: Float[ndarray, "4 4"]) -> "Robot":
-        """The robot as it stands in the world, which is its base then: for pictures and simulators."""
+        Raises InputError for unknown links, a link that no planned joint moves, a name that a link has, and
+        shapes that cannot be held.
+        """
+        what = TOOL if body.tool else "attached"
+        moved = [link for link in self.link_names if self.link_frame(link) > 0]
+        if body.link not in self.link_names:
+            raise unknown_name(f"link in {what}.link:", str(body.link), moved)
+        if body.link not in moved:
+            raise InputError(
+                f"{what}.link is {body.link}, which no planned joint moves; these are moved: "
+                f"{', '.join(moved)}"
+            )
+        if body.name in self.link_names:
+            raise InputError(
+                f"{what}.name is {body.name!r}, which is a link of {self.name}; give it another name"
+            )
+        for link in body.touch_links:
+            if link not in self.link_names:
+                raise unknown_name(f"link in {what}.touch_links:", str(link), self.link_names)
+        return _with_body(self, BodyContent(body))
+
+    def detach(self, name: str) -> "Robot":
+        """The robot without the held object or tool of that name.
+
+        Raises InputError for an unknown name, and for a body that holds another one.
+        """
+        names = [body.name for body in self.attached]
+        if name not in names:
+            raise unknown_name("body to detach:", name, names)
+        holds = [body.name for body in self.attached if body.link == name]
+        if holds:
+            raise InputError(f"{name} cannot be detached: it holds {', '.join(holds)}; detach that first")
+        left = [
+            replace(body, touch_links=tuple(link for link in body.touch_links if link != name))
+            for body in self.attached
+            if body.name != name
+        ]
+        return reduce(Robot.with_body, left, self.arm)
+
+    def placed_in_world(self, T_world_base: Float[ndarray, "4 4"]) -> "Robot":
+        """The robot with a new base link, the world, that carries the old one: for pictures and
+        simulators."""
         name = "world"
         while name in self.link_names:
             name += "_"
         axis = np.array([0.0, 0.0, 1.0])
         ground = Joint(f"{name}_to_{self.base}", "fixed", name, self.base, T_world_base, axis)
-        bare = None if self.bare is None else self.bare.standing(T_world_base)
+        bare = None if self.bare is None else self.bare.placed_in_world(T_world_base)
         return replace(self, base=name, joints=(ground, *self.joints), root="", above={}, bare=bare)
 
     @property
     def unlocked(self) -> "Robot":
-        """The robot that `with_locked` made this one of; itself if it was not made so."""
+        """The robot from which `with_locked` made this one; else the robot itself."""
         return self.__dict__.get("_unlocked", self)
 
     def __repr__(self) -> str:
@@ -436,26 +443,13 @@ class Robot(Value):
         return "\n".join(line for line in lines if line)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled: the robot, and nothing that was compiled for it."""
+        """Fields only: what was compiled or cached for the robot is not pickled."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
-def following(joints: tuple[Joint, ...], locked: dict[str, float]) -> dict[str, float]:
-    """The values of locked joints, with those that follow a locked one where it puts them."""
-    by_name = {joint.name: joint for joint in joints}
-
-    def value(name: str) -> float | None:
-        mimic = by_name[name].mimic if name in by_name else None
-        led = None if mimic is None else value(mimic.joint)
-        return locked.get(name) if mimic is None or led is None else mimic.multiplier * led + mimic.offset
-
-    values = {name: value(name) for name in (*locked, *(joint.name for joint in joints if joint.mimic))}
-    return {name: number for name, number in values.items() if number is not None}
-
-
-@lru_cache(maxsize=VARIANTS)
+@lru_cache(maxsize=LOCKED_CACHE)
 def _variant(robot: Robot, locked: tuple[tuple[str, float], ...]) -> Robot:
-    """One object for equal values, so that what is compiled for it is compiled once."""
+    """The same object for equal values, so that data derived from a robot is computed once."""
     if dict(locked) == robot.locked:
         return robot
     variant = replace(robot, locked=dict(locked))
@@ -463,8 +457,33 @@ def _variant(robot: Robot, locked: tuple[tuple[str, float], ...]) -> Robot:
     return variant
 
 
+@lru_cache(maxsize=ATTACHED_CACHE)
+def _with_body(robot: Robot, content: BodyContent) -> Robot:
+    from robotdiffuse.robots.attached_bodies import body_geometry  # compiled code; few robots need it
+
+    body = content.body
+    axis = np.array([0.0, 0.0, 1.0])
+    joint = Joint(f"{body.link}_to_{body.name}", "fixed", body.link, body.name, body.T_link_body, axis)
+    geometry = {body.name: body_geometry(body)} if body.shapes else {}
+    # goals and pictures refer to the tip; a tool on another branch than the tip's does not replace it
+    frame = robot.link_frame(body.link) if body.tool and robot.at_end(body.link) else -1
+    tip, *others = [body.name if robot.link_frame(tip) == frame else tip for tip in robot.tips]
+    return replace(
+        robot,
+        joints=(*robot.joints, joint),
+        spheres=robot.spheres | {name: spheres for name, (_, spheres) in geometry.items()},
+        meshes=robot.meshes | {name: meshes for name, (meshes, _) in geometry.items()},
+        allowed_collisions=robot.allowed_collisions
+        | {frozenset((body.name, link)) for link in body.touch_links},
+        tip=tip,
+        other_tips=tuple(others),
+        attached=(*robot.attached, body),
+        bare=robot.arm,
+    )
+
+
 def once_per_robot(build: Callable[[Robot], T]) -> Callable[[Robot], T]:
-    """A function of a robot alone that works once for each: results live as long as their robot."""
+    """Decorator: cache a function of a robot on the robot itself, for the robot's lifetime."""
     name = f"{build.__module__}.{build.__qualname__}"
 
     @wraps(build)

@@ -1,4 +1,4 @@
-"""A robot as a folder: robot.json (human-readable) and meshes.npz (convex collision meshes)."""
+"""Reads and writes robot folders: robot.json (human-readable) and meshes.npz (convex collision meshes)."""
 
 import io
 import json
@@ -14,26 +14,26 @@ from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, unit_quaternion, 
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import read_arrays, read_json
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.inertias import inertia_of
-from robotdiffuse.robots.joint_tables import JointTable
-from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
+from robotdiffuse.robots.joints import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic
+from robotdiffuse.robots.link_pair_tables import LinkPairTable
+from robotdiffuse.robots.robot import Robot
 
 FORMAT = 2
-"""2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""
-AXIS_SLACK = 1e-3
-"""Of a joint axis's length."""
-WHOLE_TURN = 6.283
-"""A continuous joint whose limits are narrower than this is revolute [rad]: older files may hold some."""
+"""Version of the format."""
+AXIS_LENGTH_TOLERANCE = 1e-3
+"""Largest difference between the length of a joint axis and 1."""
 ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
-def write_bundle(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
-    """Write robot.json and meshes.npz into a folder, each whole or not at all; other files in it stay.
+def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
+    """Write robot.json and meshes.npz into a folder, each file atomically; other files in the folder stay.
 
-    `source` says where the robot comes from: urdf, sha256, licence, and, where preparation measured them, the
-    shares of free configurations and of those that spheres refuse, free and refused. Raises InputError if the
-    folder cannot be written.
+    `source` describes the origin: urdf, sha256, licence, and, if preparation measured them, `free`, the
+    fraction of free configurations, and `refused`, the fraction of these with false collisions of spheres.
+    Raises InputError if the folder cannot be written.
     """
     folder = Path(folder)
     meshes = io.BytesIO()
@@ -48,6 +48,7 @@ def write_bundle(robot: Robot, folder: str | Path, source: dict[str, Any]) -> No
 
 
 def _replace(file: Path, content: bytes) -> None:
+    """Write a file atomically."""
     fresh = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         fresh.write_bytes(content)
@@ -56,8 +57,8 @@ def _replace(file: Path, content: bytes) -> None:
         fresh.unlink(missing_ok=True)
 
 
-def read_bundle(folder: str | Path) -> Robot:
-    """The robot in a folder; raises InputError naming the file if one is missing or damaged."""
+def read_robot_folder(folder: str | Path) -> Robot:
+    """Read the robot in a folder; raises InputError that names the file if one is missing or damaged."""
     data = _read_json(Path(folder) / ROBOT_FILE)
     meshes = _unpack(Path(folder) / MESH_FILE)
     try:
@@ -75,11 +76,11 @@ def read_bundle(folder: str | Path) -> Robot:
 
 
 def _check_tree(robot: Robot) -> None:
-    """Raises ValueError unless each joint hangs from the base or from a link of a joint before it."""
+    """Raise ValueError if the joints do not form a tree, or if other entries are inconsistent with it."""
     links = {robot.base}
     for joint in robot.joints:
         if joint.parent not in links or joint.child in links:
-            raise ValueError(f"joint {joint.name} is not part of a tree, parents before children")
+            raise ValueError(f"joint {joint.name} is not part of a tree with parents before children")
         links.add(joint.child)
     leaders = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
     for name in leaders:
@@ -97,7 +98,7 @@ def _check_tree(robot: Robot) -> None:
 
 
 def read_source(folder: str | Path) -> dict[str, Any]:
-    """Where the robot in a folder comes from, as `write_bundle` got it."""
+    """The `source` of a robot folder, as given to `write_robot_folder`."""
     source = _read_json(Path(folder) / ROBOT_FILE).get("source", {})
     return source if isinstance(source, dict) else {}
 
@@ -125,8 +126,8 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
     }
 
 
-def _table_to_json(table: JointTable) -> dict:
-    """Cells by eight, each a bit, along the last joint."""
+def _table_to_json(table: LinkPairTable) -> dict:
+    """Entry of a table; cells along the last joint are packed as bits into hexadecimal rows."""
     rows = np.packbits(np.atleast_2d(table.apart), axis=1)
     return {
         "links": list(table.links),
@@ -137,7 +138,7 @@ def _table_to_json(table: JointTable) -> dict:
     }
 
 
-def _table_from_json(data: dict) -> JointTable:
+def _table_from_json(data: dict) -> LinkPairTable:
     joints = tuple(map(str, data["joints"]))
     apart = np.array([np.frombuffer(bytes.fromhex(row), np.uint8) for row in data["apart"]])
     apart = np.unpackbits(apart, axis=1).astype(bool)
@@ -147,7 +148,7 @@ def _table_from_json(data: dict) -> JointTable:
     if ends != (len(joints),) * 3 or not all(spans):
         raise ValueError("a table over one or two joints expected, lower below upper")
     a, b = map(str, data["links"])
-    return JointTable((a, b), joints, lower, upper, apart[0] if len(joints) == 1 else apart)
+    return LinkPairTable((a, b), joints, lower, upper, apart[0] if len(joints) == 1 else apart)
 
 
 def _joint_to_json(joint: Joint) -> dict:
@@ -168,7 +169,7 @@ def _joint_to_json(joint: Joint) -> dict:
 
 
 def _dump(data: dict) -> str:
-    """JSON with one joint, sphere or pair to a line."""
+    """JSON text with one joint, sphere or pair per line."""
 
     def compact(value: object) -> str:
         return json.dumps(value, allow_nan=False)
@@ -196,7 +197,7 @@ def _read_json(file: Path) -> dict:
     data = read_json(file)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise InputError(
-            f"{file} is not a robot of format {FORMAT}; make it again with: robotdiffuse robot add"
+            f"{file} is not a robot of format {FORMAT}; create it again with: robotdiffuse robot add"
         )
     return data
 
@@ -240,12 +241,10 @@ def _joint_from_json(data: dict) -> Joint:
         or not max(rates) < np.inf
     ):
         raise ValueError(f"joint {name}: limits")
-    if not abs(np.linalg.norm(axis) - 1) < AXIS_SLACK:
+    if not abs(np.linalg.norm(axis) - 1) < AXIS_LENGTH_TOLERANCE:
         raise ValueError(f"joint {name}: an axis of length 1 expected")
-    if kind == "continuous" and upper - lower < WHOLE_TURN:
-        kind = "revolute"
-    elif kind == "continuous":
-        lower, upper = -TURNS, TURNS
+    if kind == "continuous":
+        lower, upper = -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT
     mimic = None
     if "mimic" in data:
         master, multiplier, offset = data["mimic"]
@@ -271,7 +270,7 @@ def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
 
 
 def _pack(robot: Robot) -> dict[str, ndarray]:
-    """All meshes in four arrays: reading many small ones would take longer."""
+    """All meshes in four arrays, since reading many small ones would take longer."""
     parts = [(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes]
     return {
         "links": np.array([link for link, _ in parts], dtype=np.str_),
@@ -282,6 +281,7 @@ def _pack(robot: Robot) -> dict[str, ndarray]:
 
 
 def _unpack(file: Path) -> dict[str, tuple[ConvexMesh, ...]]:
+    """Meshes by link from the arrays that `_pack` made."""
     arrays = read_arrays(file)
     try:
         links, sizes, vertices, faces = (arrays[key] for key in ("links", "sizes", "vertices", "faces"))

@@ -1,4 +1,4 @@
-"""How far an arm reaches, and the same arm in another size."""
+"""The reach of an arm, and arms scaled in size."""
 
 from dataclasses import replace
 
@@ -6,33 +6,38 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.robots.joints import Joint
 from robotdiffuse.robots.kinematics import link_origins
-from robotdiffuse.robots.robot import Joint, Robot, once_per_robot
+from robotdiffuse.robots.robot import Robot, once_per_robot
 
 SAMPLES = 4096
-"""Configurations that a reach is taken of."""
-FAR = 0.99
-"""Share of them in which the tip is nearer: the very farthest are few, and random."""
+"""Random configurations for measuring the reach."""
+REACH_QUANTILE = 0.99
+"""Quantile of the distances of the tip, since the largest ones are rare and random."""
 
 
 @once_per_robot
 def reach(robot: Robot) -> float:
-    """How far an arm's tip gets from its first joint's axis at the height of its second joint, about its
-    shoulder, but for 1 % of the configurations [m]; of several arms, the longest one's."""
+    """Distance between tip and shoulder that 99 % of the configurations do not exceed [m].
+
+    The shoulder is the point on the first joint's axis at the height of the second joint. With several arms,
+    the reach of the longest one.
+    """
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (SAMPLES, robot.dof))
     reached = []
     for tip in robot.tips:
         first = list(robot.chain(tip)[:2])
-        if not first:  # an arm that is held
+        if not first:  # all joints of this arm are locked
             continue
         offsets = robot.frame_offsets[first]
         shoulder = np.array([*offsets[0, :2, 3], (offsets[0] @ offsets[-1])[2, 3]])
         reached.append(np.linalg.norm(link_origins(robot, q, tip) - shoulder, axis=1))
-    return float(np.quantile(reached, FAR, axis=1).max())
+    return float(np.quantile(reached, REACH_QUANTILE, axis=1).max())
 
 
 def scaled(robot: Robot, scale: float) -> Robot:
-    """The bare arm, so many times as large, spheres and meshes too: it turns through the same angles."""
+    """The arm without attached bodies, scaled by a factor with its spheres and meshes; angular limits
+    stay."""
     arm = robot.arm
     prismatic = {joint.name for joint in arm.joints if joint.kind == "prismatic"}
 

@@ -1,9 +1,9 @@
-"""How torques bend along a motion, at most: what shows that they keep their limits between two looks.
+"""Bounds on second derivatives of torques along a motion, to show that limits hold between samples.
 
-A torque leaves the chord between two looks by at most an eighth of its greatest second derivative times the
-square of what is between them. That derivative is bounded by norms: inverse dynamics is sums and products of
-vectors, and the recursion of Newton and Euler carries along how long each is at most, and how long its first
-two derivatives are. A vector that is fixed in a body turns with it and keeps its length.
+Between two samples, a torque deviates from linear interpolation by at most an eighth of its largest second
+derivative times the square of the interval. Norms bound that derivative: inverse dynamics consists of sums
+and products of vectors, and the Newton-Euler recursion propagates upper bounds on the lengths of each vector
+and of its first two derivatives. A vector that is fixed in a body rotates with it and keeps its length.
 """
 
 from typing import NamedTuple
@@ -13,48 +13,52 @@ from jaxtyping import Float
 from numpy import ndarray
 
 Jet = Float[ndarray, "3 n"]
-"""Of a vector or number along n stretches of a motion: its length at most, and those of its derivatives."""
+"""Upper bounds on the length of a vector or number and of its first two derivatives, along n stretches of a
+motion."""
 
 
 class Stretches(NamedTuple):
-    """n stretches of a motion, on each of which all of this is smooth."""
+    """Bounds for n stretches of a motion, on each of which the motion is smooth."""
 
     q: Float[ndarray, "n dof"]
-    """Size of positions at most, ..."""
+    """Largest absolute joint positions."""
     v: Float[ndarray, "3 n dof"]
-    """... of their first three derivatives, ..."""
+    """Largest absolute values of their first three derivatives."""
     speed: Float[ndarray, "3 n dof"]
-    """... of the velocities that joints have and two derivatives, ..."""
+    """Largest absolute joint velocities, and of their first two derivatives."""
     pull: Float[ndarray, "3 n dof"]
-    """... and of accelerations. Positions that are held have neither, however far apart they are."""
+    """The same for joint accelerations. Velocities and accelerations are zero where the motion holds a
+    position."""
 
 
 class Body(NamedTuple):
-    """What moves with a joint, and where that hangs."""
+    """The body that moves with a joint."""
 
     parent: int
-    """Number of the joint before it; -1: none."""
+    """Index of the joint before it; -1 if there is none."""
     slides: bool
+    """Whether the joint is prismatic."""
     offset: float
-    """Between the origins of both frames, without what a sliding joint adds [m]."""
+    """Distance between the origins of both frames, at zero displacement of a prismatic joint [m]."""
     mass: float
+    """[kg]"""
     lever: float
-    """Of the centre of mass [m]."""
+    """Distance of the centre of mass from the frame's origin [m]."""
     moment: float
-    """Greatest about the centre of mass [kg m²]."""
+    """Largest principal moment about the centre of mass [kg m²]."""
 
 
 def times(a: Jet, b: Jet) -> Jet:
-    """Of a product of any kind whose length is at most that of both factors."""
+    """Bounds for a product of two vectors or numbers whose length is at most the product of their lengths."""
     return np.stack([a[0] * b[0], a[1] * b[0] + a[0] * b[1], a[2] * b[0] + 2 * a[1] * b[1] + a[0] * b[2]])
 
 
 def bend(bodies: list[Body], gravity: float, along: Stretches) -> Float[ndarray, "n dof"]:
-    """Second derivatives of torques at most."""
+    """Upper bounds on the second derivatives of torques, by the parameter of the stretches."""
     still = np.zeros((3, len(along.q)))
     weight = still.copy()
     weight[0] = gravity
-    # of each frame: its turning as it is seen, that of the dynamics, its angular and linear acceleration
+    # per frame: rotation rate of the path, angular velocity, angular and linear acceleration of the dynamics
     frames: list[tuple[Jet, Jet, Jet, Jet]] = []
     axes: list[Jet] = []
     arms: list[Jet] = []
@@ -94,5 +98,5 @@ def bend(bodies: list[Body], gravity: float, along: Stretches) -> Float[ndarray,
 
 
 def _fixed(length: float, turn: Jet) -> Jet:
-    """A vector of a length that turns with its body."""
+    """Bounds for a vector of constant length that rotates with its body."""
     return length * np.stack([np.ones_like(turn[0]), turn[0], turn[1] + turn[0] ** 2])

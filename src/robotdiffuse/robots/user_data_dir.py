@@ -1,11 +1,12 @@
-"""Where a user's robots are, with what was made for them."""
+"""The folder of the user's robots."""
 
 import os
 from pathlib import Path
 
 
 def user_robots() -> Path:
-    """Where robots that were added are kept: $ROBOTDIFFUSE_ROBOTS or the user's data directory."""
+    """The folder of added robots: $ROBOTDIFFUSE_ROBOTS, or robotdiffuse/robots in the user's data
+    directory."""
     chosen = os.environ.get("ROBOTDIFFUSE_ROBOTS")
     if chosen:
         return Path(chosen)

@@ -1,4 +1,4 @@
-"""Visual meshes: what the viewer draws. Planning and validating never use them."""
+"""Visual meshes for drawing robots. Planning and validation never use them."""
 
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -12,11 +12,12 @@ from robotdiffuse.robots.robot import Robot
 
 UNIT = 5e-5
 """Resolution of stored vertices [m]."""
-AGREEMENT = 0.03
-"""A visual mesh is used only if its bounding box is this close to that of the collision geometry [m]."""
-PLAIN = (236, 238, 240)
-HELD, TOOL = (0xD9, 0x7B, 0x5C), (176, 182, 190)
-"""What a robot holds is drawn in the colour of an obstacle, a tool like metal."""
+MAX_BOX_DIFFERENCE = 0.03
+"""Largest difference between the bounding boxes of a visual mesh that is used and of the collision geometry
+[m]."""
+LINK_COLOR = (236, 238, 240)
+HELD_COLOR, TOOL_COLOR = (0xD9, 0x7B, 0x5C), (176, 182, 190)
+"""Colours of held objects, as of obstacles, and of tools [sRGB]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +30,17 @@ class VisualMesh(Value):
 
 
 def load_visual(robot: Robot) -> dict[str, tuple[VisualMesh, ...]]:
-    """What to draw, by link: bundled visual meshes, else the convex collision meshes, else the spheres.
+    """Meshes to draw, by link: bundled visual meshes, or else the convex collision meshes, or else the
+    spheres.
 
-    A bundled mesh that does not agree with the robot's own collision geometry is not used, so that the
-    picture never shows another arm than the one that was planned for.
+    A bundled mesh that differs from the robot's collision geometry is not used, so that pictures show the
+    robot that was planned for.
     """
     bundled = _read_bundled(robot.name)
     drawn: dict[str, tuple[VisualMesh, ...]] = {}
-    colors = {body.name: TOOL if body.tool else HELD for body in robot.attached}
+    colors = {body.name: TOOL_COLOR if body.tool else HELD_COLOR for body in robot.attached}
     for link in robot.link_names:
-        collision = _collision_geometry(robot, link, colors.get(link, PLAIN))
+        collision = _collision_geometry(robot, link, colors.get(link, LINK_COLOR))
         visual = bundled.get(link)
         if visual is not None and (not collision or _agree(visual, collision)):
             drawn[link] = (visual,)
@@ -66,7 +68,7 @@ def _plain(vertices: ndarray, faces: ndarray, color: tuple[int, int, int]) -> Vi
 def _agree(visual: VisualMesh, collision: tuple[VisualMesh, ...]) -> bool:
     points = np.concatenate([mesh.vertices for mesh in collision])
     gap = np.abs([visual.vertices.min(0) - points.min(0), visual.vertices.max(0) - points.max(0)])
-    return bool(gap.max() < AGREEMENT)
+    return bool(gap.max() < MAX_BOX_DIFFERENCE)
 
 
 def _read_bundled(name: str) -> dict[str, VisualMesh]:

@@ -93,7 +93,7 @@ def goal_error(
         return max((error for error in errors if error), key=lambda error: error.excess, default=None)
     if isinstance(goal, JointGoal):
         differences = goal.positions - q
-        differences -= robot.turns(differences)
+        differences -= robot.whole_turns(differences)
         off = float(np.abs(differences).max(axis=1).min(initial=np.inf))
         if off <= settings.goal_tolerance or np.linalg.norm(differences, axis=1).min() <= blend:
             return None
@@ -164,7 +164,7 @@ def _near(
         return np.all([_near(robot, one, q, blend, settings) for one in goal.poses], axis=0)
     if isinstance(goal, JointGoal):
         differences = goal.positions[:, None] - q
-        differences -= robot.turns(differences)
+        differences -= robot.whole_turns(differences)
         reach = blend + settings.goal_tolerance * np.sqrt(robot.dof)
         return (np.linalg.norm(differences, axis=2) <= reach).any(axis=0)
     xyz = goal.xyz_tolerance

@@ -228,7 +228,7 @@ def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.robots import DATA, read_bundle
+    from robotdiffuse.robots import DATA, read_robot_folder
     from robotdiffuse.robots.kinematics import link_pose
 
     source = DATA / "panda"
@@ -252,7 +252,7 @@ def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     (folder / "meshes.npz").write_bytes(meshes)
 
     def read() -> None:
-        robot = read_bundle(folder)
+        robot = read_robot_folder(folder)
         link_pose(robot, (robot.lower + robot.upper) / 2, robot.tip)
 
     return read

@@ -35,7 +35,7 @@ from robotdiffuse.problems.problem import JointGoal, PoseGoal
 from robotdiffuse.robots import Robot, load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.urdf import read_urdf
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
 
 FOLDER = Path(__file__).parents[2] / "files" / "motion_bench_maker"
@@ -166,8 +166,8 @@ MOUNTED = """<robot name="mounted">
 def mounted(folder: Path, kind: str) -> Robot:
     """As `robot add --base base` keeps it, less the spheres, which take their time."""
     (folder / "mounted.urdf").write_text(MOUNTED.format(kind=kind))
-    write_bundle(read_urdf(folder / "mounted.urdf", base="base"), folder / "mounted", {})
-    return read_bundle(folder / "mounted")
+    write_robot_folder(read_urdf(folder / "mounted.urdf", base="base"), folder / "mounted", {})
+    return read_robot_folder(folder / "mounted")
 
 
 def test_scene_in_the_world_of_a_robot_whose_base_is_not_its_root(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from robotdiffuse.robots.fitting.allowed_collisions import (
     allowed_pairs,
     find_allowed_collisions,
 )
-from robotdiffuse.robots.fitting.false_collisions import Refusals
+from robotdiffuse.robots.fitting.false_collisions import FalseCollisions
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 
 QUICK = SamplingSettings(samples=1500)
@@ -139,7 +139,7 @@ def test_what_one_joint_folds_into_up_to_its_stop_is_allowed(bound: float, found
 
 def test_pairs_that_meet_and_are_not_checked_are_told() -> None:
     pairs = (PairReport(("l1", "l3"), "limits", 0.27), PairReport(("l1", "l2"), "adjacent", 1.0))
-    report = AddReport(box_arm(), Path(), (), pairs, Refusals(0.7, 0.0, 0.0, ()), 0.0, 0)
+    report = AddReport(box_arm(), Path(), (), pairs, FalseCollisions(0.7, 0.0, 0.0, ()), 0.0, 0)
     (warning,) = report.warnings
     assert "l1 against l3 is not checked" in warning and "27.0%" in warning
 

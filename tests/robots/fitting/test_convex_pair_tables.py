@@ -16,9 +16,9 @@ from robotdiffuse.robots.fitting.convex_pair_tables import joint_table
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface
 from robotdiffuse.robots.fitting.preparation import PreparationSettings, Prepared, prepare
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings
-from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.link_pair_tables import LinkPairTable
 from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.scene import Scene
 
 PAIR = ("fork", "flange")
@@ -76,7 +76,7 @@ def test_a_pair_that_is_always_close_refuses_little() -> None:
     prepared = made()
     robot = prepared.robot
     assert [table.links for table in robot.tables] == [PAIR]
-    assert prepared.refusals.by_spheres < 0.08
+    assert prepared.false_collisions.by_spheres < 0.08
     assert shares(replace(robot, tables=())) == (1.0, 0)
     refused, wrong = shares(robot)
     assert refused < 0.08 and wrong == 0
@@ -84,8 +84,8 @@ def test_a_pair_that_is_always_close_refuses_little() -> None:
 
 def test_tables_are_kept_in_the_robots_folder(tmp_path: Path) -> None:
     robot = made().robot
-    write_bundle(robot, tmp_path, {})
-    (table,), (kept,) = robot.tables, read_bundle(tmp_path).tables
+    write_robot_folder(robot, tmp_path, {})
+    (table,), (kept,) = robot.tables, read_robot_folder(tmp_path).tables
     assert (kept.links, kept.joints, kept.lower, kept.upper) == (
         table.links,
         table.joints,
@@ -130,7 +130,7 @@ def test_intervals_are_apart_if_all_that_is_within_them_is() -> None:
     """Along a joint that ends, and along one that turns on and on."""
     rng = np.random.default_rng(0)
     apart = rng.random((8, 8)) < 0.9
-    table = JointTable(PAIR, ("a", "b"), (-1.0, -np.pi), (1.0, np.pi), apart)
+    table = LinkPairTable(PAIR, ("a", "b"), (-1.0, -np.pi), (1.0, np.pi), apart)
     low = [rng.uniform(-1.4, 1.2, 40), rng.uniform(-9, 8, 40)]
     high = [low[0] + rng.uniform(0, 0.5, 40), low[1] + rng.uniform(0, 2, 40)]
     found = table.throughout(*zip(low, high, strict=True))

@@ -16,7 +16,7 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.fitting import preparation
 from robotdiffuse.robots.fitting.add import add_robot
-from robotdiffuse.robots.fitting.preparation import LARGE, PreparationSettings
+from robotdiffuse.robots.fitting.preparation import LARGE_REACH, PreparationSettings
 from robotdiffuse.robots.scaling import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify
@@ -75,7 +75,7 @@ def test_an_arm_with_bellows_on_a_held_joint_can_move(tmp_path: Path) -> None:
             on_a_lift(tmp_path, 1), base="base", tip="j3_link", out=tmp_path / "robot", settings=QUICK
         )
     reasons = {frozenset(pair.links): pair.reason for pair in report.pairs}
-    assert reasons[frozenset(("column", "bellows1_link"))] == "default" and report.refusals.free > 0.2
+    assert reasons[frozenset(("column", "bellows1_link"))] == "default" and report.false_collisions.free > 0.2
 
 
 def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
     assert f"--allow {pair[0]} {pair[1]}" in text and text.count("--allow") == 1
     assert not (tmp_path / "robot").exists()
     with coarse_grids():
-        assert add_robot(on_a_lift(tmp_path, 2), allow=[pair], **how).refusals.free > 0.2
+        assert add_robot(on_a_lift(tmp_path, 2), allow=[pair], **how).false_collisions.free > 0.2
 
 
 def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
             if not finer:
                 patch.setattr(preparation, "_closer", lambda *_: None)
             report = add_robot(urdf, tip="j3_link", out=tmp_path / str(finer), settings=settings)
-        refused.append(report.refusals.by_parts)
+        refused.append(report.false_collisions.by_parts)
         assert all(made.covered for made in report.links)
     assert refused[1] < 0.5 * refused[0]
 
@@ -130,7 +130,7 @@ def test_an_arm_four_times_as_large_takes_no_more_spheres(tmp_path: Path) -> Non
         )
         parts = chain("base", row("j", 4), xyz=f"0 0 {length}").replace(BALL, box)
         report = add_robot(written(tmp_path, parts), out=tmp_path / f"{size}", settings=QUICK)
-        assert all(part.covered for part in report.links) and reach(report.robot) > LARGE
+        assert all(part.covered for part in report.links) and reach(report.robot) > LARGE_REACH
         counts.append(report.sphere_count)
     assert counts[1] == pytest.approx(counts[0], rel=0.2) and min(counts) > 10
 
@@ -147,6 +147,6 @@ def test_an_arm_on_a_long_rail_is_no_larger(tmp_path: Path) -> None:
 def test_settings_are_those_of_arms_of_up_to_a_metre_and_a_half() -> None:
     settings = PreparationSettings()
     assert settings.for_reach(0.9) == settings
-    twice = settings.for_reach(2 * LARGE)
+    twice = settings.for_reach(2 * LARGE_REACH)
     assert twice.spheres.first_half == 2 * settings.spheres.first_half and twice.finest == 2 * settings.finest
     assert twice.parts.concavity == 2 * settings.parts.concavity and twice.parts.most == settings.parts.most

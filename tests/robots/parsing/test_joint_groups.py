@@ -9,7 +9,7 @@ from helpers.made_arms import chain, joint, link, row, written
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
 from robotdiffuse.robots.parsing.urdf import read_urdf
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 
 ARM = chain("base", row("j", 6))
 
@@ -133,8 +133,8 @@ def test_mimic_joints_follow(tmp_path: Path) -> None:
     )
     robot = read_urdf(written(tmp_path, ARM, parts))
     assert robot.locked == {"grip": 0.0, "other": 0.1, "third": 0.2}
-    write_bundle(robot, tmp_path / "kept", {})
-    for arm in (robot, read_bundle(tmp_path / "kept")):
+    write_robot_folder(robot, tmp_path / "kept", {})
+    for arm in (robot, read_robot_folder(tmp_path / "kept")):
         arm = arm.with_locked({"grip": 0.4})
         assert arm.locked == pytest.approx({"grip": 0.4, "other": -0.1, "third": -0.2})
         assert arm.with_locked({"grip": 0.4, "third": -0.2}).locked == arm.locked
@@ -145,14 +145,14 @@ def test_mimic_joints_follow(tmp_path: Path) -> None:
 def test_linkages_of_planned_joints_are_refused_unless_they_are_held(tmp_path: Path) -> None:
     follow = '<mimic joint="j2" multiplier="-1"/>'
     bar = link("bar") + joint("rod", "j1_link", "bar", more=follow)
-    with pytest.raises(InputError, match=r"rod follows j2, which is planned; .*--lock j2=VALUE"):
+    with pytest.raises(InputError, match=r"rod mimics j2, which is planned; .*--lock j2=VALUE"):
         read_urdf(written(tmp_path, ARM, bar))
     held = read_urdf(written(tmp_path, ARM, bar), locked={"j2": 0.5})
     assert held.locked == {"rod": -0.5, "j2": 0.5} and held.dof == 5
     bare = bar.replace(link("bar"), link("bar", ""))
     assert read_urdf(written(tmp_path, ARM, bare)).dof == 6
     inside = link("end") + joint("last", "j6_link", "end", more='<mimic joint="j5"/>')
-    with pytest.raises(InputError, match="last follows j5"):
+    with pytest.raises(InputError, match="last mimics j5"):
         read_urdf(written(tmp_path, ARM, inside), tip="end")
 
 
@@ -164,7 +164,7 @@ def test_mimic_of_nothing_or_in_a_circle(followed: str, tmp_path: Path) -> None:
         + link("end")
         + joint("other", "base", "end", more='<mimic joint="rod"/>')
     )
-    with pytest.raises(InputError, match="joint of the file that does not follow it"):
+    with pytest.raises(InputError, match="joint of the file that does not mimic it"):
         read_urdf(written(tmp_path, ARM, parts))
 
 

@@ -15,13 +15,14 @@ from robotdiffuse.core.transforms import rotation_from_rpy
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.fitting.add import add_robot
 from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.fitting.convex_parts import THIN, convex_hull
+from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, convex_hull
 from robotdiffuse.robots.fitting.preparation import PreparationSettings
 from robotdiffuse.robots.fitting.sphere_fitting import covered
+from robotdiffuse.robots.joints import CONTINUOUS_LIMIT
 from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
 from robotdiffuse.robots.parsing.urdf import UrdfTree, read_urdf
-from robotdiffuse.robots.robot import TURNS, Robot
-from robotdiffuse.robots.robot_folder import read_bundle, read_source, write_bundle
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot_folder import read_robot_folder, read_source, write_robot_folder
 
 ARM = """<robot name="tiny">
   <link name="base"><collision><origin xyz="0 0 0.05"/>
@@ -58,8 +59,8 @@ def test_joints_limits_and_geometry(tmp_path: Path) -> None:
     robot = read_urdf(urdf(tmp_path))
     assert (robot.name, robot.base, robot.tip) == ("tiny", "base", "fore")
     assert robot.joint_names == ("turn", "bend")
-    np.testing.assert_allclose(robot.lower, [-2, -TURNS])
-    np.testing.assert_allclose(robot.upper, [1, TURNS])
+    np.testing.assert_allclose(robot.lower, [-2, -CONTINUOUS_LIMIT])
+    np.testing.assert_allclose(robot.upper, [1, CONTINUOUS_LIMIT])
     np.testing.assert_allclose(robot.velocity, [1.5, 1.0])
     np.testing.assert_allclose(robot.acceleration, [6, 4])
     np.testing.assert_allclose(robot.jerk, [60, 40])
@@ -117,7 +118,7 @@ def test_what_has_no_thickness_is_given_some(corners: list[list[float]], thin: i
     hull = convex_hull(turned)
     solid = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
     size = np.sort(solid.bounding_box_oriented.primitive.extents)
-    np.testing.assert_allclose(size[:thin], THIN, rtol=0.01)
+    np.testing.assert_allclose(size[:thin], MIN_THICKNESS, rtol=0.01)
     assert solid.is_watertight and solid.volume > 0 and solid.contains(turned.mean(0)[None]).all()
 
 
@@ -188,10 +189,10 @@ def test_robot_folder_round_trip(tmp_path: Path) -> None:
         allowed_collisions=frozenset({frozenset(("base", "upper"))}),
     )
     folder = tmp_path / "out" / "tiny"
-    write_bundle(robot, folder, {"urdf": "tiny.urdf", "sha256": "x"})
+    write_robot_folder(robot, folder, {"urdf": "tiny.urdf", "sha256": "x"})
     (folder / "other.txt").write_text("kept")
-    write_bundle(robot, folder, {"urdf": "tiny.urdf", "sha256": "y"})
-    same(robot, read_bundle(folder))
+    write_robot_folder(robot, folder, {"urdf": "tiny.urdf", "sha256": "y"})
+    same(robot, read_robot_folder(folder))
     assert read_source(folder)["sha256"] == "y"
     assert sorted(file.name for file in folder.iterdir()) == ["meshes.npz", "other.txt", "robot.json"]
 
@@ -240,10 +241,10 @@ def test_damaged_folder_names_the_file(file: str, content: str, tmp_path: Path) 
         (tmp_path / name).write_bytes((robots.DATA / "panda" / name).read_bytes())
     (tmp_path / file).write_text(content)
     with pytest.raises(InputError, match=file):
-        read_bundle(tmp_path)
+        read_robot_folder(tmp_path)
     (tmp_path / file).unlink()
     with pytest.raises(InputError, match=file):
-        read_bundle(tmp_path)
+        read_robot_folder(tmp_path)
 
 
 def test_limits_file(tmp_path: Path) -> None:
@@ -323,4 +324,4 @@ def test_add_refuses_what_cannot_work(tmp_path: Path) -> None:
         add_robot(urdf(tmp_path), name="../up")
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write"):
-        write_bundle(read_urdf(urdf(tmp_path)), tmp_path / "file" / "robot", {})
+        write_robot_folder(read_urdf(urdf(tmp_path)), tmp_path / "file" / "robot", {})

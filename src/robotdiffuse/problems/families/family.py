@@ -67,7 +67,7 @@ class SampledProblem:
 
     def problem(self, robot: Robot) -> Problem:
         """The problem to reach any of the goals, with any number of full turns of their joints."""
-        goals = np.concatenate([robot.same_stance(goal, self.start) for goal in self.goals])
+        goals = np.concatenate([robot.equivalent_configurations(goal, self.start) for goal in self.goals])
         return Problem(robot, self.scene, self.start, JointGoal(goals))
 
 
@@ -132,7 +132,7 @@ def uniform_configurations(
     """
     found = np.zeros((0, robot.dof))
     for _ in range(MAX_BATCHES):
-        q = robot.least_turns(rng.uniform(robot.lower, robot.upper, (BATCH_SIZE, robot.dof)))
+        q = robot.unwound(rng.uniform(robot.lower, robot.upper, (BATCH_SIZE, robot.dof)))
         xyz = link_origins(robot, q, robot.tip)
         q = q[((xyz >= region[0]) & (xyz <= region[1])).all(axis=1)]
         found = np.concatenate([found, q[checker.free(q)] if len(q) else q])
@@ -162,7 +162,7 @@ def reaching_configurations(
 
     settings = replace(settings, position_only=True) if robot.dof < MIN_POSE_DOF else settings
     q = inverse_kinematics(robot, robot.tip, T_base_tip, count, rng=rng, accept=accept, settings=settings)
-    return robot.least_turns(q).astype(np.float32)
+    return robot.unwound(q).astype(np.float32)
 
 
 def base_spheres(robot: Robot) -> Float[ndarray, "m 4"]:

@@ -23,7 +23,7 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
-from robotdiffuse.robots.bodies import Attached
+from robotdiffuse.robots.bodies import AttachedBody
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
@@ -163,7 +163,7 @@ class MoveItFrames(dict[str, ndarray]):
         self, robot: Robot | None, T_own_root: Float[ndarray, "4 4"], own: tuple[str, ...] = ("", "world")
     ) -> None:
         """own: names of the scene's own frame; T_own_root: pose of the URDF's root in it."""
-        super().__init__({} if robot is None else robot.above | robot.fixed_below)
+        super().__init__({} if robot is None else robot.above | robot.links_fixed_to_base)
         self.links = frozenset(self)
         """Frames of the robot, whose poses a file cannot change."""
         T_base_root = np.eye(4) if robot is None else robot.T_base_root
@@ -356,15 +356,13 @@ def _attached(i: int, entry: object, frames: MoveItFrames, folder: Path) -> Move
 
 def holding_at(robot: Robot, held: MoveItAttached, start: list[float]) -> Robot:
     """The robot with an object attached at the start. touch_links that the robot lacks are ignored."""
-    from robotdiffuse.robots.attached_bodies import attach  # compiled code, which most problems do not need
-
     shapes = held.shapes
     if not held.in_link and held.link in robot.link_names:
         T_link_base = inverse(link_pose(robot, np.array(start), held.link))
         shapes = tuple(shape.moved(T_link_base) for shape in shapes)
     touch = tuple(link for link in held.touch_links if link in robot.link_names)
     T_link_body = shapes[0].solid()[0] if shapes else np.eye(4)
-    return attach(robot, Attached(held.name, held.link, T_link_body, shapes, touch))
+    return robot.with_body(AttachedBody(held.name, held.link, T_link_body, shapes, touch))
 
 
 def _joint_goal(where: str, goal: object) -> dict[str, float]:

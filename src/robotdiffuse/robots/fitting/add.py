@@ -1,4 +1,4 @@
-"""Making a robot from a URDF: spheres, allowed collisions and limits, written as a robot folder."""
+"""Adds a robot from a URDF: fits spheres, finds allowed collisions, and writes a robot folder."""
 
 import resource
 import sys
@@ -9,58 +9,60 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.robots.fitting.allowed_collisions import BY_SRDF, CHECKED, LIMITS, NAMED, POSE, PairReport
-from robotdiffuse.robots.fitting.false_collisions import PairRefusals, Refusals
+from robotdiffuse.robots.fitting.false_collisions import FalseCollisions, PairFalseCollisions
 from robotdiffuse.robots.fitting.preparation import LinkReport, PreparationSettings, Progress, prepare
 from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.robots.user_data_dir import user_robots
 
-LITTLE, REFUSED = 0.2, 0.08
-"""Shares of free configurations, and of those that spheres refuse, from which on there is a warning."""
-MOST_PROPOSED = 3
-"""Pairs that the error for a robot that is never free proposes, where none collides always."""
-TAKEN_FOR_SAFE = {
-    LIMITS: "up to a stop of one joint, which its limits allow",
-    POSE: "as in a pose that the SRDF names",
+MIN_FREE, MAX_FALSE_COLLISIONS = 0.2, 0.08
+"""A warning is given below this fraction of free configurations, and above this fraction of false
+collisions."""
+MAX_PROPOSED = 3
+"""Pairs proposed by the error for a robot that always collides with itself, if no single pair always
+collides."""
+ASSUMED_SAFE = {
+    LIMITS: "up to a limit of one joint, and the URDF's limits allow that",
+    POSE: "also in a pose that the SRDF names",
 }
-"""Reasons that somebody should look at, with what speaks for the pair."""
-KILO = 1 if sys.platform == "darwin" else 1024
-"""Bytes per unit of what the system says of a process's memory."""
+"""Reasons for allowing a pair that a person should check, with the evidence."""
+BYTES_PER_UNIT = 1 if sys.platform == "darwin" else 1024
+"""Bytes per unit of `ru_maxrss`."""
 
 
 @dataclass(frozen=True)
 class PairDifference:
-    """Two links that sampling and an SRDF see differently."""
+    """Two links that sampling and an SRDF classify differently."""
 
     links: tuple[str, str]
     sampled: str
-    """The reason by sampling, or checked."""
+    """The reason found by sampling, or `checked`."""
     colliding: float
-    """Share of the configurations in which the meshes collide."""
+    """Fraction of the configurations in which the meshes collide."""
     srdf: str
-    """The SRDF's reason, or checked."""
+    """The SRDF's reason, or `checked`."""
 
 
 @dataclass(frozen=True)
 class AddReport:
-    """What `add_robot` made."""
+    """Result of `add_robot`."""
 
     robot: Robot
     folder: Path
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
-    refusals: Refusals
+    false_collisions: FalseCollisions
     seconds: float
-    """Processor time."""
+    """Processor time [s]."""
     memory: int
-    """The most that this process has used so far [bytes]."""
+    """Peak memory of this process so far [bytes]."""
     srdf: Path | None = None
-    """The SRDF that was given, or found beside the URDF."""
+    """The SRDF given, or found beside the URDF."""
     differences: tuple[PairDifference, ...] = ()
-    """Where sampling and the SRDF differ."""
+    """Pairs of links that sampling and the SRDF classify differently."""
 
     @property
     def sphere_count(self) -> int:
@@ -68,50 +70,52 @@ class AddReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What will keep this robot from moving, and pairs that are taken for safe though they meet."""
-        found, of = [], self.refusals
+        """Problems that will limit planning, and allowed pairs of links whose meshes collide."""
+        found, of = [], self.false_collisions
         worst = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in of.pairs[:3])
-        if of.free < LITTLE:
+        if of.free < MIN_FREE:
             often = sorted(of.pairs, key=lambda pair: -pair.colliding)[:3]
             names = "; ".join(f"{' against '.join(pair.links)} {pair.colliding:.1%}" for pair in often)
             found.append(
                 f"only {of.free:.1%} of the configurations are free of self-collision by the URDF's meshes "
-                f"({names}); a pair that may touch can be allowed"
+                f"({names}); allow pairs that may touch with --allow"
             )
-        if of.by_spheres > REFUSED:
+        if of.by_spheres > MAX_FALSE_COLLISIONS:
             found.append(
-                f"covering spheres refuse {of.by_spheres:.1%} of the free configurations, more than "
-                f"{REFUSED:.0%} ({worst}); plans there will not be found"
+                f"covering spheres collide falsely in {of.by_spheres:.1%} of the free configurations, more "
+                f"than {MAX_FALSE_COLLISIONS:.0%} ({worst}); planning cannot use these"
             )
         found += [
             f"{' against '.join(pair.links)} is not checked, though the URDF's meshes collide in "
-            f"{pair.colliding:.1%} of the configurations, {TAKEN_FOR_SAFE[pair.reason]}; see that the arm "
-            f"cannot hit itself there"
+            f"{pair.colliding:.1%} of the configurations, {ASSUMED_SAFE[pair.reason]}; make "
+            f"sure that the arm cannot hit itself there"
             for pair in self.pairs
-            if pair.reason in TAKEN_FOR_SAFE and pair.colliding
+            if pair.reason in ASSUMED_SAFE and pair.colliding
         ]
         return (*found, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
-def never_free(refusals: Refusals) -> bool:
-    """Whether every configuration that was looked at collides with itself, so that nothing can be planned."""
-    return refusals.free == 0 or refusals.by_parts == 1
+def never_free(false_collisions: FalseCollisions) -> bool:
+    """Whether all sampled configurations are in self-collision, so that nothing can be planned."""
+    return false_collisions.free == 0 or false_collisions.by_parts == 1
 
 
-def never_free_error(urdf: str | Path, refusals: Refusals) -> InputError:
-    """The error for a robot that is never free; it proposes the pairs of links that always collide, or else
-    those that collide most often."""
+def never_free_error(urdf: str | Path, false_collisions: FalseCollisions) -> InputError:
+    """The error for a robot that always collides with itself.
 
-    def colliding(pair: PairRefusals) -> float:
+    It proposes to allow the pairs of links that always collide, or else those that collide most often.
+    """
+
+    def colliding(pair: PairFalseCollisions) -> float:
         return max(pair.colliding, pair.by_parts)
 
-    often = sorted(refusals.pairs, key=lambda pair: -colliding(pair))
-    worst = [pair for pair in often if colliding(pair) == 1] or often[:MOST_PROPOSED]
+    often = sorted(false_collisions.pairs, key=lambda pair: -colliding(pair))
+    worst = [pair for pair in often if colliding(pair) == 1] or often[:MAX_PROPOSED]
     names = "; ".join(f"{' and '.join(pair.links)} collide in {colliding(pair):.1%}" for pair in worst)
     options = " ".join(f"--allow {' '.join(pair.links)}" for pair in worst)
     return InputError(
-        f"{urdf}: every configuration collides with itself: {names}; if the links may touch, allow it by "
-        f"{options}, or give the SRDF, which knows such pairs, by --srdf FILE"
+        f"{urdf}: every configuration collides with itself: {names}; if these links may touch, add "
+        f"{options}, or give an SRDF that allows such pairs with --srdf FILE"
     )
 
 
@@ -132,15 +136,26 @@ def add_robot(
     allow: Sequence[tuple[str, str]] = (),
     packages: dict[str, str | Path] | None = None,
 ) -> AddReport:
-    """Read a URDF (see read_urdf), prepare it (see preparation.py), write the robot folder.
+    """Read a URDF, prepare the robot (see `prepare`) and write the robot folder.
 
-    `name` defaults to the URDF's; `out`, the folder, to `user_robots() / name`; `limits` is a file in the
-    form of MoveIt's joint_limits.yaml. The same input and seed give the same robot. Raises InputError for
-    bad input, and for a robot that always collides with itself.
+    Args:
+        urdf: URDF or xacro file.
+        name: Name of the robot; by default the URDF's.
+        base: See `UrdfTree.robot`, also for `tip`, `locked` and `group`.
+        limits: Joint limits, a file in the form of MoveIt's joint_limits.yaml.
+        out: Folder to write; by default `user_robots() / name`.
+        licence: Licence of the geometry, kept in the folder.
+        settings: Settings of the preparation.
+        seed: The same input and seed give the same robot.
+        progress: Called at each step.
+        srdf: Source of groups, poses and passive joints; by default the SRDF found beside the URDF. Pairs of
+            links that it allows are not checked, but only if it is given here. All pairs found by sampling
+            are compared with the SRDF's.
+        allow: Further pairs of links that are not checked.
+        packages: Folders of ROS packages by name.
 
-    Groups, poses and passive joints are those of `srdf`, or of the SRDF found beside the URDF. Pairs of links
-    that need no check are found by sampling and compared with the SRDF's; a given `srdf` allows its pairs
-    too, one that was found does not. `allow` are further pairs.
+    Raises:
+        InputError: For bad input, and for a robot that always collides with itself.
     """
     begin = time.process_time()
     tree = UrdfTree(Path(urdf), packages or {})
@@ -151,22 +166,22 @@ def add_robot(
         raise unknown_name("link in allow", link, robot.link_names)
     name = name or robot.name
     if not name or Path(name).name != name or name.startswith("."):
-        raise InputError(f"robot name is {name!r}; it must be usable as a folder's name: give --name NAME")
+        raise InputError(f"robot name is {name!r}; it must be a valid folder name: give --name NAME")
     robot = replace(robot, name=name)
     if limits is not None:
         robot = with_limits(robot, read_limits(limits))
     if not robot.meshes:
         raise InputError(
-            f"{urdf}: no link has collision geometry, nor a visual one that could stand for it; nothing "
-            f"could be checked: give its links <collision> elements"
+            f"{urdf}: no link has collision or visual geometry, so collisions cannot be checked; add "
+            f"<collision> elements to its links"
         )
     known = {} if semantics is None else semantics.allowed
     allowed = {pair: BY_SRDF for pair in known} if srdf is not None else {}
     allowed |= {frozenset(pair): NAMED for pair in allow}
     surfaces = {link: tree.surfaces(link) for link in robot.meshes}
     made = prepare(robot, surfaces, settings or PreparationSettings(), seed, progress, allowed)
-    if never_free(made.refusals):
-        raise never_free_error(urdf, made.refusals)
+    if never_free(made.false_collisions):
+        raise never_free_error(urdf, made.false_collisions)
     differences = tuple(
         PairDifference(pair.links, pair.reason, pair.colliding, known.get(frozenset(pair.links), CHECKED))
         for pair in made.sampled
@@ -174,12 +189,17 @@ def add_robot(
     )
     folder = user_robots() / name if out is None else Path(out)
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": licence}
-    shares = {"free": round(made.refusals.free, 4), "refused": round(made.refusals.by_spheres, 4)}
+    measured = made.false_collisions
+    shares = {"free": round(measured.free, 4), "refused": round(measured.by_spheres, 4)}
     note = (
-        f"{made.refusals.free:.1%} of the configurations are free of self-collision; convex parts refuse "
-        f"{made.refusals.by_parts:.1%} of these, spheres {made.refusals.by_spheres:.1%}"
+        f"{measured.free:.1%} of the configurations are free of self-collision; convex parts "
+        f"collide falsely in {measured.by_parts:.1%} of these, spheres in "
+        f"{measured.by_spheres:.1%}"
     )
-    write_bundle(replace(made.robot, notes=(*robot.notes, note)), folder, source | shares)
-    seconds, memory = time.process_time() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KILO
-    shown = (made.links, made.pairs, made.refusals, seconds, memory, found, differences)
-    return AddReport(read_bundle(folder), folder, *shown)
+    write_robot_folder(replace(made.robot, notes=(*robot.notes, note)), folder, source | shares)
+    seconds, memory = (
+        time.process_time() - begin,
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT,
+    )
+    shown = (made.links, made.pairs, made.false_collisions, seconds, memory, found, differences)
+    return AddReport(read_robot_folder(folder), folder, *shown)

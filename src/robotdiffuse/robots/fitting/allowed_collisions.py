@@ -1,4 +1,4 @@
-"""Pairs of links that need no check against each other, found by sampling configurations."""
+"""Finds pairs of links that need no collision check against each other, by sampling configurations."""
 
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
@@ -14,83 +14,89 @@ from scipy.optimize import linprog
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.fitting.convex_parts import planes_of
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
+from robotdiffuse.robots.joints import MOVING_KINDS, Joint
+from robotdiffuse.robots.robot import Robot
 
 ADJACENT, ALWAYS, NEVER, CHECKED = "adjacent", "always", "never", "checked"
 DEFAULT, POSE, LIMITS = "default", "pose", "limits"
 NAMED, BY_SRDF = "named", "srdf"
-"""Reasons from outside: the pair was named by who adds the robot, or an SRDF allows it."""
+"""Reasons given by the user: the pair was named when the robot was added, or an SRDF allows it."""
 BINS = 24
-"""Of a joint's range, to see whether it alone says where two links collide."""
-STOPPED = 5.2
-"""A joint whose range is narrower has a stop [rad]; that of wider ones may be chosen."""
-FEWER = 10
-"""Of so many samples one is looked at for adjacent links, which are allowed whatever it says."""
-OFTEN, UNCERTAIN = 0.2, 0.25
-"""Share of the configurations in which links collide that a joint's stops keep apart, at least, and of the
-variance of colliding that the other joints may explain, at most."""
-MOST_HELD = 1
-"""Held joints through which a link of the arm carries another one of its own, as a lift its bellows: behind
-more of them is a head, or another arm."""
-COARSE = 0.03
-"""Meshes of links that overlap in a named pose by no more are taken for coarse there [m]."""
-ROUNDING = 1e-9
-"""What balls around meshes are larger by, and those within smaller [m]: more than rounding takes away."""
-NEAR = 0.1
-"""Links whose balls never come so near [m] are driven towards each other from few samples."""
+"""Bins of a joint's range, to test whether the joint alone determines when two links collide."""
+MAX_STOPPED_RANGE = 5.2
+"""A joint with a narrower range has mechanical stops [rad]; limits of wider ranges may be arbitrary."""
+ADJACENT_STRIDE = 10
+"""One in this many samples is tested for adjacent links, which are allowed in any case."""
+MIN_LIMITS_COLLIDING, MAX_UNEXPLAINED = 0.2, 0.25
+"""For the reason `limits`: the smallest fraction of colliding configurations, and the largest fraction of the
+variance of colliding that the joint with the stop leaves unexplained."""
+MAX_HELD_JOINTS = 1
+"""Largest number of held joints between an arm's link and another link that belongs to the arm, such as the
+bellows of a lift. Links after more held joints belong to a head or another arm."""
+MAX_POSE_OVERLAP = 0.03
+"""If links overlap in a named pose by less than this, their meshes count as coarse there [m]."""
+BALL_MARGIN = 1e-9
+"""Margin of bounding and inscribed balls of meshes [m], larger than rounding errors."""
+NEAR_DISTANCE = 0.1
+"""For pairs of links that stay further apart than this, fewer descents are made [m]."""
 
 
 @dataclass(frozen=True)
 class SamplingSettings:
-    """How the pairs are found."""
+    """Settings of `find_allowed_collisions`."""
 
     samples: int = 20_000
-    """Configurations, uniform within the limits of all joints, gripper joints included."""
+    """Number of configurations, uniform within the limits of all joints, including gripper joints."""
     always: float = 0.95
-    """Share of collisions from which on a pair counts as always colliding (0.95 in MoveIt's assistant)."""
+    """A pair that collides in at least this fraction of the samples counts as always colliding (0.95 in
+    MoveIt's Setup Assistant)."""
     descents: int = 20
-    """Closest samples from which a pair that never collided is driven towards collision, to be sure."""
+    """For a pair without collisions: number of closest samples from which a descent searches for one."""
 
     def __post_init__(self) -> None:
         if self.samples < 100:
-            raise InputError(f"samples is {self.samples}; fewer than 100 find no pairs")
+            raise InputError(f"samples is {self.samples}; it must be at least 100")
         if not 0.5 < self.always <= 1:
             raise InputError(f"always is {self.always}; it must be above 0.5 and at most 1")
 
 
 @dataclass(frozen=True)
 class PairReport:
-    """What sampling says about two links."""
+    """How sampling classifies a pair of links."""
 
     links: tuple[str, str]
     reason: str
-    """adjacent, always, never, default, pose, limits, named or srdf (allowed), or checked."""
+    """checked, or why the pair is allowed: adjacent, always, never, default, pose, limits, named or srdf."""
     colliding: float
-    """Share of the configurations in which the meshes collide."""
+    """Fraction of the configurations in which the meshes collide."""
 
 
 def find_allowed_collisions(
     robot: Robot, settings: SamplingSettings, rng: np.random.Generator
 ) -> tuple[PairReport, ...]:
-    """One report for each pair of links with meshes on different frames; the robot needs covering spheres.
+    """Classify each pair of links with meshes on different frames; the robot needs covering spheres.
 
-    Allowed are, as in MoveIt's setup assistant: adjacent links (joined by a joint, links without geometry
-    between them skipped); pairs that always or never collide; and pairs that collide in the default pose,
-    with the joints between them at zero. For such a pair the limits of the joints say that the manufacturer
-    holds that pose to be safe, so the meshes are coarse there. Hence it must be within the limits, and both
-    links must be the arm's own: the limits know nothing of a tool that is fixed to the last link, or of
-    another arm. A link behind one held joint is the arm's own too, if the pair also collides with that joint
-    where it is held: planning cannot move it away. Because of the limits a pair is allowed as well that
-    collides in a fifth of the configurations or more, up to a stop of one joint between them, which alone
-    says where: stops are where the links on both sides of a joint meet. And so is one that overlaps a little
-    in a pose that an SRDF names, as the tucked one.
+    These pairs are allowed, the first four as in MoveIt's Setup Assistant:
 
-    Meshes are tested with Coal, where the covering spheres do not already show that they are apart. Pairs
-    that never collided are driven together by random descent from their closest samples; those that can be
-    made to collide are checked.
+    - adjacent: a joint connects the links; links without geometry between them are skipped. - always: the
+    links collide in nearly all samples. - never: the links collide in no sample, and no descent finds a
+    collision. - default: the links collide in the default pose, with the joints between them at zero. If the
+    limits include that
+      pose, the manufacturer considers it safe, so the meshes are too coarse there. Both links must belong to
+      the arm, since the limits do not account for a tool on the last link or for another arm. A link after
+      one held joint belongs to the arm too, if the pair also collides at that joint's held value: planning
+      cannot move it away.
+    - limits: the links collide in at least a fifth of the samples, up to a stop of one joint between them,
+    which alone
+      determines where. Joints have stops where the links on both sides meet.
+    - pose: the links overlap slightly in a named pose of the SRDF, such as a tucked one.
+
+    Coal tests the meshes unless the covering spheres show that they are apart. For pairs without collisions,
+    random descents from the closest samples search for one; if they find one, the pair is checked.
     """
     links = Links(robot)
     default = np.clip(np.zeros((1, len(links.joints))), links.lower, links.upper)
@@ -105,22 +111,24 @@ def find_allowed_collisions(
             return ADJACENT
         if colliding.mean() >= settings.always:
             return ALWAYS
-        by_default = _own_between(robot, a, b, MOST_HELD)
+        by_default = _own_between(robot, a, b, MAX_HELD_JOINTS)
         zero = by_default is not None and all(joint.lower <= 0 <= joint.upper for joint in by_default)
         if zero and links.collide(default_poses, a, b, 0) and links.collide(held_poses, a, b, 0):
             return DEFAULT
-        if any(-COARSE < links.mesh_distance(pose, a, b) <= 0 for pose in named):
+        if any(-MAX_POSE_OVERLAP < links.mesh_distance(pose, a, b) <= 0 for pose in named):
             return POSE
         between = _own_between(robot, a, b) or ()
-        if colliding.mean() >= OFTEN and any(links.stops(joint, q, colliding) for joint in between):
+        if colliding.mean() >= MIN_LIMITS_COLLIDING and any(
+            links.stop_explains(joint, q, colliding) for joint in between
+        ):
             return LIMITS
-        descents = settings.descents if near.min() < NEAR else settings.descents // 5
+        descents = settings.descents if near.min() < NEAR_DISTANCE else settings.descents // 5
         if not colliding.any() and not _descend(links, a, b, q[np.argsort(near)[:descents]], rng):
             return NEVER
         return CHECKED
 
     reports = []
-    few = {link: T[: max(len(q) // FEWER, 1)] for link, T in poses.items()}
+    few = {link: T[: max(len(q) // ADJACENT_STRIDE, 1)] for link, T in poses.items()}
     for a, b in _moving_pairs(robot):
         near = links.sphere_distance(few if frozenset((a, b)) in adjacent else poses, a, b)
         colliding = np.zeros(len(near), dtype=bool)
@@ -131,12 +139,12 @@ def find_allowed_collisions(
 
 
 def allowed_pairs(reports: tuple[PairReport, ...]) -> frozenset[frozenset[str]]:
-    """The pairs that need no check."""
+    """The pairs of links that are not checked."""
     return frozenset(frozenset(report.links) for report in reports if report.reason != CHECKED)
 
 
 def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator) -> bool:
-    """Whether random descent on the distance between the meshes finds a collision of the links."""
+    """Whether random descents on the distance between the meshes find a collision of two links."""
 
     wanted = frozenset((a, b))
     for start in starts:
@@ -156,21 +164,24 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
     return False
 
 
-def _own_between(robot: Robot, a: str, b: str, most_held: int = 0) -> list[Joint] | None:
-    """The movable joints between two links of the arm itself; None if one of them is not the arm's. Through
-    so many held joints at most, `most_held`, a link of the arm may carry another one of its own."""
+def _own_between(robot: Robot, a: str, b: str, max_held: int = 0) -> list[Joint] | None:
+    """The movable joints between two links that belong to the arm; None if one of them does not.
+
+    A link belongs to the arm if at most `max_held` held joints connect it to a moving link, and if it is not
+    a tool.
+    """
     by_child = {joint.child: joint for joint in robot.joints}
 
     def joints_above(link: str) -> list[Joint]:
         return [by_child[link], *joints_above(by_child[link].parent)] if link in by_child else []
 
     def own(link: str) -> bool:
-        """What its links carry is the arm's own too, as the bellows of a lift; but for the last one's."""
+        """Whether a link belongs to the arm; true for what its links carry, except for the last one."""
         planned = [joint for joint in above[link] if joint in robot.planned_joints][:1]
         carried = above[link][: above[link].index(planned[0])] if planned else above[link]
         held = [joint for joint in carried if joint.kind in MOVING_KINDS]
         tool = robot.at_end(link) and above[link][:1] != planned
-        return not tool and len(held) <= most_held
+        return not tool and len(held) <= max_held
 
     above = {link: joints_above(link) for link in (a, b)}
     if not own(a) or not own(b):
@@ -180,6 +191,7 @@ def _own_between(robot: Robot, a: str, b: str, most_held: int = 0) -> list[Joint
 
 
 def _moving_pairs(robot: Robot) -> list[tuple[str, str]]:
+    """Pairs of links with meshes that move relative to each other."""
     links = [link for link in robot.link_names if link in robot.meshes]
     return [
         (a, b)
@@ -190,7 +202,7 @@ def _moving_pairs(robot: Robot) -> list[tuple[str, str]]:
 
 
 def _adjacent(robot: Robot) -> set[frozenset[str]]:
-    """Links joined by a joint; links without geometry are passed through."""
+    """Pairs of links that a joint connects; skips links without geometry."""
     solid: dict[str, str] = {robot.base: robot.base}
     pairs = set()
     for joint in robot.joints:
@@ -201,7 +213,8 @@ def _adjacent(robot: Robot) -> set[frozenset[str]]:
 
 
 class Links:
-    """Poses of all links for many values of all movable joints, and tests of pairs of links."""
+    """Poses of all links for batches of values of all movable joints, and collision tests of pairs of
+    links."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -220,25 +233,28 @@ class Links:
 
     @cached_property
     def balls(self) -> dict[str, Float[ndarray, "parts 4"]]:
-        """Around each part."""
+        """Balls [x y z radius] around each part, by link [m]."""
         return {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
 
     @cached_property
     def inner(self) -> dict[str, Float[ndarray, "parts 4"]]:
-        """Within each part."""
+        """Balls [x y z radius] inside each part, by link [m]."""
         return {link: np.stack([_inner(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
 
     def random(self, count: int, rng: np.random.Generator) -> Float[ndarray, "n d"]:
+        """Uniform values of all joints within their limits."""
         return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
 
     def named(self, pose: dict[str, float]) -> Float[ndarray, "d"]:
-        """The values of all joints in a pose of some of them; the others' as they are held, else zero."""
+        """Values of all joints in a named pose; joints that it omits keep their locked value, or else
+        zero."""
         rest = self.robot.locked | pose
         return np.array([rest.get(j.name, min(max(0.0, j.lower), j.upper)) for j in self.joints])
 
-    def stops(self, joint: Joint, q: Float[ndarray, "n d"], colliding: Bool[ndarray, "n"]) -> bool:
-        """Whether a joint alone says in which configurations two links collide, up to one of its stops."""
-        if joint not in self.joints or joint.upper - joint.lower > STOPPED:
+    def stop_explains(self, joint: Joint, q: Float[ndarray, "n d"], colliding: Bool[ndarray, "n"]) -> bool:
+        """Whether a joint alone determines in which configurations two links collide, up to one of its
+        stops."""
+        if joint not in self.joints or joint.upper - joint.lower > MAX_STOPPED_RANGE:
             return False
         share = (q[:, self.joints.index(joint)] - joint.lower) / (joint.upper - joint.lower)
         place = np.minimum((share * BINS).astype(int), BINS - 1)
@@ -246,12 +262,12 @@ class Links:
         often = np.bincount(place, colliding, minlength=BINS) / count
         left = (often * (1 - often) * count).sum() / len(q)
         whole = colliding.mean() * (1 - colliding.mean())
-        return bool(max(often[0], often[-1]) > 0.99 and left < UNCERTAIN * whole)
+        return bool(max(often[0], often[-1]) > 0.99 and left < MAX_UNEXPLAINED * whole)
 
     def poses(
         self, q: Float[ndarray, "n d"], wanted: frozenset[str] | None = None
     ) -> dict[str, Float[ndarray, "n 4 4"]]:
-        """T_base_link by link; of `wanted` links, if given, how they stand to each other: seen from any one
+        """T_base_link by link. With `wanted` links, only their relative poses, in the frame of some common
         link."""
         start, joints = (self.robot.base, self.robot.joints) if wanted is None else self._between(wanted)
         poses = {start: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
@@ -260,7 +276,7 @@ class Links:
         return poses
 
     def _motion(self, joint: Joint, q: Float[ndarray, "n d"]) -> Float[ndarray, "*n 4 4"]:
-        """T_parent_child for many values of all joints."""
+        """T_parent_child for a batch of values of all joints."""
         if joint.kind not in MOVING_KINDS:
             return joint.T_parent_joint
         column, multiplier, offset, still, of_cosine, of_sine = self._moves[joint.name]
@@ -271,9 +287,9 @@ class Links:
 
     @cached_property
     def _moves(self) -> dict[str, tuple[int, float, float, ndarray, ndarray, ndarray]]:
-        """By movable joint: the column of its value or of the one that it follows, what that is multiplied by
-        and what is added; and T_parent_child at no value, and what its cosine and its sine, or a slide's
-        length, are multiplied by in it."""
+        """By movable joint: the column of its (or its leader's) value, the factor and offset of that value,
+        and the matrices C, A, B of T_parent_child = C + cos(value) A + sin(value) B, or C + value B if
+        prismatic."""
         by_name = {joint.name: joint for joint in self.robot.joints}
         columns = {joint.name: i for i, joint in enumerate(self.joints)}
         moves = {}
@@ -297,7 +313,7 @@ class Links:
         return moves
 
     def _between(self, links: frozenset[str]) -> tuple[str, list[Joint]]:
-        """The last link that leads to all of some links, and the joints from there to them."""
+        """The last common ancestor of links, and the joints from there to them."""
         if links not in self._leading:
             by_child = {joint.child: joint for joint in self.robot.joints}
             chains = []
@@ -313,9 +329,9 @@ class Links:
         return self._leading[links]
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
-        """Signed distance between the covering spheres of two links [m]: at most that of their meshes."""
+        """Signed distances between the covering spheres of two links [m], a lower bound for their meshes."""
         first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
-        return -deepest_touches(poses[a], poses[b], first, second, NEAR, -np.inf)[0]
+        return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""
@@ -334,7 +350,8 @@ class Links:
         return False
 
     def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Float[ndarray, "n 3"]:
-        """Where convex parts of two links overlap in configuration i, a place for each two parts."""
+        """Points where convex parts of two links overlap in configuration i, one for each pair of parts
+        [m]."""
         T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
         apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
         found = []
@@ -370,8 +387,8 @@ class Links:
         parts: Int[ndarray, "2 n"],
         limit: float,
     ) -> Float[ndarray, "n"]:
-        """Distances between a part of one link and one of another, each in one of the configurations [m]; at
-        least `limit` where it is more."""
+        """Distances between parts of two links [m]: parts[:, k] in configuration rows[k]. Distances above
+        `limit` are replaced by lower bounds that are above it too."""
         balls = [self.balls[link][parts[k]] for k, link in enumerate((a, b))]
         middles = [
             np.einsum("nij,nj->ni", poses[link][rows, :3, :3], ball[:, :3]) + poses[link][rows, :3, 3]
@@ -395,15 +412,15 @@ class Links:
 
 
 def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
-    """Centre and radius of a ball that holds a mesh."""
+    """Centre and radius of a ball that contains a mesh [m]."""
     center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    return np.append(center, np.linalg.norm(mesh.vertices - center, axis=1).max() + ROUNDING)
+    return np.append(center, np.linalg.norm(mesh.vertices - center, axis=1).max() + BALL_MARGIN)
 
 
 @lru_cache(maxsize=1024)
 def _inner(mesh: ConvexMesh) -> Float[ndarray, "4"]:
-    """Centre and radius of a largest ball within a convex mesh."""
+    """Centre and radius of a largest ball inside a convex mesh [m]."""
     normals, offsets = planes_of(mesh)
     planes = np.column_stack([normals, np.ones(len(normals))])
     found = linprog([0, 0, 0, -1], planes, offsets, bounds=[(None, None)] * 3 + [(0, None)])
-    return np.append(found.x[:3], found.x[3] - ROUNDING) if found.success else np.array([0, 0, 0, -np.inf])
+    return np.append(found.x[:3], found.x[3] - BALL_MARGIN) if found.success else np.array([0, 0, 0, -np.inf])

@@ -1,9 +1,10 @@
-"""Pairs of links that pass closer to each other than covering spheres can tell, as a flange in a fork.
+"""Tables for pairs of links that pass closer to each other than covering spheres can resolve, as a flange in
+a fork.
 
-How two links stand to each other depends only on the joints between them. Where these are one or two, a table
-over them says, by the convex parts, where the two are apart: in a cell in whose middle their distance is more
-than what any point of one moves within the cell, seen from the other. Cells of which that cannot be said are
-split, down to a fraction of a millimetre of motion.
+The relative pose of two links depends only on the joints between them. If these are one or two joints, a
+table over their values tells where the convex parts of the links are apart. A cell counts as free if the
+distance of the links at its centre exceeds the motion of any point of one link, seen from the other, within
+the cell. Other cells are split, down to a fraction of a millimetre of motion.
 """
 
 import numpy as np
@@ -11,20 +12,21 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.robots.fitting.allowed_collisions import Links
-from robotdiffuse.robots.joint_tables import TURN, JointTable
+from robotdiffuse.robots.link_pair_tables import TURN, LinkPairTable
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
 
 CELLS = 128
-"""Of a table along each joint: a power of two."""
-SLACK = 1e-5
-"""More than what rounding does to a distance [m]."""
+"""Cells of a table along each joint; a power of two."""
+ROUNDING = 1e-5
+"""Upper bound on the rounding error of a distance [m]."""
 
 
-def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float) -> JointTable:
-    """Where the convex parts of two links are apart that have one or two joints between them.
+def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float) -> LinkPairTable:
+    """Table over the one or two joints between two links: where their convex parts are apart.
 
-    Cells within which they move no further than `finest` [m] are not split.
+    Cells in which the links move by less than `finest` [m] relative to each other are not split; they count
+    as colliding unless proven free.
     """
     joints = robot.joints_between(*pair)
     far = max(pair, key=robot.link_frame)
@@ -39,12 +41,12 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     apart = np.ones((CELLS,) * len(joints), dtype=bool)
     size = np.full(len(joints), float(CELLS))
     parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
-    low = np.zeros((parts.shape[1], len(joints)))  # a row for each two parts in a cell where they may touch
+    low = np.zeros((parts.shape[1], len(joints)))  # one row per pair of parts and cell where they may touch
     while len(low):
         cells, cell = np.unique(low, axis=0, return_inverse=True)
         q = np.tile(held, (len(cells), 1))
         q[:, columns] = lower + edge * (cells + size / 2)
-        travel = float(lever @ (edge * size) / 2) + SLACK
+        travel = float(lever @ (edge * size) / 2) + ROUNDING
         poses = links.poses(q, frozenset(pair))
         distance = links.part_distances(poses, *pair, cell.ravel(), parts, travel)
         touch = distance <= travel
@@ -57,13 +59,13 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
         low, parts = low[touch & ~given_up], parts[:, touch & ~given_up]
         low = np.concatenate([low, low + size * (np.arange(len(size)) == axis)])
         parts = np.tile(parts, 2)
-        if (size <= 1).all():  # of a cell in which something touches no more is asked
+        if (size <= 1).all():  # one contact decides a cell, so drop its other pairs
             is_open = apart[tuple(_cells(low, size)[0].T)]
             low, parts = low[is_open], parts[:, is_open]
     names = tuple(robot.joint_names[joint] for joint in joints)
-    return JointTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), apart)
+    return LinkPairTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), apart)
 
 
 def _cells(low: Float[ndarray, "n joints"], size: Float[ndarray, "joints"]) -> tuple[ndarray, ndarray]:
-    """The first cell along each joint that boxes reach into, and the one behind the last."""
+    """Index of the first cell along each joint that boxes overlap, and one past the last."""
     return np.floor(low).astype(int), np.ceil(low + size).astype(int)

@@ -1,10 +1,10 @@
-"""Convex parts that together hold a collision mesh: what Coal can measure exactly.
+"""Approximate convex decomposition: convex parts that cover a collision mesh, for exact distances by Coal.
 
-A mesh is cut by planes until no part's hull sticks out of it too far, then parts are joined again as long as
-their common hull does not. A hull of all that a plane leaves on one side of a closed surface holds the solid
-on that side, so the parts cover mesh and solid by construction, whatever the mesh looks like. How far a hull
-sticks out is measured on a voxel grid: what cannot be reached from outside without crossing the surface is
-solid, so that holes smaller than a voxel, inner walls and triangles that overlap do no harm.
+Planes cut a mesh until no part's hull sticks out of it too far. Then parts are merged as long as their common
+hull does not stick out too far. The hull of the part of a closed surface on one side of a plane contains the
+solid on that side, so the parts cover mesh and solid by construction, whatever the mesh looks like. A voxel
+grid measures how far a hull sticks out. Voxels that cannot be reached from outside without crossing the
+surface count as solid, so holes smaller than a voxel, inner walls and overlapping triangles do no harm.
 """
 
 from dataclasses import dataclass, replace
@@ -18,31 +18,31 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.robot import ConvexMesh
+from robotdiffuse.robots.bodies import ConvexMesh
 
-THIN = 1e-3
-"""Least thickness of a hull [m]: of a sheet, spheres and distances would have none to go by."""
-CUTS = np.arange(1, 10) / 10
-"""Where a part may be cut, along each axis, as shares of its length."""
-STEP = 1e-4
-"""How far from such a surface a part is cut [m]."""
-TIE = 0.999
-"""Of cuts that leave as little volume, but for such a factor, the first is taken."""
-WALLS = 6
-"""Surfaces across an axis at which a part may be cut too, at most."""
-CHOICE_POINTS = 1200
-"""Points of the surface from which the best cut is chosen, about."""
-MOST_NORMALS = 1000
-"""Faces of a hull whose planes are all looked at when it is simplified."""
-DEEPEST = 60
-"""Times that a triangle is halved, at most."""
-TIGHT, SLOPE = 0.125, 0.3
-"""About a tight place parts may stick out by such a share of what they may elsewhere, and by so much more per
-distance from there."""
-MORE = 4
-"""About tight places a link is cut into so many times as many parts, at most."""
-GROWTH = 1e-7
-"""Simplified hulls are larger by this [m]: more than rounding takes away."""
+MIN_THICKNESS = 1e-3
+"""Smallest thickness of a hull [m]: spheres and distances need a sheet to have a volume."""
+CUT_FRACTIONS = np.arange(1, 10) / 10
+"""Candidate cuts along each axis, as fractions of the part's length."""
+WALL_OFFSET = 1e-4
+"""Distance between a surface and a cut beside it [m]."""
+IMPROVEMENT = 0.999
+"""A later candidate cut must reduce the volume of the hulls below this fraction of the best so far."""
+MAX_WALLS = 6
+"""Largest number of surfaces perpendicular to an axis at which further cuts are tried."""
+MAX_CUT_POINTS = 1200
+"""Approximate largest number of surface points for choosing a cut."""
+MAX_NORMALS = 1000
+"""A hull with more faces has similar normals merged before it is simplified."""
+MAX_SPLITS = 60
+"""Largest number of times that a triangle is halved."""
+TIGHT_FRACTION, TIGHT_SLOPE = 0.125, 0.3
+"""At a tight place, parts may stick out by this fraction of the usual distance; the allowance grows by this
+slope with the distance from there."""
+TIGHT_PART_FACTOR = 4
+"""A link with tight places may have this many times as many parts."""
+SIMPLIFIED_GROWTH = 1e-7
+"""Growth of simplified hulls [m], larger than rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,15 @@ class PartSettings:
     concavity: float = 0.007
     """How far the hull of a part may stick out of the mesh [m]."""
     most: int = 16
-    """Parts of a link, at most."""
+    """Largest number of parts per link."""
     voxels: int = 400_000
-    """Of the grid on which that is measured, about."""
+    """Approximate number of voxels of the grid that measures concavity."""
     finest: float = 0.0015
-    """Edge of a voxel, at least [m]."""
+    """Smallest voxel edge [m]."""
     faces: int = 400
-    """Hulls with more triangles are simplified, outwards."""
+    """Hulls with more triangles are simplified; they only grow."""
     rounding: float = 5e-4
-    """How far a simplified hull may stick out of the hull [m], as long as 120 planes suffice."""
+    """How far a simplified hull may stick out of the hull [m], if 120 planes suffice for that."""
 
     def __post_init__(self) -> None:
         if not self.finest > 0 or not self.concavity > 0 or self.most < 1:
@@ -70,18 +70,18 @@ class PartSettings:
             )
 
     def scaled(self, size: float) -> "PartSettings":
-        """For meshes that are so many times as large."""
+        """The settings for meshes scaled by a factor."""
         lengths = ("concavity", "finest", "rounding")
         return replace(self, **{name: size * getattr(self, name) for name in lengths})
 
     def finer(self) -> "PartSettings":
-        """With voxels of half the size."""
+        """The settings with voxels of half the size."""
         return replace(self, voxels=8 * self.voxels, finest=self.finest / 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangle mesh in the frame of its link [m]; it need not be closed."""
+    """A triangle mesh in the frame of its link [m]; it may be open."""
 
     vertices: Float[ndarray, "v 3"]
     faces: Int[ndarray, "f 3"]
@@ -92,22 +92,25 @@ def convex_parts(
     settings: PartSettings | None = None,
     tight: Float[ndarray, "n 3"] | None = None,
 ) -> tuple[ConvexMesh, ...]:
-    """Convex meshes whose union holds the surfaces of a link and what they enclose; about `tight` places they
-    stick out as little as they can."""
+    """Convex meshes whose union contains the surfaces of a link and the space that they enclose.
+
+    Near `tight` places [n, 3], in the link's frame, the meshes stick out as little as possible.
+    """
     settings = settings or PartSettings()
     soups = [surface.vertices[surface.faces] for surface in surfaces]
-    space = _Space.around(soups, settings if tight is None else settings.finer())
+    space = _DistanceGrid.around(soups, settings if tight is None else settings.finer())
     parts = [_Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
     parts = _cut(parts, space, settings, max(settings.most, 2 * len(parts)))
     if tight is not None:
-        about, space = space.about(tight, settings.concavity)
-        parts = [replace(part, concavity=about.concavity(part.hull)) for part in parts]
-        parts = _cut(parts, about, settings, MORE * settings.most)
-    return tuple(_without_contained(_joined([part.hull for part in parts], space, settings)))
+        tight_only, space = space.near_tight(tight, settings.concavity)
+        parts = [replace(part, concavity=tight_only.concavity(part.hull)) for part in parts]
+        parts = _cut(parts, tight_only, settings, TIGHT_PART_FACTOR * settings.most)
+    return tuple(_without_contained(_merged([part.hull for part in parts], space, settings)))
 
 
-def _cut(parts: list["_Part"], space: "_Space", settings: PartSettings, most: int) -> list["_Part"]:
-    """Parts cut in two, those that stick out furthest first."""
+def _cut(parts: list["_Part"], space: "_DistanceGrid", settings: PartSettings, most: int) -> list["_Part"]:
+    """Parts cut in two, the most concave first, until all are within `settings.concavity` or there are
+    `most`."""
     parts = list(parts)
     while len(parts) < most:
         worst = max(range(len(parts)), key=lambda i: parts[i].concavity)
@@ -118,8 +121,9 @@ def _cut(parts: list["_Part"], space: "_Space", settings: PartSettings, most: in
 
 
 def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
-    """Convex hull with outward faces; points thinner than `THIN` in a direction are given that thickness."""
-    points = _thick(points)
+    """Convex hull with outward faces; a point set thinner than `MIN_THICKNESS` in a direction is thickened to
+    it."""
+    points = _thickened(points)
     hull = ConvexHull(points)
     used, index = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = points[used], index.reshape(hull.simplices.shape)
@@ -129,16 +133,16 @@ def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
     return ConvexMesh(vertices, faces)
 
 
-def _thick(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
-    """The points, and others beside them along the principal axes in which they are thin: around each."""
+def _thickened(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+    """The points, or copies shifted to both sides along the principal axes in which the set is too thin."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    for axis in axes[np.ptp(points @ axes.T, axis=0) < THIN]:
-        points = np.concatenate([points - axis * THIN / 2, points + axis * THIN / 2])
+    for axis in axes[np.ptp(points @ axes.T, axis=0) < MIN_THICKNESS]:
+        points = np.concatenate([points - axis * MIN_THICKNESS / 2, points + axis * MIN_THICKNESS / 2])
     return points
 
 
 def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:
-    """Outward unit normals; zero for a face without area."""
+    """Outward unit normals of the faces; zero for a face without area."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     size = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -149,24 +153,25 @@ def planes_of(mesh: ConvexMesh) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "
     """Normals and offsets of the distinct planes of a convex mesh."""
     normals = face_normals(mesh)
     normals = np.unique(np.round(normals[np.linalg.norm(normals, axis=1) > 0.5], 9), axis=0)
-    # the farthest vertex, not the face's own: rounding must not put a plane inside the mesh
+    # offsets from the farthest vertex, so that rounding does not put a plane inside the mesh
     return normals, (mesh.vertices @ normals.T).max(0)
 
 
 def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: int = 120) -> ConvexMesh:
-    """A convex mesh that holds a hull, of some of the hull's own planes; the same one if it has few faces.
+    """A convex mesh with fewer faces that contains a hull; the hull itself if it has at most
+    `settings.faces`.
 
-    Planes are added where the corners that the others leave stick out most.
+    It is bounded by up to `most` of the hull's planes. Planes are added where its corners stick out most.
     """
     settings = settings or PartSettings()
     if len(hull.faces) <= settings.faces:
         return hull
     normals = face_normals(hull)
-    if len(normals) > MOST_NORMALS:  # those that are much alike count once
+    if len(normals) > MAX_NORMALS:  # merge similar normals
         _, first = np.unique(np.round(normals * 12).astype(int) @ [1, 100, 10_000], return_index=True)
         normals = normals[first]
     normals = np.concatenate([np.eye(3), -np.eye(3), normals[np.linalg.norm(normals, axis=1) > 0.5]])
-    offsets = (hull.vertices @ normals.T).max(0) + GROWTH
+    offsets = (hull.vertices @ normals.T).max(0) + SIMPLIFIED_GROWTH
     chosen, middle = list(range(6)), hull.vertices.mean(0)
     try:
         while True:
@@ -188,29 +193,30 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: 
 class _Part:
     triangles: Float[ndarray, "n 3 3"]
     points: Float[ndarray, "m 3"]
-    """All over the triangles, for the choice of cuts."""
+    """Points spread over the triangles, for choosing cuts."""
     hull: ConvexMesh
     concavity: float
 
     @staticmethod
-    def of(triangles: ndarray, points: ndarray, space: "_Space", settings: PartSettings) -> "_Part":
+    def of(triangles: ndarray, points: ndarray, space: "_DistanceGrid", settings: PartSettings) -> "_Part":
         hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
         return _Part(triangles, points, hull, space.concavity(hull))
 
-    def halves(self, space: "_Space", settings: PartSettings) -> list["_Part"]:
-        """The two sides of the plane that leaves hulls of least volume; itself if it is too small to cut."""
+    def halves(self, space: "_DistanceGrid", settings: PartSettings) -> list["_Part"]:
+        """The two parts on the sides of the plane that gives hulls of least volume; the part itself if too
+        small to cut."""
         low, size = self.hull.vertices.min(0), np.ptp(self.hull.vertices, axis=0)
         points, apart = _thinned(self.points, space.pitch)
         best, least = None, np.inf
         for axis in sorted(np.flatnonzero(size > 6 * space.pitch), key=lambda axis: -size[axis]):
-            for at in (*_walls(points[:, axis], space.pitch), *(low[axis] + CUTS * size[axis])):
+            for at in (*_wall_cuts(points[:, axis], space.pitch), *(low[axis] + CUT_FRACTIONS * size[axis])):
                 height = points[:, axis] - at
                 volume = 0.0
                 for side in (points[height <= 0], points[height > 0]):
                     edge = side[np.abs(side[:, axis] - at) <= apart]
-                    edge[:, axis] = at  # where the surface meets the plane, about
+                    edge[:, axis] = at  # approximates the intersection of surface and plane
                     volume += _volume(np.concatenate([side, edge]))
-                if volume < TIE * least:
+                if volume < IMPROVEMENT * least:
                     best, least = (int(axis), float(at)), volume
         halves = _sides(self.triangles, *best) if best else ()
         if best is None or not all(map(len, halves)):
@@ -221,15 +227,15 @@ class _Part:
 
 
 @dataclass(frozen=True, eq=False)
-class _Space:
-    """What is around a surface: for each voxel the distance to the solid, zero in it [m]."""
+class _DistanceGrid:
+    """Distances of voxels from a solid, zero inside [m]."""
 
     origin: Float[ndarray, "3"]
     pitch: float
     distance: Float[ndarray, "nx ny nz"]
 
     @staticmethod
-    def around(soups: list[Float[ndarray, "n 3 3"]], settings: PartSettings) -> "_Space":
+    def around(soups: list[Float[ndarray, "n 3 3"]], settings: PartSettings) -> "_DistanceGrid":
         corners = np.concatenate(soups).reshape(-1, 3)
         low, high = corners.min(0), corners.max(0)
         size = np.maximum(high - low, settings.finest)
@@ -241,21 +247,25 @@ class _Space:
             _mark(occupied, split(soup, pitch / 2), origin, pitch)
         found: Any = ndimage.label(~occupied)
         free = found[0] == found[0][0, 0, 0]
-        return _Space(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
+        return _DistanceGrid(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
 
-    def about(self, tight: Float[ndarray, "n 3"], concavity: float) -> tuple["_Space", "_Space"]:
-        """With greater distances about some places, so that what sticks out there counts for more: only these
-        distances, and all."""
+    def near_tight(
+        self, tight: Float[ndarray, "n 3"], concavity: float
+    ) -> tuple["_DistanceGrid", "_DistanceGrid"]:
+        """Two copies with distances enlarged near `tight` places, so that sticking out there counts more.
+
+        The first is zero elsewhere; the second keeps the other distances.
+        """
         near = np.argwhere((self.distance > 0) & (self.distance < 3 * concavity))
         far = KDTree(tight).query(self.origin + (near + 0.5) * self.pitch)[0]
-        allowed = TIGHT * concavity + SLOPE * np.maximum(far - 2 * concavity, 0.0)
+        allowed = TIGHT_FRACTION * concavity + TIGHT_SLOPE * np.maximum(far - 2 * concavity, 0.0)
         near, allowed = near[allowed < concavity], allowed[allowed < concavity]
         alone = np.zeros_like(self.distance)
         alone[tuple(near.T)] = self.distance[tuple(near.T)] * concavity / allowed
         return replace(self, distance=alone), replace(self, distance=np.maximum(alone, self.distance))
 
     def concavity(self, hull: ConvexMesh) -> float:
-        """How far a hull sticks out of the solid [m], about."""
+        """How far a hull sticks out of the solid, approximately [m]."""
         low = np.floor((hull.vertices.min(0) - self.origin) / self.pitch).astype(int)
         high = np.ceil((hull.vertices.max(0) - self.origin) / self.pitch).astype(int) + 1
         return _farthest_inside(self.distance, self.origin, self.pitch, low, high, *planes_of(hull))
@@ -263,7 +273,7 @@ class _Space:
 
 @njit(cache=True)
 def _mark(occupied, triangles, origin, pitch):
-    """Mark the voxels in which corners of triangles lie."""
+    """Mark the voxels that contain corners of triangles."""
     for t in range(len(triangles)):
         for k in range(3):
             i = int((triangles[t, k, 0] - origin[0]) / pitch)
@@ -273,7 +283,7 @@ def _mark(occupied, triangles, origin, pitch):
 
 @njit(cache=True)
 def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
-    """Largest distance of a voxel whose centre is within the planes."""
+    """Largest value of `distance` among voxels whose centres are within the planes."""
     best = 0.0
     for i in range(max(low[0], 0), min(high[0], distance.shape[0])):
         x = origin[0] + (i + 0.5) * pitch
@@ -293,26 +303,26 @@ def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
     return best
 
 
-def _walls(heights: Float[ndarray, "n"], pitch: float) -> list[float]:
-    """Just before and behind where a surface runs across an axis: parts often meet there."""
+def _wall_cuts(heights: Float[ndarray, "n"], pitch: float) -> list[float]:
+    """Cuts just before and after surfaces perpendicular to an axis, where parts often meet."""
     counts, edges = np.histogram(heights, max(int(np.ptp(heights) / pitch), 1))
-    most = np.argsort(-counts)[:WALLS]
+    most = np.argsort(-counts)[:MAX_WALLS]
     middles = [
         float(np.median(heights[(heights >= edges[k]) & (heights <= edges[k + 1])]))
         for k in most
         if counts[k] > 2 * np.median(counts)
     ]
-    return [middle + step for middle in middles for step in (-STEP, STEP)]
+    return [middle + step for middle in middles for step in (-WALL_OFFSET, WALL_OFFSET)]
 
 
 def _spread(triangles: Float[ndarray, "n 3 3"], pitch: float) -> Float[ndarray, "m 3"]:
-    """Points all over a surface."""
+    """Points spread over a surface, one per cube of edge `pitch` [m]."""
     return _one_per_cube(split(triangles, 2 * pitch).reshape(-1, 3), pitch)
 
 
 def _thinned(points: Float[ndarray, "n 3"], size: float) -> tuple[Float[ndarray, "m 3"], float]:
-    """Fewer points, one of each cube, and the edge of the cubes [m]."""
-    while len(points) > CHOICE_POINTS:
+    """At most `MAX_CUT_POINTS` points, one per cube, and the edge of the cubes [m]."""
+    while len(points) > MAX_CUT_POINTS:
         size *= 1.3
         points = _one_per_cube(points, size)
     return points, size
@@ -334,11 +344,11 @@ def _volume(points: Float[ndarray, "n 3"]) -> float:
 def _sides(
     triangles: Float[ndarray, "n 3 3"], axis: int, at: float
 ) -> tuple[Float[ndarray, "a 3 3"], Float[ndarray, "b 3 3"]]:
-    """What of triangles lies on the two sides of an axis-aligned plane."""
+    """Triangles cut by an axis-aligned plane: those below and those above it."""
     height = triangles[:, :, axis] - at
     below, above = (height <= 0).all(1), (height >= 0).all(1)
     crossing, height = triangles[~below & ~above], height[~below & ~above]
-    # the corner that is alone on its side comes first
+    # rotate corners so that the one alone on its side comes first
     negative = height < 0
     alone = np.where(negative.sum(1) == 1, negative.argmax(1), (~negative).argmax(1))
     turn = (alone[:, None] + np.arange(3)) % 3
@@ -354,8 +364,8 @@ def _sides(
     )
 
 
-def _joined(hulls: list[ConvexMesh], space: _Space, settings: PartSettings) -> list[ConvexMesh]:
-    """Hulls joined, those first whose common hull sticks out least, as long as it does not too far."""
+def _merged(hulls: list[ConvexMesh], space: _DistanceGrid, settings: PartSettings) -> list[ConvexMesh]:
+    """Hulls merged pairwise, least common concavity first, while it is within `settings.concavity`."""
     hulls = list(hulls)
     known: dict[tuple[int, int], tuple[float, ConvexMesh]] = {}
     while len(hulls) > 1:
@@ -377,7 +387,7 @@ def _joined(hulls: list[ConvexMesh], space: _Space, settings: PartSettings) -> l
 
 
 def _without_contained(hulls: list[ConvexMesh]) -> list[ConvexMesh]:
-    """Hulls without those that lie in one other."""
+    """Hulls without those contained in another one."""
     kept = sorted(hulls, key=lambda hull: float(np.prod(np.ptp(hull.vertices, axis=0))))
     for hull in tuple(kept):
         others = [planes_of(other) for other in kept if other is not hull]
@@ -395,7 +405,7 @@ def split(triangles: Float[ndarray, "n 3 3"], size: "float | Float[ndarray, 'n']
 @njit(cache=True)
 def _split(triangles, squares):
     out, count = np.empty((4 * len(triangles) + 64, 3, 3)), 0
-    open_ones = np.empty((DEEPEST + 2, 3, 3))
+    open_ones = np.empty((MAX_SPLITS + 2, 3, 3))
     for t in range(len(triangles)):
         open_ones[0], left = triangles[t], 1
         while left > 0:
@@ -408,7 +418,7 @@ def _split(triangles, squares):
                     square += (open_ones[left, i, d] - open_ones[left, j, d]) ** 2
                 if square > longest:
                     longest, k = square, i
-            if longest <= squares[t] or left >= DEEPEST:
+            if longest <= squares[t] or left >= MAX_SPLITS:
                 if count == len(out):
                     out = np.concatenate((out, np.empty_like(out)))
                 out[count] = open_ones[left]

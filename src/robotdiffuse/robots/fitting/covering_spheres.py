@@ -1,8 +1,8 @@
-"""Spheres that cover convex solids, in milliseconds: for tools and for what a robot holds.
+"""Covers convex solids, such as tools and held objects, with spheres in milliseconds.
 
-The solid is cut along its axes into a lattice of convex pieces, and each piece is held by a sphere around its
-corners. So surface and inside are covered, provably. The fit of `sphere_fitting.py` needs about half as many
-spheres for the same closeness, and takes seconds.
+The solid is cut along its axes into a lattice of convex pieces, and each piece gets a sphere around its
+corners. So the spheres provably cover surface and interior. The fit in `sphere_fitting.py` needs about half
+as many spheres for the same tolerance, but takes seconds.
 """
 
 import numpy as np
@@ -13,18 +13,18 @@ from scipy.spatial import ConvexHull, QhullError
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.sphere_fitting import MARGIN, SphereSettings
 
-CLOSE = SphereSettings()
-"""How closely spheres follow links."""
-MOST = 100
-"""Spheres of a solid: where they do not suffice, they stick out further."""
-MOST_CUTS = 40
-"""Pieces along an axis, at most."""
-STEPS, ALL = 15, 0.999
-"""Of the search for the smallest sphere around corners; it ends when all are at this share of the radius."""
+LINK_TOLERANCES = SphereSettings()
+"""Tolerances of the spheres of links."""
+MAX_SPHERES = 100
+"""Largest number of spheres per solid; if they do not suffice, they exceed the tolerance."""
+MAX_PIECES_PER_AXIS = 40
+BOUNDING_STEPS, EQUIDISTANT = 15, 0.999
+"""Steps of the search for a small sphere around points. It ends early if all points are at least at this
+fraction of the radius from the centre."""
 
 
 def cover(mesh: ConvexMesh) -> Float[ndarray, "n 4"]:
-    """Spheres [x y z radius, m] that hold all of a convex mesh, its inside too."""
+    """Spheres [x y z radius, m] that cover surface and interior of a convex mesh."""
     axes = _axes(mesh.vertices)
     vertices = mesh.vertices @ axes.T
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -41,21 +41,27 @@ def cover(mesh: ConvexMesh) -> Float[ndarray, "n 4"]:
 
 
 def _tolerance(size: Float[ndarray, "3"]) -> float:
-    """How far spheres may stick out [m]: as those of a hand."""
-    return max(min(CLOSE.second_half, CLOSE.relative * float(size.min()) / 2), CLOSE.finest)
+    """How far the spheres of a box-sized solid may stick out [m]: the tolerance for the hand's links."""
+    return max(
+        min(LINK_TOLERANCES.second_half, LINK_TOLERANCES.relative * float(size.min()) / 2),
+        LINK_TOLERANCES.finest,
+    )
 
 
 def _axes(vertices: Float[ndarray, "v 3"]) -> Float[ndarray, "3 3"]:
-    """The mesh's own axes, or the principal ones where a box along those is smaller; rows."""
+    """Axes as rows: those of the mesh's frame, or the principal axes if a box along these is smaller."""
     principal = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     own, other = np.ptp(vertices, axis=0).prod(), np.ptp(vertices @ principal.T, axis=0).prod()
     return principal if other < 0.9 * own else np.eye(3)
 
 
 def _lattice(size: Float[ndarray, "3"]) -> tuple[int, ...]:
-    """Pieces along each axis of a box: as few as keep to the tolerance, or the best of at most MOST."""
-    counts = np.stack(np.meshgrid(*3 * [np.arange(1, MOST_CUTS + 1)], indexing="ij"), axis=-1).reshape(-1, 3)
-    counts = counts[counts.prod(axis=1) <= MOST]
+    """Number of pieces along each axis: the fewest within the tolerance, or else the closest of at most
+    MAX_SPHERES."""
+    counts = np.stack(
+        np.meshgrid(*3 * [np.arange(1, MAX_PIECES_PER_AXIS + 1)], indexing="ij"), axis=-1
+    ).reshape(-1, 3)
+    counts = counts[counts.prod(axis=1) <= MAX_SPHERES]
     half = size / counts / 2
     out = np.linalg.norm(half, axis=1) - half.min(axis=1)
     close = np.flatnonzero(out <= _tolerance(size))
@@ -64,7 +70,7 @@ def _lattice(size: Float[ndarray, "3"]) -> tuple[int, ...]:
 
 
 def _slices(corners: Float[ndarray, "v 3"], axis: int, cuts: Float[ndarray, "c"]) -> list[ndarray]:
-    """The corners of what lies between the cuts of the hull of corners."""
+    """Corners of the slices that cuts at coordinates along an axis make of the hull of `corners`."""
     slices = []
     for cut in cuts:
         below, above = corners[corners[:, axis] < cut], corners[corners[:, axis] > cut]
@@ -80,23 +86,23 @@ def _slices(corners: Float[ndarray, "v 3"], axis: int, cuts: Float[ndarray, "c"]
 
 
 def _outermost(points: Float[ndarray, "n 3"], axis: int) -> Float[ndarray, "m 3"]:
-    """The corners of the hull of points in a plane across an axis."""
+    """Corners of the hull of points in a plane perpendicular to an axis."""
     try:
         return points[ConvexHull(np.delete(points, axis, axis=1)).vertices]
-    except QhullError:  # in a line, or one point
+    except QhullError:  # collinear points, or one point
         return np.unique(points, axis=0)
 
 
 def _around(points: Float[ndarray, "n 3"]) -> Float[ndarray, "4"]:
-    """A small sphere around points: the best of the middle of their box and some steps of Badoiu and
-    Clarkson."""
+    """A small sphere around points: the best of the centre of their box and of some steps of Badoiu and
+    Clarkson's algorithm."""
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     best = np.array([*center, np.inf])
-    for i in range(1, STEPS):
+    for i in range(1, BOUNDING_STEPS):
         far = np.linalg.norm(points - center, axis=1)
         if far.max() < best[3]:
             best = np.array([*center, far.max()])
-        if far.min() > ALL * far.max():
+        if far.min() > EQUIDISTANT * far.max():
             break
         center = center + (points[far.argmax()] - center) / (i + 1)
     return best

@@ -1,4 +1,5 @@
-"""How many free configurations covering spheres and convex parts refuse, pair by pair of links, and where."""
+"""Measures false collisions: free configurations in which covering spheres or convex parts of two links
+collide."""
 
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
@@ -18,59 +19,58 @@ from robotdiffuse.robots.fitting.convex_parts import Surface
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import deepest_touches
 from robotdiffuse.robots.robot import Robot
 
-CUBE = 0.01
-"""Of the places where spheres touch one is kept of each cube with this edge [m]."""
-
-MOST_PLACES = 2000
-"""Configurations from which places are taken, of each pair."""
-FEW_PLACES = 60
-"""The same where convex parts are too coarse."""
-FORGIVEN = 0.003
-"""Share of the configurations with the narrowest gaps that a pair may go on to refuse."""
+PLACE_SPACING = 0.01
+"""Edge of the cubes of which each keeps one place where spheres touch [m]."""
+MAX_SPHERE_CASES = 2000
+"""Largest number of false collisions of spheres per pair of links that are examined."""
+MAX_PART_CASES = 60
+"""Largest number of false collisions of convex parts per pair of links that are examined."""
+NARROWEST_FRACTION = 0.003
+"""Fraction of the configurations, those with the narrowest gaps, that a pair may keep as false collisions."""
 
 
 @dataclass(frozen=True)
-class PairRefusals:
-    """A pair of links that is checked."""
+class PairFalseCollisions:
+    """False collisions of a pair of links that is checked."""
 
     links: tuple[str, str]
     colliding: float
-    """Share of the configurations in which the true meshes collide."""
+    """Fraction of the configurations in which the true meshes collide."""
     by_parts: float
-    """Share of the free configurations in which convex parts of the two collide."""
+    """Fraction of the free configurations in which convex parts of the two collide."""
     by_spheres: float
-    """The same of spheres; those that parts refuse too are among them."""
+    """The same for spheres; includes configurations in which the parts collide too."""
     gaps: Float[ndarray, "configurations"]
-    """Distances of the parts where spheres alone refuse, of some of these configurations [m]."""
+    """Distances between the parts in some of the configurations in which only the spheres collide [m]."""
     places: dict[str, Float[ndarray, "n 4"]]
-    """In the frame of each of the two links: where spheres touch though the parts are apart, and how far the
-    parts are from each other then, at least [m]."""
+    """By link and in its frame: rows x y z where spheres touch although the parts are apart, and the smallest
+    distance of the parts there [m]."""
     coarse: dict[str, Float[ndarray, "m 3"]]
-    """In the frame of each of the two links: where parts overlap though the true meshes are apart, of the one
-    whose parts stick out further there."""
+    """By link and in its frame: places where parts overlap although the true meshes are apart [m]. Each place
+    is listed for the link whose parts stick out further there."""
 
 
 @dataclass(frozen=True)
-class Refusals:
-    """What of the free configurations is refused, for touching itself where its true meshes do not."""
+class FalseCollisions:
+    """False self-collisions of a robot."""
 
     free: float
-    """Share of the configurations in which the true meshes are free."""
+    """Fraction of the configurations in which the true meshes do not collide."""
     by_parts: float
-    """Share of those that convex parts refuse."""
+    """Fraction of the free configurations in which convex parts collide."""
     by_spheres: float
-    """Share of those that covering spheres refuse."""
-    pairs: tuple[PairRefusals, ...]
-    """Those that refuse most first."""
+    """Fraction of the free configurations in which covering spheres collide."""
+    pairs: tuple[PairFalseCollisions, ...]
+    """Pairs of links, most false collisions of spheres first."""
 
 
-def measure_refusals(
+def measure_false_collisions(
     robot: Robot, surfaces: Mapping[str, tuple[Surface, ...]], samples: int, rng: np.random.Generator
-) -> Refusals:
-    """Of configurations uniform within the limits of the planned joints, others held as they are.
+) -> FalseCollisions:
+    """Measure false collisions over `samples` random configurations.
 
-    `surfaces` are the true meshes of the links; they are asked only where convex parts collide, and those
-    only where spheres do.
+    Planned joints are uniform within their limits; locked joints keep their values. `surfaces` are the true
+    meshes by link. They are tested only where convex parts collide, and the parts only where spheres do.
     """
     links = Links(robot)
     q = links.random(samples, rng)
@@ -98,30 +98,30 @@ def measure_refusals(
                 meshes[i] = _collide(trees[a], trees[b], poses[a][i], poses[b][i])
         found.append((spheres, parts, meshes, middle))
     if not found:
-        return Refusals(1.0, 0.0, 0.0, ())
+        return FalseCollisions(1.0, 0.0, 0.0, ())
     free = ~np.any([meshes for _, _, meshes, _ in found], axis=0)
     count = max(int(free.sum()), 1)
     pairs = []
     for (a, b), (spheres, parts, meshes, middle) in zip(robot.checked_pairs(), found, strict=True):
-        idle = np.flatnonzero(spheres & ~parts & free)[:MOST_PLACES]
-        gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in idle])
+        false_spheres = np.flatnonzero(spheres & ~parts & free)[:MAX_SPHERE_CASES]
+        gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in false_spheres])
         every = gaps
-        # the narrowest few stay refused
-        wide = gaps >= np.sort(gaps)[: int(samples * FORGIVEN * len(idle) / max(spheres.sum(), 1)) + 1].max(
-            initial=0.0
-        )
-        idle, gaps = idle[wide], gaps[wide]
-        T_base_a, T_base_b = poses[a][idle], poses[b][idle]
-        at = np.einsum("nij,nj->ni", T_base_a[:, :3, :3], middle[idle]) + T_base_a[:, :3, 3]
+        # tolerate the narrowest few
+        wide = gaps >= np.sort(gaps)[
+            : int(samples * NARROWEST_FRACTION * len(false_spheres) / max(spheres.sum(), 1)) + 1
+        ].max(initial=0.0)
+        false_spheres, gaps = false_spheres[wide], gaps[wide]
+        T_base_a, T_base_b = poses[a][false_spheres], poses[b][false_spheres]
+        at = np.einsum("nij,nj->ni", T_base_a[:, :3, :3], middle[false_spheres]) + T_base_a[:, :3, 3]
         on_b = np.einsum("nji,nj->ni", T_base_b[:, :3, :3], at - T_base_b[:, :3, 3])
-        places = {a: _one_per_cube(middle[idle], gaps), b: _one_per_cube(on_b, gaps)}
-        vain = np.flatnonzero(parts & ~meshes & free)[:FEW_PLACES]
-        coarse = _sticking_out(links, trees, poses, (a, b), vain)
+        places = {a: _one_per_cube(middle[false_spheres], gaps), b: _one_per_cube(on_b, gaps)}
+        false_parts = np.flatnonzero(parts & ~meshes & free)[:MAX_PART_CASES]
+        coarse = _sticking_out(links, trees, poses, (a, b), false_parts)
         shares = (float((parts & free).sum() / count), float((spheres & free).sum() / count))
-        pairs.append(PairRefusals((a, b), float(meshes.mean()), *shares, every, places, coarse))
+        pairs.append(PairFalseCollisions((a, b), float(meshes.mean()), *shares, every, places, coarse))
     by_parts = np.any([parts for _, parts, _, _ in found], axis=0)
     by_spheres = np.any([spheres for spheres, _, _, _ in found], axis=0)
-    return Refusals(
+    return FalseCollisions(
         float(free.mean()),
         float((by_parts & free).sum() / count),
         float((by_spheres & free).sum() / count),
@@ -136,8 +136,8 @@ def _sticking_out(
     pair: tuple[str, str],
     rows: Int[ndarray, "n"],
 ) -> dict[str, Float[ndarray, "places 3"]]:
-    """Places where parts of two links overlap in some configurations, for the link whose true meshes are
-    further from there."""
+    """Places where parts of two links overlap in configurations `rows`, each listed for the link whose true
+    meshes are further from it, in that link's frame."""
     found: dict[str, list[ndarray]] = {link: [] for link in pair}
     request, point = coal.DistanceRequest(), coal.Sphere(1e-6)
     for i in rows:
@@ -158,10 +158,10 @@ def _sticking_out(
 
 
 def _one_per_cube(points: Float[ndarray, "n 3"], gaps: Float[ndarray, "n"]) -> Float[ndarray, "m 4"]:
-    """Of each cube the place with the narrowest gap."""
+    """The place with the narrowest gap of each cube."""
     order = np.argsort(gaps)
     rows = np.column_stack([points, gaps])[order]
-    return rows[np.unique(np.floor(rows[:, :3] / CUBE), axis=0, return_index=True)[1]]
+    return rows[np.unique(np.floor(rows[:, :3] / PLACE_SPACING), axis=0, return_index=True)[1]]
 
 
 def _collide(
@@ -170,7 +170,7 @@ def _collide(
     T_a: ndarray,
     T_b: ndarray,
 ) -> bool:
-    """Whether surfaces of two links cross (one within the other is not found)."""
+    """Whether surfaces of two links intersect; one inside the other is not detected."""
     request, result = coal.CollisionRequest(), coal.CollisionResult()
     place_a, place_b = coal_pose(T_a), coal_pose(T_b)
     return any(

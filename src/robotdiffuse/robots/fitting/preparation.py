@@ -1,9 +1,10 @@
-"""From a robot's collision meshes to what planning needs: convex parts, covering spheres, allowed pairs.
+"""Prepares a robot for planning: convex parts, covering spheres and allowed collisions from its collision
+meshes.
 
-It measures itself: configurations in which the true meshes are free, but parts or spheres are not, are what
-the planner will never see. Where a pair of links refuses too many of them, parts and spheres are made again,
-finer in the places where the two touch in vain; where no spheres are fine enough, a table over the joints
-between the two says where they are apart.
+Configurations in which the true meshes are free, but parts or spheres collide, are lost to planning.
+Preparation measures these false collisions. If a pair of links has too many, its parts and spheres are made
+again, finer at the places where they touch. If no spheres are fine enough, a table over the joints between
+the links tells where they are apart.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,55 +25,60 @@ from robotdiffuse.robots.fitting.allowed_collisions import (
 )
 from robotdiffuse.robots.fitting.convex_pair_tables import joint_table
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_parts
-from robotdiffuse.robots.fitting.false_collisions import PairRefusals, Refusals, measure_refusals
+from robotdiffuse.robots.fitting.false_collisions import (
+    FalseCollisions,
+    PairFalseCollisions,
+    measure_false_collisions,
+)
 from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
-from robotdiffuse.robots.fitting.sphere_size_grid import FLOOR, Bounds, Solid
+from robotdiffuse.robots.fitting.sphere_size_grid import FLOOR_TOLERANCE, Bounds, Solid
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
 
-LARGE = 1.4
-"""Reach [m] from which on the lengths of settings grow with the reach: a larger arm works in more room, and
-needs no more parts and spheres."""
+LARGE_REACH = 1.4
+"""Reach beyond which the lengths in the settings grow with the reach [m]: a larger arm works in more space,
+and needs no more parts and spheres."""
 Progress = Callable[[str, int, int], None]
-"""Called with what is being done, the number of the step and the number of steps."""
-FINER = 0.5
-"""From round to round, how far convex parts may stick out where they refuse much, as a share."""
-LEFT = 0.6
-"""What pairs that stay as they are may refuse together, as a share of what all may."""
-FASTER = 0.6
-"""From round to round, a factor of that share."""
-GAP_SHARE = 1.2
-"""Of the gap between two links that spheres bridge in vain, what those of each may stick out into it, on
-average."""
+"""Called with the current activity, the index of the step and the number of steps."""
+CONCAVITY_SHRINKAGE = 0.5
+"""Factor per round on the concavity of convex parts with many false collisions."""
+UNREFINED_FRACTION = 0.6
+"""Fraction of the allowed false collisions that pairs left as they are may have together."""
+GAP_SHRINKAGE = 0.6
+"""Factor per round on `GAP_FRACTION`."""
+GAP_FRACTION = 1.2
+"""Average distance that spheres of each link may stick out into a gap that they bridge, as a fraction of the
+gap."""
 
 
 @dataclass(frozen=True)
 class PreparationSettings:
-    """How a robot is prepared."""
+    """Settings of `prepare`."""
 
     parts: PartSettings = field(default_factory=PartSettings)
     spheres: SphereSettings = field(default_factory=SphereSettings)
     sampling: SamplingSettings = field(default_factory=SamplingSettings)
-    refused: float = 0.075
-    """Share of the free configurations that spheres may refuse before they are made finer."""
+    max_false_collisions: float = 0.075
+    """Fraction of the free configurations with false collisions of spheres above which links are refined."""
     samples: int = 4000
-    """Configurations on which that is measured."""
+    """Random configurations for measuring false collisions."""
     rounds: int = 2
-    """Times that links are made finer, at most."""
+    """Largest number of refinements."""
     finest: float = 0.002
-    """Spheres need not stick out by less anywhere [m]."""
+    """Smallest tolerance of spheres [m]."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.refused < 1 or self.samples < 100 or self.rounds < 0:
+        if not 0 < self.max_false_collisions < 1 or self.samples < 100 or self.rounds < 0:
             raise InputError(
-                f"preparation: refused is {self.refused} (must be between 0 and 1), samples {self.samples} "
+                f"preparation: max_false_collisions is {self.max_false_collisions} (must be between 0 "
+                f"and 1), samples {self.samples} "
                 f"(at least 100), rounds {self.rounds} (at least 0)"
             )
 
     def for_reach(self, reach: float) -> "PreparationSettings":
-        """The settings with their lengths in the size of an arm that reaches so far [m]."""
-        size = max(reach / LARGE, 1.0)
+        """The settings with their lengths scaled for an arm with a reach [m]."""
+        size = max(reach / LARGE_REACH, 1.0)
         return replace(
             self, parts=self.parts.scaled(size), spheres=self.spheres.scaled(size), finest=size * self.finest
         )
@@ -86,32 +92,32 @@ class LinkReport:
     parts: int
     spheres: int
     stick_out: float
-    """How far a sphere reaches out of the parts, at most [m]; also to where a neighbour is at any angle."""
+    """Largest distance that a sphere sticks out of the parts [m]; includes space inside neighbours."""
     covered: bool
     """Whether the spheres provably cover the surface of the parts."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """What `prepare` made."""
+    """Result of `prepare`."""
 
     robot: Robot
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
     sampled: tuple[PairReport, ...]
-    """The pairs by sampling alone."""
-    refusals: Refusals
+    """The pairs as sampling alone classifies them."""
+    false_collisions: FalseCollisions
 
 
 @dataclass(eq=False)
 class _Link:
-    """One link while it is made."""
+    """A link during preparation."""
 
     name: str
     surfaces: tuple[Surface, ...]
     parts: PartSettings
     tight: Float[ndarray, "n 3"] | None = None
-    """Where parts may hardly stick out."""
+    """Places where parts should stick out as little as possible."""
     bounds: Bounds = field(default_factory=lambda: Bounds(0.0))
     solid: Solid | None = None
 
@@ -122,15 +128,16 @@ class _Link:
         return replace(robot, meshes=robot.meshes | {self.name: meshes})
 
     def fit(self, robot: Robot, settings: SphereSettings, seed: int) -> Robot:
-        """The robot with this link's spheres; `tight` places that were found stay."""
+        """The robot with this link's spheres; keeps `bounds.tight`."""
         if self.solid is None:
             meshes = robot.meshes[self.name]
-            self.solid = Solid.of(meshes, settings.tolerance(robot, self.name, np.inf))
-            tolerance = settings.tolerance(robot, self.name, self.solid.depth)
+            frame = robot.link_frame(self.name)
+            self.solid = Solid.of(meshes, settings.tolerance(frame, robot.dof, np.inf))
+            tolerance = settings.tolerance(frame, robot.dof, self.solid.depth)
             hidden = hidden_by_neighbours(robot, self.name)
             self.bounds = Bounds(tolerance, hidden, self.bounds.tight, _floor(robot, self.name))
         fit = fit_spheres(self.solid, self.bounds, np.random.default_rng(seed), settings)
-        fit = np.round(fit, 6)  # as the file holds them: these are validated
+        fit = np.round(fit, 6)  # as stored in the file, so that these values are checked
         return replace(robot, spheres=robot.spheres | {self.name: fit})
 
 
@@ -144,8 +151,13 @@ def prepare(
 ) -> Prepared:
     """The robot with parts, spheres and allowed pairs for the collision meshes of its links.
 
-    `surfaces` are the meshes by link, in the links' frames; `allowed` pairs, with reasons, that need no check
-    whatever sampling says. The same input and seed give the same robot.
+    Args:
+        robot: The robot; its meshes, spheres and allowed collisions are replaced.
+        surfaces: Collision meshes by link, in the links' frames.
+        settings: Tolerances and numbers of samples.
+        seed: The same input and seed give the same robot.
+        progress: Called at each step.
+        allowed: Pairs of links, with reasons, that are not checked even if sampling finds collisions.
     """
     settings = settings.for_reach(_turning_reach(robot))
     links = {name: _Link(name, meshes, settings.parts) for name, meshes in surfaces.items()}
@@ -168,25 +180,27 @@ def prepare(
     robot = replace(robot, allowed_collisions=allowed_pairs(pairs))
     tried = []
     for k in range(settings.rounds + 1):
-        progress("configurations refused", 2 * len(links) + 1 + k, steps)
-        refusals = measure_refusals(robot, surfaces, settings.samples, np.random.default_rng(seed))
-        tried.append((refusals.by_spheres, k, robot, refusals))
-        if refusals.by_spheres <= settings.refused or k == settings.rounds:
+        progress("false collisions", 2 * len(links) + 1 + k, steps)
+        false_collisions = measure_false_collisions(
+            robot, surfaces, settings.samples, np.random.default_rng(seed)
+        )
+        tried.append((false_collisions.by_spheres, k, robot, false_collisions))
+        if false_collisions.by_spheres <= settings.max_false_collisions or k == settings.rounds:
             break
-        robot = _refined(robot, links, refusals, k, settings, seed)
-    _, _, robot, refusals = min(tried, key=lambda one: one[:2])  # finer is not always better
-    closer = _closer(robot, links, refusals, settings, seed)
+        robot = _refined(robot, links, false_collisions, k, settings, seed)
+    _, _, robot, false_collisions = min(tried, key=lambda one: one[:2])  # refinement can add false collisions
+    closer = _with_finer_parts(robot, links, false_collisions, settings, seed)
     if closer is not None:
-        again = measure_refusals(closer, surfaces, settings.samples, np.random.default_rng(seed))
-        worst = max(refusals.by_spheres, settings.refused)
-        if again.by_parts < refusals.by_parts and again.by_spheres <= worst:
-            robot, refusals = closer, again
+        again = measure_false_collisions(closer, surfaces, settings.samples, np.random.default_rng(seed))
+        worst = max(false_collisions.by_spheres, settings.max_false_collisions)
+        if again.by_parts < false_collisions.by_parts and again.by_spheres <= worst:
+            robot, false_collisions = closer, again
     progress("done", steps, steps)
-    return Prepared(robot, tuple(_report(robot, name) for name in links), pairs, sampled, refusals)
+    return Prepared(robot, tuple(_report(robot, name) for name in links), pairs, sampled, false_collisions)
 
 
 def _turning_reach(robot: Robot) -> float:
-    """What the arm reaches without its rails [m]: an arm on a long one is no larger."""
+    """Reach of the arm with its prismatic joints fixed [m], since an arm on a long rail is not larger."""
     slides = {j.name: (j.lower + j.upper) / 2 for j in robot.planned_joints if j.kind == "prismatic"}
     return 0.0 if len(slides) == robot.dof else reach(robot.with_locked(slides))
 
@@ -200,18 +214,18 @@ def _report(robot: Robot, link: str) -> LinkReport:
 def _refined(
     robot: Robot,
     links: dict[str, _Link],
-    refusals: Refusals,
+    false_collisions: FalseCollisions,
     k: int,
     settings: PreparationSettings,
     seed: int,
 ) -> Robot:
-    """The robot with finer parts and spheres where pairs of links refuse much."""
-    worst = _worst(refusals, settings.refused)
+    """The robot with finer parts and spheres for pairs of links with many false collisions."""
+    worst = _worst(false_collisions, settings.max_false_collisions)
     close = {pair.links for pair in worst if _beyond_spheres(robot, pair, settings)}
     coarse = {
         name
         for pair in worst
-        if pair.by_parts > settings.refused / 5
+        if pair.by_parts > settings.max_false_collisions / 5
         for name in pair.links
         if pair.links not in close or len(pair.coarse[name])
     }
@@ -222,7 +236,9 @@ def _refined(
         if len(tight):
             link.tight = tight if link.tight is None else np.concatenate([link.tight, tight])
         else:
-            link.parts = replace(link.parts, concavity=link.parts.concavity * FINER, most=2 * link.parts.most)
+            link.parts = replace(
+                link.parts, concavity=link.parts.concavity * CONCAVITY_SHRINKAGE, most=2 * link.parts.most
+            )
         robot = link.decompose(robot)
     again = coarse | {name for pair in worst if pair.links not in close for name in pair.links}
     for name in sorted(again):
@@ -230,7 +246,7 @@ def _refined(
         tight = [_shared(pair, name) for pair in worst if name in pair.links and pair.links not in close]
         if tight:
             places = np.concatenate(tight)
-            gaps = GAP_SHARE * FASTER**k * places[:, 3]
+            gaps = GAP_FRACTION * GAP_SHRINKAGE**k * places[:, 3]
             places[:, 3] = np.clip(gaps, settings.finest, link.bounds.tolerance)
             known = [] if link.bounds.tight is None else [link.bounds.tight]
             link.bounds = replace(link.bounds, tight=np.concatenate([*known, places]))
@@ -239,15 +255,19 @@ def _refined(
     return _with_tables(robot, close | stale, settings)
 
 
-def _closer(
-    robot: Robot, links: dict[str, _Link], refusals: Refusals, settings: PreparationSettings, seed: int
+def _with_finer_parts(
+    robot: Robot,
+    links: dict[str, _Link],
+    false_collisions: FalseCollisions,
+    settings: PreparationSettings,
+    seed: int,
 ) -> Robot | None:
-    """The robot with finer parts where pairs of links overlap by parts alone; None if none were found to.
+    """The robot with finer parts for pairs of links whose parts collide falsely; None if there are none.
 
-    Start and goal are often such contacts, of an arm at rest beside its own body.
+    Starts and goals often are such contacts, of an arm at rest beside its own body.
     """
     places: dict[str, list[ndarray]] = {}
-    for pair in refusals.pairs:
+    for pair in false_collisions.pairs:
         for name in pair.links:
             if len(pair.coarse[name]):
                 places.setdefault(name, []).append(pair.coarse[name])
@@ -263,36 +283,37 @@ def _closer(
 
 
 def _with_tables(robot: Robot, pairs: set[tuple[str, str]], settings: PreparationSettings) -> Robot:
-    """The robot with tables over the joints between some pairs of links made, or made again."""
+    """The robot with new tables over the joints between the given pairs of links."""
     of_parts, tables = Links(robot), {table.links: table for table in robot.tables}
     for pair in sorted(pairs):
         tables[pair] = joint_table(robot, of_parts, pair, settings.finest / 4)
     return replace(robot, tables=tuple(tables.values()))
 
 
-def _beyond_spheres(robot: Robot, pair: PairRefusals, settings: PreparationSettings) -> bool:
-    """Whether the finest spheres refuse a pair too much, and a table over one or two joints can tell more."""
+def _beyond_spheres(robot: Robot, pair: PairFalseCollisions, settings: PreparationSettings) -> bool:
+    """Whether even the finest spheres of a pair collide falsely too often, and a table over one or two joints
+    can help."""
     narrow = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
-    hopeless = narrow * (pair.by_spheres - pair.by_parts) > settings.refused / 3
+    hopeless = narrow * (pair.by_spheres - pair.by_parts) > settings.max_false_collisions / 3
     return bool(hopeless) and len(robot.joints_between(*pair.links)) in (1, 2)
 
 
-def _shared(pair: PairRefusals, link: str) -> Float[ndarray, "n 4"]:
-    """Places on one of two links, and what of the gap its spheres may fill [m].
+def _shared(pair: PairFalseCollisions, link: str) -> Float[ndarray, "n 4"]:
+    """Places on one of two links, and the part of the gap that its spheres may fill [m].
 
-    Spheres that stick out by t over an area A are about A / t in number: of both links together they are
-    fewest if the link with the larger area has more of the gap, as the roots of the areas are.
+    About A / t spheres that stick out by t cover an area A. The two links need the fewest spheres together if
+    they share the gap in proportion to the square roots of their areas.
     """
     areas = np.sqrt([len(pair.places[link]), *(len(places) for places in pair.places.values())])
     return pair.places[link] * (1, 1, 1, 2 * areas[0] / max(areas[1:].sum(), 1))
 
 
-def _worst(refusals: Refusals, refused: float) -> list[PairRefusals]:
-    """As few pairs as leave the others well within what may be refused."""
-    left = sum(pair.by_spheres for pair in refusals.pairs)
+def _worst(false_collisions: FalseCollisions, allowed: float) -> list[PairFalseCollisions]:
+    """The fewest pairs without which the others are well below the allowed fraction of false collisions."""
+    left = sum(pair.by_spheres for pair in false_collisions.pairs)
     worst = []
-    for pair in refusals.pairs:
-        if left <= LEFT * refused:
+    for pair in false_collisions.pairs:
+        if left <= UNREFINED_FRACTION * allowed:
             break
         worst.append(pair)
         left -= pair.by_spheres
@@ -300,14 +321,18 @@ def _worst(refusals: Refusals, refused: float) -> list[PairRefusals]:
 
 
 def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
-    """The plane z = 0 of the base in the link's frame, for a link that moves but never tilts or rises: a
-    robot may stand on a table there. If the link's own meshes reach lower, the plane is below them."""
+    """Upward normal and offset of the floor in the link's frame, for a link that moves but never tilts or
+    rises.
+
+    The floor is the plane z = 0 of the base, where the robot may stand on a table, or lower if the link's own
+    meshes reach lower. None for other links.
+    """
     if robot.link_frame(link) == 0:
-        return None  # never checked against the scene
+        return None  # base links are never checked against the scene
     links = Links(robot)
     T_base_link = links.poses(links.random(20, np.random.default_rng(0)))[link]
     if np.ptp(T_base_link[:, 2], axis=0).max() > 1e-6:
         return None
     up, height = T_base_link[0, 2, :3], T_base_link[0, 2, 3]
     lowest = min(float((mesh.vertices @ up).min()) for mesh in robot.meshes[link])
-    return up, min(-height, lowest - FLOOR)
+    return up, min(-height, lowest - FLOOR_TOLERANCE)

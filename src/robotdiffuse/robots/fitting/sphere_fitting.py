@@ -1,13 +1,14 @@
-"""Spheres that cover the convex collision meshes of a link, sticking out little.
+"""Fits covering spheres to the convex collision meshes of a link.
 
-The surface is cut into small triangles. A sphere is convex, so it covers a triangle if and only if it holds
-its three corners: a set of spheres in which every small triangle lies within one sphere provably covers the
-surface, not just samples of it.
+The surface is cut into small triangles, the cells. A sphere is convex, so it covers a triangle if and only if
+it contains the three corners. If every cell lies within one sphere, the spheres provably cover the surface,
+not just samples of it.
 
-How large a sphere may be about a place is told by a grid (see sphere_room.py). For the cells given to one
-sphere, its best centre p is the minimum of max |corner - p| - room(p). Like Lloyd's algorithm, the fit
-alternates between giving each cell to the sphere that holds it with most room to spare and moving each sphere
-to its best centre. It starts from a greedy set cover and drops spheres as long as all have room.
+A grid holds the largest allowed radius of a sphere by its centre (see `sphere_size_grid.py`). For the cells
+assigned to a sphere, the best centre p minimises the excess radius max |corner - p| - max_radius(p). Like
+Lloyd's algorithm, the fit alternates between assigning each cell to the sphere that covers it with the least
+excess and moving each sphere to its best centre. It starts from a greedy set cover and drops spheres as long
+as none gets too large.
 """
 
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import split
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     DIRECTIONS,
@@ -29,45 +31,45 @@ from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     relax,
     within,
 )
-from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Room, Solid, stacked_planes
-from robotdiffuse.robots.robot import ConvexMesh, Robot
+from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Solid, SphereSizeGrid, stacked_planes
 
 MARGIN = 1e-5
-"""Added to the radii [m]: covers rounding in files and in single-precision kernels."""
-BURIED = 1e-9
-"""What lies deeper in another part is no surface of the union [m]."""
-SLACK = 0.1
-"""Of the spacing of the grid, what room a sphere may lack."""
-COARSE, FINE = (5.0, 60_000), (8.0, 150_000)
-"""Cells to choose spheres by, and to fit them to in the end: how many to the radius of a disc, and in all."""
-APART = 0.02
-"""Spheres that are added at once begin at least so far from each other [m]."""
+"""Added to the radii [m], for rounding in files and in single-precision kernels."""
+BURIED_DEPTH = 1e-9
+"""Points deeper than this in another part are not on the surface of the union [m]."""
+EXCESS_TOLERANCE = 0.1
+"""Largest excess radius that is accepted, as a fraction of the grid spacing."""
+COARSE_CELLS, FINE_CELLS = (5.0, 60_000), (8.0, 150_000)
+"""Cell sizes for choosing spheres and for the final fit: cells per radius of the disc that a sphere covers,
+and the largest number of cells."""
+ADDED_SPACING = 0.02
+"""Smallest distance between spheres that are added in one round [m]."""
 
 
 @dataclass(frozen=True)
 class SphereSettings:
-    """How closely spheres follow the meshes of a link."""
+    """How closely covering spheres follow the meshes of a link."""
 
     first_half: float = 0.015
-    """How far a sphere may stick out of a link that half of the joints (rounded up) or fewer move [m]."""
+    """How far a sphere may stick out of a link that at most half of the joints (rounded up) move [m]."""
     second_half: float = 0.009
     """The same for the links beyond, which work closer to obstacles [m]."""
     fixed: float = 0.03
-    """The same for links that no planned joint moves, which nothing but the arm itself can meet [m]."""
+    """The same for links that no planned joint moves, which can only collide with the arm itself [m]."""
     relative: float = 1.0
-    """Never more than this times the radius of the largest sphere inside the link."""
+    """Upper bound on the tolerance, as a multiple of the radius of the largest sphere inside the link."""
     finest: float = 0.004
-    """Nor less than this [m]."""
+    """Lower bound on the tolerance [m]."""
     candidates: int = 1000
-    """Places inside the mesh that the greedy cover chooses from."""
+    """Candidate centres of the greedy cover."""
     rounds: int = 5
-    """Rounds of the alternation for each number of spheres."""
+    """Rounds of assigning cells and moving spheres, for each number of spheres."""
     tries: int = 3
-    """Spheres that turn out to be needed before the others of a round are no longer asked."""
+    """Failed attempts to drop a sphere after which a round of dropping ends."""
     starts: int = 1
-    """Fits from different starts, of which the one with the fewest spheres is kept."""
+    """Number of random starts; the fit with the fewest spheres is kept."""
     most: int = 200
-    """Spheres of a link, about; where they do not suffice, they stick out further."""
+    """Approximate largest number of spheres per link; if they do not suffice, they exceed the tolerance."""
 
     def __post_init__(self) -> None:
         if not 0 < self.finest <= min(self.first_half, self.second_half):
@@ -77,14 +79,14 @@ class SphereSettings:
             )
 
     def scaled(self, size: float) -> "SphereSettings":
-        """For links that are so many times as large."""
+        """The settings for links scaled by a factor."""
         lengths = ("first_half", "second_half", "fixed", "finest")
         return replace(self, **{name: size * getattr(self, name) for name in lengths})
 
-    def tolerance(self, robot: Robot, link: str, inradius: float) -> float:
-        """How far the spheres of a link may stick out [m] whose largest inner sphere has this radius [m]."""
-        frame = robot.link_frame(link)
-        wanted = self.first_half if frame <= (robot.dof + 1) // 2 else self.second_half
+    def tolerance(self, frame: int, dof: int, inradius: float) -> float:
+        """How far the spheres of a link may stick out [m]: a link on a frame (see `Robot.link_frame`) of a
+        robot with `dof` planned joints, whose largest inscribed sphere has the radius `inradius` [m]."""
+        wanted = self.first_half if frame <= (dof + 1) // 2 else self.second_half
         if frame == 0:
             wanted = max(wanted, self.fixed)
         return float(max(min(wanted, self.relative * inradius), self.finest))
@@ -96,31 +98,31 @@ def fit_spheres(
     rng: np.random.Generator,
     settings: SphereSettings = SphereSettings(),
 ) -> Float[ndarray, "n 4"]:
-    """Spheres [x y z radius, m] that cover convex meshes, inside and surface, and keep within bounds."""
-    room = solid.room(bounds)
+    """Spheres [x y z radius, m] within bounds that cover surface and interior of a solid."""
+    sizes = solid.sphere_sizes(bounds)
     inside = solid.inside
-    # sticking out of a flat face by e, a sphere covers a disc of radius sqrt(2 r e); cells are much smaller
-    coarse, fine = (_Cells.of(solid, bounds, *size) for size in (COARSE, FINE))
+    # a sphere that sticks out of a flat face by e covers a disc of radius sqrt(2 r e); cells are much smaller
+    coarse, fine = (_Cells.of(solid, bounds, *size) for size in (COARSE_CELLS, FINE_CELLS))
     covers = []
     for _ in range(settings.starts):
         places = rng.permutation(inside)[: settings.candidates] + rng.uniform(-0.5, 0.5, 3) * solid.spacing
-        centers = _thin_out(room, coarse, _first_cover(room, coarse, places, settings), settings)
+        centers = _thin_out(sizes, coarse, _first_cover(sizes, coarse, places, settings), settings)
         covers.append(centers)
-    centers = _with_enough(room, fine, min(covers, key=len), settings)
-    centers, _ = _relax(room, fine, centers, settings.rounds, -np.inf)  # as little as so many can
-    return _without_holes(solid, inside, _with_radii(room, fine, centers))
+    centers = _with_enough_spheres(sizes, fine, min(covers, key=len), settings)
+    centers, _ = _relax(sizes, fine, centers, settings.rounds, -np.inf)  # minimise the excess
+    return _without_holes(solid, inside, _with_radii(sizes, fine, centers))
 
 
 def stick_out(solid: Solid, spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n"]:
-    """How far each sphere reaches out of the meshes [m]."""
-    return spheres[:, 3] - solid.as_room().at(spheres[:, :3])
+    """How far each sphere sticks out of the solid [m]."""
+    return spheres[:, 3] - solid.inscribed_sizes().at(spheres[:, :3])
 
 
 def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], finest: float = 2e-6) -> bool:
     """Whether the spheres provably cover the surface of the union of the meshes.
 
-    Triangles that no one sphere holds are cut in four, until all are held, or a corner is found that is in
-    no sphere, or they are smaller than `finest` [m].
+    Triangles that no single sphere contains are cut in four, until all are contained, or a corner is found
+    outside all spheres, or triangles are smaller than `finest` [m].
     """
     triangles, spheres = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), for_kernels(spheres)
     single = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
@@ -129,7 +131,7 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], fine
         held, bare = held_by_one(triangles, spheres)
         is_open = ~held
         for planes in single:
-            hidden = within(corners, *planes, BURIED)
+            hidden = within(corners, *planes, BURIED_DEPTH)
             is_open &= ~hidden.reshape(-1, 3).all(1)
             bare &= ~hidden
         if bare.any():
@@ -146,18 +148,21 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], fine
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Small triangles of the surface of the union of meshes."""
+    """Small triangles on the surface of the union of meshes."""
 
     points: Float[ndarray, "p 3"]
     corners: Int[ndarray, "c 3"]
     """Indices into points."""
     sharp: Bool[ndarray, "p"]
-    """Vertices of the meshes; all other points lie between neighbours on a face or an edge."""
+    """Whether a point is a vertex of a mesh; all others lie between neighbours on a face or an edge."""
 
     @staticmethod
     def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "_Cells":
-        """Triangles, without those inside another mesh, whose edges are a fraction of the largest disc that a
-        sphere within bounds can cover; a larger one where there would be more than `most`."""
+        """Cells of a solid without triangles inside another mesh.
+
+        Edges are at most 1 / `cut` of the radius of the largest disc that a sphere within bounds can cover;
+        longer if there would be more than `most` cells.
+        """
         soup, vertices, left_out = [], [], False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
         boxes = [(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh in solid.meshes]
@@ -171,7 +176,7 @@ class _Cells:
                 if other != k:
                     asked = np.flatnonzero(((low >= lowest) & (high <= highest)).all(1) & ~hidden)
                     corners = triangles[asked].reshape(-1, 3)
-                    hidden[asked] = within(corners, *planes[other], BURIED).reshape(-1, 3).all(1)
+                    hidden[asked] = within(corners, *planes[other], BURIED_DEPTH).reshape(-1, 3).all(1)
             triangles = triangles[~hidden]
             if bounds.varies:
                 tolerances = bounds.tolerances(triangles.mean(1))
@@ -190,19 +195,29 @@ class _Cells:
         points = points[first]
         sharp = np.zeros(len(points), dtype=bool)
         sharp[index.ravel()[:count]] = True
-        # where triangles were left out, any point may be a corner of what is left
+        # where triangles were left out, any point may be a corner of the remaining surface
         sharp |= left_out
         return _Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
 
-    def assigned(self, room: Room, centers: Float[ndarray, "n 3"]) -> "_Assignment":
+    def assigned(self, sizes: SphereSizeGrid, centers: Float[ndarray, "n 3"]) -> "_Assignment":
         count = len(self.corners)
-        owner, heir = np.empty(count, np.int64), np.empty(count, np.int64)
-        least, second = np.empty(count), np.empty(count)
-        assign(self.points, self.corners, centers, room.at(centers), owner, least, heir, second)
-        return _Assignment(owner, least, heir, second)
+        owner, runner_up = np.empty(count, np.int64), np.empty(count, np.int64)
+        owner_excess, second_excess = np.empty(count), np.empty(count)
+        assign(
+            self.points,
+            self.corners,
+            centers,
+            sizes.at(centers),
+            owner,
+            owner_excess,
+            runner_up,
+            second_excess,
+        )
+        return _Assignment(owner, owner_excess, runner_up, second_excess)
 
     def part(self, mine: Bool[ndarray, "c"]) -> "_Cells":
-        """Some of the cells; points on their border count as vertices, for what is beyond holds them."""
+        """A subset of the cells; points on its border count as vertices, since other cells need them
+        covered."""
         outside = np.zeros(len(self.points), dtype=bool)
         outside[self.corners[~mine]] = True
         used, index = np.unique(self.corners[mine], return_inverse=True)
@@ -210,87 +225,90 @@ class _Cells:
 
 
 class _Assignment(NamedTuple):
-    """Which sphere each cell is given to."""
+    """Which sphere each cell is assigned to."""
 
     owner: Int[ndarray, "c"]
-    """The one that holds it with most room to spare."""
-    least: Float[ndarray, "c"]
-    """What that one lacks [m]."""
-    heir: Int[ndarray, "c"]
-    """The next best one; -1 if there is none."""
-    second: Float[ndarray, "c"]
-    """What that one lacks [m]."""
+    """The sphere that covers the cell with the least excess."""
+    owner_excess: Float[ndarray, "c"]
+    """Its excess radius for the cell [m]."""
+    runner_up: Int[ndarray, "c"]
+    """The second best sphere; -1 if there is none."""
+    second_excess: Float[ndarray, "c"]
+    """Its excess radius [m]."""
 
 
 def _relax(
-    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
+    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
 ) -> tuple[Float[ndarray, "n 3"], float]:
-    """Better centres, and how much room the worst sphere lacks [m]; ends early at `enough`."""
-    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *room.arrays, DIRECTIONS)
+    """Improved centres and the largest excess radius [m]; ends early at `enough`."""
+    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *sizes.arrays, DIRECTIONS)
 
 
 def _first_cover(
-    room: Room, cells: _Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
+    sizes: SphereSizeGrid, cells: _Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "k 3"]:
-    """Centres from a greedy set cover."""
-    chosen = greedy_cover(cells.points, cells.corners, places, room.at(places))
-    return _with_enough(room, cells, places[chosen], settings)
+    """Centres from a greedy set cover of the cells."""
+    chosen = greedy_cover(cells.points, cells.corners, places, sizes.at(places))
+    return _with_enough_spheres(sizes, cells, places[chosen], settings)
 
 
-def _with_enough(
-    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
+def _with_enough_spheres(
+    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "m 3"]:
-    """Centres moved, with more until all spheres have the room that they need."""
-    enough = room.spacing * SLACK
-    centers, worst = _relax(room, cells, centers, settings.rounds, enough)
+    """Improved centres, with spheres added until none exceeds its largest radius, or there are
+    `settings.most`."""
+    enough = sizes.spacing * EXCESS_TOLERANCE
+    centers, worst = _relax(sizes, cells, centers, settings.rounds, enough)
     while worst > enough and len(centers) < settings.most:
-        lacking = cells.assigned(room, centers).least
-        extra = _apart(cells.points[cells.corners].mean(1), lacking, len(centers) // 20 + 1)
-        centers, worst = _relax(room, cells, np.concatenate([centers, extra]), settings.rounds, enough)
+        excess = cells.assigned(sizes, centers).owner_excess
+        extra = _farthest_apart(cells.points[cells.corners].mean(1), excess, len(centers) // 20 + 1)
+        centers, worst = _relax(sizes, cells, np.concatenate([centers, extra]), settings.rounds, enough)
     return centers
 
 
-def _apart(points: Float[ndarray, "c 3"], lacking: Float[ndarray, "c"], count: int) -> Float[ndarray, "k 3"]:
-    """The points that lack most, none close to another."""
-    order = np.argsort(-lacking)[: max(1, int((lacking > 0).sum()))]
+def _farthest_apart(
+    points: Float[ndarray, "c 3"], excess: Float[ndarray, "c"], count: int
+) -> Float[ndarray, "k 3"]:
+    """Up to `count` points with the largest excess, apart from each other."""
+    order = np.argsort(-excess)[: max(1, int((excess > 0).sum()))]
     points, chosen = points[order], []
     while len(points) and len(chosen) < count:
         chosen.append(points[0])
-        points = points[np.linalg.norm(points - points[0], axis=1) > APART]
+        points = points[np.linalg.norm(points - points[0], axis=1) > ADDED_SPACING]
     return np.array(chosen)
 
 
 def _thin_out(
-    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
+    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "m 3"]:
-    """Drop spheres, those first whose cells the others take over best, as long as there is room.
+    """Centres without the spheres whose cells the others can cover; the least needed ones are dropped first.
 
-    Only those that take over cells are moved for it.
+    Only the spheres that take over cells are moved.
     """
-    enough = room.spacing * SLACK
+    enough = sizes.spacing * EXCESS_TOLERANCE
     centers, kept = centers.copy(), np.zeros(len(centers), dtype=bool)
     while len(centers) > 1:
-        given = cells.assigned(room, centers)
+        given = cells.assigned(sizes, centers)
         loss = np.full(len(centers), -np.inf)
-        np.maximum.at(loss, given.owner, given.second)
+        np.maximum.at(loss, given.owner, given.second_excess)
         dropped, moved, failures = np.zeros_like(kept), np.zeros_like(kept), 0
         for i in np.argsort(loss):
-            heirs = np.unique(given.heir[given.owner == i])
-            if kept[i] or moved[i] or moved[heirs].any():
+            takers = np.unique(given.runner_up[given.owner == i])
+            if kept[i] or moved[i] or moved[takers].any():
                 continue
-            if not len(heirs):
+            if not len(takers):
                 dropped[i] = True
                 continue
             among = np.zeros(len(centers), dtype=bool)
-            among[i] = among[heirs] = True
+            among[i] = among[takers] = True
             part = cells.part(among[given.owner])
-            rest, worst = _relax(room, part, centers[heirs], settings.rounds, enough)
+            rest, worst = _relax(sizes, part, centers[takers], settings.rounds, enough)
             if worst > enough:
                 kept[i], failures = True, failures + 1
                 if failures == settings.tries:
                     break
                 continue
-            centers[heirs], dropped[i] = rest, True
+            centers[takers], dropped[i] = rest, True
             moved |= among
         if not dropped.any():
             break
@@ -299,9 +317,12 @@ def _thin_out(
     return centers
 
 
-def _with_radii(room: Room, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "m 4"]:
-    """Least radii with which each sphere holds its own cells; spheres without any are dropped."""
-    owner = cells.assigned(room, centers).owner
+def _with_radii(
+    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"]
+) -> Float[ndarray, "m 4"]:
+    """Spheres with the smallest radii that cover the cells assigned to them; spheres without cells are
+    dropped."""
+    owner = cells.assigned(sizes, centers).owner
     radii = np.zeros(len(centers))
     far = np.linalg.norm(cells.points[cells.corners] - centers[owner][:, None], axis=2).max(1)
     np.maximum.at(radii, owner, far + MARGIN)
@@ -311,10 +332,11 @@ def _with_radii(room: Room, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Fl
 def _without_holes(
     solid: Solid, inside: Float[ndarray, "g 3"], spheres: Float[ndarray, "n 4"]
 ) -> Float[ndarray, "m 4"]:
-    """Fill holes inside the meshes, where a small obstacle could hide, from the deepest place on."""
-    depth = solid.as_room().at(inside)
+    """Spheres with more of them added in uncovered holes inside the solid, where a small obstacle could
+    hide."""
+    depth = solid.inscribed_sizes().at(inside)
     gap = gaps(inside, spheres)
-    # nothing between the grid's points is further from them than half of a cube's diagonal
+    # every point is within half a cube's diagonal of a grid point
     half = np.sqrt(0.75) * solid.spacing
     is_open = gap > np.where(depth > 2 * half, -half, 0.0)
     inside, depth, extra = inside[is_open], depth[is_open], []
@@ -328,5 +350,6 @@ def _without_holes(
 
 
 def _disc(tolerance: Any, depth: float) -> Any:
-    """Radius of what a sphere covers of a face [m] that sticks out by a tolerance, from a depth."""
+    """Radius of the disc on a flat face that a sphere covers [m]: one whose inscribed part has the radius
+    `depth` and which sticks out by `tolerance`."""
     return np.sqrt(2 * tolerance * depth + tolerance**2)

@@ -1,19 +1,23 @@
-"""Compiled inner loops of the sphere fit. A surface is cells (triangles of points); the room for a sphere
-about each place is a grid."""
+"""Compiled inner loops of the sphere fit, and of tests between sets of spheres.
+
+A surface consists of cells, which are triangles of points. A grid holds the largest radius of a sphere by its
+centre. Without jaxtyping annotations, since Numba compiles these functions. Lengths are in metres.
+"""
 
 import math
 
 import numpy as np
 from numba import njit
 
-FIRST_STEP, LAST_STEP, SHRINK = 0.004, 0.0005, 0.8
-"""Step of the search for centres [m]: in the first round, at least, and from round to round."""
-FINEST_STEP = 2e-4
-"""[m]; smaller steps than this end the search for one centre."""
-OUTSIDE = -1.0
-"""Room outside the grid [m]."""
-GAIN = 1e-7
-"""Steps that gain less than this are not taken [m]."""
+INITIAL_STEP, MIN_INITIAL_STEP, STEP_SHRINKAGE = 0.004, 0.0005, 0.8
+"""Initial step of the search for a centre [m]: in the first round, its lower bound, and its factor per
+round."""
+MIN_STEP = 2e-4
+"""The search for a centre ends at this step [m]."""
+OUTSIDE_GRID = -1.0
+"""Largest radius just outside the grid [m]: negative, so that no sphere is placed there."""
+MIN_GAIN = 1e-7
+"""Steps that reduce the excess by less than this are not taken [m]."""
 
 DIRECTIONS = np.array(
     [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=np.float64
@@ -23,7 +27,11 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 @njit(cache=True)
 def plane_depths(points, normals, offsets, starts):
-    """Distance to the nearest face plane of the part in which each point is deepest; negative outside."""
+    """Distance [n] from each point to the nearest face plane of the part in which it is deepest; negative
+    outside.
+
+    Planes are as in `sphere_size_grid.stacked_planes`.
+    """
     depths = np.empty(len(points))
     for i in range(len(points)):
         x, y, z = points[i]
@@ -41,7 +49,7 @@ def plane_depths(points, normals, offsets, starts):
 
 @njit(cache=True)
 def within(points, normals, offsets, starts, depth):
-    """Whether each point is deeper in a part than `depth`."""
+    """Whether each point is deeper than `depth` in a part."""
     found = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
         x, y, z = points[i]
@@ -57,14 +65,14 @@ def within(points, normals, offsets, starts, depth):
 
 
 @njit(cache=True, fastmath=True)
-def room_at(x, y, z, grid, origin, spacing):
-    """Value of a grid between its points; outside the grid a low one, the lower the further."""
+def max_radius_at(x, y, z, grid, origin, spacing):
+    """Grid value interpolated at a point; outside the grid, negative and decreasing with the distance."""
     u, v, w = (x - origin[0]) / spacing, (y - origin[1]) / spacing, (z - origin[2]) / spacing
     beyond = 0.0
     for value, count in ((u, grid.shape[0]), (v, grid.shape[1]), (w, grid.shape[2])):
         beyond = max(beyond, -value, value - (count - 1.001))
     if beyond > 0.0:
-        return OUTSIDE - beyond * spacing
+        return OUTSIDE_GRID - beyond * spacing
     i, j, k = int(u), int(v), int(w)
     u, v, w = u - i, v - j, w - k
     low = (grid[i, j, k] * (1 - w) + grid[i, j, k + 1] * w) * (1 - v)
@@ -75,26 +83,31 @@ def room_at(x, y, z, grid, origin, spacing):
 
 
 @njit(cache=True, fastmath=True)
-def rooms_at(centers, grid, origin, spacing):
-    rooms = np.empty(len(centers))
+def max_radii_at(centers, grid, origin, spacing):
+    """Grid values [n] interpolated at centres [n, 3]."""
+    radii = np.empty(len(centers))
     for i in range(len(centers)):
-        rooms[i] = room_at(centers[i, 0], centers[i, 1], centers[i, 2], grid, origin, spacing)
-    return rooms
+        radii[i] = max_radius_at(centers[i, 0], centers[i, 1], centers[i, 2], grid, origin, spacing)
+    return radii
 
 
 @njit(cache=True, fastmath=True)
 def squared_distance(a, i, b, j):
+    """Squared distance between row i of a and row j of b."""
     x, y, z = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
     return x * x + y * y + z * z
 
 
 @njit(cache=True, fastmath=True)
 def assign(points, corners, centers, depths, owner, least, heir, second):
-    """For each cell the sphere that holds it with the least stick-out, that stick-out, and the next best."""
+    """Write for each cell the sphere that covers it with the least excess, that excess, and the second best.
+
+    `depths` are the largest radii of spheres at `centers`.
+    """
     for c in range(len(corners)):
         best, runner, mine, next_best = 1e9, 1e9, -1, -1
         for i in range(len(centers)):
-            # a first corner that is too far settles it: most spheres are
+            # most spheres are too far from the first corner already
             reach = runner + depths[i]
             far = squared_distance(points, corners[c, 0], centers, i)
             if reach <= 0.0 or far >= reach * reach:
@@ -111,8 +124,10 @@ def assign(points, corners, centers, depths, owner, least, heir, second):
 
 @njit(cache=True, fastmath=True)
 def greedy_cover(points, corners, places, depths):
-    """Places such that spheres about some hold all cells, as few as greedy choice finds; a cell that none can
-    hold within its room is left to those that lack least."""
+    """Indices of places at which spheres cover all cells, by a greedy choice.
+
+    A cell that no sphere of an allowed radius covers is left to the spheres with the least excess.
+    """
     holds = np.zeros((len(corners), len(places)), np.bool_)
     counts = np.zeros(len(places), np.int64)
     for c in range(len(corners)):
@@ -144,7 +159,7 @@ def greedy_cover(points, corners, places, depths):
 
 @njit(cache=True)
 def enclosing(spheres):
-    """Centre and radius of a ball that holds spheres."""
+    """Centre and radius of a ball that contains spheres."""
     center = np.array([0.5 * (spheres[:, k].min() + spheres[:, k].max()) for k in range(3)])
     radius = 0.0
     for i in range(len(spheres)):
@@ -155,7 +170,7 @@ def enclosing(spheres):
 
 @njit(cache=True)
 def relative(A, B, T):
-    """Writes the pose [3, 4] of the second of two frames in the first, of poses [4, 4]."""
+    """Write the pose [3, 4] of frame B in frame A into T; A and B are poses [4, 4]."""
     for i in range(3):
         for j in range(3):
             T[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
@@ -166,7 +181,7 @@ def relative(A, B, T):
 
 @njit(cache=True)
 def ball_distances(T_base_a, T_base_b, first, second):
-    """Signed distances [a, b] between the balls of two sets at two poses [4, 4] [m]."""
+    """Signed distances [a, b] between the balls of two sets, each set at its pose [4, 4] [m]."""
     T, found = np.empty((3, 4)), np.empty((len(first), len(second)))
     relative(T_base_a, T_base_b, T)
     for j in range(len(second)):
@@ -182,11 +197,12 @@ def ball_distances(T_base_a, T_base_b, first, second):
 
 @njit(cache=True)
 def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
-    """For poses [n, 4, 4] of two sets of spheres how deep any two of them overlap [m] (negative if none do),
-    and the middle of where they do, in the frame of the first set.
+    """Deepest overlap of two sets of spheres at each of n poses [m], negative if none overlap, and its
+    middle.
 
-    Where balls around the two sets are further from each other than `apart`, only that is told; nothing is
-    looked for that overlaps by no more than `least`.
+    Poses are [n, 4, 4]; middles are [n, 3], in the frame of the first set. Where bounding balls of the sets
+    are more than `apart` from each other, the depth is minus their distance. Overlaps up to `least` are not
+    searched.
     """
     depth, middle = np.full(len(T_base_a), least), np.zeros((len(T_base_a), 3))
     a_center, a_radius = enclosing(first)
@@ -206,7 +222,7 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
             x = T[0, 0] * second[j, 0] + T[0, 1] * second[j, 1] + T[0, 2] * second[j, 2] + T[0, 3]
             y = T[1, 0] * second[j, 0] + T[1, 1] * second[j, 1] + T[1, 2] * second[j, 2] + T[1, 3]
             z = T[2, 0] * second[j, 0] + T[2, 1] * second[j, 1] + T[2, 2] * second[j, 2] + T[2, 3]
-            # most spheres are further from all of the first set than those that were found
+            # skip spheres too far from the first set to overlap more deeply
             reach = a_radius + second[j, 3] - depth[n]
             dx, dy, dz = a_center[0] - x, a_center[1] - y, a_center[2] - z
             if reach <= 0.0 or dx * dx + dy * dy + dz * dz >= reach * reach:
@@ -226,7 +242,7 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
 
 @njit(cache=True, fastmath=True)
 def gaps(points, spheres):
-    """Signed distance of points from a union of spheres [m]; inside only a bound."""
+    """Signed distance of points from a union of spheres [m]; inside, only a bound."""
     out = np.empty(len(points))
     for n in range(len(points)):
         least = 1e9
@@ -241,7 +257,8 @@ def gaps(points, spheres):
 
 @njit(cache=True)
 def held_by_one(triangles, spheres):
-    """Whether one sphere holds all of each triangle; and whether no sphere holds each corner."""
+    """Whether a single sphere contains each triangle [t]; and whether each corner [3 t] is outside all
+    spheres."""
     held, bare = np.zeros(len(triangles), np.bool_), np.ones(3 * len(triangles), np.bool_)
     for t in range(len(triangles)):
         for i in range(len(spheres)):
@@ -261,26 +278,26 @@ def held_by_one(triangles, spheres):
 
 
 @njit(cache=True, fastmath=True)
-def stick_out_at(x, y, z, own, count, grid, origin, spacing):
-    """How far a sphere at a centre sticks out if it holds the own points."""
+def excess_radius(x, y, z, own, count, grid, origin, spacing):
+    """Excess radius of a sphere at a centre that contains the first `count` points of `own`."""
     far = 0.0
     for k in range(count):
         dx, dy, dz = own[k, 0] - x, own[k, 1] - y, own[k, 2] - z
         far = max(far, dx * dx + dy * dy + dz * dz)
-    return math.sqrt(far) - room_at(x, y, z, grid, origin, spacing)
+    return math.sqrt(far) - max_radius_at(x, y, z, grid, origin, spacing)
 
 
 @njit(cache=True, fastmath=True)
 def move_center(center, own, count, step, grid, origin, spacing, directions):
-    """Pattern search for the centre of least stick-out; changes `center`."""
-    least = stick_out_at(center[0], center[1], center[2], own, count, grid, origin, spacing)
-    while step > FINEST_STEP:
-        best, way = least - GAIN, -1
+    """Pattern search for the centre of least excess radius, in place."""
+    least = excess_radius(center[0], center[1], center[2], own, count, grid, origin, spacing)
+    while step > MIN_STEP:
+        best, way = least - MIN_GAIN, -1
         for k in range(len(directions)):
             x = center[0] + step * directions[k, 0]
             y = center[1] + step * directions[k, 1]
             z = center[2] + step * directions[k, 2]
-            value = stick_out_at(x, y, z, own, count, grid, origin, spacing)
+            value = excess_radius(x, y, z, own, count, grid, origin, spacing)
             if value < best:
                 best, way = value, k
         if way < 0:
@@ -292,9 +309,9 @@ def move_center(center, own, count, step, grid, origin, spacing, directions):
 
 @njit(cache=True, fastmath=True)
 def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing, directions):
-    """Alternate between giving cells to spheres and moving the spheres.
+    """Alternate between assigning cells to spheres and moving the spheres.
 
-    Returns the best centres met and how far they stick out; ends early at `enough`.
+    Returns the best centres found and their largest excess radius; ends early at `enough`.
     """
     cells, count = len(corners), len(centers)
     owner = np.empty(cells, np.int64)
@@ -305,9 +322,11 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
     order, ends = np.empty(cells, np.int64), np.empty(count + 1, np.int64)
     centers = centers.copy()
     best, best_value = centers.copy(), 1e9
-    step = FIRST_STEP
+    step = INITIAL_STEP
     for r in range(rounds + 1):
-        assign(points, corners, centers, rooms_at(centers, grid, origin, spacing), owner, least, heir, second)
+        assign(
+            points, corners, centers, max_radii_at(centers, grid, origin, spacing), owner, least, heir, second
+        )
         value = least.max()
         if value < best_value:
             best, best_value = centers.copy(), value
@@ -343,5 +362,5 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
                         found += 1
             if found > 0:
                 move_center(centers[i], own, found, step, grid, origin, spacing, directions)
-        step = max(SHRINK * step, LAST_STEP)
+        step = max(STEP_SHRINKAGE * step, MIN_INITIAL_STEP)
     return best, best_value

@@ -1,8 +1,8 @@
-"""Where the spheres of a link may reach: how large a sphere may be about each place, on a grid.
+"""Largest allowed radius of a link's covering spheres as a function of their centre, on a grid.
 
-A sphere may hold every point whose distance from the link is at most the tolerance, which may be less near
-some places; points that neighbouring links hide at any angle of the joints between them; and none below the
-plane that the robot stands on.
+A sphere may contain points whose distance from the link is at most the tolerance, which may be smaller near
+some places, and points that are inside a neighbouring link at any angle of the joint between them. It may not
+contain points below the plane that the robot stands on.
 """
 
 from collections.abc import Callable
@@ -15,45 +15,46 @@ from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import planes_of
-from robotdiffuse.robots.fitting.sphere_fitting_kernel import plane_depths, rooms_at
-from robotdiffuse.robots.robot import ConvexMesh
+from robotdiffuse.robots.fitting.sphere_fitting_kernel import max_radii_at, plane_depths
 
 GRID_POINTS = 200_000
-"""Of a grid around a link, about."""
-FINEST = 0.0015
-"""Spacing of a grid, at least [m]."""
-BESIDE = 0.03
-"""How far a grid reaches beyond the link, at least [m]: spheres may reach so far into a neighbour."""
-AROUND, SLOPE = 0.015, 0.3
-"""A smaller tolerance holds so far from its place [m], and grows by so much per distance beyond."""
+"""Approximate number of points of the grid around a link."""
+MIN_SPACING = 0.0015
+"""Smallest spacing of a grid [m]."""
+MIN_PADDING = 0.03
+"""Smallest padding of the grid around the link [m]: spheres may reach this far into a neighbour."""
+TIGHT_RADIUS, TIGHT_SLOPE = 0.015, 0.3
+"""A smaller tolerance applies within this distance of its place [m]; beyond, it grows by this much per
+metre."""
 
-THIN = 5e-4
-"""Radius that spheres inside a plate are taken to have at least [m]."""
-FLOOR = 0.0015
-"""Spheres may always stick out so far towards the floor [m]: a link may lie on it."""
-LEVEL = np.log(1.3)
-"""Tolerances within such a factor count as the lowest of them."""
+MIN_DEPTH = 5e-4
+"""Lower bound on the inscribed radius of a link, for thin plates [m]."""
+FLOOR_TOLERANCE = 0.0015
+"""Spheres may always stick out this far towards the floor [m], since a link may lie on it."""
+TOLERANCE_LEVEL = np.log(1.3)
+"""Logarithm of the factor within which tolerances are grouped; the lowest of a group applies to all of it."""
 
 Planes = tuple[Float[ndarray, "p 3"], Float[ndarray, "p"], ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """How far the spheres of a link may reach out of it."""
+    """How far the spheres of a link may stick out of it."""
 
     tolerance: float
     """[m]"""
     hidden: Callable[[Float[ndarray, "n 3"]], Bool[ndarray, "n"]] | None = None
-    """Whether neighbours hide points, which then may be held."""
+    """Whether points are inside a neighbour, so that spheres may contain them."""
     tight: Float[ndarray, "n 4"] | None = None
-    """Places x y z, and how far spheres may stick out there [m]; nothing is hidden about them."""
+    """Rows x y z and how far spheres may stick out there [m]. Near these, `hidden` does not apply."""
     floor: tuple[Float[ndarray, "3"], float] | None = None
-    """Upward normal n of a plane and its offset: points with n . x below it are not held."""
+    """Upward normal n and offset of a plane: spheres may not contain points x with n . x below the offset."""
 
     @property
     def varies(self) -> bool:
-        """Whether the tolerance is less in some places."""
+        """Whether the tolerance is smaller in some places."""
         return self.tight is not None or self.floor is not None
 
     def tolerances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
@@ -61,21 +62,24 @@ class Bounds:
         allowed = np.full(len(points), self.tolerance)
         if self.floor is not None:
             normal, offset = self.floor
-            np.minimum(allowed, np.maximum(points @ normal - offset, FLOOR), out=allowed)
+            np.minimum(allowed, np.maximum(points @ normal - offset, FLOOR_TOLERANCE), out=allowed)
         if self.tight is None:
             return allowed
-        level = np.ceil(np.log(self.tight[:, 3]) / LEVEL)
+        level = np.ceil(np.log(self.tight[:, 3]) / TOLERANCE_LEVEL)
         for one in np.unique(level):
             places = self.tight[level == one]
-            far = KDTree(places[:, :3]).query(points, distance_upper_bound=AROUND + self.tolerance / SLOPE)[0]
-            least = places[:, 3].min() + SLOPE * np.maximum(far - AROUND, 0.0)
+            far = KDTree(places[:, :3]).query(
+                points, distance_upper_bound=TIGHT_RADIUS + self.tolerance / TIGHT_SLOPE
+            )[0]
+            least = places[:, 3].min() + TIGHT_SLOPE * np.maximum(far - TIGHT_RADIUS, 0.0)
             np.minimum(allowed, least, out=allowed)
         return allowed
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
-    """How large a sphere may be about each place: negative where none may be [m], linear between points."""
+class SphereSizeGrid:
+    """Largest radius of a sphere by its centre [m], interpolated on a grid; negative where no sphere may
+    be."""
 
     grid: Float[ndarray, "nx ny nz"]
     origin: Float[ndarray, "3"]
@@ -86,12 +90,13 @@ class Room:
         return self.grid, self.origin, self.spacing
 
     def at(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        return rooms_at(np.ascontiguousarray(points), *self.arrays)
+        """Largest radius at points [m]."""
+        return max_radii_at(np.ascontiguousarray(points), *self.arrays)
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """Signed distances from the faces of a union of convex meshes on a grid [m]: negative inside."""
+    """A union of convex meshes, with signed distances from its surface on a grid [m], negative inside."""
 
     meshes: tuple[ConvexMesh, ...]
     distance: Float[ndarray, "nx ny nz"]
@@ -100,42 +105,42 @@ class Solid:
 
     @staticmethod
     def of(meshes: tuple[ConvexMesh, ...], tolerance: float) -> "Solid":
-        """With a grid that suffices for spheres that stick out by a tolerance [m]."""
+        """The solid, with a grid large enough for spheres that stick out by a tolerance [m]."""
         corners = np.concatenate([mesh.vertices for mesh in meshes])
         low, high = corners.min(0), corners.max(0)
-        beside = max(BESIDE, tolerance)
-        spacing = max(float(np.prod(high - low + 2 * beside) / GRID_POINTS) ** (1 / 3), FINEST)
+        beside = max(MIN_PADDING, tolerance)
+        spacing = max(float(np.prod(high - low + 2 * beside) / GRID_POINTS) ** (1 / 3), MIN_SPACING)
         low, high = low - beside - 2 * spacing, high + beside + 2 * spacing
         shape = np.ceil((high - low) / spacing).astype(int) + 1
         planes = stacked_planes(meshes)
-        depth = plane_depths(_places(shape, low, spacing), *planes).reshape(shape)
+        depth = plane_depths(_grid_points(shape, low, spacing), *planes).reshape(shape)
         inside = depth > 0
-        # inside of several meshes the planes between them do not count: carried on from the outer surface
-        deep = depth if len(meshes) == 1 else _carried(inside, spacing, np.maximum(-depth, 0.0))
+        # planes between overlapping meshes are not surface: measure from the outer surface instead
+        deep = depth if len(meshes) == 1 else _distance_inside(inside, spacing, np.maximum(-depth, 0.0))
         return Solid(meshes, np.where(inside, -deep, -depth), low, spacing)
 
     @property
     def points(self) -> Float[ndarray, "n 3"]:
-        """The points of the grid."""
-        return _places(self.distance.shape, self.origin, self.spacing)
+        """Points of the grid."""
+        return _grid_points(self.distance.shape, self.origin, self.spacing)
 
     @property
     def depth(self) -> float:
-        """Radius of the largest sphere inside [m], about."""
-        return max(float(-self.distance.min()), THIN)
+        """Approximate radius of the largest inscribed sphere [m]."""
+        return max(float(-self.distance.min()), MIN_DEPTH)
 
     @property
     def inside(self) -> Float[ndarray, "n 3"]:
-        """Points of the grid inside; of something that is thinner than the grid, the nearest ones."""
+        """Grid points inside the solid; the nearest ones if the solid is thinner than the spacing."""
         distance = self.distance.ravel()
         return self.points[distance < max(0.0, float(distance.min()) + self.spacing / 2)]
 
-    def as_room(self) -> Room:
-        """Room for spheres that do not stick out at all."""
-        return Room(-self.distance, self.origin, self.spacing)
+    def inscribed_sizes(self) -> SphereSizeGrid:
+        """Largest radii of spheres that do not stick out at all."""
+        return SphereSizeGrid(-self.distance, self.origin, self.spacing)
 
-    def room(self, bounds: Bounds) -> Room:
-        """Room for the spheres of a link."""
+    def sphere_sizes(self, bounds: Bounds) -> SphereSizeGrid:
+        """Largest radii of spheres within bounds."""
         points, distance = self.points, self.distance.ravel()
         allowed = np.full(len(points), bounds.tolerance)
         near = (distance > -bounds.tolerance) & (distance < 2 * bounds.tolerance)
@@ -150,15 +155,15 @@ class Solid:
             beyond = np.maximum(beyond, offset - points @ normal)
         beyond = beyond.reshape(self.distance.shape)
         outside = beyond > 0
-        grid = _carried(~outside, self.spacing, np.maximum(beyond, 0.0))
-        return Room(np.where(outside, -beyond, grid), self.origin, self.spacing)
+        grid = _distance_inside(~outside, self.spacing, np.maximum(beyond, 0.0))
+        return SphereSizeGrid(np.where(outside, -beyond, grid), self.origin, self.spacing)
 
 
-def _carried(
+def _distance_inside(
     mask: Bool[ndarray, "nx ny nz"], spacing: float, value: Float[ndarray, "nx ny nz"]
 ) -> Float[ndarray, "nx ny nz"]:
-    """On a mask, the distance from its surface: to the nearest point off the mask, less that one's `value`,
-    its own distance from the surface."""
+    """Distance of the points of a mask from its surface [m]: that to the nearest point outside the mask,
+    minus `value` there, the distance of that point from the surface."""
     if not mask.any() or mask.all():
         return np.where(mask, spacing * sum(mask.shape), 0.0)
     found: Any = ndimage.distance_transform_edt(mask, return_indices=True)
@@ -167,7 +172,8 @@ def _carried(
 
 
 def stacked_planes(meshes: tuple[ConvexMesh, ...]) -> Planes:
-    """Normals and offsets of the planes of all meshes, and the first of each mesh and their number."""
+    """Normals and offsets of the face planes of all meshes, and the index where each mesh's planes start,
+    with their total number last."""
     planes = [planes_of(mesh) for mesh in meshes]
     starts = np.cumsum([0, *(len(offsets) for _, offsets in planes)])
     return np.concatenate([normals for normals, _ in planes]), np.concatenate([o for _, o in planes]), starts
@@ -179,8 +185,9 @@ def depths(meshes: tuple[ConvexMesh, ...], points: Float[ndarray, "n 3"]) -> Flo
     return plane_depths(np.ascontiguousarray(points), *stacked_planes(meshes))
 
 
-def _places(
+def _grid_points(
     shape: tuple[int, ...] | ndarray, origin: Float[ndarray, "3"], spacing: float
 ) -> Float[ndarray, "n 3"]:
+    """Coordinates of all points of a grid [m]."""
     axes = [low + spacing * np.arange(count) for low, count in zip(origin, shape, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Which joints of a URDF's tree are an arm: chains that end where a gripper or a hand begins; or several."""
+"""Finds the arms in a URDF's tree of joints: chains that end where a gripper or a hand begins."""
 
 import re
 from dataclasses import dataclass
@@ -6,38 +6,39 @@ from itertools import takewhile
 from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 from robotdiffuse.robots.parsing.srdf import Srdf
-from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
+from robotdiffuse.robots.robot import Robot
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
-"""In the name of a joint: it is a gripper's, if few joints follow it."""
+"""Matches names of gripper joints, if few joints come after them."""
 BOTH, ALL = "both", "all"
-"""Groups of all arms of a robot: of two, and of any number."""
-ENDINGS = "_-/0123456789 "
-"""Of what the names of an arm's joints have in common."""
-PINCH, GRASP = 2, 3
-"""Movable joints in a row that a way from a branching has at most if the branching is a gripper's: of two
-ways, as two fingers are, and of more."""
-ARM = 4
-"""Movable joints in a row that an arm has at least where there are several chains. After so many, three or
-more ways are a hand's, however long its fingers."""
+"""Names of the group of all arms: of two, and of any number."""
+SUFFIX_CHARACTERS = "_-/0123456789 "
+"""Characters stripped from the end of the common prefix of an arm's joint names."""
+MAX_FINGER_JOINTS, MAX_HAND_FINGER_JOINTS = 2, 3
+"""Largest number of movable joints per branch of a gripper: with two branches, such as two fingers, and with
+other numbers of branches."""
+MIN_ARM_JOINTS = 4
+"""Smallest number of movable joints of an arm if there are several chains. After this many joints, three or
+more branches form a hand, however long its fingers are."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A chain of movable joints and the link that it ends with."""
+    """A chain of movable joints and the link at its end."""
 
     joints: tuple[str, ...]
     tip: str
     own: int
-    """How many of the joints come after the last branching above the arm."""
+    """Number of joints after the last branching."""
 
     @property
     def name(self) -> str:
-        """What its own joints' names have in common at their beginning, else the tip."""
+        """The common prefix of the names of the joints after the last branching, or else the tip."""
         columns = zip(*self.joints[-self.own :], strict=False)
         same = takewhile(lambda letters: len({*letters}) == 1, columns)
-        common = "".join(letters[0] for letters in same).rstrip(ENDINGS)
+        common = "".join(letters[0] for letters in same).rstrip(SUFFIX_CHARACTERS)
         return common.removesuffix("joint").rstrip("_-/ ") or self.tip
 
 
@@ -45,62 +46,67 @@ class JointTree:
     """The movable joints below a link."""
 
     def __init__(self, base: str, joints: list[Joint]) -> None:
-        """`joints` as in `Robot.joints`: all below the base, parents before children."""
+        """Takes `joints` as in `Robot.joints`: all below the base, parents before children."""
         self.base = base
         self.below: dict[str, list[Joint]] = {}
         self.moving: dict[str, int] = {}
-        """Independent movable joints in a row below each link, at most."""
+        """Largest number of independent movable joints in a chain below each link."""
         self.moved: set[str] = set()
-        """Links with a movable joint below them, be it one that follows another."""
+        """Links with a movable joint below them, mimic joints included."""
         depth: dict[str, int] = {}
         for joint in joints:
             self.below.setdefault(joint.parent, []).append(joint)
         for joint in reversed(joints):
-            self.moving[joint.parent] = max(self.moving.get(joint.parent, 0), self._way(joint))
+            self.moving[joint.parent] = max(self.moving.get(joint.parent, 0), self._chain_length(joint))
             depth[joint.parent] = max(depth.get(joint.parent, 0), depth.get(joint.child, 0) + 1)
             if joint.kind in MOVING_KINDS or joint.child in self.moved:
                 self.moved.add(joint.parent)
         self._depth = depth
 
-    def _way(self, joint: Joint) -> int:
+    def _chain_length(self, joint: Joint) -> int:
+        """Largest number of independent movable joints in a chain that begins with a joint."""
         drives = joint.kind in MOVING_KINDS and joint.mimic is None
         return self.moving.get(joint.child, 0) + drives
 
     def arms(self) -> list[Arm]:
-        """The chains that could be meant: arms where there are some, else the longest chains."""
-        found = self._from(self.base, (), 0)
-        own = [arm for arm in found if arm.own >= ARM]
+        """The arms below the base, or else the longest chains of movable joints."""
+        found = self._arms_from(self.base, (), 0)
+        own = [arm for arm in found if arm.own >= MIN_ARM_JOINTS]
         longest = max((len(arm.joints) for arm in found), default=0)
         return own or [arm for arm in found if len(arm.joints) == longest]
 
-    def _from(self, link: str, chain: tuple[str, ...], own: int) -> list[Arm]:
+    def _arms_from(self, link: str, chain: tuple[str, ...], own: int) -> list[Arm]:
+        """Arms that continue a chain of joints at a link; `own` of its joints come after the last
+        branching."""
         while True:
             ways = [j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.moved]
-            if chain and self._holds(ways, own):
+            if chain and self._begins_gripper(ways, own):
                 return [Arm(chain, link, own)]
             if len(ways) > 1:
-                branches = [self._from(j.child, *self._with(j, chain, 0)) for j in ways]
+                branches = [self._arms_from(j.child, *self._extended(j, chain, 0)) for j in ways]
                 return [arm for branch in branches for arm in branch]
             if not ways:
-                return [Arm(chain, self._end(link), own)] if own else []
-            chain, own = self._with(ways[0], chain, own)
+                return [Arm(chain, self._deepest(link), own)] if own else []
+            chain, own = self._extended(ways[0], chain, own)
             link = ways[0].child
 
-    def _with(self, joint: Joint, chain: tuple[str, ...], own: int) -> tuple[tuple[str, ...], int]:
+    def _extended(self, joint: Joint, chain: tuple[str, ...], own: int) -> tuple[tuple[str, ...], int]:
+        """A chain and its number of own joints, extended by a joint if that is movable."""
         return ((*chain, joint.name), own + 1) if joint.kind in MOVING_KINDS else (chain, own)
 
-    def _holds(self, ways: list[Joint], own: int) -> bool:
-        """Whether a gripper or a hand begins where these joints branch off, `own` joints after the last."""
-        rows = [self._way(joint) for joint in ways]
+    def _begins_gripper(self, ways: list[Joint], own: int) -> bool:
+        """Whether a gripper or a hand begins where these joints branch off, `own` joints after the last
+        branching."""
+        rows = [self._chain_length(joint) for joint in ways]
         if len(ways) == 1:
             jaw = ways[0].kind in MOVING_KINDS and GRIPPER.search(ways[0].name)
-            return bool(jaw) and rows[0] <= GRASP
+            return bool(jaw) and rows[0] <= MAX_HAND_FINGER_JOINTS
         if len(ways) == 2:
-            return max(rows) <= PINCH
-        return len(ways) > 2 and (max(rows) <= GRASP or own >= ARM)
+            return max(rows) <= MAX_FINGER_JOINTS
+        return len(ways) > 2 and (max(rows) <= MAX_HAND_FINGER_JOINTS or own >= MIN_ARM_JOINTS)
 
-    def _end(self, link: str) -> str:
-        """The deepest link that fixed joints connect with a link."""
+    def _deepest(self, link: str) -> str:
+        """The deepest link below a link."""
         while self.below.get(link):
             link = max(self.below[link], key=lambda joint: self._depth.get(joint.child, 0)).child
         return link
@@ -109,11 +115,11 @@ class JointTree:
 def planned_joints(
     file: Path, base: str, joints: list[Joint], tip: str | None, group: str | None, srdf: Srdf | None
 ) -> tuple[set[str], list[str]]:
-    """Names of the joints that are planned if they are not locked, and the tips: several of a group that is a
-    tree, as two arms are.
+    """Names of the joints that are planned unless they are locked, and the tips.
 
-    `joints` are all below the base, parents before children. Raises InputError for an unknown tip or group, a
-    group of joints that do not all lead to the tip that is named, and several arms of which none is chosen.
+    There are several tips if the group has several chains, such as two arms. `joints` are all joints below
+    the base, parents before children. Raises InputError for an unknown tip or group, a group with joints that
+    do not lead to the given tip, and a robot with several arms of which none is chosen.
     """
     above = {joint.child: joint for joint in joints}
     if tip is not None and tip not in (base, *above):
@@ -144,7 +150,7 @@ def planned_joints(
 
 
 def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> list[str]:
-    """Where a group's joints end: at the tips of the chains that it is written as, else at last links."""
+    """Tips of a group: those of the chains that define it, or else the last links of its joints."""
     last = {joint.child: joint.child for joint in above.values() if joint.name in chosen}
     for link in [*last]:
         for joint in chain(above, link)[:-1]:
@@ -157,13 +163,13 @@ def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> lis
 
 
 def passive_notes(srdf: Srdf | None, joints: list[Joint]) -> list[str]:
-    """What a robot says of the passive joints that it holds."""
+    """Notes on the passive joints, which are held."""
     passive = frozenset() if srdf is None else srdf.passive
     return [f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in passive]
 
 
 def chain(above: dict[str, Joint], tip: str) -> list[Joint]:
-    """The joints that lead to a link, from the base on; `above` is the joint above each link."""
+    """The joints from the base to a link; `above` maps links to their parent joints."""
     joints: list[Joint] = []
     while tip in above:
         joints.append(above[tip])
@@ -172,7 +178,7 @@ def chain(above: dict[str, Joint], tip: str) -> list[Joint]:
 
 
 def refuse_linkages(file: Path, robot: Robot) -> None:
-    """Joints that follow a planned one would move, and are held: InputError if they move geometry."""
+    """Raise InputError if joints that mimic a planned joint move geometry, since planning would hold them."""
     by_name = {joint.name: joint for joint in robot.joints}
     above = {joint.child: joint for joint in robot.joints}
     for joint in robot.joints:
@@ -183,15 +189,15 @@ def refuse_linkages(file: Path, robot: Robot) -> None:
             continue
         if any(joint in chain(above, link) for link in (*robot.meshes, *robot.tips)):
             raise InputError(
-                f"{file}: joint {joint.name} follows {leader.name}, which is planned; linkages are not "
-                f"supported: hold it with --lock {leader.name}=VALUE, or end the arm above it with --tip"
+                f"{file}: joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "
+                f"hold it with --lock {leader.name}=VALUE, or end the arm above it with --tip"
             )
 
 
 def _one_arm(file: Path, arms: list[Arm], groups: list[str]) -> list[Arm]:
-    """The only arm of a robot, if it has any; InputError, which lists them, if there are several.
+    """The only arm of a robot, or none; raises InputError that lists the arms if there are several.
 
-    `groups` are names that may be chosen besides, those of its SRDF.
+    `groups` are the names of groups in the SRDF, for the message.
     """
     if len(arms) < 2:
         return arms
@@ -203,8 +209,7 @@ def _one_arm(file: Path, arms: list[Arm], groups: list[str]) -> list[Arm]:
 
 
 def _named_arms(file: Path, arms: list[Arm], name: str, groups: list[str]) -> list[Arm]:
-    """The arm that a name of `_names_of` or a tip stands for, or all; InputError, which lists them, for
-    others."""
+    """The arm with a name of `_names_of` or with a tip, or all arms; raises InputError for other names."""
     names = _names_of(arms)
     chosen = [arm for arm, its in zip(arms, names, strict=True) if name in (its, arm.tip)]
     if chosen:
@@ -220,7 +225,7 @@ def _together(arms: list[Arm]) -> str:
 
 
 def _names_of(arms: list[Arm]) -> list[str]:
-    """The arms' names, or their tips where two have the same name."""
+    """The names of arms, or their tips if two have the same name."""
     names = [arm.name for arm in arms]
     return [arm.tip if names.count(arm.name) > 1 else arm.name for arm in arms]
 

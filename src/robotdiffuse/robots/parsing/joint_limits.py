@@ -1,4 +1,4 @@
-"""Joint limits from a file, in the form of MoveIt's joint_limits.yaml."""
+"""Reads joint limits from files in the form of MoveIt's joint_limits.yaml."""
 
 import math
 from dataclasses import replace
@@ -7,8 +7,9 @@ from pathlib import Path
 from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, MIN_RATE
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 from robotdiffuse.robots.parsing.urdf import ACCELERATION_PER_VELOCITY, JERK_PER_ACCELERATION
-from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
+from robotdiffuse.robots.robot import Robot
 
 FIELDS = {
     "min_position": "lower",
@@ -26,24 +27,27 @@ FLAGS = (
 
 
 def read_limits(file: str | Path) -> dict[str, dict[str, float]]:
-    """Limits by joint and field of Joint, from a YAML or JSON file.
+    """Read limits from a YAML or JSON file: values by joint, and by field of `Joint`.
 
-    It holds joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position, max_position,
-    max_velocity, max_acceleration, max_jerk; MoveIt's has_..._limits are accepted, and a field whose flag is
-    false is left out. Raises InputError naming the joint and the field.
+    The file has the form joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position,
+    max_position, max_velocity, max_acceleration and max_jerk. A field is ignored if MoveIt's flag
+    has_..._limits for it is false. Raises InputError that names the joint and the field.
     """
     data = read_yaml(file, "joint limits")
     joints = data.get("joint_limits") if isinstance(data, dict) else None
     if not isinstance(joints, dict):
         raise InputError(
-            f"{file} holds no joint_limits; it must be joint_limits: {{JOINT: {{max_velocity: ...}}}}"
+            f"{file} has no joint_limits; it must contain joint_limits: {{JOINT: {{max_velocity: ...}}}}"
         )
     return {str(name): _fields(str(file), str(name), entry) for name, entry in joints.items()}
 
 
 def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
-    """The robot with other limits; acceleration and jerk follow a new velocity unless they are given too. A
-    continuous joint that is given a position is revolute from then on, within half a turn either way."""
+    """The robot with limits changed, by joint and field; InputError for an unknown joint.
+
+    A new velocity limit also scales acceleration and jerk limits, unless these are given. A continuous joint
+    with a position limit becomes revolute; a missing second limit is half a turn.
+    """
     movable = {joint.name: joint for joint in robot.joints if joint.kind in MOVING_KINDS}
     for name in limits:
         if name not in movable:

@@ -1,25 +1,25 @@
-"""Mobile bases in a URDF: what a scene places where it places the robot."""
+"""Detects mobile bases in a URDF."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from robotdiffuse.robots.robot import Joint
+from robotdiffuse.robots.joints import Joint
 
-SLIDE, TURN = "prismatic", ("revolute", "continuous")
-STRAIGHT = 1e-3
-"""What the cosine of a right angle may be."""
+ROTATING_KINDS = ("revolute", "continuous")
+RIGHT_ANGLE_TOLERANCE = 1e-3
+"""Largest absolute cosine of an angle that counts as a right angle."""
 
 
 def moves_in_a_plane(joints: Sequence[Joint]) -> bool:
-    """Whether joints, each on the one before, are two slides across each other and a turn about what stands
-    upright on both: a base on wheels."""
+    """Whether a chain of joints moves in a plane, as a base on wheels: two perpendicular prismatic joints,
+    and a rotation about the axis perpendicular to both."""
     moving = [joint for joint in joints if joint.kind != "fixed"]
-    if sorted(joint.kind in TURN for joint in moving) != [False, False, True]:
+    if sorted(joint.kind in ROTATING_KINDS for joint in moving) != [False, False, True]:
         return False
     R, axes = np.eye(3), []
     for joint in joints:
         R = R @ joint.T_parent_joint[:3, :3]
         if joint.kind != "fixed":
             axes.append(R @ joint.axis)
-    return bool(np.abs(np.array(axes) @ np.transpose(axes) - np.eye(3)).max() < STRAIGHT)
+    return bool(np.abs(np.array(axes) @ np.transpose(axes) - np.eye(3)).max() < RIGHT_ANGLE_TOLERANCE)

@@ -1,4 +1,4 @@
-"""Files that a URDF names, in packages too, and the URDF that a xacro file stands for."""
+"""Finds the files and ROS packages that a URDF refers to, and compiles xacro files."""
 
 import os
 import re
@@ -9,27 +9,29 @@ from typing import IO, Any
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import input_file, is_file, read_bytes
 
-MOST_PACKAGES = 32
-"""Packages of a xacro file that are looked for one after the other."""
-PREFIX = re.compile(rb"""</?([A-Za-z_][\w.-]*):[\w.-]+|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=\s*["']""")
-"""The prefix of an element or of an attribute."""
-MISSING = re.compile(r"Package not found: (\S+)")
-"""What xacrodoc says of a package."""
+MAX_PACKAGES = 32
+"""Largest number of packages that a xacro file may refer to."""
+NAMESPACE_PREFIX = re.compile(rb"""</?([A-Za-z_][\w.-]*):[\w.-]+|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=\s*["']""")
+"""Matches the namespace prefix of an element or attribute."""
+PACKAGE_NOT_FOUND = re.compile(r"Package not found: (\S+)")
+"""Matches xacrodoc's error for an unknown package."""
 
 
 @dataclass(frozen=True)
 class Packages:
-    """Where the packages that a URDF names are looked for.
+    """Finds the ROS packages of a URDF.
 
-    A package's folder is taken from `folders`, then from ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then it is
-    any folder from the URDF's upwards that has the file, with the package's name before it or without.
+    The folder of a package is searched in `folders`, then in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH.
+    Otherwise, files are searched relative to the URDF's folder and all folders above, with or without the
+    package's name.
     """
 
     urdf: Path
     folders: dict[str, str | Path]
 
     def folder(self, name: str) -> Path | None:
-        """The folder of a package by option, environment, or its name upwards of the URDF."""
+        """The folder of a package, from `folders`, the environment, or the folders above the URDF; None if
+        none."""
         if name in self.folders:
             return Path(self.folders[name])
         ros, ament = _folders("ROS_PACKAGE_PATH"), _folders("AMENT_PREFIX_PATH")
@@ -44,15 +46,15 @@ class Packages:
         return next((folder for folder in candidates if folder.is_dir()), None)
 
     def file(self, filename: str) -> Path:
-        """The file of a package://, file:// or relative name; InputError, with what helps, without."""
+        """The path of a package://, file:// or relative file name; raises InputError if there is no such
+        file."""
         start = self.urdf.resolve().parent
         if not filename.startswith("package://"):
             found = start / filename.removeprefix("file://")
             if is_file(found):
                 return found
             raise InputError(
-                f"{self.urdf}: mesh file {shown(filename)} is not there; put it there, or take its "
-                f"element out"
+                f"{self.urdf}: mesh file {shown(filename)} does not exist; add it, or remove its element"
             )
         package, _, rest = filename.removeprefix("package://").partition("/")
         folder = self.folder(package)
@@ -62,8 +64,8 @@ class Packages:
             if is_file(candidate):
                 return candidate
         raise InputError(
-            f"{self.urdf}: mesh file {shown(filename)} is not there (looked from {start} upwards); say where "
-            f"the package is: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
+            f"{self.urdf}: mesh file {shown(filename)} does not exist (searched from {start} upwards); give "
+            f"the package's folder: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
         )
 
 
@@ -72,9 +74,10 @@ def _folders(variable: str) -> list[Path]:
 
 
 def urdf_text(path: Path, packages: Packages) -> bytes:
-    """The URDF in a file, or the one that a xacro file stands for, compiled by xacrodoc.
+    """The text of a URDF file, or of a xacro file compiled by xacrodoc.
 
-    Raises InputError if it cannot be read or compiled, or for a xacro file without xacrodoc.
+    Raises InputError if the file cannot be read or compiled, or if it is a xacro file and xacrodoc is not
+    installed.
     """
     text = read_bytes(path, "URDF")
     if path.suffix == ".xacro" or b"<xacro:" in text:
@@ -83,8 +86,9 @@ def urdf_text(path: Path, packages: Packages) -> bytes:
 
 
 def _with_prefixes(text: bytes) -> bytes:
-    """The XML with undeclared prefixes declared: simulators' elements, as <drake:member>, often lack it."""
-    used = {found for pair in PREFIX.findall(text) for found in pair if found}
+    """The XML with undeclared namespace prefixes declared, which simulators' elements such as <drake:member>
+    often lack."""
+    used = {found for pair in NAMESPACE_PREFIX.findall(text) for found in pair if found}
     missing = sorted(name for name in used - {b"xml", b"xmlns"} if b"xmlns:" + name not in text)
     declared = b"".join(b' xmlns:%s="%s"' % (name, name) for name in missing)
     return text.replace(b"<robot", b"<robot" + declared, 1) if missing else text
@@ -93,10 +97,10 @@ def _with_prefixes(text: bytes) -> bytes:
 def _compiled(path: Path, packages: Packages) -> bytes:
     try:
         import xacro
-        from xacrodoc import packages as known
+        from xacrodoc import packages as known  # importing it makes xacro use its package look-up
     except ImportError:
         raise InputError(
-            f"{path} is a xacro file; install what compiles it, pip install 'robotdiffuse[xacro]', or "
+            f"{path} is a xacro file; install its compiler with pip install 'robotdiffuse[xacro]', or "
             f"compile it elsewhere: xacro {path.name} > {path.name.split('.')[0]}.urdf"
         ) from None
     for module in (xacro, known):
@@ -118,15 +122,15 @@ def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:
     known.reset()
     known.walk_up_from(path)
     known.update_package_cache(packages.folders)
-    for _ in range(MOST_PACKAGES):
+    for _ in range(MAX_PACKAGES):
         try:
-            xacro.init_stacks(str(path.resolve()))  # what is included is looked for from here
+            xacro.init_stacks(str(path.resolve()))  # includes are relative to this file
             document = xacro.parse(None, str(path.resolve()))
             xacro.process_doc(document, mappings={})
-            return document.toxml("utf-8")
-        except Exception as error:  # xacro raises whatever it meets, and wraps what was raised within it
+            return document.toxml("utf-8")  # type: ignore[attr-defined]
+        except Exception as error:  # xacro passes on and wraps exceptions of any kind
             why = " ".join(str(error).split())
-            missing = MISSING.search(why)
+            missing = PACKAGE_NOT_FOUND.search(why)
             if missing is None:
                 raise InputError(
                     f"{path}: xacro cannot compile it ({why}); compile it with its arguments: xacro "
@@ -136,8 +140,8 @@ def _by_xacro(xacro: Any, known: Any, path: Path, packages: Packages) -> bytes:
             folder = packages.folder(name)
             if folder is None:
                 raise InputError(
-                    f"{path}: package {shown(name)} is not found; say where it is: --package {name}=FOLDER, "
+                    f"{path}: package {shown(name)} is not found; give its folder: --package {name}=FOLDER, "
                     f"or ROS_PACKAGE_PATH"
                 ) from None
             known.update_package_cache({name: folder})
-    raise InputError(f"{path}: it names more than {MOST_PACKAGES} packages")
+    raise InputError(f"{path} refers to more than {MAX_PACKAGES} packages")

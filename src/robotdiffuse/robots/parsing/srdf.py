@@ -1,4 +1,4 @@
-"""Reading an SRDF file: what MoveIt's setup assistant says about a URDF's robot.
+"""Reads SRDF files, which MoveIt's Setup Assistant writes for a URDF.
 
 Format: https://docs.ros.org/en/noetic/api/srdfdom/html/ and MoveIt's "URDF and SRDF" page.
 """
@@ -11,37 +11,49 @@ from pathlib import Path
 from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import is_file, parse_xml, read_bytes
-from robotdiffuse.robots.robot import MOVING_KINDS, Joint
+from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 
-FOLDERS = (".", "../srdf", "../config", "srdf", "config")
-"""Where the SRDF of a URDF is looked for, from the URDF's folder."""
-RESTING = ("home", "default", "ready", "rest", "neutral", "zero", "init", "tuck", "tucked", "open", "opened")
-"""Names of poses that joints outside the planned group are held in, first come first."""
+SRDF_FOLDERS = (".", "../srdf", "../config", "srdf", "config")
+"""Folders that are searched for the SRDF of a URDF, relative to the URDF's folder."""
+REST_POSES = (
+    "home",
+    "default",
+    "ready",
+    "rest",
+    "neutral",
+    "zero",
+    "init",
+    "tuck",
+    "tucked",
+    "open",
+    "opened",
+)
+"""Names of poses in which joints outside the planned group are held, in order of preference."""
 
 
 @dataclass(frozen=True)
 class Srdf:
-    """What is read of it; names need not be those of the URDF."""
+    """Content of an SRDF file. Names are not checked against the URDF."""
 
     path: Path
     allowed: dict[frozenset[str], str] = field(default_factory=dict)
-    """Pairs of links that need no check, with the reason: Adjacent, Never, Default, Always, User ..."""
+    """Pairs of links that are not checked, with the reason: Adjacent, Never, Default, Always, User ..."""
     groups: dict[str, "Group"] = field(default_factory=dict)
     poses: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Named states of groups, values by joint [rad] or [m]; states of one name are joined."""
+    """Named poses: values by joint [rad] or [m]. States of several groups with the same name are merged."""
     passive: frozenset[str] = frozenset()
-    """Joints without a drive."""
+    """Joints without an actuator."""
 
     def joints(self, group: str, joints: tuple[Joint, ...]) -> list[Joint]:
         """The movable joints of a group and of its subgroups, parents before children.
 
-        Raises InputError for a group, joint or link that is not there.
+        Raises InputError for an unknown group, joint or link.
         """
         named = self._named(group, {joint.child: joint for joint in joints}, ())
         return [joint for joint in joints if joint.name in named and joint.kind in MOVING_KINDS]
 
     def tips(self, group: str) -> list[str]:
-        """The tips of the chains that a known group and its subgroups are written as."""
+        """Tip links of the chains that define a group and its subgroups; the group must exist."""
         content = self.groups[group]
         return [tip for _, tip in content.chains] + [tip for sub in content.groups for tip in self.tips(sub)]
 
@@ -65,35 +77,37 @@ class Srdf:
         return found.union(*(self._named(name, above, (*within, group)) for name in content.groups))
 
     def resting(self) -> dict[str, float]:
-        """Values of joints in the poses of `RESTING`."""
+        """Values of joints in the poses named in `REST_POSES` [rad] or [m], the first pose that has the
+        joint."""
         values: dict[str, float] = {}
-        for name in RESTING:
+        for name in REST_POSES:
             values = self.poses.get(name, {}) | values
         return values
 
 
 @dataclass(frozen=True)
 class Group:
-    """A group as it is written: any mixture of these."""
+    """A group as defined in the file, by any combination of the fields."""
 
     joints: tuple[str, ...] = ()
     links: tuple[str, ...] = ()
-    """Each stands for the joint above it."""
+    """Links, each of which stands for its parent joint."""
     chains: tuple[tuple[str, str], ...] = ()
-    """Base and tip link."""
+    """Base and tip link of each chain."""
     groups: tuple[str, ...] = ()
 
 
 def srdf_beside(urdf: str | Path, robot: str) -> Path | None:
-    """The SRDF named like the URDF or its robot, in the URDF's folder or where packages keep it."""
+    """The SRDF with the name of the URDF or of its robot, in the URDF's folder or in `SRDF_FOLDERS`; None if
+    none."""
     urdf = Path(urdf)
     names = dict.fromkeys((urdf.name.split(".")[0], robot))
-    found = (urdf.parent / folder / f"{name}.srdf" for name in names for folder in FOLDERS)
+    found = (urdf.parent / folder / f"{name}.srdf" for name in names for folder in SRDF_FOLDERS)
     return next((file for file in found if is_file(file)), None)
 
 
 def read_srdf(file: str | Path) -> Srdf:
-    """Read an SRDF; raises InputError, one line that names the file, where something is missing in it."""
+    """Read an SRDF file; raises InputError that names the file if it is unreadable or incomplete."""
     path = Path(file)
     root = parse_xml(read_bytes(path, "SRDF"), str(path))
     if root.tag != "robot":

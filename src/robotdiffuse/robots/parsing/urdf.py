@@ -1,4 +1,4 @@
-"""Reading a serial arm from a URDF file."""
+"""Reads robots from URDF and xacro files."""
 
 import hashlib
 import xml.etree.ElementTree as ET
@@ -14,24 +14,27 @@ from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, MIN_RATE, MIN_SIZ
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import parse_xml, read_triangles
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull
 from robotdiffuse.robots.inertias import Inertia, inertia_of
+from robotdiffuse.robots.joints import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
 from robotdiffuse.robots.parsing.joint_groups import passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.parsing.mobile_bases import moves_in_a_plane
 from robotdiffuse.robots.parsing.packages import Packages, urdf_text
 from robotdiffuse.robots.parsing.srdf import Srdf
-from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
+from robotdiffuse.robots.robot import Robot
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 KINDS = (*MOVING_KINDS, "fixed")
-MOST_LINKS = 500
-"""Of a robot; humanoids with hands have about 100."""
+MAX_LINKS = 500
+"""Largest number of links of a robot; humanoids with hands have about 100."""
 DEFAULT_VELOCITY = 1.0
-"""For movable joints whose URDF gives none [rad/s] or [m/s]."""
+"""Velocity limit of movable joints for which the URDF gives none [rad/s] or [m/s]."""
 ACCELERATION_PER_VELOCITY = 4.0
-"""URDF has no acceleration limit: full speed after a quarter of a second [1/s]."""
+"""Ratio of acceleration and velocity limits, since URDF has no acceleration limit: full speed after 0.25 s
+[1/s]."""
 JERK_PER_ACCELERATION = 10.0
-"""Nor one for jerk: full acceleration after a tenth of a second [1/s]."""
+"""Ratio of jerk and acceleration limits: full acceleration after 0.1 s [1/s]."""
 
 
 def read_urdf(
@@ -43,8 +46,10 @@ def read_urdf(
     srdf: Srdf | None = None,
     packages: dict[str, str | Path] | None = None,
 ) -> Robot:
-    """A robot from a URDF or xacro file, see `UrdfTree.robot`; `packages` are folders by name, see
-    `robots.parsing.packages`."""
+    """Read a robot from a URDF or xacro file.
+
+    See `UrdfTree.robot` for the other arguments; `packages` are folders of ROS packages by name.
+    """
     return UrdfTree(Path(path), packages or {}).robot(base, tip, locked, group, srdf)
 
 
@@ -54,7 +59,7 @@ class UrdfTree:
 
     path: Path
     folders: dict[str, str | Path]
-    """Of packages by name."""
+    """Folders of ROS packages by name."""
     notes: list[str] = field(default_factory=list)
     _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
 
@@ -69,28 +74,28 @@ class UrdfTree:
             )
         self.name = root.get("name") or self.path.stem
         self.links = {self._name(link, "link"): link for link in root.findall("link")}
-        if len(self.links) > MOST_LINKS:
-            raise InputError(f"{self.path} has {len(self.links)} links; at most {MOST_LINKS} are read")
+        if len(self.links) > MAX_LINKS:
+            raise InputError(f"{self.path} has {len(self.links)} links; at most {MAX_LINKS} are supported")
         solid = any(link.find("collision") is not None for link in self.links.values())
         self.kind = "collision" if solid else "visual"
-        """The elements of links that are their geometry."""
+        """Elements of links that are read as collision geometry."""
         self.elements = {self._name(joint, "joint"): joint for joint in root.findall("joint")}
         self.parents: dict[str, str] = {}
-        """The joint above each link but the root."""
+        """Parent joint of each link except the root."""
         self.children: dict[str, list[str]] = {}
         for name, element in self.elements.items():
             parent, child = self._end(name, element, "parent"), self._end(name, element, "child")
             if child in self.parents:
                 raise InputError(
                     f"{self.path}: link {child} has two parent joints ({self.parents[child]}, {name}); a "
-                    f"URDF is a tree: leave one out, and let the joints that close the loop mimic others"
+                    f"URDF is a tree: remove one, and let the joints that close the loop mimic others"
                 )
             self.parents[child] = name
             self.children.setdefault(parent, []).append(name)
         roots = [link for link in self.links if link not in self.parents]
         if len(roots) != 1:
             raise InputError(
-                f"{self.path}: a URDF has one root link, this one has {len(roots)}"
+                f"{self.path}: a URDF must have one root link; this one has {len(roots)}"
                 + (f" ({', '.join(roots[:5])}); connect them with fixed joints" if roots else ": a loop")
             )
         self.root = roots[0]
@@ -103,25 +108,32 @@ class UrdfTree:
         group: str | None = None,
         srdf: Srdf | None = None,
     ) -> Robot:
-        """A robot from a URDF or xacro file, with convex collision meshes and without spheres.
+        """The robot, with convex collision meshes and without spheres.
 
-        `base` is the root of the tree by default; where it stands in the root's frame is kept, for scenes
-        that are given there, while links above it are left out. `group` names a group of the SRDF, or an arm
-        by what the names of its joints begin with, or is "both" or "all"; `tip` a link. A group of several
-        chains, as of two arms, is one robot with several tips. Without both, the robot must have one arm:
-        from the base as far as the link where a gripper or a hand begins (`robots.parsing.joint_groups` tells how these are
-        known), else to the deepest link. So it is panda_hand for a Panda with fingers.
+        Planned joints are the movable joints of the group, or all from base to tip, without passive joints
+        and mimic joints. All other joints are locked: at the value in `locked`, in a rest pose of the SRDF,
+        or at zero clipped into their limits. Locked mimic joints follow their leaders.
 
-        Planned are the movable joints of the group, or all from base to tip; less passive ones and those that
-        mimic others. All other joints are locked: at what `locked` says, in a pose of the SRDF, or at zero
-        clipped into their limits; mimic joints where the joint that they follow puts them.
+        Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity limit and 10 / s times
+        the acceleration limit (`parsing.joint_limits` changes them). Collision elements become convex hulls
+        in the link's frame; cylinders, capsules and spheres become polyhedra around them. If no link has
+        collision elements, visual elements are used, with a note.
 
-        Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity and 10 / s times the
-        acceleration (see limits.py to set them). Collision elements become convex hulls in the link's frame;
-        cylinders, capsules and spheres become polyhedra around them. If no link has any, visual ones are
-        taken, with a note.
+        Args:
+            base: First link of the robot; by default the root. Links above it are left out, but its pose in
+            the
+                root's frame is kept, for scenes given in that frame.
+            tip: Last link. By default the link where a gripper or a hand begins (see
+                `robots.parsing.joint_groups`), such as panda_hand for a Panda with fingers, or else the
+                deepest link.
+            locked: Values of locked joints by name [rad] or [m].
+            group: A group of the SRDF, the common prefix of an arm's joint names, or "both" or "all". A group
+                of several chains, such as two arms, is one robot with several tips. Without group and tip,
+                the robot must have one arm.
+            srdf: Groups, named poses and passive joints.
 
-        Raises InputError, one line that names the file, for anything missing or contradictory in it.
+        Raises:
+            InputError: If the file or the arguments are incomplete or contradictory; it names the file.
         """
         base = base or self.root
         if base not in self.links:
@@ -149,7 +161,7 @@ class UrdfTree:
             for joint in joints
             if joint.kind in MOVING_KINDS and (joint.name not in planned or joint.lower == joint.upper)
         }
-        robot = replace(robot, locked=following(robot.joints, rest)).with_locked(locked or {})
+        robot = replace(robot, locked=with_mimics(robot.joints, rest)).with_locked(locked or {})
         if robot.dof == 0:
             raise InputError(
                 f"{self.path}: no movable joint between {base} and {ends[0]}; choose another --base or --tip"
@@ -159,8 +171,8 @@ class UrdfTree:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the URDF, compiled if it is a xacro file, and of the collision meshes it names: equal if
-        the robot is."""
+        """SHA-256 of the URDF (compiled, if it is a xacro file) and of its mesh files: equal for equal
+        robots."""
         digest = hashlib.sha256(self.text)
         for element in self.links.values():
             for mesh in element.findall(f"{self.kind}/geometry/mesh"):
@@ -208,7 +220,7 @@ class UrdfTree:
         return joints
 
     def above(self, link: str) -> dict[str, Float[ndarray, "4 4"]]:
-        """T_link_ancestor of the links above a link, up to the first movable joint."""
+        """T_link_ancestor by ancestor of a link, up to the first movable joint."""
         found: dict[str, ndarray] = {}
         T_link_ancestor = np.eye(4)
         while link in self.parents:
@@ -222,8 +234,10 @@ class UrdfTree:
         return found
 
     def carried(self, link: str) -> str:
-        """What a scene that places the robot places, on the way to a link: the root, or what a mobile base
-        without geometry carries, be it one joint or three."""
+        """The link that a robot pose in a scene refers to, on the way to `link`.
+
+        This is the link that a mobile base without geometry (one joint, or three) carries, or else the root.
+        """
         way: list[str] = []
         end = link
         while end in self.parents:
@@ -249,7 +263,7 @@ class UrdfTree:
             child = self._end(name, element, "child")
             raise InputError(
                 f"{self.path}: {what} has type {shown(kind)}; supported: {', '.join(KINDS)}; "
-                f"--base {child} plans what is on {child} as it stands"
+                f"use --base {child} to plan for the part above it"
             )
         axis_element = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0])
@@ -279,11 +293,11 @@ class UrdfTree:
             if leaders[-1] not in self.elements or leaders[-1] in leaders[:-1]:
                 raise InputError(
                     f"{self.path}: joint {leaders[-2]} mimics {shown(leaders[-1])}; it must be another "
-                    f"joint of the file that does not follow it"
+                    f"joint of the file that does not mimic it"
                 )
             last, leader = leader, self.elements[leaders[-1]].find("mimic")
         if self.elements[leaders[-1]].get("type") == "fixed" or last is None:
-            self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; taken as independent")
+            self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
             return None
         what = f"joint {name}: mimic"
         multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{what} multiplier")
@@ -297,7 +311,7 @@ class UrdfTree:
                 text, most = limit.get(what, ""), MAX_RATE if what == "velocity" else MAX_COORDINATE
                 given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit", most)[0])
         if joint.kind == "continuous":
-            given["lower"], given["upper"] = -TURNS, TURNS
+            given["lower"], given["upper"] = -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT
         if "lower" not in given and "upper" not in given:
             raise InputError(
                 f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
@@ -309,11 +323,11 @@ class UrdfTree:
         if 0 < velocity < MIN_RATE:
             raise InputError(
                 f"{self.path}: joint {joint.name}: velocity limit is {velocity:g}; it must be at least "
-                f"{MIN_RATE:g}, or 0 where there is none"
+                f"{MIN_RATE:g}, or 0 if there is none"
             )
         if velocity <= 0:
             velocity = DEFAULT_VELOCITY
-            self.notes.append(f"joint {joint.name} has no velocity limit; {velocity:g} taken")
+            self.notes.append(f"joint {joint.name} has no velocity limit; {velocity:g} assumed")
         acceleration = ACCELERATION_PER_VELOCITY * velocity
         jerk = JERK_PER_ACCELERATION * acceleration
         return replace(
@@ -327,7 +341,7 @@ class UrdfTree:
         )
 
     def _effort(self, name: str, limit: ET.Element | None) -> float:
-        """0 where none is given, or one that cannot be used: most robots are planned without."""
+        """The effort limit; 0 if it is missing or invalid, since most planning needs none."""
         if limit is None or limit.get("effort") is None:
             return 0.0
         try:
@@ -337,7 +351,7 @@ class UrdfTree:
         return max(float(effort), 0.0)
 
     def inertias(self, links: list[str]) -> dict[str, Inertia]:
-        """Of the links that have a mass; those that no body can have are left out, with a note."""
+        """Inertias of the links that have a mass. Physically impossible ones are left out, with a note."""
         found = {}
         for link in links:
             element = self.links[link].find("inertial")
@@ -347,7 +361,7 @@ class UrdfTree:
             try:
                 found[link] = self._inertia(element, f"link {link}: inertial")
             except (InputError, ValueError):
-                self.notes.append(f"link {link} has an inertia that no body has; left out")
+                self.notes.append(f"link {link} has a physically impossible inertia; left out")
         return found
 
     def _inertia(self, element: ET.Element, what: str) -> Inertia:
@@ -362,13 +376,15 @@ class UrdfTree:
         return inertia_of([mass, *T[:3, 3], *moments[np.triu_indices(3)]])
 
     def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
-        """Hulls of the links' collision elements by link, in its frame; of their visual ones if no link of
-        the file has any of the others."""
+        """Convex hulls of the links' collision elements, by link and in its frame.
+
+        If no link of the file has collision elements, those of the visual elements.
+        """
         parts = {
             link: tuple(convex_hull(surface.vertices) for surface in self.surfaces(link)) for link in links
         }
         if self.kind == "visual" and any(parts.values()):
-            self.notes.append("no link has collision geometry; the visual geometry is taken")
+            self.notes.append("no link has collision geometry; the visual geometry is used")
         elif any(parts.values()):
             shown = [
                 link for link in links if not parts[link] and self.links[link].find("visual") is not None
@@ -378,7 +394,7 @@ class UrdfTree:
         return parts
 
     def surfaces(self, link: str) -> tuple[Surface, ...]:
-        """The link's collision elements as the file has them, in the link's frame."""
+        """The link's collision elements as triangle meshes, in the link's frame."""
         if link not in self._surfaces:
             self._surfaces[link] = self._read_surfaces(link)
         return self._surfaces[link]
@@ -420,7 +436,7 @@ class UrdfTree:
             points = np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
         else:
             raise InputError(
-                f"{self.path}: link {link}: {self.kind} shape <{shape.tag}> is not known; known: box, "
+                f"{self.path}: link {link}: {self.kind} shape <{shape.tag}> is not supported; known: box, "
                 f"capsule, cylinder, mesh, sphere"
             )
         hull = convex_hull(points)
@@ -436,20 +452,20 @@ class UrdfTree:
             raise InputError(f"{self.path}: {error}") from None
         if len(vertices) < 4:
             raise InputError(
-                f"{self.path}: link {link}: {file} holds no triangle mesh with four corners; repair it or "
-                f"take its element out"
+                f"{self.path}: link {link}: {file} has no triangle mesh with at least four vertices; "
+                f"repair it or remove its element"
             )
         return Surface(vertices, faces)
 
     def _scale(self, shape: ET.Element, where: str) -> Float[ndarray, "3"]:
         scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"{where} scale")
         if (np.abs(scale) < MIN_SIZE).any():
-            raise InputError(f"{where} scale is {shown(shape.get('scale'))}; no number of it may be 0")
+            raise InputError(f"{where} scale is {shown(shape.get('scale'))}; its numbers must not be 0")
         return scale
 
 
 def _ball() -> Float[ndarray, "n 3"]:
-    """A polyhedron about the unit ball."""
+    """Vertices of a polyhedron around the unit ball."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
     inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
     return np.array(ball.vertices) / inner

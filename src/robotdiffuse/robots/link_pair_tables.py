@@ -1,4 +1,4 @@
-"""Tables over the joints between two links that say where the links are apart."""
+"""Tables that tell for which values of the joints between two links the links do not collide."""
 
 from dataclasses import dataclass
 
@@ -10,25 +10,25 @@ from robotdiffuse.core.bounds import Value
 
 TURN = 2 * np.pi
 ROUNDING = 1e-5
-"""More than what rounding does to a joint's value [rad] or [m]."""
+"""Upper bound on the rounding error of a joint value [rad] or [m]."""
 
 
 @dataclass(frozen=True, eq=False)
-class JointTable(Value):
-    """Where the convex parts of two links are apart, by the one or two joints between them."""
+class LinkPairTable(Value):
+    """Where the convex parts of two links are apart, as a function of the one or two joints between them."""
 
     links: tuple[str, str]
     joints: tuple[str, ...]
-    """In the order of the chain."""
+    """Joints between the links, from the base on."""
     lower: tuple[float, ...]
-    """Where the table begins along each joint [rad] or [m]."""
+    """Joint values at which the table begins [rad] or [m]."""
     upper: tuple[float, ...]
-    """Where it ends: a whole turn from there, it begins again."""
+    """Joint values at which it ends. A range of one whole turn repeats itself."""
     apart: Bool[ndarray, "*cells"]
-    """Whether the links are apart in all of a cell."""
+    """Whether the links are apart throughout a cell."""
 
     def at(self, *values: Float[ndarray, "n"]) -> Bool[ndarray, "n"]:
-        """Whether the links are known to be apart at values of the joints."""
+        """Whether the links are known to be apart at joint values, one array per joint."""
         known, index = np.ones(len(values[0]), dtype=bool), []
         for axis, value in enumerate(values):
             cell = np.floor((value - self.lower[axis]) / self._edge(axis)).astype(int)
@@ -41,8 +41,11 @@ class JointTable(Value):
     def throughout(
         self, *intervals: tuple[Float[ndarray, "n"], Float[ndarray, "n"]]
     ) -> Bool[ndarray, "*intervals"]:
-        """Whether the links are known to be apart in all of each interval of the joint between them, or each
-        pair of an interval of one joint and one of the other."""
+        """Whether the links are known to be apart throughout intervals [low, high] of the joints between
+        them.
+
+        With two joints, the result holds every combination of an interval of the first and one of the second.
+        """
         touch = ~self.apart
         for axis, (low, high) in enumerate(intervals):
             touch = np.moveaxis(np.tensordot(self._reached(axis, low, high), touch, (1, axis)), 0, axis)
@@ -60,7 +63,7 @@ class JointTable(Value):
     def _reached(
         self, axis: int, low: Float[ndarray, "n"], high: Float[ndarray, "n"]
     ) -> Bool[ndarray, "n cells"]:
-        """Which cells along a joint intervals reach into."""
+        """Which cells along a joint each interval overlaps."""
         count = self.apart.shape[axis]
         first = np.floor((low - ROUNDING - self.lower[axis]) / self._edge(axis)).astype(int)
         last = np.floor((high + ROUNDING - self.lower[axis]) / self._edge(axis)).astype(int)
