@@ -120,7 +120,9 @@ def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -
 def with_near_goals(robot: Robot, drawn: SampledProblem) -> SampledProblem:
     """The problem with the goals of continuous joints moved by whole turns as near to the start as
     possible."""
-    return replace(drawn, goals=np.stack([robot.equivalent_configurations(q, drawn.start)[0] for q in drawn.goals]))
+    return replace(
+        drawn, goals=np.stack([robot.equivalent_configurations(q, drawn.start)[0] for q in drawn.goals])
+    )
 
 
 def _line_is_free(

@@ -107,4 +107,7 @@ def corner_kept(constraints: PathConstraints | None, q: Float[ndarray, "n dof"])
     """Whether the polyline through configurations, such as a rounded corner, keeps the constraints as closely
     as the search does."""
     rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
-    return constraints is None or constraints.first_violation(rows, tolerance_fraction=TOLERANCE_FRACTION) is None
+    return (
+        constraints is None
+        or constraints.first_violation(rows, tolerance_fraction=TOLERANCE_FRACTION) is None
+    )
