@@ -45,7 +45,7 @@ from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.shard_maker import draw, solve, with_near_goals
 from robotdiffuse.generation.solvers import SEARCHES
-from robotdiffuse.problems.families.family import Drawn
+from robotdiffuse.problems.families.family import SampledProblem
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
@@ -83,7 +83,7 @@ class Found(NamedTuple):
 
 
 def searched(
-    settings: GenerationSettings, checker: CollisionChecker, drawn: Drawn, seed: int, marks: tuple[float, ...]
+    settings: GenerationSettings, checker: CollisionChecker, drawn: SampledProblem, seed: int, marks: tuple[float, ...]
 ) -> Iterator[Found]:
     """The path of the search at these CPU times [s], and where it ends by itself."""
     began = time.process_time()
@@ -101,7 +101,7 @@ def searched(
         yield Found(spent, search.cost, float(checker.link_clearances(along).min()), search.safety_distance)
 
 
-def problems(settings: GenerationSettings, robot: Robot, count: int) -> Iterator[tuple[int, Drawn]]:
+def problems(settings: GenerationSettings, robot: Robot, count: int) -> Iterator[tuple[int, SampledProblem]]:
     """Random ones that the straight line does not solve."""
     number = 0
     while count > 0:

@@ -49,6 +49,8 @@ def test_the_search_works_without_a_server(site: Path) -> None:
 
 
 def test_the_command_reference_has_every_option(site: Path) -> None:
+    import robotdiffuse as rd
+
     page = (site / "reference" / "commands.html").read_text(encoding="utf-8")
     for word in (
         "robotdiffuse data generate",
@@ -60,6 +62,8 @@ def test_the_command_reference_has_every_option(site: Path) -> None:
 
 
 def test_the_python_reference_has_every_public_name(site: Path) -> None:
+    import robotdiffuse as rd
+
     page = (site / "reference" / "python.html").read_text(encoding="utf-8")
     for name in dir(rd):
         assert f'.{name}"' in page, name

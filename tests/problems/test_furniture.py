@@ -153,7 +153,7 @@ def test_targets_have_the_fingers_in_the_region() -> None:
     approach = np.array([0.6, 0.0, -0.8])
     region = Region(np.array([0.5, 0.1, 0.3]), np.array([0.4, 0.2, 2 * REGION_MARGIN]), 0.7, approach)
     rng = np.random.default_rng(5)
-    T = np.stack([sample_target(region, rng, spread=0.3, fingers=0.1) for _ in range(2000)])
+    T = np.stack([sample_target(region, rng, spread=0.3, finger_length=0.1) for _ in range(2000)])
     products = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), (2000, 3, 3)), atol=1e-12)
     local = (T[:, :3, 3] + 0.1 * T[:, :3, 2] - region.center) @ turned(0.7)

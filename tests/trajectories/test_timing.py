@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.trajectories import speed_limits as speeds_module
+from robotdiffuse.trajectories import speed_limits
 from robotdiffuse.trajectories.corner_rounding import BLEND_DEVIATION, BlendedPolyline, half_widths
-from robotdiffuse.trajectories.speed_limits import LEAST_JERK, TimingSettings, timing_grid
+from robotdiffuse.trajectories.speed_limits import MIN_JERK, TimingSettings, symmetric_bounds, timing_grid
 from robotdiffuse.trajectories.timing import SAME_WAYPOINT_DISTANCE, time_parameterize
-from robotdiffuse.trajectories.timing_kernel import fastest, slowdown
+from robotdiffuse.trajectories.timing_kernel import fastest_speeds, slowdown
 from robotdiffuse.validation.rates import RateTolerances, rate_violations
 
 VELOCITY = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
@@ -281,13 +281,15 @@ def test_fine_rows_keep_the_limits_to_the_letter() -> None:
         assert (np.abs(t.accelerations) <= robot.acceleration).all()
 
 
-def toppra_duration(robot: Robot, line: BlendedPolyline, settings: TimingSettings) -> float:
-    """Duration [s] of the motion along a line with toppra's speeds, slowed down as ours are."""
+def toppra_speeds(
+    line: BlendedPolyline, grid: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+) -> np.ndarray | None:
+    """toppra's fastest speeds at the grid points of a line; None if it finds none."""
 
     class Geometry(toppra.interpolator.AbstractGeometricPath):
         @property
         def dof(self) -> int:
-            return robot.dof
+            return len(velocity)
 
         @property
         def path_interval(self) -> np.ndarray:
@@ -297,14 +299,20 @@ def toppra_duration(robot: Robot, line: BlendedPolyline, settings: TimingSetting
             return line(np.atleast_1d(np.asarray(path_positions, dtype=np.float64)), order)
 
     constraints = [
-        toppra.constraint.JointVelocityConstraint(robot.velocity),
+        toppra.constraint.JointVelocityConstraint(velocity),
         toppra.constraint.JointAccelerationConstraint(
-            robot.acceleration, discretization_scheme=toppra.constraint.DiscretizationType.Interpolation
+            acceleration, discretization_scheme=toppra.constraint.DiscretizationType.Interpolation
         ),
     ]
-    grid = timing_grid(line, settings)
     algorithm = toppra.algorithm.TOPPRA(constraints, Geometry(), gridpoints=grid, solver_wrapper="seidel")
-    speeds = algorithm.compute_parameterization(0.0, 0.0)[1]
+    return algorithm.compute_parameterization(0.0, 0.0)[1]
+
+
+def toppra_duration(robot: Robot, line: BlendedPolyline, settings: TimingSettings) -> float:
+    """Duration [s] of the motion along a line with toppra's speeds, slowed down as ours are."""
+    grid = timing_grid(line, settings)
+    speeds = toppra_speeds(line, grid, robot.velocity, robot.acceleration)
+    assert speeds is not None
     slower = slowdown(line.arrays, grid, speeds, robot.velocity, robot.acceleration)
     return slower * float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
 
@@ -362,7 +370,7 @@ def test_every_path_has_a_timing(
     line = BlendedPolyline(q, half_widths(q, 10 ** rng.uniform(-4, 0, count - 2)))
     grid = timing_grid(line, TimingSettings())
     first, second = line(grid, 1), line(grid, 2)
-    found = fastest(first, second, grid, velocity, *symmetric(acceleration, len(grid)))
+    found = fastest_speeds(first, second, grid, velocity, *symmetric_bounds(acceleration, len(grid)))
     assert (found[1:-1] > 0).all() and np.isfinite(found).all()
     assert (np.abs(first) * found[:, None] <= velocity * (1 + 1e-9)).all()
     pull = (np.diff(found**2) / (2 * np.diff(grid)))[:, None]
@@ -370,8 +378,8 @@ def test_every_path_has_a_timing(
         rates = first[end] * pull + second[end] * found[end, None] ** 2
         assert (np.abs(rates) <= acceleration * (1 + 1e-4)).all()
 
-    theirs = speeds_module._speeds_by_toppra(line, grid, velocity, acceleration, 0.0)
-    if np.isfinite(theirs).all() and (theirs[1:-1] > 0.01 * theirs.max()).all():
+    theirs = toppra_speeds(line, grid, velocity, acceleration)
+    if theirs is not None and np.isfinite(theirs).all() and (theirs[1:-1] > 0.01 * theirs.max()).all():
         ours, least = ((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum() for speeds in (found, theirs))
         assert ours == pytest.approx(least, rel=1e-3)
 
@@ -402,8 +410,8 @@ def test_rows_of_a_motion_without_end_are_counted(jerk: float | None) -> None:
     robot = arm((1e-6,), (1.0,))
     t = time_parameterize(robot, path(robot, [[0.0], [1.0]]), always, always, TimingSettings(jerk=jerk))
     assert t.duration == pytest.approx(1e6, rel=0.05)
-    assert len(t.times) <= speeds_module.MOST_ROWS + 1
-    assert wrong_rates(robot, t, VALIDATOR) == []
+    assert len(t.times) <= speed_limits.MAX_ROWS + 1
+    assert rate_violations(robot, t, VALIDATOR) == []
 
 
 @pytest.mark.parametrize("jerk", [2e3, 7.5e3, 1e5, 1e300])
@@ -411,12 +419,12 @@ def test_rows_tell_the_acceleration_under_a_high_limit_of_jerk(jerk: float) -> N
     """It rose to its most between two rows, whose rates then did not agree: no motion was valid."""
     robot, q = arm(), np.cumsum(np.random.default_rng(0).normal(0, 0.5, (5, 7)), axis=0)
     t = time_parameterize(robot, path(robot, q), always, always, TimingSettings(jerk=jerk))
-    assert wrong_rates(robot, t, VALIDATOR) == []
+    assert rate_violations(robot, t, VALIDATOR) == []
 
 
 def test_the_least_limit_of_jerk_costs_little_more_than_it_must() -> None:
     """With the accelerations of seven fixed shares of the limits it was 20 times the least."""
     robot = arm((20.0,), (80.0,))
-    t = time_parameterize(robot, path(robot, [[0.0], [1.0]]), always, always, TimingSettings(jerk=LEAST_JERK))
+    t = time_parameterize(robot, path(robot, [[0.0], [1.0]]), always, always, TimingSettings(jerk=MIN_JERK))
     least = (32 / LEAST_JERK) ** (1 / 3)
     assert least <= t.duration < 1.4 * least

@@ -12,7 +12,7 @@ from numpy import ndarray
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.certificates.checker import Findings, check
 from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof, Tolerances
-from robotdiffuse.core.bounds import FASTEST, numbers, within
+from robotdiffuse.core.bounds import MAX_RATE, numbers, within
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
@@ -148,7 +148,7 @@ def _motion(record: dict[str, Any]) -> Path | Trajectory:
     shape = (len(rows["positions"]) if rows["positions"] is not None else 0, len(names))
     for name, array in rows.items():
         wanted = shape[:1] if name == "times" else shape
-        if array is None or array.shape != wanted or not len(array) or not within(array, FASTEST):
+        if array is None or array.shape != wanted or not len(array) or not within(array, MAX_RATE):
             raise InputError(f"motion.{name} must be finite numbers of shape {'x'.join(map(str, wanted))}")
     if len(rows) == 1:
         return Path(names, rows["positions"])  # type: ignore[arg-type]
@@ -196,7 +196,7 @@ def _hashes(name: str, value: object) -> dict[str, str]:
 
 def _vector(name: str, value: object) -> ndarray:
     array = np.zeros(0) if value == [] else numbers(value)
-    if array is None or array.ndim != 1 or not within(array, FASTEST):
+    if array is None or array.ndim != 1 or not within(array, MAX_RATE):
         raise InputError(f"{name} must be a list of finite numbers")
     return array
 

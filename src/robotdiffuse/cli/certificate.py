@@ -28,7 +28,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def run_check(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.certificates.proof import load_certificate
+    from robotdiffuse.certificates.certificate import load_certificate
     from robotdiffuse.problems.files import load_problem
 
     certificate = load_certificate(arguments.file)

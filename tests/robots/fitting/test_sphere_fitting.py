@@ -78,7 +78,7 @@ def test_grid_knows_signed_distances() -> None:
     np.testing.assert_allclose(solid.distance.ravel(), beyond.max(1), atol=1e-9)
     # inside two boxes that share a wall the wall is no surface
     two = Solid.of((box((0.1, 0.1, 0.1)), box((0.1, 0.1, 0.1), (0.1, 0, 0))), TOLERANCE)
-    assert two.as_room().at(np.array([[0.05, 0.0, 0.0]]))[0] == pytest.approx(0.05, abs=two.spacing / 2)
+    assert two.inscribed_sizes().at(np.array([[0.05, 0.0, 0.0]]))[0] == pytest.approx(0.05, abs=two.spacing / 2)
 
 
 @pytest.mark.parametrize("size", [(0.002, 0.002, 0.002), (0.03, 0.02, 0.0005)])
@@ -94,7 +94,7 @@ def test_what_neighbours_hide_wholly_is_covered_too() -> None:
     """Baxter's sonar ring is within its torso: room without end was no number."""
     solid = Solid.of((box((0.01, 0.01, 0.01)),), TOLERANCE)
     hidden = Bounds(TOLERANCE, lambda points: np.ones(len(points), dtype=bool))
-    assert np.isfinite(solid.room(hidden).grid).all()
+    assert np.isfinite(solid.sphere_sizes(hidden).grid).all()
     spheres = fit_spheres(solid, hidden, np.random.default_rng(0), QUICK)
     assert covered(solid.meshes, spheres) and len(spheres) == 1
 
