@@ -324,7 +324,7 @@ def test_robot_add_with_srdf_and_robot_list(
 
     assert run("robot", "add", str(file), "--allow", "j1_link", "j4_link") == 0
     told = capsys.readouterr()
-    assert "made.srdf sees differently" in told.out and "User" in told.out and "named 1" in told.out
+    assert "differences from made.srdf" in told.out and "User" in told.out and "named 1" in told.out
     assert "5 of 11: spheres of base" in told.err and "11 of 11: done" in told.err
     allowed = load_robot("made").allowed_collisions
     assert frozenset(("j1_link", "j4_link")) in allowed

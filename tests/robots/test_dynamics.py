@@ -41,7 +41,7 @@ def test_a_pendulum_by_hand() -> None:
     assert dynamics.torques(q, v, a)[0, 0] == pytest.approx(expected, abs=1e-9)
     lying = transform(np.zeros(3), rotation_about(Y, np.pi / 2))  # gravity along the base's x
     turned = Dynamics(pendulum(), Payload(1.5, [0.0, 0.0, -1.0]), lying)
-    assert abs(turned.holding(np.zeros((1, 1)))[0, 0]) == pytest.approx(2.5 * GRAVITY, abs=1e-9)
+    assert abs(turned.holding_torques(np.zeros((1, 1)))[0, 0]) == pytest.approx(2.5 * GRAVITY, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5", "xarm7"])

@@ -24,13 +24,15 @@ def add(commands: argparse._SubParsersAction) -> None:
 
     listing = actions.add_parser(
         "list",
-        help="the robots that problems can name",
-        description="List the bundled robots and those that were added.",
+        help="list robots",
+        description="List the bundled and the added robots.",
     )
     listing.set_defaults(run=run_list)
 
     info = actions.add_parser(
-        "info", help="joints, limits and collision model", description="Show what is known of a robot."
+        "info",
+        help="show joints, limits and collision model",
+        description="Show joints, limits and collision model of a robot.",
     )
     info.add_argument("robot", metavar="ROBOT", help="a bundled name, a prepared folder or a URDF file")
     info.set_defaults(run=run_info)
@@ -38,33 +40,37 @@ def add(commands: argparse._SubParsersAction) -> None:
     make = actions.add_parser(
         "add",
         help="prepare a robot from its URDF",
-        description="Fit covering spheres to the collision meshes of a URDF and find the pairs of links that "
-        "need no check; write it all to a folder that problems can name.",
+        description="Fit covering spheres to the collision meshes of a URDF, find the pairs of links that need "
+        "no collision check, and write a robot folder that problems can name.",
     )
     make.add_argument("urdf", metavar="URDF", help="URDF or xacro file of an arm")
-    make.add_argument("--name", metavar="NAME", help="name that problems use (default: the URDF's)")
-    make.add_argument("--out", metavar="FOLDER", help="where to write it (default: the user's robots)")
+    make.add_argument("--name", metavar="NAME", help="name of the robot in problems (default: the URDF's)")
+    make.add_argument(
+        "--out", metavar="FOLDER", help="folder to write (default: in the user's data directory)"
+    )
     make.add_argument(
         "--group",
         metavar="NAME",
-        help="group of the SRDF, or arm, that is planned; 'both' or 'all' arms as one robot (default: the "
-        "only arm)",
+        help="SRDF group or arm to plan for; 'both' or 'all' for all arms as one robot (default: the only "
+        "arm)",
     )
     make.add_argument("--base", metavar="LINK", help="first link of the arm (default: the root)")
-    make.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where a gripper begins)")
+    make.add_argument(
+        "--tip", metavar="LINK", help="last link of the arm (default: the link where a gripper begins)"
+    )
     make.add_argument(
         "--lock",
         type=assignment,
         action="append",
         default=[],
         metavar="JOINT=VALUE",
-        help="hold a joint at a value [rad or m]; repeatable",
+        help="lock a joint at a value [rad or m]; repeatable",
     )
     make.add_argument(
         "--srdf",
         metavar="FILE",
-        help="SRDF with groups, poses, passive joints and pairs of links to allow (default: groups, poses "
-        "and passive joints of the one beside the URDF)",
+        help="SRDF with groups, poses, passive joints and allowed pairs of links (default: groups, poses and "
+        "passive joints of the SRDF beside the URDF)",
     )
     make.add_argument(
         "--allow",
@@ -72,7 +78,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         action="append",
         default=[],
         metavar=("LINK", "LINK"),
-        help="two links that need no check against each other; repeatable",
+        help="two links that are not checked against each other; repeatable",
     )
     make.add_argument(
         "--package",
@@ -80,12 +86,15 @@ def add(commands: argparse._SubParsersAction) -> None:
         action="append",
         default=[],
         metavar="NAME=FOLDER",
-        help="where a package:// is (default: ROS_PACKAGE_PATH, AMENT_PREFIX_PATH, upwards of the URDF)",
+        help="folder of a ROS package (default: search ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders "
+        "above the URDF)",
     )
     make.add_argument(
-        "--limits", metavar="FILE", help="joint limits in the form of MoveIt's joint_limits.yaml"
+        "--limits", metavar="FILE", help="joint limits, a file in the form of MoveIt's joint_limits.yaml"
     )
-    make.add_argument("--licence", metavar="TEXT", help="licence of the URDF's geometry, kept as a note")
+    make.add_argument(
+        "--licence", metavar="TEXT", help="licence of the URDF's geometry, stored with the robot"
+    )
     make.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
     make.set_defaults(run=run_add)
 
@@ -107,7 +116,7 @@ def run_list(arguments: argparse.Namespace) -> int:
         weights = "no" if weights_for("model", robot) is None else "yes"
         refused, pairs = read_source(place).get("refused"), len(robot.checked_pairs())
         rows.append((name, robot.dof, spheres, pairs, refused, weights, str(place)))
-    refused = Column("refused", "%", ".1f", scale=100.0)
+    refused = Column("false collisions", "%", ".1f", scale=100.0)
     columns = ("robot", "joints", "spheres", "checked pairs", refused, "weights", Column("folder", left=True))
     show(Table.of("", columns, rows))
     return 0
@@ -132,7 +141,7 @@ def run_add(arguments: argparse.Namespace) -> int:
         from robotdiffuse.cli.robot_report import print_preparation
         from robotdiffuse.robots.fitting.add import add_robot
 
-        task = bar.add_task("reading")
+        task = bar.add_task("reading the URDF")
 
         def progress(what: str, step: int, steps: int) -> None:
             if console.is_terminal:
@@ -164,7 +173,7 @@ def run_add(arguments: argparse.Namespace) -> int:
 
 
 def _print_pairs(report: "AddReport") -> None:
-    """How many pairs of links are allowed for which reason, and where the SRDF sees it otherwise."""
+    """Print how many pairs of links are allowed for which reason, and where the SRDF differs."""
     from robotdiffuse.evaluation.tables import Column, Table, show
 
     reasons = Counter(pair.reason for pair in report.pairs)
@@ -174,11 +183,12 @@ def _print_pairs(report: "AddReport") -> None:
         return
     columns = ("link", "link", "by sampling", Column("colliding", "%", ".1f", scale=100.0), "by the SRDF")
     rows = [(*pair.links, pair.sampled, pair.colliding, pair.srdf) for pair in report.differences]
-    title = f"pairs that {report.srdf.name} sees differently"
+    title = f"differences from {report.srdf.name}"
     show(Table.of(title, columns, rows) if rows else Table.pairs("", [(title, "none")]))
 
 
 def print_robot(robot: "Robot") -> None:
+    """Print tables of joints, limits and collision model."""
     from robotdiffuse.core.transforms import inverse
     from robotdiffuse.evaluation.tables import Column, Table, show
 
@@ -189,7 +199,7 @@ def print_robot(robot: "Robot") -> None:
     ends = [("tip", tip) for tip in robot.tips] if robot.other_tips else []
     pairs = [("base", robot.base), *ends] if ends else [("base, tip", f"{robot.base}, {robot.tip}")]
     if robot.root not in ("", robot.base):
-        at = "on a joint that moves it" if robot.T_base_root is None else _place(inverse(robot.T_base_root))
+        at = "on a movable joint" if robot.T_base_root is None else _place(inverse(robot.T_base_root))
         pairs.append((f"base in {robot.root}", at))
     pairs += [
         ("links", f"{len(robot.link_names)}"),

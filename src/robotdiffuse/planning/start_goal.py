@@ -210,7 +210,7 @@ def _usable_goals(
 
 def _too_heavy(context: PlanningContext, q: Float[ndarray, "dof"]) -> str | None:
     """Which joint cannot hold the problem's payload there."""
-    return None if context.validator.dynamics is None else context.validator.dynamics.too_much(q)
+    return None if context.validator.dynamics is None else context.validator.dynamics.overload_message(q)
 
 
 def _goals(

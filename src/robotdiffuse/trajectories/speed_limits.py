@@ -348,7 +348,7 @@ def _times_too_fast(
 ) -> float:
     """How many times slower a motion must be, at least 1, for its torques to keep their limits: what is not
     gravity's part goes with the square of its speed."""
-    gravity = dynamics.holding(q)
+    gravity = dynamics.holding_torques(q)
     own = dynamics.torques(q, v, a) - gravity
     room = np.maximum(dynamics.limits - np.sign(own) * gravity, ROOM * dynamics.limits)
     return float(np.sqrt((np.abs(own) / room).max(initial=1.0)))
