@@ -6,7 +6,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.visual_meshes import PLAIN, UNIT, VisualMesh
+from robotdiffuse.robots.visual_meshes import LINK_COLOR, UNIT, VisualMesh
 
 
 def write_visual(visual: dict[str, VisualMesh], file: Path) -> None:
@@ -74,7 +74,7 @@ def _read_mesh(file: Path, T_link_mesh: ndarray) -> list[tuple[ndarray, ndarray,
         if not isinstance(piece, trimesh.Trimesh):
             continue
         material = getattr(piece.visual, "material", None)
-        color = np.array(PLAIN, np.uint8) if material is None else np.asarray(material.main_color)[:3]
+        color = np.array(LINK_COLOR, np.uint8) if material is None else np.asarray(material.main_color)[:3]
         vertices, index = np.unique(np.round(piece.vertices, 5), axis=0, return_inverse=True)
         faces = index.reshape(-1)[piece.faces]
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]

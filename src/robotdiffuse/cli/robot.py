@@ -40,8 +40,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     make = actions.add_parser(
         "add",
         help="prepare a robot from its URDF",
-        description="Fit covering spheres to the collision meshes of a URDF, find the pairs of links that need "
-        "no collision check, and write a robot folder that problems can name.",
+        description="Fit covering spheres to the collision meshes of a URDF, find the pairs of links that "
+        "need no check, and write a robot folder that problems can name.",
     )
     make.add_argument("urdf", metavar="URDF", help="URDF or xacro file of an arm")
     make.add_argument("--name", metavar="NAME", help="name of the robot in problems (default: the URDF's)")
