@@ -318,7 +318,7 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
 def test_add_refuses_what_cannot_work(tmp_path: Path) -> None:
     joint = "<joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"
     bare = f"<robot name='bare'><link name='a'/><link name='b'/>{joint}</robot>"
-    with pytest.raises(InputError, match="collision geometry"):
+    with pytest.raises(InputError, match="no link has collision or visual geometry"):
         add_robot(urdf(tmp_path, bare), out=tmp_path / "bare")
     with pytest.raises(InputError, match="robot name"):
         add_robot(urdf(tmp_path), name="../up")
