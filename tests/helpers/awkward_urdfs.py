@@ -165,7 +165,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         solid(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])),
         "has no triangle mesh",
     ),
-    "a point": (solid(b"v 0 0 0\nv 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\nf 2 3 4\n", "part.obj"), "holds no"),
+    "a point": (solid(b"v 0 0 0\nv 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\nf 2 3 4\n", "part.obj"), "has no"),
     "a mesh with corners that are no numbers": (
         solid(b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n", "part.obj"),
         "has no triangle mesh",

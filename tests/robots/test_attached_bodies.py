@@ -1,4 +1,4 @@
-"""Tools and held objects: against the same geometry on a robot of its own, by hand, and by sampling."""
+"""Tools and held objects: compared with the same geometry built into a robot, by hand, and by sampling."""
 
 import pickle
 from dataclasses import replace
@@ -60,7 +60,7 @@ def test_spheres_cover_surface_and_inside(mesh: ConvexMesh) -> None:
 
 
 def surface_points(shape: Shape) -> ndarray:
-    """Points on the true surface of a shape, where it stands."""
+    """Points on the true surface of a shape at its pose."""
     if isinstance(shape, rd.Mesh):
         return shape.world_vertices
     d = np.random.default_rng(2).normal(size=(2000, 3))

@@ -1,4 +1,4 @@
-"""The robots that come with the package: spheres hold their meshes, refuse little, and NOTICE names them."""
+"""Bundled robots: spheres cover their meshes, cause few false collisions, and NOTICE names the robots."""
 
 from pathlib import Path
 
@@ -28,14 +28,14 @@ def test_no_sampled_point_of_the_meshes_is_outside_the_spheres(name: str) -> Non
             mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
             points = np.asarray(trimesh.sample.sample_surface(mesh, 200, seed=0)[0])
             others = parts[:k] + parts[k + 1 :]
-            if others:  # what lies in another part is no surface
+            if others:  # points inside another part are not on the surface
                 points = points[~within(points, *stacked_planes(others), 1e-9)]
             assert (gaps(points, robot.spheres[link].copy()) <= 0).all(), link
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_what_spheres_call_free_is_free_and_little_else_is(name: str) -> None:
-    """Refused: 8 % is what preparation warns of; the standard error of 400 samples is one and a half."""
+    """Preparation warns of more than 8 % false collisions; the standard error with 400 samples is 1.5 %."""
     robot, scene = load_robot(name), Scene()
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (400, robot.dof))
     by_spheres, by_meshes = CollisionChecker(robot, scene).free(q), ~ExactCollision(robot, scene).collides(q)
@@ -50,7 +50,7 @@ def test_licences_are_named(name: str) -> None:
 
 
 def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
-    """No problem between shelves was solved: the ends differed by turns of a UR's shoulder, which the floor
+    """Shelf problems were unsolvable: start and goal differed by turns of a UR's shoulder, which the floor
     blocks."""
     robot = load_robot("ur5e")
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, 6))
@@ -66,8 +66,8 @@ def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
 
 
 def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
-    """One random problem in ten had no way for a UR even without obstacles: its upper arm hung down beyond
-    the base, from where the goal can be reached over the top, a turn further."""
+    """One random problem in ten was unsolvable for a UR even without obstacles: its upper arm hung down
+    beside the base, and only the equivalent goal one turn further can be reached, over the top."""
     robot, home = load_robot("ur5e"), np.array([0, -1.57, 1.57, -1.57, -1.57, 0])
     start = np.array([0.5, 2.9, 0.7, 0.4, 2.7, 0.2])
     goals = robot.equivalent_configurations(home, start)

@@ -1,4 +1,5 @@
-"""Torques against Pinocchio's own reading of the URDF, and a pendulum by hand; payloads of problems."""
+"""Torques compared with Pinocchio's own reading of the URDF and with a pendulum by hand; payloads of
+problems."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +28,7 @@ Y = np.array([0.0, 1.0, 0.0])
 
 
 def pendulum(effort: float = 10.0) -> Robot:
-    """A rod of 2 kg and 1 m that hangs down at 0, about y."""
+    """A rod of 2 kg and 1 m that rotates about y and hangs down at 0."""
     hinge = Joint("hinge", "revolute", "base", "rod", np.eye(4), Y, -3.0, 3.0, 2.0, 8.0, 80.0, effort=effort)
     rod = inertia_of([2.0, 0.0, 0.0, -0.5, 2 / 12, 0, 0, 2 / 12, 0, 0])
     return Robot("pendulum", "base", "rod", (hinge,), inertias={"rod": rod})
@@ -41,7 +42,7 @@ def test_a_pendulum_by_hand() -> None:
     assert dynamics.torques(q, v, a)[0, 0] == pytest.approx(expected, abs=1e-9)
     lying = transform(np.zeros(3), rotation_about(Y, np.pi / 2))  # gravity along the base's x
     turned = Dynamics(pendulum(), Payload(1.5, [0.0, 0.0, -1.0]), lying)
-    assert abs(turned.holding(np.zeros((1, 1)))[0, 0]) == pytest.approx(2.5 * GRAVITY, abs=1e-9)
+    assert abs(turned.holding_torques(np.zeros((1, 1)))[0, 0]) == pytest.approx(2.5 * GRAVITY, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5", "xarm7"])
@@ -90,7 +91,7 @@ def test_the_validator_names_joint_torque_and_limit() -> None:
     found = verify_trajectory(heavy, result.trajectory).violation
     assert found is not None and found.kind == "torque" and found.subject == "panda_joint2"
     assert found.message.endswith("N m, its effort limit is 87 N m, with the payload")
-    # weak in the middle, where the rod is level
+    # the limit is too low in the middle, where the rod is level
     weak = rd.Problem(pendulum(9.0), rd.Scene(), [0.3], [2.9], payload=Payload(0.0))
     across = verify(weak, JointPath(("hinge",), np.array([[0.3], [2.9]]))).violation
     assert across is not None and across.kind == "torque"

@@ -1,4 +1,4 @@
-"""Inverse kinematics: solutions reach the pose, lie within limits, differ, and are honest about failure."""
+"""Inverse kinematics: solutions reach the pose, lie within limits and differ; unreachable poses give none."""
 
 from dataclasses import replace
 
@@ -19,14 +19,14 @@ from robotdiffuse.robots.robot import Robot
 
 
 def errors(robot: Robot, frame: str, T: np.ndarray, q: np.ndarray) -> tuple[float, float]:
-    """Largest position [m] and orientation error [rad] of solutions, by PyTorch's kinematics."""
+    """Largest position error [m] and orientation error [rad] of solutions, by the PyTorch kinematics."""
     poses = ForwardKinematics(robot, torch.float64).link(torch.tensor(q), frame).numpy()
     turns = [rotation_angle(pose[:3, :3] @ T[:3, :3].T) for pose in poses]
     return float(np.linalg.norm(poses[:, :3, 3] - T[:3, 3], axis=1).max()), max(turns)
 
 
 def smallest_gap(q: np.ndarray) -> float:
-    """Least max-norm distance between two different rows."""
+    """Smallest max-norm distance between two rows."""
     gaps = np.abs(q[:, None] - q[None]).max(-1)
     return float(gaps[~np.eye(len(q), dtype=bool)].min(initial=np.inf))
 
@@ -46,7 +46,7 @@ def test_solutions_are_exact_distinct_and_within_limits(name: str) -> None:
 
 
 def test_every_configuration_of_the_panda_can_be_found_again() -> None:
-    """Of 300 reachable poses all are solved; the benchmark does 1,000 with ten solutions each."""
+    """All of 300 reachable poses are solved; the benchmark solves 1,000 with ten solutions each."""
     robot, rng = example_robot("panda"), np.random.default_rng(4)
     for _ in range(300):
         T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "panda_hand")
@@ -54,7 +54,8 @@ def test_every_configuration_of_the_panda_can_be_found_again() -> None:
 
 
 def test_ur5_has_at_most_eight_solutions() -> None:
-    """A 6R arm with a spherical-like wrist and joints of one turn each: the textbook's eight."""
+    """A 6R arm with a nearly spherical wrist and joints of one turn has the eight solutions of the
+    textbook."""
     robot, rng = example_robot("ur5"), np.random.default_rng(5)
     counts = []
     for _ in range(20):
@@ -119,7 +120,7 @@ def test_accept_is_honoured() -> None:
 
 
 def test_a_narrow_range_of_acceptance_is_found() -> None:
-    """Solutions close to refused ones are tried too: here 0.02 rad of the elbow's turn are accepted."""
+    """Solutions close to rejected ones are tried too: here a range of 0.02 rad of the elbow is accepted."""
     robot, rng = example_robot("panda"), np.random.default_rng(8)
     T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
     q = inverse_kinematics(robot, "panda_hand", T, 1, rng=rng, accept=lambda q: abs(q[:, 0] - 0.5) < 0.01)

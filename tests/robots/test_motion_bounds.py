@@ -1,4 +1,4 @@
-"""Motion radii: never below the truth, and close to it."""
+"""Motion radii: never below the true maxima, and close to them."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def test_never_below_and_close_to_sampled_maxima(name: str) -> None:
     radii, sampled = motion_radii(robot), sampled_radii(robot, 20_000)
     assert (radii >= sampled).all()
     assert ((radii > 0) == (sampled > 0)).all()
-    # The bound itself is within 1 %; the rest is what random sampling misses of the maximum.
+    # the bound itself is within 1 %; the rest is the gap between sampled and true maxima
     assert (radii <= 1.04 * sampled + 1e-3).all()
 
 
@@ -73,7 +73,7 @@ def test_planar_arm_by_hand() -> None:
     arm = planar_arm(0.5, 0.4, 0.3)
     joints = tuple(replace(joint, lower=-3.0, upper=3.0) for joint in arm.joints)
     robot = replace(arm, joints=joints, spheres={"l0": np.ones((1, 4)), "tip": np.array([[0, 0, 9.0, 0.05]])})
-    # Heights along the axes do not count. Stretched out, the sphere at the tip is furthest.
+    # heights along the axes do not count; the sphere at the tip of the stretched arm is furthest
     radii = motion_radii(robot)
     np.testing.assert_array_equal(radii[0], 0)
     exact = np.array([1.25, 0.75, 0.35])

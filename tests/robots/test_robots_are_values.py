@@ -1,4 +1,4 @@
-"""The same robot is one object in a process, and what is compiled for it is compiled once."""
+"""Equal robots are one object per process, so that derived data is computed once."""
 
 import pickle
 from dataclasses import replace
@@ -22,7 +22,7 @@ LEFT, RIGHT = "panda_finger_joint1", "panda_finger_joint2"
 
 
 def test_fifty_problem_files_with_locked_joints_share_one_robot(tmp_path: Path) -> None:
-    """Each was a robot of its own, whose arrays the first plan compiled: 95 ms a plan in place of 18."""
+    """Each used to be a new object whose arrays the first plan prepared: 95 ms per plan instead of 18."""
     robot = load_robot("panda", locked={LEFT: 0.035, RIGHT: 0.035})
     start = (robot.lower + robot.upper) / 2
     for i in range(50):

@@ -1,4 +1,4 @@
-"""Two arms as one robot: which joints are planned, what a goal of one hand means, plans, proofs, tools."""
+"""Two arms as one robot: planned joints, goals for one hand, plans, proofs, tools."""
 
 import time
 from dataclasses import replace
@@ -40,7 +40,7 @@ PARTS = chain("base", ["waist"]), chain("waist_link", row("left_", 4)), chain("w
 
 @cache
 def two_arms() -> Robot:
-    """Boxes covered by spheres, on a torso that a planned joint turns."""
+    """Two arms of boxes covered by spheres, on a torso that a planned joint rotates."""
     robot = example_robot("two_arms")
     spheres = {link: np.concatenate([cover(part) for part in parts]) for link, parts in robot.meshes.items()}
     beside = [("pedestal", "torso")]
@@ -95,7 +95,8 @@ def test_files_keep_all_tips(tmp_path: Path) -> None:
 
 
 def test_spheres_parts_and_the_arms_of_one_robot_agree() -> None:
-    """What covering spheres call free is free by the parts; and Baxter's left arm is where it is alone."""
+    """Configurations that are free by spheres are free by parts; Baxter's left arm has the same poses as
+    alone."""
     robot, rng = two_arms(), np.random.default_rng(0)
     q = rng.uniform(robot.lower, robot.upper, (2000, robot.dof))
     free, hits = CollisionChecker(robot, rd.Scene()).free(q), ExactCollision(robot, rd.Scene()).collides(q)
@@ -116,7 +117,7 @@ def test_the_other_arm_keeps_its_values_in_inverse_kinematics() -> None:
     for one in found:
         np.testing.assert_allclose(link_pose(robot, one, "right_lower"), T, atol=1e-5)
         assert (one[1:4] == rest[1:4]).all()
-    assert len({*found[:, 6]}) == len(found)  # the joint behind the link is anywhere
+    assert len({*found[:, 6]}) == len(found)  # the joint after the link is random
 
 
 @pytest.mark.parametrize("planner", ["rrt_connect", "aorrtc", "robotdiffuse"])
@@ -134,7 +135,7 @@ def test_planners_move_both_arms_past_each_other(planner: str) -> None:
 
 
 def _crossing(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Two free configurations between which the straight way is not."""
+    """Two free configurations with a collision on the straight line between them."""
     checker = CollisionChecker(robot, rd.Scene([rd.Sphere([0.45, 0.0, 0.75], 0.05)]))
     rng = np.random.default_rng(3)
     while True:
@@ -185,7 +186,7 @@ def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:
     ]
     assert (bounds >= np.reshape(heights, (-1, 9)).max(axis=1) - 1e-9).all()
     still = q.copy()
-    still[:, 1:4] = q[0, 1:4]  # the left arm, which only the moved one's bounds may depend on
+    still[:, 1:4] = q[0, 1:4]  # the left arm does not move
     assert robot.joint_names[1:4] == ("left_shoulder", "left_elbow", "left_wrist")
     np.testing.assert_array_equal(constraint_bounds(problem, still, 0.0)[0].bounds, bounds)
 
@@ -235,7 +236,7 @@ def test_added_planned_and_verified_from_the_command_line(
 def test_the_first_robot_of_several_arms_compiles_which_is_said_and_takes_no_time_of_the_call(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Code for trees of joints is compiled at their first plan: who waits need not have a new machine."""
+    """Kernels for branching robots are compiled at the first plan, on machines of any age; a note says so."""
     robot, shown = two_arms(), []
     monkeypatch.setattr(plan, "Spinner", lambda text: (shown.append(text), Spinner(text))[1])
     q = np.zeros(robot.dof)
@@ -251,7 +252,7 @@ def test_the_first_robot_of_several_arms_compiles_which_is_said_and_takes_no_tim
 
 
 def test_both_arms_reach_as_far_as_one() -> None:
-    """Lines on the page were twice as wide once: the reach was of the offsets of all joints of both arms."""
+    """The reach used to sum the offsets of both arms, which doubled the width of lines on the live page."""
     both, left, right = (rd.load_robot(f"baxter{arm}") for arm in ("", "_left", "_right"))
     assert reach(both) == pytest.approx(max(reach(left), reach(right)), rel=0.01)  # of random configurations
     assert reach_bound(both) <= max(reach_bound(left), reach_bound(right)) + 1e-9

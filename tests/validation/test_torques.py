@@ -19,7 +19,7 @@ LOOKS = 41
 
 def farthest_off(dynamics: Dynamics, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
     """Largest distances of torques from their chords in each piece, by dense samples, and their bounds."""
-    bulges = dynamics.bends(pieces.along) / 8
+    bulges = dynamics.second_derivatives(pieces.along) / 8
     u = np.linspace(0.0, 1.0, LOOKS)
     piece = np.repeat(np.arange(len(bulges)), LOOKS)
     torques = dynamics.torques(*pieces.states(piece, np.tile(u, len(bulges)))).reshape(len(bulges), LOOKS, -1)

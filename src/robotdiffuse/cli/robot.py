@@ -57,14 +57,16 @@ def add(commands: argparse._SubParsersAction) -> None:
         "only arm)",
     )
     make.add_argument("--base", metavar="LINK", help="first link of the arm (default: the root)")
-    make.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where a gripper begins)")
+    make.add_argument(
+        "--tip", metavar="LINK", help="last link of the arm (default: the link where a gripper begins)"
+    )
     make.add_argument(
         "--lock",
         type=assignment,
         action="append",
         default=[],
         metavar="JOINT=VALUE",
-        help="hold a joint at a value [rad or m]; repeatable",
+        help="lock a joint at a value [rad or m]; repeatable",
     )
     make.add_argument(
         "--srdf",
@@ -138,7 +140,7 @@ def run_add(arguments: argparse.Namespace) -> int:
     with exit_on_interrupt(bar.stop), bar:
         from robotdiffuse.robots.fitting.add import add_robot
 
-        task = bar.add_task("reading")
+        task = bar.add_task("reading the URDF")
 
         def progress(what: str, step: int, steps: int) -> None:
             if console.is_terminal:

@@ -215,7 +215,7 @@ def _usable_goals(
 
 def _too_heavy(context: PlanningContext, q: Float[ndarray, "dof"]) -> str | None:
     """A message that names the joint that cannot hold the problem's payload there; None if all can."""
-    return None if context.validator.dynamics is None else context.validator.dynamics.too_much(q)
+    return None if context.validator.dynamics is None else context.validator.dynamics.overload_message(q)
 
 
 def _goals(

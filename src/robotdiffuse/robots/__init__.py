@@ -107,7 +107,8 @@ def _from_urdf(urdf: Path) -> Robot:
             continue  # the damaged folder of another robot must not matter here
     if len({(robot.base, robot.joint_names) for robot in made.values()}) > 1:
         raise InputError(
-            f"{urdf} was added as {', '.join(made)}, which plan different joints; use one of these names instead"
+            f"{urdf} was added as {', '.join(made)}, which plan different joints; "
+            f"use one of these names instead"
         )
     if made:
         return next(iter(made.values()))

@@ -9,7 +9,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.inertias import Inertia, Payload
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.torque_bounds import Body, Stretches, bend
+from robotdiffuse.robots.torque_bounds import Body, Stretches, second_derivative_bounds
 
 GRAVITY = 9.81
 """Gravitational acceleration along -z of the world [m/s²]."""
@@ -72,22 +72,22 @@ class Dynamics:
             out[i] = self._rnea(self._model, self._data, q[i], v[i], a[i])
         return out
 
-    def bends(self, along: Stretches) -> Float[ndarray, "n dof"]:
+    def second_derivatives(self, along: Stretches) -> Float[ndarray, "n dof"]:
         """Bounds on the second derivatives of torques along stretches, by the parameter of the stretches."""
-        return bend(self._bodies, GRAVITY, along)
+        return second_derivative_bounds(self._bodies, GRAVITY, along)
 
-    def holding(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+    def holding_torques(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
         """Torques at rest [N m] or [N]."""
         still = np.zeros_like(q)
         return self.torques(q, still, still)
 
-    def too_much(self, q: Float[ndarray, "dof"]) -> str | None:
+    def overload_message(self, q: Float[ndarray, "dof"]) -> str | None:
         """A message about the joint whose torque at rest exceeds its limit most; None if none does."""
-        torques = np.abs(self.holding(q[None])[0])
+        torques = np.abs(self.holding_torques(q[None])[0])
         j = int((torques / self.limits).argmax())
-        return None if torques[j] <= self.limits[j] else self.words(j, torques[j])
+        return None if torques[j] <= self.limits[j] else self.torque_message(j, torques[j])
 
-    def words(self, j: int, torque: float) -> str:
+    def torque_message(self, j: int, torque: float) -> str:
         """A message about a torque above its limit."""
         unit = "N" if self.robot.prismatic[j] else "N m"
         name, limit = self.robot.joint_names[j], self.limits[j]

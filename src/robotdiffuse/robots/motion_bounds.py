@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.robots.motion_bounds_kernel import carried, turned
+from robotdiffuse.robots.motion_bounds_kernel import interpolated, sliding_maximum
 from robotdiffuse.robots.robot import Robot, once_per_robot
 
 COLUMNS = 180
@@ -45,7 +45,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     by_row = np.ascontiguousarray(directions.transpose(0, 2, 1))
     support = np.full((len(links), ROWS, COLUMNS), -np.inf)
     farthest = np.zeros(len(links))
-    carry_over = lru_cache(_carry)  # many offsets share a rotation
+    interpolation_of = lru_cache(_offset_interpolation)  # many offsets share a rotation
     for j in reversed(range(robot.dof)):
         for i in np.flatnonzero(frames == j + 1):
             spheres = robot.spheres[links[i]]
@@ -66,11 +66,11 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
         else:
             radii[moved, j] = h[:, ROWS // 2].max(-1) + ARC_SAGITTA * r
             sagitta = ARC_SAGITTA * np.linalg.norm(directions[..., :2], axis=-1)
-            h = _turned(h, lower, upper) + sagitta * r[:, None, None]
+            h = _rotated(h, lower, upper) + sagitta * r[:, None, None]
         offset = robot.frame_offsets[j]
         rotation = offset[:3, :3].tobytes()
-        carry = _kept_carry(rotation) if robot.attached else carry_over(rotation)
-        h = carried(h.reshape(len(moved), -1), *carry, r)
+        interpolation = _cached_interpolation(rotation) if robot.attached else interpolation_of(rotation)
+        h = interpolated(h.reshape(len(moved), -1), *interpolation, r)
         support[moved] = h.reshape(-1, ROWS, COLUMNS) + directions @ offset[:3, 3]
         farthest[moved] = r + np.linalg.norm(offset[:3, 3])
     radii = np.concatenate([known, radii])
@@ -92,21 +92,21 @@ def _directions() -> Float[ndarray, "rows columns 3"]:
     )
 
 
-_Carry = tuple[Int[ndarray, "4 n"], Float[ndarray, "4 n"], Float[ndarray, "n"]]
+_Interpolation = tuple[Int[ndarray, "4 n"], Float[ndarray, "4 n"], Float[ndarray, "n"]]
 
 
-def _carry(rotation: bytes) -> _Carry:
+def _offset_interpolation(rotation: bytes) -> _Interpolation:
     """Interpolation that maps support functions over an offset with a rotation, given as bytes of its
     matrix."""
     return _interpolation(_directions() @ np.frombuffer(rotation).reshape(3, 3))
 
 
-_kept_carry = lru_cache(maxsize=64)(_carry)
+_cached_interpolation = lru_cache(maxsize=64)(_offset_interpolation)
 """Cache for arms with attached bodies, since each new object needs the same interpolations. About 1 MB
 each."""
 
 
-def _turned(
+def _rotated(
     support: Float[ndarray, "n rows columns"], lower: float, upper: float
 ) -> Float[ndarray, "n rows columns"]:
     """Largest grid value among the longitudes that rotations by [lower, upper] map to each longitude."""
@@ -114,10 +114,10 @@ def _turned(
     width = -int(np.floor(lower / STEP)) - first + 1
     if width >= COLUMNS:
         return np.broadcast_to(support.max(-1, keepdims=True), support.shape)
-    return turned(support, first, width)
+    return sliding_maximum(support, first, width)
 
 
-def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Carry:
+def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Interpolation:
     """Grid corners around each direction, their weights, which sum to one, and the lengths of the
     residuals."""
     u = directions.reshape(-1, 3)

@@ -8,7 +8,7 @@ from numba import njit
 
 
 @njit(cache=True)
-def turned(support, first, width):
+def sliding_maximum(support, first, width):
     """Largest value [n, rows, columns] among `width` longitudes, beginning `first` after each longitude."""
     n, rows, columns = support.shape
     out, wide, next_wide = np.empty_like(support), np.empty(columns), np.empty(columns)
@@ -30,7 +30,7 @@ def turned(support, first, width):
 
 
 @njit(cache=True)
-def carried(values, corners, weights, residual, reach):
+def interpolated(values, corners, weights, residual, reach):
     """Bounds [n, directions] in rotated directions: values interpolated from four grid corners each, with
     weights [4, directions], plus the residual times the distance `reach` [n] of the farthest point."""
     out = np.empty_like(values)

@@ -48,12 +48,12 @@ class Body(NamedTuple):
     """Largest principal moment about the centre of mass [kg m²]."""
 
 
-def times(a: Jet, b: Jet) -> Jet:
+def product(a: Jet, b: Jet) -> Jet:
     """Bounds for a product of two vectors or numbers whose length is at most the product of their lengths."""
     return np.stack([a[0] * b[0], a[1] * b[0] + a[0] * b[1], a[2] * b[0] + 2 * a[1] * b[1] + a[0] * b[2]])
 
 
-def bend(bodies: list[Body], gravity: float, along: Stretches) -> Float[ndarray, "n dof"]:
+def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretches) -> Float[ndarray, "n dof"]:
     """Upper bounds on the second derivatives of torques, by the parameter of the stretches."""
     still = np.zeros((3, len(along.q)))
     weight = still.copy()
@@ -68,16 +68,16 @@ def bend(bodies: list[Body], gravity: float, along: Stretches) -> Float[ndarray,
         )
         axis, arm = _fixed(1.0, turn), _fixed(body.offset, turn)
         v, speed, pull = along.v[:, :, j], along.speed[:, :, j], along.pull[:, :, j]
-        along_axis = times(speed, axis)
+        along_axis = product(speed, axis)
         if body.slides:
-            arm = arm + times(np.stack([along.q[:, j], v[0], v[1]]), axis)
-        linear = linear + times(angular, arm) + times(spin, times(spin, arm))
+            arm = arm + product(np.stack([along.q[:, j], v[0], v[1]]), axis)
+        linear = linear + product(angular, arm) + product(spin, product(spin, arm))
         if body.slides:
-            linear = linear + times(pull, axis) + 2 * times(spin, along_axis)
+            linear = linear + product(pull, axis) + 2 * product(spin, along_axis)
         else:
-            angular = angular + times(pull, axis) + times(spin, along_axis)
+            angular = angular + product(pull, axis) + product(spin, along_axis)
             spin = spin + along_axis
-            turn = turn + times(np.stack([v[0], v[1], v[2]]), axis)
+            turn = turn + product(np.stack([v[0], v[1], v[2]]), axis)
         frames.append((turn, spin, angular, linear))
         axes.append(axis)
         arms.append(arm)
@@ -86,14 +86,14 @@ def bend(bodies: list[Body], gravity: float, along: Stretches) -> Float[ndarray,
     for j in reversed(range(len(bodies))):
         body, (turn, spin, angular, linear) = bodies[j], frames[j]
         lever = _fixed(body.lever, turn)
-        own = body.mass * (linear + times(angular, lever) + times(spin, times(spin, lever)))
+        own = body.mass * (linear + product(angular, lever) + product(spin, product(spin, lever)))
         inertia = body.moment * np.stack([np.ones_like(turn[0]), 2 * turn[0], 2 * turn[1] + 4 * turn[0] ** 2])
-        moment = times(inertia, angular) + times(spin, times(inertia, spin)) + times(lever, own)
+        moment = product(inertia, angular) + product(spin, product(inertia, spin)) + product(lever, own)
         forces[j], moments[j] = forces[j] + own, moments[j] + moment
-        found[:, j] = times(axes[j], forces[j] if body.slides else moments[j])[2]
+        found[:, j] = product(axes[j], forces[j] if body.slides else moments[j])[2]
         if body.parent >= 0:
             forces[body.parent] = forces[body.parent] + forces[j]
-            moments[body.parent] = moments[body.parent] + moments[j] + times(arms[j], forces[j])
+            moments[body.parent] = moments[body.parent] + moments[j] + product(arms[j], forces[j])
     return found
 
 

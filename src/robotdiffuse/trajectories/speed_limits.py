@@ -318,7 +318,7 @@ def _torque_slowdown(
 ) -> float:
     """How many times slower a motion must be, at least 1, for its torques to keep their limits: all torque
     but gravity's grows with the square of the speed."""
-    gravity = dynamics.holding(q)
+    gravity = dynamics.holding_torques(q)
     own = dynamics.torques(q, v, a) - gravity
     room = np.maximum(dynamics.limits - np.sign(own) * gravity, MIN_TORQUE_SHARE * dynamics.limits)
     return float(np.sqrt((np.abs(own) / room).max(initial=1.0)))

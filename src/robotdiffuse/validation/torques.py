@@ -96,7 +96,7 @@ def _farthest(q: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
 def first_excess(dynamics: Dynamics, pieces: Pieces, slack: float) -> TorqueExcess | None:
     """The first torque that exceeds its limit by more than a share `slack`; None if it is proved that none
     does."""
-    allowed, bends = dynamics.limits * (1 + slack), dynamics.bends(pieces.along)
+    allowed, bends = dynamics.limits * (1 + slack), dynamics.second_derivatives(pieces.along)
     count = len(bends)
     piece, low, high = np.arange(count), np.zeros(count), np.ones(count)
 

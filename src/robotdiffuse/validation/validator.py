@@ -293,7 +293,7 @@ class Verifier:
             float(np.interp(beyond.place, np.arange(len(clock)), clock)),
             self.robot.joint_names[beyond.joint],
         )
-        message = self.dynamics.words(beyond.joint, beyond.torque) + what
+        message = self.dynamics.torque_message(beyond.joint, beyond.torque) + what
         return [Violation("torque", at, message, name, None, beyond.excess)]
 
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:

@@ -1,4 +1,4 @@
-"""Pairs of links that never, always or by default collide, on arms made by hand; what the spheres add."""
+"""Allowed collisions on arms made by hand: pairs of links that never, always or by default collide."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +42,7 @@ def test_arm_that_cannot_fold_is_not() -> None:
 
 
 def test_rare_collision_is_found_by_descent() -> None:
-    """The links touch only within a hundredth of the range of both joints, which 100 samples miss."""
+    """The links collide only in a hundredth of the range of both joints, which 100 samples miss."""
     robot = limited(box_arm(), 2.2)
     few = SamplingSettings(samples=100)
     for seed in range(3):
@@ -52,7 +52,7 @@ def test_rare_collision_is_found_by_descent() -> None:
 
 
 def overlapping(lower: float, own: bool = True) -> Robot:
-    """Link a and, two joints on, link c, whose meshes overlap while joint 2 is near zero."""
+    """Links a and c, two joints apart, whose meshes overlap while joint 2 is near zero."""
     z = np.array([0, 0, 1.0])
     kind = "revolute" if own else "fixed"
     joints = [
@@ -91,7 +91,7 @@ def test_tool_that_collides_in_the_default_pose_is_checked() -> None:
 
 
 def test_what_a_link_carries_is_the_arms_own() -> None:
-    """Fetch's bellows: fixed to the lift, within the base while that is down."""
+    """Like Fetch's bellows: fixed to the lift, and inside the base while the lift is down."""
     robot = with_middle(overlapping(0.0, own=False))
     turn = Joint("4", "revolute", "m", "hand", np.eye(4), np.array([0, 0, 1.0]), -1.0, 1.0)
     assert reasons(replace(robot, tip="hand", joints=(*robot.joints, turn)))["a", "c"] == "default"
@@ -103,7 +103,7 @@ def test_what_a_link_carries_is_the_arms_own() -> None:
     ids=["where it overlaps", "elsewhere", "two joints"],
 )
 def test_what_a_link_carries_on_a_held_joint_is_the_arms_own(held: dict[str, float], found: str) -> None:
-    """The bellows of the vendor's Fetch hang from a joint of their own, which planning holds."""
+    """The bellows of the vendor's Fetch have a joint of their own, which planning holds."""
     robot, z = with_middle(overlapping(0.0)), np.array([0, 0, 1.0])
     *rest, bellows = robot.joints
     carried = [Joint("3", "prismatic", "m", "c", bellows.T_parent_joint, z, 0.0, 1.0)]
@@ -117,7 +117,7 @@ def test_what_a_link_carries_on_a_held_joint_is_the_arms_own(held: dict[str, flo
 
 @pytest.mark.parametrize(("bend", "found"), [(2.2, "pose"), (2.1, "checked")])
 def test_what_touches_in_a_named_pose_is_allowed(bend: float, found: str) -> None:
-    """Tucked arms lie upon each other."""
+    """Links of tucked arms touch each other."""
     arm = box_arm()
     pose = dict(zip(arm.joint_names, (0.0, 2.2, bend), strict=True))
     assert reasons(replace(arm, poses={"tucked": pose}))["l1", "l3"] == found
@@ -125,8 +125,8 @@ def test_what_touches_in_a_named_pose_is_allowed(bend: float, found: str) -> Non
 
 @pytest.mark.parametrize(("bound", "found"), [(2.5, "limits"), (3.1, "checked")])
 def test_what_one_joint_folds_into_up_to_its_stop_is_allowed(bound: float, found: str) -> None:
-    """Baxter's forearm and wrist collide by mesh in half of the bend's range; its arm never does. Of a joint
-    that turns all the way round, the range says nothing."""
+    """The meshes of Baxter's forearm and wrist collide in half of the joint's range; the real links never do.
+    The range of a joint that makes a full turn proves nothing."""
     wide = limited(box_arm(), bound)
     last = wide.joint_names[2]
     joints = (replace(j, lower=-0.2, upper=0.2) if j.name == last else j for j in wide.joints)
@@ -162,7 +162,7 @@ def test_share_of_collisions_by_hand() -> None:
 
 
 def test_links_stand_to_each_other_as_seen_from_the_base() -> None:
-    """Poses of some links alone begin where the ways to them part."""
+    """Poses of wanted links are relative to their last common ancestor."""
     robot = load_robot("panda")
     links = Links(robot)
     q = links.random(3, np.random.default_rng(0))
@@ -183,7 +183,7 @@ def test_same_seed_same_pairs() -> None:
 
 
 def test_bundled_panda_has_the_expected_pairs() -> None:
-    """Those of MoveIt's Panda that stand for real contacts, and the hand against the forearm."""
+    """Checked pairs include those of MoveIt's Panda with real contacts, and the hand against the forearm."""
     checked = set(map(frozenset, load_robot("panda").checked_pairs()))
     for a in ("panda_link0", "panda_link1", "panda_link2"):
         for b in ("panda_link5", "panda_link6", "panda_link7", "panda_hand", "panda_leftfinger"):

@@ -1,4 +1,4 @@
-"""A flange that turns within a fork, closer to it than spheres can tell: a table over the joints between."""
+"""Table over the joints between a fork and a flange that rotates in it, closer than spheres can resolve."""
 
 from dataclasses import replace
 from functools import cache
@@ -36,7 +36,7 @@ def box(size: tuple[float, ...], at: tuple[float, ...]) -> Surface:
 
 
 def disc(radius: float, thickness: float) -> Surface:
-    """About the x axis."""
+    """Rotation about the x axis."""
     turned = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
     mesh = trimesh.creation.cylinder(radius, thickness, transform=turned)
     return Surface(np.array(mesh.vertices), np.array(mesh.faces))
@@ -44,8 +44,7 @@ def disc(radius: float, thickness: float) -> Surface:
 
 @cache
 def made() -> Prepared:
-    """A flange, 3 mm from either prong of a fork wherever it is turned; bent far back, it hits what holds
-    them."""
+    """A flange 3 mm from both prongs of a fork at any angle; bent far back, it hits the base of the fork."""
     y, x, rates = np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), (2.0, 8.0, 80.0)
     joints = (
         Joint("bend", "revolute", "fork", "wrist", np.eye(4), y, -3.0, 3.0, *rates),
@@ -64,7 +63,8 @@ def made() -> Prepared:
 
 
 def shares(robot: Robot) -> tuple[float, int]:
-    """Of the configurations that are free by the meshes those refused, and the number wrongly called free."""
+    """Fraction of free configurations with false collisions, and the number of configurations wrongly called
+    free."""
     q = np.random.default_rng(3).uniform(robot.lower, robot.upper, (3000, robot.dof))
     checker = CollisionChecker(robot, Scene())
     free, exact = checker.free(q), ~ExactCollision(robot, Scene()).collides(q)
@@ -127,7 +127,7 @@ def test_tables_say_no_more_than_the_parts(pair: tuple[str, str]) -> None:
 
 
 def test_intervals_are_apart_if_all_that_is_within_them_is() -> None:
-    """Along a joint that ends, and along one that turns on and on."""
+    """Intervals along a joint with limits, and along a continuous one."""
     rng = np.random.default_rng(0)
     apart = rng.random((8, 8)) < 0.9
     table = LinkPairTable(PAIR, ("a", "b"), (-1.0, -np.pi), (1.0, np.pi), apart)

@@ -1,4 +1,4 @@
-"""Convex parts hold their mesh, follow it closely, and stay few and simple."""
+"""Convex parts contain their mesh, follow it closely, and are few and simple."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def _together(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def boxes(*corners: tuple[tuple[float, ...], tuple[float, ...]]) -> trimesh.Trimesh:
-    """Axis-aligned boxes [low, high] in one mesh, as they are: with inner walls where they meet."""
+    """Axis-aligned boxes [low, high] concatenated to one mesh, with inner walls where they meet."""
     made = [
         trimesh.creation.box(
             np.subtract(high, low),
@@ -50,7 +50,7 @@ MESHES = {"L": L, "frame": FRAME, "tube": TUBE, "bowl": BOWL}
 
 
 def beyond(parts: tuple, points: np.ndarray) -> np.ndarray:
-    """How far points are outside of the nearest part, at most."""
+    """Largest distance of points from the nearest part."""
     return np.min([(points @ n.T - o).max(1) for n, o in map(planes_of, parts)], axis=0)
 
 
@@ -72,14 +72,14 @@ def test_an_l_is_two_parts_of_its_own_volume() -> None:
 
 
 def test_a_frame_stays_open() -> None:
-    """No single cut makes its hull smaller: it must not stop there."""
+    """No single cut reduces the volume of the hull; cutting must continue nevertheless."""
     parts = convex_parts((surface(FRAME),))
     assert 4 <= len(parts) <= 6
     assert beyond(parts, np.array([[0.2, 0.05, 0.2]]))[0] > 0.1
 
 
 def test_parts_stick_out_little_about_tight_places() -> None:
-    """A wide hole is filled where that is allowed, but not beside the place where something passes."""
+    """A wide hole is filled within the tolerance, but not near a tight place."""
     coarse = PartSettings(concavity=0.2)
     tight = np.array([[0.06, 0.05, 0.06]])
     whole = convex_parts((surface(FRAME),), coarse)

@@ -1,4 +1,4 @@
-"""Covering spheres: every surface point inside, little sticking out; on shapes with sharp and round edges."""
+"""Covering spheres contain every surface point and stick out little, on shapes with sharp and round edges."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_spheres_cover_and_hardly_stick_out(name: str) -> None:
     assert covered(meshes, spheres)
     assert gaps(surface_samples(meshes, 20_000, 1), spheres).max() <= 1e-9
     assert stick_out(solid, spheres).max() <= TOLERANCE + solid.spacing
-    # by an independent way: points of the spheres against the solid
+    # independent check: points on the spheres against the solid
     rng = np.random.default_rng(2)
     unit = rng.normal(size=(200, 3))
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
@@ -59,7 +59,7 @@ def test_spheres_cover_and_hardly_stick_out(name: str) -> None:
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_nothing_inside_is_left_open(name: str) -> None:
-    """A point of a cloud could hide in a hole."""
+    """A point of a cloud could be missed in a hole."""
     meshes = SHAPES[name]
     solid = Solid.of(meshes, TOLERANCE)
     spheres = fit_spheres(solid, Bounds(TOLERANCE), np.random.default_rng(0), QUICK)
@@ -71,19 +71,21 @@ def test_nothing_inside_is_left_open(name: str) -> None:
 
 
 def test_grid_knows_signed_distances() -> None:
-    """Against the distance of a box by hand, and the inner corner of an L."""
+    """Compared with the distance of a box by hand, and at the inner corner of an L."""
     solid = Solid.of(SHAPES["box"], TOLERANCE)
     points, half = solid.points, np.array([0.05, 0.03, 0.1])
     beyond = np.abs(points) - half
     np.testing.assert_allclose(solid.distance.ravel(), beyond.max(1), atol=1e-9)
-    # inside two boxes that share a wall the wall is no surface
+    # a wall shared by two boxes is not surface
     two = Solid.of((box((0.1, 0.1, 0.1)), box((0.1, 0.1, 0.1), (0.1, 0, 0))), TOLERANCE)
-    assert two.inscribed_sizes().at(np.array([[0.05, 0.0, 0.0]]))[0] == pytest.approx(0.05, abs=two.spacing / 2)
+    assert two.inscribed_sizes().at(np.array([[0.05, 0.0, 0.0]]))[0] == pytest.approx(
+        0.05, abs=two.spacing / 2
+    )
 
 
 @pytest.mark.parametrize("size", [(0.002, 0.002, 0.002), (0.03, 0.02, 0.0005)])
 def test_what_is_finer_than_the_grid_is_covered_too(size: tuple[float, float, float]) -> None:
-    """Baxter's sonar ring is a ball of 1 mm: no point of the grid is inside."""
+    """Baxter's sonar ring is a ball of 1 mm, with no grid point inside."""
     meshes = (box(size),)
     solid = Solid.of(meshes, 0.009)
     spheres = fit_spheres(solid, Bounds(0.004), np.random.default_rng(0), QUICK)
@@ -91,7 +93,7 @@ def test_what_is_finer_than_the_grid_is_covered_too(size: tuple[float, float, fl
 
 
 def test_what_neighbours_hide_wholly_is_covered_too() -> None:
-    """Baxter's sonar ring is within its torso: room without end was no number."""
+    """Baxter's sonar ring is inside its torso; unlimited sphere sizes gave NaN."""
     solid = Solid.of((box((0.01, 0.01, 0.01)),), TOLERANCE)
     hidden = Bounds(TOLERANCE, lambda points: np.ones(len(points), dtype=bool))
     assert np.isfinite(solid.sphere_sizes(hidden).grid).all()
@@ -142,7 +144,7 @@ def test_covered_finds_a_small_gap() -> None:
 
 
 def two_cylinders() -> Robot:
-    """Two upright cylinders, the upper one turning on the lower one."""
+    """Two upright cylinders; the upper one rotates on the lower one."""
     can = convex_hull(
         np.array(trimesh.creation.cylinder(0.05, 0.2, sections=48).vertices) + np.array([0, 0, 0.1])
     )

@@ -1,4 +1,4 @@
-"""Awkward URDFs: each is prepared and plans a motion, or is refused by one line that says what to do."""
+"""Awkward URDFs: each is prepared and plans a motion, or raises a one-line error that says what to do."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +51,7 @@ def test_what_cannot_work_is_refused_by_one_line_that_says_what_to_do(name: str,
 
 
 def on_a_lift(folder: Path, held: int) -> Path:
-    """An arm on a lift, with bellows on so many held joints that always overlap the column behind it."""
+    """An arm on a lift, with bellows on a number of held joints that always overlap the column behind it."""
     column = (
         '<collision><origin xyz="-0.2 0 0.2"/><geometry><box size="0.05 0.05 0.6"/></geometry></collision>'
     )
@@ -69,7 +69,7 @@ def on_a_lift(folder: Path, held: int) -> Path:
 
 
 def test_an_arm_with_bellows_on_a_held_joint_can_move(tmp_path: Path) -> None:
-    """Of the vendor's Fetch not one configuration was free, and the exit status was 0."""
+    """No configuration of the vendor's Fetch was free, yet the exit status was 0."""
     with coarse_grids():
         report = add_robot(
             on_a_lift(tmp_path, 1), base="base", tip="j3_link", out=tmp_path / "robot", settings=QUICK
@@ -92,7 +92,8 @@ def test_an_arm_that_is_never_free_is_refused_with_the_pair_to_allow(tmp_path: P
 
 
 def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
-    """Goals of Fetch and Baxter were refused whose arm touches the parts of the torso, but not the torso."""
+    """Goals of Fetch and Baxter collided falsely: the arm touches convex parts of the torso, but not the
+    torso."""
     walls = [
         trimesh.creation.box(np.subtract(high, low), trimesh.transformations.translation_matrix(middle))
         for low, high in (
@@ -111,7 +112,7 @@ def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
     for finer in (False, True):
         with coarse_grids(), pytest.MonkeyPatch.context() as patch:
             if not finer:
-                patch.setattr(preparation, "_closer", lambda *_: None)
+                patch.setattr(preparation, "_with_finer_parts", lambda *_: None)
             report = add_robot(urdf, tip="j3_link", out=tmp_path / str(finer), settings=settings)
         refused.append(report.false_collisions.by_parts)
         assert all(made.covered for made in report.links)
@@ -119,8 +120,8 @@ def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
 
 
 def test_an_arm_four_times_as_large_takes_no_more_spheres(tmp_path: Path) -> None:
-    """An ABB IRB140 of which a package holds a model with 3 m of reach took over 400 s: spheres 15 mm from
-    links of 2 m."""
+    """A model of an ABB IRB140 with a reach of 3 m took over 400 s, with spheres that stick out 15 mm of 2 m
+    links."""
     counts = []
     for size in (2, 8):
         length, width = 0.4 * size, 0.06 * size

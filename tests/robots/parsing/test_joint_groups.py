@@ -1,4 +1,4 @@
-"""Which joints are planned: arms, grippers, hands, groups of an SRDF, joints that follow others."""
+"""Which joints are planned: arms, grippers, hands, groups of an SRDF, mimic joints."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ END = {
         "j6_link",
     ),
 }
-"""What an arm may have at its end, by name, and where the arm ends then."""
+"""End effectors by name, and the link where the arm ends."""
 
 
 @pytest.mark.parametrize("name", END)
@@ -82,7 +82,7 @@ def test_two_arms_are_listed_and_asked_about(tmp_path: Path) -> None:
         robot = read_urdf(file, group=group)
         assert robot.joint_names == tuple(row("right_", 7))
         assert robot.locked.keys() == {*row("left_", 7), "head"}
-        assert "left_7_link" in robot.meshes  # held, and still there to be hit
+        assert "left_7_link" in robot.meshes  # held, but still checked for collisions
     with pytest.raises(InputError, match=r"unknown group of .* 'middle'; known: all, both, left, right"):
         read_urdf(file, group="middle")
 
@@ -123,7 +123,7 @@ MIMIC = '<mimic joint="grip" multiplier="-0.5" offset="0.1"/>'
 
 
 def test_mimic_joints_follow(tmp_path: Path) -> None:
-    """Also one that follows a follower, and a robot that was written and read again."""
+    """Including a mimic of a mimic joint, and a robot written to and read from a folder."""
     parts = (
         chain("j6_link", ["grip"])
         + link("b")
@@ -142,7 +142,7 @@ def test_mimic_joints_follow(tmp_path: Path) -> None:
             arm.with_locked({"third": 0.3})
 
 
-def test_linkages_of_planned_joints_are_refused_unless_they_are_held(tmp_path: Path) -> None:
+def test_mimics_of_planned_joints_raise_unless_they_are_locked(tmp_path: Path) -> None:
     follow = '<mimic joint="j2" multiplier="-1"/>'
     bar = link("bar") + joint("rod", "j1_link", "bar", more=follow)
     with pytest.raises(InputError, match=r"rod mimics j2, which is planned; .*--lock j2=VALUE"):

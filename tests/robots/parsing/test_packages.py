@@ -1,4 +1,4 @@
-"""Where mesh files and packages are found, and xacro files."""
+"""Mesh files, packages and xacro files."""
 
 import os
 import sys
@@ -65,7 +65,7 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
     assert robot.joint_names == ("j1", "j2", "j3", "j4") and "end" in robot.meshes
     digest = UrdfTree(file, {}).digest
     xacro(part / "urdf", macro.replace("0.04", "0.05"), "solid.xacro")
-    assert UrdfTree(file, {}).digest != digest  # of what it stands for, not of the file
+    assert UrdfTree(file, {}).digest != digest  # of the compiled URDF, not of the file
 
 
 def test_xacro_does_not_wait_for_a_pipe(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_xacro_does_not_wait_for_a_pipe(tmp_path: Path) -> None:
 
 
 def test_xacro_includes_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever the program runs; and a .urdf may be one."""
+    """In any working directory; a file named .urdf can contain xacro."""
     pytest.importorskip("xacrodoc")
     mesh(tmp_path / "some_arm")
     (tmp_path / "some_arm" / "part").mkdir()

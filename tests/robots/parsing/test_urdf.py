@@ -1,4 +1,4 @@
-"""Reading URDFs, writing and reading robot folders, and the way from a URDF to a robot that can be used."""
+"""Reading URDFs, writing and reading robot folders, and adding robots."""
 
 import json
 from dataclasses import replace
@@ -113,7 +113,7 @@ def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
     ],
 )
 def test_what_has_no_thickness_is_given_some(corners: list[list[float]], thin: int) -> None:
-    """A sheet, a line and a point, turned: a hull about them, by half a millimetre each way."""
+    """The hulls of a sheet, a line and a point are thickened by half a millimetre to each side."""
     turned = np.array(corners, float) @ rotation_from_rpy(0.3, -0.8, 1.2).T
     hull = convex_hull(turned)
     solid = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
@@ -285,7 +285,7 @@ def test_velocity_limits_that_make_motions_endless_are_refused(tmp_path: Path) -
 
 def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
-    # balls, which are fitted in no time
+    # balls, because they are fitted quickly
     balls = ARM.replace(BOX, '<sphere radius="0.15"/>').replace(TUBE, '<sphere radius="0.1"/>')
     file, steps = urdf(tmp_path, balls), []
     report = add_robot(
@@ -304,7 +304,7 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(InputError, match=r"known: .*panda, .*tiny"):
         load_robot("other")
 
-    # a changed URDF is another robot: it is fitted anew, and kept
+    # a changed URDF is another robot, prepared and stored anew
     larger = urdf(tmp_path, balls.replace('radius="0.15"', 'radius="0.16"'))
     changed = load_robot(larger)
     assert any("spheres were fitted" in note for note in changed.notes)
@@ -318,7 +318,7 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
 def test_add_refuses_what_cannot_work(tmp_path: Path) -> None:
     joint = "<joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"
     bare = f"<robot name='bare'><link name='a'/><link name='b'/>{joint}</robot>"
-    with pytest.raises(InputError, match="collision geometry"):
+    with pytest.raises(InputError, match="no link has collision or visual geometry"):
         add_robot(urdf(tmp_path, bare), out=tmp_path / "bare")
     with pytest.raises(InputError, match="robot name"):
         add_robot(urdf(tmp_path), name="../up")
