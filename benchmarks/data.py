@@ -83,7 +83,11 @@ class Found(NamedTuple):
 
 
 def searched(
-    settings: GenerationSettings, checker: CollisionChecker, drawn: SampledProblem, seed: int, marks: tuple[float, ...]
+    settings: GenerationSettings,
+    checker: CollisionChecker,
+    drawn: SampledProblem,
+    seed: int,
+    marks: tuple[float, ...],
 ) -> Iterator[Found]:
     """The path of the search at these CPU times [s], and where it ends by itself."""
     began = time.process_time()

@@ -49,7 +49,6 @@ def test_the_search_works_without_a_server(site: Path) -> None:
 
 
 def test_the_command_reference_has_every_option(site: Path) -> None:
-    import robotdiffuse as rd
 
     page = (site / "reference" / "commands.html").read_text(encoding="utf-8")
     for word in (

@@ -146,7 +146,9 @@ def test_levers_are_within_reach() -> None:
     work = kernel.make_work(rows)
     for q in rng.uniform(robot.lower, robot.upper, (100, robot.dof)):
         kernel.evaluate(rows, q, 0, work)
-        assert (work.levers[0, 0, : rows.chain_length[0]] <= rows.lever_bounds[0, : rows.chain_length[0]] + 1e-12).all()
+        assert (
+            work.levers[0, 0, : rows.chain_length[0]] <= rows.lever_bounds[0, : rows.chain_length[0]] + 1e-12
+        ).all()
 
 
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)

@@ -181,7 +181,8 @@ def print_preparation(report: "AddReport") -> None:
         (of.link, of.parts, of.spheres, of.stick_out, "yes" if of.covered else "no") for of in report.links
     ]
     share = [
-        Column(name, "%", ".1f", scale=100.0) for name in ("colliding", "falsely by parts", "falsely by spheres")
+        Column(name, "%", ".1f", scale=100.0)
+        for name in ("colliding", "falsely by parts", "falsely by spheres")
     ]
     pairs = [
         (", ".join(of.links), of.colliding, of.by_parts, of.by_spheres)
