@@ -5,7 +5,8 @@ import sys
 from typing import NoReturn
 
 GC_THRESHOLD = 10_000
-"""New objects between two garbage collections. Imports create half a million objects, none of them garbage."""
+"""New objects between two garbage collections. Imports create half a million objects, none of them
+garbage."""
 
 
 def main() -> int:

@@ -426,5 +426,5 @@ def test_the_least_limit_of_jerk_costs_little_more_than_it_must() -> None:
     """With the accelerations of seven fixed shares of the limits it was 20 times the least."""
     robot = arm((20.0,), (80.0,))
     t = time_parameterize(robot, path(robot, [[0.0], [1.0]]), always, always, TimingSettings(jerk=MIN_JERK))
-    least = (32 / LEAST_JERK) ** (1 / 3)
+    least = (32 / MIN_JERK) ** (1 / 3)
     assert least <= t.duration < 1.4 * least

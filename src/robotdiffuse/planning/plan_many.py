@@ -40,8 +40,8 @@ def plan_many(
 
     A problem that raises an error, or kills its process, has a result with status ERROR; the others continue.
     Processes import the main script: without the line `if __name__ == "__main__":` above what it does, all
-    results have status ERROR. Each process compiles or loads its kernels before its first problem, outside the
-    time limit.
+    results have status ERROR. Each process compiles or loads its kernels before its first problem, outside
+    the time limit.
 
     Raises InputError at once for an unknown planner, settings or weights that do not fit it, unknown
     arguments or arguments out of bounds, and a number of workers below 1.

@@ -220,8 +220,8 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     length = float(np.linalg.norm(way))
     if length < MIN_LINE_LENGTH:
         raise InputError(
-            f"cartesian_line: {line.frame} is {1e3 * length:.2g} mm from its goal position; a line must be at "
-            f"least {1e3 * MIN_LINE_LENGTH:g} mm long"
+            f"cartesian_line: {line.frame} is {1e3 * length:.2g} mm from its goal position; a line must be "
+            f"at least {1e3 * MIN_LINE_LENGTH:g} mm long"
         )
     place = transform(T_start[:3, 3] + way / 2, rotation_z_to(way / length))
     half = np.array([0.0, 0.0, length / 2])

@@ -404,7 +404,8 @@ def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float
     unit = "m" if joint.kind == "prismatic" else "rad"
     if not abs(value) <= MAX_COORDINATE:
         raise InputError(
-            f"{field}: {joint.name} is {value}; it must be a finite number within ±{MAX_COORDINATE:g} [{unit}]"
+            f"{field}: {joint.name} is {value}; "
+            f"it must be a finite number within ±{MAX_COORDINATE:g} [{unit}]"
         )
     if joint.kind == "continuous":
         return float(value)

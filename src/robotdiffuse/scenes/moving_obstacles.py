@@ -207,8 +207,8 @@ def _times(name: str, value: object) -> Float[ndarray, "k"]:
     times = numbers(value)
     if times is None or times.ndim != 1 or len(times) < 2 or not within(times, MAX_DURATION):
         raise InputError(
-            f"{name}.times is {shown(value)}; it must be two or more times within ±{MAX_DURATION:g} s, one for "
-            "each of the poses"
+            f"{name}.times is {shown(value)}; it must be two or more times within ±{MAX_DURATION:g} s, one "
+            "for each of the poses"
         )
     backwards = np.flatnonzero(np.diff(times) <= 0)
     if len(backwards):
