@@ -1,4 +1,4 @@
-"""Arguments of the wrong type are an InputError of one line, for every public function that takes them."""
+"""Arguments of the wrong type are an InputError of one line, for every public function that takes them.
 
 In a process of its own: in this one beartype, which tests switch on, would refuse it first.
 """

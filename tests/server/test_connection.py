@@ -1,4 +1,4 @@
-"""Clients that speak no HTTP, send or read too slowly, or disconnect; found by tests/helpers/fuzz/server.py."""
+"""Clients that speak no HTTP, send or read too slowly, or disconnect; found by tests/helpers/fuzz."""
 
 import asyncio
 import json
