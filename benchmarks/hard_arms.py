@@ -2,19 +2,18 @@
 
     python benchmarks/hard_arms.py [--robots baxter_left ...] [--problems 32] [--processor-time]
 
-Hard is a problem of furniture or clutter that `aorrtc` does not solve within SOON with the seed of the
-selection; those that nothing solves within the longest limit are among them. Prints a report that is kept in
-benchmarks/results/hard_arms.txt. With --processor-time the planners' clock is this process's own, for a
-machine that others use too.
+Hard is a problem of furniture or clutter that `aorrtc` does not solve within SELECTION_LIMIT with the seed
+of the selection; those that nothing solves within the longest limit are among them. Prints a report that is
+kept in benchmarks/results/hard_arms.txt. With --processor-time the planners' clock is this process's own, for
+a machine that others use too.
 """
 
 import argparse
-import time
 from contextlib import suppress
 
 import numpy as np
-from report import header, print_table, progress
 
+from common import header, parse, print_table, progress, use_processor_time
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
@@ -24,9 +23,9 @@ from robotdiffuse.robots import ROBOTS, load_robot
 FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
 PLANNERS = ("robotdiffuse", "aorrtc")
 SEED, SELECTION = 23, 9_000
-"""Of the problems, and of the calls that select the hard ones."""
-SOON = 0.15
-"""Limit of these calls [s]."""
+"""Seeds of the problems, and of the calls that select the hard ones."""
+SELECTION_LIMIT = 0.15
+"""Time limit of the calls that select the hard ones [s]."""
 
 
 def hard_ones(name: str, count: int) -> list[Problem]:
@@ -36,11 +35,11 @@ def hard_ones(name: str, count: int) -> list[Problem]:
     while len(found) < count:
         family = FAMILIES[drawn % len(FAMILIES)]
         drawn += 1
-        with suppress(InputError):  # no free ends in many scenes
+        with suppress(InputError):  # many scenes have no free start and goal
             problem = family_for(family, robot).draw(robot, rng).problem(robot)
             if drawn == 1 or not found:
                 search.warm_up(problem, "converged")
-            if not search.plan(problem, SOON, seed=SELECTION, until="first").solved:
+            if not search.plan(problem, SELECTION_LIMIT, seed=SELECTION, until="first").solved:
                 found.append(problem)
     print(f"{name}: {count} hard problems among {drawn} draws", flush=True)
     return found
@@ -52,11 +51,11 @@ def main() -> None:
     parser.add_argument("--problems", type=int, default=32, help="for each robot (32)")
     parser.add_argument("--limits", nargs="+", type=float, default=[1.0, 4.0], help="[s] (1 4)")
     parser.add_argument("--processor-time", action="store_true", help="of this process, as the clock")
-    arguments = parser.parse_args()
+    arguments = parse(parser, robots=["baxter_right"], problems=1, limits=[0.2], processor_time=True)
     head = header("numpy", "numba")
     if arguments.processor_time:
         head += "; times of the processor"
-        time.perf_counter = time.process_time
+        use_processor_time()
     rows = []
     for name in arguments.robots:
         problems = hard_ones(name, arguments.problems)
