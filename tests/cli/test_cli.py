@@ -34,7 +34,7 @@ BAD_CALL = {
     "weights that are none": (["plan", "problem.json", "--weights", "."], "holds no model"),
     "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: a_star, aorrtc, d_star_lite"),
     "no time": (["plan", "problem.json", "--time-limit", "0"], "'0' is not a positive number"),
-    "unknown end": (["plan", "problem.json", "--until", "soon"], "'first', 'short', 'limit'"),
+    "unknown end": (["plan", "problem.json", "--until", "soon"], "'first', 'converged', 'time_limit'"),
     "negative clearance": (["plan", "problem.json", "--clearance", "-1"], "'-1' is not a number of at le"),
     "scaled too far": (["plan", "problem.json", "--velocity-scaling", "2"], "'2' is not between 0 and 1"),
     "endless time": (["plan", "problem.json", "--time-limit", "inf"], "'inf' is not a positive number"),
@@ -59,7 +59,7 @@ BAD_CALL = {
     "no condition at all": ([*TRAIN, "--condition-drop", "1"], "condition_drop is 1.0"),
     "unknown device": ([*TRAIN, "--device", "tpu"], "known: cpu, cuda"),
     "no data workers": ([*TRAIN, "--workers", "0"], "'0' is not an integer of at least 1"),
-    "workers for existing data": ([*TRAIN, "--workers", "2"], "--workers is for data that are made"),
+    "workers for existing data": ([*TRAIN, "--workers", "2"], "--workers is for data to be generated"),
 }  # fmt: skip
 
 

@@ -1,15 +1,11 @@
 """The command `train`: options, and data that are generated during the training."""
 
-import multiprocessing
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from helpers.commands import run
-from robotdiffuse.datasets.manifest import write_manifest
-from robotdiffuse.generation import GenerationSettings
-from robotdiffuse.generation.factory import manifest_of
 from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
@@ -56,15 +52,3 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         device="cpu",
     )
     assert row.denoiser == "decoder_only" and row.denoiser_settings is None
-
-
-def test_data_that_cannot_be_made_meanwhile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One line, before training begins."""
-    out = tmp_path / "data"
-    out.mkdir()
-    manifest = manifest_of(GenerationSettings())
-    write_manifest(out, replace(manifest, versions=manifest.versions | {"numpy": "0"}))
-    assert run(*TRAIN, "--data", out, "--generate", 1) == 2
-    error = capsys.readouterr().err
-    assert "was begun with numpy 0" in error and error.count("\n") == 1
-    assert not multiprocessing.active_children()

@@ -113,7 +113,7 @@ def test_bad_input_is_a_clear_line(
     assert "unknown robot 'ur5x'; known: " in error("--robot", "ur5x")
     assert "give --robot to generate data" in error()
     assert "--data needs --out" in error("--data", str(tmp_path))
-    assert "--trajectories sets the number of motions" in error(
+    assert "--trajectories is for data to be generated" in error(
         *("--data", str(tmp_path), "--out", "x", "--trajectories", "3")
     )
     full = type("Usage", (), {"free": 1_000_000})

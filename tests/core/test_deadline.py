@@ -62,7 +62,7 @@ def test_timing_is_begun_a_little_late_too() -> None:
 def test_a_motion_whose_timing_takes_too_long_is_a_time_out(
     more: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(speed_limits, "ROW_SECONDS", 1e3)
+    monkeypatch.setattr(speed_limits, "SECONDS_PER_ROW", 1e3)
     result = RRTConnect().plan(problem(), 20.0, **more)
     assert result.status is Status.TIMEOUT
     assert "time limit of 20 s is too short for timing: there was no time for the" in result.reason
@@ -75,7 +75,7 @@ def test_a_start_velocity_whose_timing_takes_too_long_is_a_time_out(monkeypatch:
 
     def then_slow(*arguments: object) -> object:
         found = attempt(*arguments)  # type: ignore[arg-type]
-        monkeypatch.setattr(speed_limits, "ROW_SECONDS", 1e3)
+        monkeypatch.setattr(speed_limits, "SECONDS_PER_ROW", 1e3)
         return found
 
     monkeypatch.setattr(start_velocity, "attempt", then_slow)

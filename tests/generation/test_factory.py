@@ -220,7 +220,7 @@ def test_unknown_kinds_are_refused_with_those_known(name: str, known: str) -> No
 def test_scenes_out_of_reach_are_refused() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rop, "ROP", replace(rop.ROP, tip_x=(5.0, 5.1)))
-        patch.setattr(family, "SCENES", 2)
+        patch.setattr(family, "MAX_SCENES", 2)
         with pytest.raises(InputError, match="no free start and goal in 2 scenes of Rop for panda"):
             make_shard(replace(SETTINGS, mix={"rop": 1.0}), 0)
 

@@ -128,7 +128,10 @@ def test_files_keep_views_and_policy(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"unknown": "hopeful"}, "unknown policy in unknown: 'hopeful'; known: predicted, occupied"),
+        (
+            {"unknown": "hopeful"},
+            "unknown policy in unknown: 'hopeful'; known: occupied, optimistic, padded, predicted",
+        ),
         ({"views": 3}, "views is 3"),
         ({"views": [view(BALL_ROW, np.zeros(3))]}, r"views\[0\].configuration has 3 values; panda has 7"),
     ],

@@ -1,8 +1,5 @@
 """Depth images and point clouds of simulated cameras."""
 
-import runpy
-from pathlib import Path as FilePath
-
 import numpy as np
 import pytest
 
@@ -176,12 +173,3 @@ def test_a_world_without_surfaces_cannot_be_looked_at() -> None:
         pytest.raises(InputError, match=r"World\(\.\.\., visuals=True\)"),
     ):
         render(world, CAMERA)
-
-
-def test_example(capsys: pytest.CaptureFixture[str]) -> None:
-    runpy.run_path(str(FilePath(__file__).parents[2] / "examples" / "depth_camera.py"))
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split(",")[0] for line in lines[::3]] == ["1 camera(s)", "2 camera(s)"]
-    assert all("solved" in line for line in lines[::3])
-    assert all(line.startswith("  in the whole scene: ") for line in lines[1::3])
-    assert all(line.startswith("  in simulation: ") for line in lines[2::3])

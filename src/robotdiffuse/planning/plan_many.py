@@ -80,10 +80,12 @@ def _planned(
     def one(problem: Problem) -> PlanResult:
         if not_started:  # nor would the next process
             return _error(loaded[0], problem, str(not_started[0]), request)
-        asked = tuple(getattr(problem, field.name) for field in fields(problem) if field.name != "robot")
+        values = {
+            field.name: getattr(problem, field.name) for field in fields(problem) if field.name != "robot"
+        }
         worker = idle.get()
         try:
-            return replace(worker.call(_plan, number[problem.robot], asked), problem=problem)
+            return replace(worker.call(_plan, number[problem.robot], values), problem=problem)
         except NotStartedError as error:
             not_started.append(error)
             return _error(loaded[0], problem, str(error), request)
@@ -126,9 +128,9 @@ def _prepare(loaded: PlannerArguments, robots: list[Robot], request: PlanRequest
     _state = _State(load_planner(*loaded), robots, request, set())
 
 
-def _plan(robot: int, asked: tuple) -> PlanResult:
+def _plan(robot: int, values: dict[str, Any]) -> PlanResult:
     assert _state is not None
-    problem = Problem(_state.robots[robot], *asked)
+    problem = Problem(_state.robots[robot], **values)
     if problem.robot not in _state.warm:
         _state.planner.warm_up(problem)
         _state.warm.add(problem.robot)

@@ -491,7 +491,10 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
         "joint_constraints alone, or be the only goal",
     ),
     "position alone": (pose_request(["orientation_constraints"], []), "one position and one orientation"),
-    "two links": (pose_request(["orientation_constraints", 0, "link_name"], "x"), "must be one link"),
+    "two links": (
+        pose_request(["orientation_constraints", 0, "link_name"], "x"),
+        "both must constrain one link",
+    ),
     "offset": (pose_request(["position_constraints", 0, "target_point_offset"], [0, 0, 1]), "must be zero"),
     "region": (pose_request(["position_constraints", 0, "constraint_region"], {}), "has 0 primitive_poses"),
 }

@@ -12,7 +12,7 @@ import pytest
 
 from robotdiffuse.cli import main
 
-pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
+pytest.importorskip("viser", reason="live needs viser: pip install 'robotdiffuse[live]'")
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_bad_input_is_one_line(wrong, monkeypatch: pytest.MonkeyPatch) -> None:
     ]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "the page needs viser: pip install 'robotdiffuse[live]'" in wrong()
+    assert "live needs viser: pip install 'robotdiffuse[live]'" in wrong()
 
 
 def status(url: str, **fields: str) -> int:

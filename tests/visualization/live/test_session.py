@@ -78,7 +78,7 @@ def test_a_motion_is_planned_validated_and_certified(session: Session) -> None:
         "first path",
         "planning",
         "timing",
-        "validating once more",
+        "validating again",
     ]
 
 

@@ -47,7 +47,9 @@ class PlannerProcess:
     def __init__(self, spec: PlannerSpec, log: FilePath) -> None:
         """`log`: the process's output is appended to this file."""
         entries = {what: {n: astuple(e) for n, e in table.items()} for what, table in added_entries().items()}
-        self._process = LineProcess([*COMMAND, spec.text, json.dumps([sys.path, entries])], log)
+        self._process = LineProcess(
+            [*COMMAND, spec.text, json.dumps([sys.path, entries], default=sorted)], log
+        )
 
     def warm(self, run: Run) -> None:
         """Warm up for a run's robot. If the process dies of that, `plan` will report it."""
@@ -153,7 +155,12 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"  # of PyTorch, which only planners with a network load
     path, entries = json.loads(sys.argv[2])
     sys.path += [place for place in path if place not in sys.path]
-    adopt_entries({what: {n: Entry(*e) for n, e in table.items()} for what, table in entries.items()})
+    adopt_entries(
+        {
+            what: {n: Entry(*e[:-1], frozenset(e[-1])) for n, e in table.items()}
+            for what, table in entries.items()
+        }
+    )
     spec = PlannerSpec.parse(sys.argv[1])
     serve(spec.load(), spec.request(), sys.stdin, answers)
 
