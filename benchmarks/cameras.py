@@ -427,6 +427,7 @@ def main() -> None:
 
 def smoke(arguments: argparse.Namespace) -> None:
     """Run every part on one problem."""
+    print(header("numba", "numpy", "torch"))
     use_processor_time()
     with TemporaryDirectory() as folder:
         arguments.records = f"{folder}/records.jsonl"

@@ -280,7 +280,7 @@ def main() -> None:
         "called free of these",
         "refused of free",
     ]
-    print_table("Covering spheres against exact meshes (Coal)", [*columns, "refused of free"], rows)
+    print_table("Covering spheres against exact meshes (Coal)", columns, rows)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator
-from dataclasses import astuple
+from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import TextIO
 
@@ -46,7 +46,7 @@ class PlannerProcess:
 
     def __init__(self, spec: PlannerSpec, log: FilePath) -> None:
         """`log`: the process's output is appended to this file."""
-        entries = {what: {n: astuple(e) for n, e in table.items()} for what, table in added_entries().items()}
+        entries = {what: {n: asdict(e) for n, e in table.items()} for what, table in added_entries().items()}
         self._process = LineProcess(
             [*COMMAND, spec.text, json.dumps([sys.path, entries], default=sorted)], log
         )
@@ -157,7 +157,7 @@ def main() -> None:
     sys.path += [place for place in path if place not in sys.path]
     adopt_entries(
         {
-            what: {n: Entry(*e[:-1], frozenset(e[-1])) for n, e in table.items()}
+            what: {n: Entry(**(e | {"supports": frozenset(e["supports"])})) for n, e in table.items()}
             for what, table in entries.items()
         }
     )
