@@ -168,7 +168,7 @@ def test_a_call_loads_the_network_in_its_own_time_or_not_at_all(monkeypatch):
     planner.load_wanted(PANDA)
     assert loaded == [PANDA]
     planner.plan(PROBLEM, time_limit=0.5, until="time_limit")
-    assert len(loaded) > 1, "at hand, it is used"
+    assert len(loaded) > 1, "once loaded, it is used"
     loaded.clear()
     fresh = RobotDiffuse()
     fresh.load_wanted(PANDA)
