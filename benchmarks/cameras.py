@@ -34,7 +34,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -42,9 +41,7 @@ from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.evaluation.statistics import compare, wilson_interval
-from robotdiffuse.learning.checkpoint import load_completion
-from robotdiffuse.learning.completion import bundled, predict
-from robotdiffuse.learning.completion.network import CompletionNetwork
+from robotdiffuse.learning.completion import Completion, exported_completion, predict
 from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
 from robotdiffuse.perception.confidence import MIN_RISK, confidence
 from robotdiffuse.perception.depth_view import DepthView
@@ -117,7 +114,7 @@ def views(problem: Problem, family: str, number: int, count: int, noisy: bool) -
     return taken
 
 
-def plan(problem: Problem, partial: Problem, method: str, network: CompletionNetwork | None = None) -> Row:
+def plan(problem: Problem, partial: Problem, method: str, network: Completion | None = None) -> Row:
     """A record of a method that plans on `partial`, what was seen, and is validated in the true scene.
 
     `network` predicts in place of the bundled one.
@@ -152,7 +149,7 @@ def is_free(problem: Problem, result: PlanResult) -> bool:
 
 def run(arguments: argparse.Namespace) -> None:
     """Make the records that are missing."""
-    networks = {BY + Path(folder).name: load_completion(folder) for folder in arguments.weights}
+    networks = {BY + Path(folder).name: exported_completion(folder) for folder in arguments.weights}
     methods = [*arguments.methods, *networks]
     kept = JsonLines(Path(arguments.records))
     place = {"views": arguments.views, "noise": arguments.noise}
@@ -277,20 +274,14 @@ def times(families: list[str]) -> None:
     for family in families:
         problem = held_out_problem(family, 0)
         seen = observe(views(problem, family, 0, 1, False), problem.robot, problem.start)
-        volumes.append([torch.from_numpy(array)[None] for array in pack(seen)])
-    torch.set_num_threads(1)
-    spent = {"fp32": list[float](), "bf16": list[float]()}
+        volumes.append(pack(seen))
+    network, spent = exported_completion(), list[float]()
     for i in range(TIMED_CALLS + WARM_UP_CALLS):
-        for name, taken in spent.items():
-            with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=name == "bf16"):
-                began = time.process_time()
-                bundled().probabilities(*volumes[i % len(volumes)])
-                taken.append(time.process_time() - began)
-    for name, taken in spent.items():
-        least, median = 1e3 * min(taken[WARM_UP_CALLS:]), 1e3 * np.median(taken[WARM_UP_CALLS:])
-        print(
-            f"network in {name}: {median:.1f} ms of CPU time (median), {least:.1f} least, {TIMED_CALLS} calls"
-        )
+        began = time.process_time()
+        network(*volumes[i % len(volumes)])
+        spent.append(time.process_time() - began)
+    least, median = 1e3 * min(spent[WARM_UP_CALLS:]), 1e3 * np.median(spent[WARM_UP_CALLS:])
+    print(f"network: {median:.1f} ms of CPU time (median), {least:.1f} least, {TIMED_CALLS} calls")
 
 
 def fit(rows: list[Row]) -> None:
@@ -406,12 +397,12 @@ def main() -> None:
     if arguments.smoke:
         smoke(arguments)
     elif arguments.times:
-        print(header("torch"))
+        print(header("onnxruntime"))
         times(arguments.families)
     elif arguments.fit:
         fit(JsonLines(Path(arguments.records)).rows)
     elif arguments.report:
-        print(header("numba", "numpy", "torch"))
+        print(header("numba", "numpy", "onnxruntime"))
         rows = JsonLines(Path(arguments.records)).rows
         if arguments.next_view:
             report_next_view(rows)
@@ -427,7 +418,7 @@ def main() -> None:
 
 def smoke(arguments: argparse.Namespace) -> None:
     """Run every part on one problem."""
-    print(header("numba", "numpy", "torch"))
+    print(header("numba", "numpy", "onnxruntime"))
     use_processor_time()
     with TemporaryDirectory() as folder:
         arguments.records = f"{folder}/records.jsonl"

@@ -15,19 +15,23 @@ from rich.console import Console
 from rich.progress import track
 
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.core.types import UNTIL
+from robotdiffuse.core.types import UNTIL, Trajectory
 from robotdiffuse.evaluation.machine import about
 from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.tables import Column, Rows, Table, show
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.validator import PyBulletOracle
+from robotdiffuse.trajectories.speed_limits import jerk_limits
 
 Item = TypeVar("Item")
 WIDTH = 120
 """Of printed tables [characters]."""
 FIRST, CONVERGED, TIME_LIMIT = UNTIL
 """Values of `until`: stop at the first path, when more time stops paying, or at the time limit."""
+CHECK_STEP = 1e-4
+"""Time between the checks of a motion's limits [s]."""
 ORACLE_TOLERANCE = 0.001
 """PyBullet's own error in distances [m]."""
 
@@ -84,6 +88,14 @@ def dense(q: Float[ndarray, "n dof"], step: float) -> Float[ndarray, "m dof"]:
         count = max(int(np.ceil(np.abs(b - a).max() / step)), 1)
         parts.append(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
     return np.concatenate(parts)
+
+
+def limit_shares(robot: Robot, motion: Trajectory) -> Float[ndarray, "3"]:
+    """The largest shares of the limits of velocity, acceleration and jerk, every CHECK_STEP."""
+    at = motion.at(np.arange(0.0, motion.duration, CHECK_STEP))
+    limits = robot.velocity, robot.acceleration, jerk_limits(robot)
+    rates = at.velocities, at.accelerations, motion.peak_jerks
+    return np.array([np.abs(rate / limit).max() for rate, limit in zip(rates, limits, strict=True)])
 
 
 class MeshContacts(NamedTuple):

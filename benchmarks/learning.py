@@ -360,7 +360,7 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, help="file for the plot of guidance")
     arguments = parse(parser, parts=",".join(PARTS), families="rop", problems=2, most_steps=2)
     parts, families = parts_of(arguments.parts, PARTS), parts_of(arguments.families, FAMILIES)
-    print(header("numpy", "numba", "torch"))
+    print(header("numpy", "numba", "onnxruntime"))
     print(f"weights: {arguments.weights or 'the bundled ones'}")
     every = dict[str, list[Case]]()
     if set(parts) - {"guidance"}:

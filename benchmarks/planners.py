@@ -28,6 +28,7 @@ from common import (
     contacts_on_meshes,
     dense,
     header,
+    limit_shares,
     parse,
     parts_of,
     print_table,
@@ -35,6 +36,7 @@ from common import (
     use_processor_time,
 )
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.types import LENGTH
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.methods import planned
 from robotdiffuse.evaluation.problem_sets import gather_cases
@@ -155,7 +157,9 @@ def limits(cases: Sequence[Case]) -> None:
             over = []
             for case in progress(cases, f"{name} {limit:g} s"):
                 with Clock() as clock:
-                    result = planner.plan(case.problem, limit, until=TIME_LIMIT, clearance=0.0)
+                    result = planner.plan(
+                        case.problem, limit, until=TIME_LIMIT, clearance=0.0, objective=LENGTH
+                    )
                 over.append((1e3 * (clock.wall - limit), result.solved))
             late = np.array([o for o, _ in over])
             solved = sum(s for _, s in over)
@@ -215,11 +219,13 @@ def with_thin_obstacles(problem: Problem, rng: np.random.Generator) -> Problem:
 
 
 def collisions(motions: int, seed: int) -> None:
-    """Print how many returned motions collide on meshes, half of them in scenes with thin obstacles."""
+    """Print how many returned motions collide on meshes, half of them in scenes with thin obstacles, how many
+    stop on the way, and the largest shares of the limits of velocity, acceleration and jerk."""
     rng, rows = np.random.default_rng(seed), []
     families = [load_family(name) for name in FAMILIES]
     for name in ("aorrtc", "robotdiffuse"):
-        planner, hits, checked, configurations = load_planner(name), [0, 0], 0, 0
+        planner, hits, checked, configurations = load_planner(name), [0, 0, 0], 0, 0
+        shares = np.zeros(3)
         for i in progress(range(motions // 2), name):
             problem = families[i % len(families)].draw(PANDA, np.random.default_rng([seed, i])).problem(PANDA)
             problem = with_thin_obstacles(problem, rng) if i % 2 else problem
@@ -231,8 +237,11 @@ def collisions(motions: int, seed: int) -> None:
             contacts = contacts_on_meshes(problem, q, tolerance=0.0)
             hits[0] += contacts.coal > 0
             hits[1] += contacts.pybullet
-        rows.append((name, checked, configurations, *hits))
-    columns = ["planner", "motions", "configurations", "in collision by Coal", "by PyBullet"]
+            hits[2] += bool(result.stops)
+            shares = np.maximum(shares, limit_shares(PANDA, result.trajectory))
+        rows.append((name, checked, configurations, *hits, *(f"{share:.5f}" for share in shares)))
+    columns = ["planner", "motions", "configurations", "in collision by Coal", "by PyBullet", "with stops"]
+    columns += ["velocity", "acceleration", "jerk"]
     print_table("Returned motions on meshes", columns, rows)
 
 

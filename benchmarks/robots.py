@@ -26,6 +26,7 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import rotation_angle, transform
+from robotdiffuse.core.types import LENGTH
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
@@ -113,7 +114,8 @@ def measure(name: str, problems: int) -> Tally:
                 check(problem, result, oracle, tally)
             if i % COMPARED_EVERY == 0 and result.solved and result.stage != "straight_line":
                 ours, theirs = (
-                    p.plan(problem, SHORT, seed=i, until=TIME_LIMIT, clearance=0.0) for p in (hybrid, search)
+                    p.plan(problem, SHORT, seed=i, until=TIME_LIMIT, clearance=0.0, objective=LENGTH)
+                    for p in (hybrid, search)
                 )
                 if ours.path is not None and theirs.path is not None:
                     tally.ratios.append(ours.path.length / theirs.path.length)

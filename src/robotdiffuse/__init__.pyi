@@ -10,6 +10,7 @@ from .core.types import Path as Path
 from .core.types import Status as Status
 from .core.types import Trajectory as Trajectory
 from .datasets.loader import RopDataset as RopDataset
+from .datasets.own_motions import write_dataset as write_dataset
 from .perception.depth_view import DepthView as DepthView
 from .planning import load_planner as load_planner
 from .planning import plan as plan
@@ -31,6 +32,7 @@ from .problems.goals import PosesGoal as PosesGoal
 from .problems.problem import Problem as Problem
 from .robots import load_robot as load_robot
 from .robots.inertias import Payload as Payload
+from .scenes.height_map import HeightMap as HeightMap
 from .scenes.moving_obstacles import MovingObstacle as MovingObstacle
 from .scenes.scene import Scene as Scene
 from .scenes.shapes import Box as Box

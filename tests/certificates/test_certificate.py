@@ -183,6 +183,10 @@ def claimed_nothing(record: dict[str, Any]) -> None:
     record["self_clearance"] = 0.0
 
 
+def less_jerk(record: dict[str, Any]) -> None:
+    record["jerks"][1][1] *= 0.99
+
+
 def tighter(record: dict[str, Any]) -> None:
     record["tolerances"]["chord"] = 1e-9
 
@@ -204,6 +208,7 @@ TAMPERED = {
     removed_claim: r"proof: \w+ against [\w ]+ is missing",
     claimed_more: r"proof: \w+ against the scene from row [\d.]+ to row [\d.]+ is clear by [\d.]+ m, not by",
     claimed_nothing: "proof: its self clearance is 0 m, which is not positive",
+    less_jerk: r"jerks: that of \w+ is [\d.]+, not [\d.]+",
     looser: "tolerances: goal_tolerance is 0.5, looser than 0.0001",
     tighter: "motion: its cubics leave the straight lines that were certified",
 }
@@ -293,7 +298,7 @@ def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytes
     made, wanted = TOO_QUICK[name]
     problem, motion = made()
     report = Report(True, None, 1.0, 0.2)
-    monkeypatch.setattr("robotdiffuse.certificates.search.verify_trajectory", lambda *_: report)
+    monkeypatch.setattr("robotdiffuse.certificates.search.verify", lambda *_: report)
     found = certify(problem, motion).check(problem).differences
     assert any(wanted in line for line in found), found
     assert all(line.startswith("motion: j0 exceeds its limit of mean") for line in found), found

@@ -48,7 +48,12 @@ def certified(asked: str) -> tuple[Problem, Certificate]:
     return problem, certify(problem, result.trajectory)
 
 
-@pytest.mark.parametrize("asked", ASKED)
+def slow_with_constraints(case: str, asked: str) -> Any:
+    """A case of a test; planning with constraints takes most of a minute to compile."""
+    return pytest.param(case, marks=pytest.mark.slow if asked in ("cone", "line") else ())
+
+
+@pytest.mark.parametrize("asked", [slow_with_constraints(asked, asked) for asked in ASKED])
 def test_each_is_proved_and_its_file_holds(asked: str, tmp_path: FilePath) -> None:
     problem, certificate = certified(asked)
     certificate.save(tmp_path / "certificate.json")
@@ -107,7 +112,9 @@ TAMPERED: dict[str, tuple[str, Callable[[Certificate], Certificate], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", TAMPERED)
+@pytest.mark.parametrize(
+    "case", [slow_with_constraints(case, asked) for case, (asked, *_) in TAMPERED.items()]
+)
 def test_tampering_is_caught(case: str) -> None:
     asked, tampered, wanted = TAMPERED[case]
     problem, certificate = certified(asked)
@@ -140,7 +147,7 @@ FORGED: dict[str, tuple[str, dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", FORGED)
+@pytest.mark.parametrize("case", [slow_with_constraints(case, asked) for case, (asked, *_) in FORGED.items()])
 def test_whoever_forges_the_hashes_too_still_needs_a_proof(case: str) -> None:
     asked, other, wanted = FORGED[case]
     problem, certificate = certified(asked)
@@ -200,6 +207,7 @@ def test_bounds_in_time_are_bounds() -> None:
         assert (there.clearance >= found.clearance - found.displacement - 1e-9).all()
 
 
+@pytest.mark.slow
 def test_paths_with_constraints_are_certified_and_with_moving_obstacles_refused() -> None:
     problem, _ = certified("cone")
     path = rd.load_planner("aorrtc").plan(problem, time_limit=20.0).path

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from helpers.commands import run
 from helpers.motion_stores import line, random_motions, record, write_motions
 from robotdiffuse.robots import load_robot
@@ -100,7 +101,7 @@ BAD = {
     "check without data": (["check", "."], "no data set"),
     "view without data": (["view", "."], "no data set"),
     "export without data": (["export", ".", "x.npz"], "no data set"),
-    "import without a file": (["import", "x.npz", "--out", "y"], "cannot read x.npz"),
+    "import without a file": (["import", "x.npz", "--out", "y"], "x.npz does not exist"),
     "unknown robot": (["check", "set", "--robot", "pandaa"], "pandaa"),
     "unknown ending": (["view", "set", "--out", "x.png"], "unknown ending '.png'"),
     "page in no folder": (["info", "set", "--page", "no/x.html"], "the folder no does not exist"),
@@ -124,3 +125,15 @@ def test_missing_pybullet_is_status_2(folder, capsys, monkeypatch):
     assert run("data", "check", folder, "--workers", 1) == 2
     error = capsys.readouterr().err
     assert "--no-pybullet" in error and "pip install" in error and error.count("\n") == 1
+
+
+def test_info_on_motions_that_are_all_straight_warns_of_nothing(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    start = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+    line = start + np.linspace(0, 0.3, 5)[:, None]
+    rd.write_dataset(
+        [line] * 20, [rd.Scene([rd.Sphere([-2, 0.1 * i, 1], 0.1)]) for i in range(20)], tmp_path / "d"
+    )
+    assert run("data", "info", tmp_path / "d") == 0
+    assert not [str(warning.message) for warning in recwarn if warning.category is UserWarning]

@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from helpers.commands import GOAL, PROBLEM, START, run, write_problem
+from robotdiffuse.cli.demo import shelf_problem
 from robotdiffuse.core.results import PlanResult, load_result
+from robotdiffuse.core.types import Path as Path_
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import planner_settings
+from robotdiffuse.problems.problem import JointGoal
+from robotdiffuse.validation.validator import verify
 
 ROOT = Path(__file__).parents[2]
 
@@ -188,3 +192,33 @@ def test_example_in_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     runpy.run_path(str(ROOT / "examples" / "plan.py"))
     assert capsys.readouterr().out.startswith("solved")
     assert (tmp_path / "motion.csv").exists()
+
+
+def test_the_clearance_is_printed_beside_the_requested_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = write_problem(tmp_path, scene=[{"sphere": {"center": [0, 5, 0], "radius": 0.1}}])
+    assert run("plan", far, "--planner", "aorrtc", "--clearance", 0.02) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "certified > 1 m to the scene (asked: 20 mm), at least" in printed and "millimetres" in printed
+    assert run("plan", far, "--clearance", 5) == 2
+    assert "clearance is 5.0; it must be between 0 and 0.5" in capsys.readouterr().err
+
+
+def test_files_of_the_wrong_kind_name_the_right_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = write_problem(tmp_path)
+    PlanResult(Status.NO_PATH, "none", "aorrtc", "panda", 0.1, 0).save("result.json")
+    assert run("plan", "result.json") == 2
+    assert "it is a result, not a problem; `robotdiffuse view` draws it" in capsys.readouterr().err
+    for file in (problem, tmp_path / "problem.yaml"):
+        assert run("view", file) == 2
+        assert "it is a problem; `robotdiffuse plan" in capsys.readouterr().err
+
+
+def test_the_demo_of_another_arm_is_not_solved_by_the_straight_line() -> None:
+    problem = shelf_problem("ur5e")
+    assert isinstance(problem.goal, JointGoal)
+    lines = [Path_(problem.robot.joint_names, np.stack([problem.start, q])) for q in problem.goal.positions]
+    assert not any(verify(problem, line).valid for line in lines)

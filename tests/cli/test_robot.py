@@ -44,7 +44,7 @@ def test_robot_add_with_srdf_and_robot_list(
     assert run("robot", "list") == 0
     out = capsys.readouterr().out
     assert all(name in out for name in ("panda", "made", "by_srdf"))
-    assert len(repr(load_robot("panda")).splitlines()) <= 10
+    assert len(str(load_robot("panda")).splitlines()) <= 10
 
 
 def test_robot_info(capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from helpers.commands import run
-from robotdiffuse.learning.denoisers.unet import UNetSettings
+from robotdiffuse.learning.denoisers.settings import UNetSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
 
@@ -52,3 +52,17 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         device="cpu",
     )
     assert row.denoiser == "decoder_only" and row.denoiser_settings is None
+
+
+def test_the_bundled_encoder_is_taken_where_none_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    trained: list[PlannerTraining] = []
+
+    def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
+        trained.append(settings)
+        return {}
+
+    monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
+    assert run("train", "planner", "--data", "d", "--out", "o") == 0
+    assert trained[0].encoder == str(Path("o", "encoder")) and Path("o", "encoder", "encoder.json").is_file()
+    assert run("train", "planner", "--data", "d", "--out", "o", "--config", "table2_pointnet") == 0
+    assert trained[1].encoder == "pointnet"

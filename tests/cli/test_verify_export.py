@@ -101,5 +101,9 @@ def test_only_valid_motions_are_exported(planned: Path, capsys: pytest.CaptureFi
     assert not Path("b.yaml").exists()
     assert run("publish", planned / "r.json", "--to", "host:0") == 2
     assert "'host:0' is not HOST or HOST:PORT" in capsys.readouterr().err
+    assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "1000") == 0
+    assert Path("fine.csv").read_text().splitlines()[2].startswith("0.001,")
+    assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "-1") == 2
+    capsys.readouterr()
     assert run("export", planned / "r.json", "--out", "a.foo") == 2
     assert "known: .mcap, .rosbag2, .rrd, .yaml" in capsys.readouterr().err

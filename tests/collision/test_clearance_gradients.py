@@ -11,8 +11,10 @@ from robotdiffuse.collision.batched_clearances import packed_clearances_and_grad
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.clearance_features import link_clearances
-from robotdiffuse.learning.denoisers.transformer import TransformerSettings
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.denoisers.settings import TransformerSettings
+from robotdiffuse.learning.forward_kinematics import ForwardKinematics
+from robotdiffuse.learning.motion_model import MotionModelSettings
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.config import PlannerTraining
@@ -20,7 +22,6 @@ from robotdiffuse.learning.training.losses import ArmDistance
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
@@ -138,7 +139,7 @@ def test_the_denoiser_s_inputs() -> None:
     q = configurations(2, 16, seed=6).astype(np.float64)
     for with_gradients in (False, True):
         torch.manual_seed(0)
-        model = MotionModel(
+        model = MotionNetwork(
             RobotIdentity.of(PANDA), model_settings(waypoints=16, clearance_gradients=with_gradients)
         )
         reference = model.reference(q[:, 0], q[:, -1])

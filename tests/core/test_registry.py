@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.processes import SingleWorker, on_this_machine
 from robotdiffuse.core.registry import Entry, Registry, added_entries, adopt_entries
 from robotdiffuse.planning import PLANNERS
@@ -46,3 +47,35 @@ def test_adopted_entries_are_in_registries_made_later() -> None:
     # a worker passes them on to its own workers
     found = added_entries()
     assert (found["fruit"], found["nut"]) == ({"fig": theirs}, {"hazel": theirs})
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
+    """A registry, and an installed package with two entry points for it, one of which is broken."""
+    package = tmp_path / "orchard-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: orchard\nVersion: 1.0\n")
+    (package / "entry_points.txt").write_text(
+        "[test.fruits]\nplum = orchard:PLUM\nstone = orchard:STONE\ngone = no_such_module:GONE\n"
+    )
+    entry = (
+        "from robotdiffuse.core.registry import Entry\nPLUM = Entry('pathlib:Path', 'a plum')\nSTONE = 1\n"
+    )
+    (tmp_path / "orchard.py").write_text(entry)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return Registry("drupe", {"pear": Entry("pathlib:PurePath", "a pear")}, group="test.fruits")
+
+
+def test_entries_of_installed_packages_are_loaded_when_they_are_used(installed: Registry) -> None:
+    assert list(installed) == ["pear"] and "plum" in installed
+    assert installed.entry("plum").description == "a plum" and installed.load("plum") is Path
+    assert list(installed) == ["pear", "plum"]
+    with pytest.raises(InputError, match="known: gone, pear, plum, stone"):
+        installed.entry("apple")
+
+
+def test_an_entry_point_that_cannot_be_loaded_is_named(installed: Registry) -> None:
+    with pytest.raises(InputError, match="drupe gone: its entry point no_such_module:GONE cannot be loaded"):
+        installed.entry("gone")
+    with pytest.raises(InputError, match="orchard:STONE is a int; it must be an Entry"):
+        installed.load_installed()

@@ -14,8 +14,10 @@ from numpy import ndarray
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.core.bounds import Value, for_kernels, read_only
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Status
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
-from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh
+from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh, Surface
 from robotdiffuse.robots.link_pair_tables import LinkPairTable
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.robots.visual_meshes import VisualMesh
@@ -54,6 +56,7 @@ VALUES: dict[type[Value], Callable[[], Value]] = {
     rd.Capsule: lambda: rd.Capsule(HALF, 0.1, 0.2),
     rd.Mesh: lambda: rd.Mesh(CORNERS, FACES, UP),
     rd.PointCloud: lambda: rd.PointCloud(CORNERS),
+    rd.HeightMap: lambda: rd.HeightMap(ROWS, 0.1, UP),
     SeenPoints: lambda: SeenPoints(CORNERS),
     AssumedPoints: lambda: AssumedPoints(CORNERS),
     rd.Scene: lambda: rd.Scene([sphere()]),
@@ -63,6 +66,7 @@ VALUES: dict[type[Value], Callable[[], Value]] = {
     Joint: lambda: Joint("j", "revolute", "a", "b", POSE, UP),
     Robot: robot,
     ConvexMesh: lambda: ConvexMesh(CORNERS, FACES),
+    Surface: lambda: Surface(CORNERS, FACES),
     VisualMesh: lambda: VisualMesh(CORNERS, FACES, np.zeros((4, 3), np.uint8)),
     AttachedBody: lambda: AttachedBody("tool", "l3", POSE, (sphere(),)),
     LinkPairTable: lambda: LinkPairTable(("a", "b"), ("j",), (0.0,), (1.0,), np.ones(4, bool)),
@@ -117,6 +121,27 @@ def test_every_kind_of_value_is_tried() -> None:
     }
     assert {*kinds()} | {SeenPoints, AssumedPoints} == {*VALUES}
     assert with_arrays - {*VALUES} == {rd.Certificate}  # nothing is kept of one: each check begins anew
+
+
+@pytest.mark.parametrize("kind", VALUES, ids=lambda kind: kind.__name__)
+def test_the_text_of_a_value_is_one_line(kind: type[Value]) -> None:
+    value = VALUES[kind]()
+    assert "\n" not in repr(value) and len(repr(value)) < 300 and repr(value).startswith(kind.__name__)
+
+
+def test_large_arrays_are_shown_by_their_shape_and_defaults_not_at_all() -> None:
+    assert repr(rd.Box(HALF, HALF)) == "Box(center=[0.5, 0.5, 0.5], size=[0.5, 0.5, 0.5])"
+    assert repr(rd.PointCloud(np.zeros((5000, 3)))) == "PointCloud(points=<5000 x 3 array>)"
+    assert "solved" in repr(PlanResult(Status.SOLVED, "", "aorrtc", "arm", 0.1, 0, path=VALUES[rd.Path]()))  # type: ignore[arg-type]
+    assert repr(PlanResult(Status.TIMEOUT, "no path", "aorrtc", "arm", 0.1, 0)) == (
+        "PlanResult(timeout, aorrtc in 100 ms: no path)"
+    )
+
+
+def test_what_is_prepared_for_a_robot_is_not_among_its_names() -> None:
+    arm = robot()
+    arm.__dict__["some.module.prepared"] = 1
+    assert "joint_names" in dir(arm) and not any("." in name for name in dir(arm))
 
 
 @pytest.mark.parametrize("kind", VALUES, ids=lambda kind: kind.__name__)

@@ -13,8 +13,9 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets import robot_npz
 from robotdiffuse.datasets.loader import RopDataset
 from robotdiffuse.datasets.manifest import read_manifest
+from robotdiffuse.datasets.motion_rows import problem_of
 from robotdiffuse.datasets.robot_npz import export_npz, import_npz
-from robotdiffuse.datasets.shards import check_shard, problem_of, read_shard, write_shard
+from robotdiffuse.datasets.shards import check_shard, read_shard, write_shard
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
@@ -57,10 +58,11 @@ def test_export_for_the_authors(tmp_path):
     arrays["obstacle_kinds"][0] = [SPHERE, 0, 0, SPHERE]
     arrays["obstacle_params"][0, 3, :3] = [1, 2, 3]
     write_shard(tmp_path, 2, arrays, {})
-    count = export_npz(tmp_path, tmp_path / "robot.npz")
+    count, left_out = export_npz(tmp_path, tmp_path / "robot.npz")
     with np.load(tmp_path / "robot.npz") as file:
         x, y = file["x_train"], file["y_train"]
     kinds = np.concatenate([read_shard(tmp_path, i)["obstacle_kinds"] for i in (0, 1)])
+    assert left_out == 53 - count  # 30 + 20 + 3 motions
     assert count == len(x) == ((kinds == SPHERE).sum(1) == 2).sum() + 1
     assert x.shape[1:] == (254, 7) and y.shape[1:] == (23,)
     assert x.dtype == y.dtype == np.float32

@@ -3,6 +3,7 @@
 import builtins
 import errno
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets import shards
 from robotdiffuse.datasets.manifest import read_manifest, write_manifest
+from robotdiffuse.datasets.robot_npz import import_npz
 from robotdiffuse.datasets.shards import (
     ARRAYS,
     SPLITS,
@@ -354,3 +356,19 @@ def test_without_zarr(tmp_path, arrays, monkeypatch):
     for call in (lambda: write_shard(tmp_path, 0, arrays, {}), lambda: shards.read_shard(tmp_path, 0)):
         with pytest.raises(InputError, match=r'pip install "robotdiffuse\[data\]"'):
             call()
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "shard_00000.zarr/seed/zarr.json", "robot.npz"])
+def test_a_pipe_in_a_data_set_is_not_waited_for(tmp_path, arrays, name):
+    """It hung."""
+    write_shard(tmp_path, 0, arrays, {})
+    (tmp_path / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    read = {
+        "manifest.json": lambda: read_manifest(tmp_path),
+        "robot.npz": lambda: import_npz(tmp_path / name, tmp_path / "set"),
+    }
+    with pytest.raises(
+        InputError, match=f"{name} cannot be read: it is a device or a pipe; it must be a file"
+    ):
+        read.get(name, lambda: read_shard(tmp_path, 0))()

@@ -14,7 +14,7 @@ from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.transformer import Transformer
 from robotdiffuse.learning.encoders import make_encoder
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.planner import model_settings
@@ -29,7 +29,7 @@ def test_every_config_makes_a_model(name: str) -> None:
     settings = planner_training(name, given)
     encoder = settings.encoder if settings.jointly else "compression_autoencoder"
     made = None if settings.encoder is None else make_encoder(encoder or "")
-    model = MotionModel(RobotIdentity.of(PANDA), model_settings(settings, made))
+    model = MotionNetwork(RobotIdentity.of(PANDA), model_settings(settings, made))
     assert isinstance(model.denoiser, DENOISERS.load(settings.denoiser))
     assert (settings.minutes is None) != (settings.samples is None)
 
@@ -38,7 +38,7 @@ def test_the_papers_config_has_its_figures() -> None:
     settings = planner_training("paper", {"data": "data", "encoder": "folder"})
     assert settings.samples == 64 * 25_000 and settings.batch == 64 and settings.learning_rate == 3e-4
     assert settings.schedule.steps == 200 and settings.waypoints == 254 and settings.objective == "clean"
-    model = MotionModel(
+    model = MotionNetwork(
         RobotIdentity.of(PANDA), model_settings(settings, make_encoder("compression_autoencoder"))
     )
     assert isinstance(model.denoiser, Transformer)

@@ -21,7 +21,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion
 from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.datasets.manifest import read_manifest
-from robotdiffuse.datasets.shards import check_shard, path_of, problem_of, read_shard
+from robotdiffuse.datasets.motion_rows import path_of, problem_of
+from robotdiffuse.datasets.shards import check_shard, read_shard
 from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.shard_maker import PROBLEMS_PER_SHARD, draw, make_shard
 from robotdiffuse.problems.families import family, rop

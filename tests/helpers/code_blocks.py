@@ -206,10 +206,15 @@ def _pip(words: list[str]) -> None:
             assert not missing, f"{word}: there is no extra {', '.join(missing)}"
 
 
+def _toml(page: Notebook, block: Block) -> None:
+    tomllib.loads(block.code)
+
+
 TRIED: dict[str, Callable[[Notebook, Block], None]] = {
     "python": _python,
     "yaml": _yaml,
     "sh": _sh,
     "text": lambda page, block: None,
     "xml": _content,
+    "toml": _toml,
 }

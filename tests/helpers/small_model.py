@@ -3,15 +3,16 @@
 import torch
 
 from helpers.box_arm import box_arm
-from robotdiffuse.learning.denoisers.transformer import TransformerSettings
-from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.denoisers.settings import TransformerSettings
+from robotdiffuse.learning.encoders.settings import PointAutoencoderSettings
+from robotdiffuse.learning.motion_model import MotionModelSettings
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 
 SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
 
 
-def small_model(seed: int = 0) -> MotionModel:
+def small_model(seed: int = 0) -> MotionNetwork:
     """A model for the arm of boxes, with random weights in the last layer too."""
     torch.manual_seed(seed)
     settings = MotionModelSettings(
@@ -19,6 +20,6 @@ def small_model(seed: int = 0) -> MotionModel:
         encoder_settings=SMALL_ENCODER,
         denoiser_settings=TransformerSettings(width=16, layers=2, heads=2, hidden=32, patch=4),
     )
-    model = MotionModel(RobotIdentity.of(box_arm()), settings)
+    model = MotionNetwork(RobotIdentity.of(box_arm()), settings)
     torch.nn.init.normal_(model.denoiser.out.weight, std=0.2)
     return model

@@ -9,15 +9,8 @@ import torch
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_completion, save_completion
-from robotdiffuse.learning.completion import predict
-from robotdiffuse.learning.completion.network import (
-    CompletionNetwork,
-    CompletionSettings,
-    folded,
-    reachable,
-    unfolded,
-    voxel_centers,
-)
+from robotdiffuse.learning.completion import exported_completion, predict
+from robotdiffuse.learning.completion.network import CompletionNetwork, folded, unfolded
 from robotdiffuse.learning.completion.samples import (
     FREE,
     OCCUPIED,
@@ -28,6 +21,7 @@ from robotdiffuse.learning.completion.samples import (
     true_voxels,
     unpack_fine,
 )
+from robotdiffuse.learning.completion.volume import CompletionSettings, reachable, voxel_centers
 from robotdiffuse.learning.training import completion as training
 from robotdiffuse.learning.training.completion import (
     CompletionTraining,
@@ -102,7 +96,7 @@ def test_the_network_s_inputs() -> None:
     np.testing.assert_allclose(planes[6], np.hypot(*np.moveaxis(voxel_centers()[..., :2], -1, 0)), atol=1e-6)
 
 
-def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A small network that has memorised one sample predicts the true voxels."""
     settings = replace(TINY, learning_rate=1e-2)
     task = training.CompletionTask(settings, training.Processes("cpu"))
@@ -124,7 +118,8 @@ def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch
         optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < 0.3 * losses[0]
-    p = predict(volume, task.module)
+    save_completion(task.module, tmp_path, {})
+    p = predict(volume, exported_completion(tmp_path))
     assert p.shape == tuple(2 * n for n in SHAPE) and p.dtype == np.float32
     free = volume.free.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     assert (p[free] == 0).all()
@@ -186,10 +181,10 @@ def test_temperature_and_calibration() -> None:
 
 def test_nothing_is_predicted_beyond_reach() -> None:
     """Training covers no voxels there, so the network would predict walls a metre around the arm."""
-    unknown = np.zeros((1, *SHAPE), np.uint8)
-    p = load_completion().probabilities(*(torch.from_numpy(unknown) for _ in range(2))).detach().numpy()
+    unknown = np.zeros(SHAPE, np.uint8)
+    p = exported_completion()(unknown, unknown)
     reachable = training.reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
-    assert not p[0][~reachable].any() and p[0][reachable].any()
+    assert not p[~reachable].any() and p[reachable].any()
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -197,9 +192,8 @@ def test_bundled_weights_are_better_than_a_constant(family: str) -> None:
     """Average precision over unknown voxels of 2 cm above the ground; a constant has the share of occupied
     ones."""
     samples = draw_samples((family,), PANDA, [11, 12, 13, 14])
-    network, above = load_completion(), training.voxel_centers()[..., 2] > 0.02
-    with torch.no_grad():
-        p = network.probabilities(*(torch.from_numpy(a) for a in (samples.seen, samples.behind))).numpy()
+    network, above = exported_completion(), training.voxel_centers()[..., 2] > 0.02
+    p = [network(*volume) for volume in zip(samples.seen, samples.behind, strict=True)]
     truth = unpack_fine(samples.truth)
     counted = ((samples.seen & (FREE | OCCUPIED)) == 0) & training.reachable() & above
     stated = np.stack([unpack_fine(pack_fine(one > 0.1)) for one in p])

@@ -15,7 +15,8 @@ from robotdiffuse.learning.encoders.point_autoencoder import (
     chamfer,
     nearest,
 )
-from robotdiffuse.learning.motion_model import GuideFn, MotionModel, MotionModelSettings
+from robotdiffuse.learning.motion_model import GuideFn, MotionModelSettings
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.config import PlannerTraining
@@ -224,7 +225,7 @@ def test_sampling_settings_are_checked() -> None:
         sample_with(small_model(), SamplingSettings(sampling_steps=201))
 
 
-def sample_with(model: MotionModel, settings: SamplingSettings, guide: GuideFn | None = None) -> np.ndarray:
+def sample_with(model: MotionNetwork, settings: SamplingSettings, guide: GuideFn | None = None) -> np.ndarray:
     def far(q: np.ndarray) -> np.ndarray:
         return np.full((*q.shape[:2], 3), 0.4, np.float32)
 

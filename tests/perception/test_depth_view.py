@@ -1,6 +1,7 @@
 """Depth views: points of pixels by hand, clouds as images, what is refused; files of images and clouds."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -130,3 +131,16 @@ def test_points_that_were_seen_are_sampled_as_a_cloud() -> None:
     points = np.random.default_rng(0).uniform(0.2, 0.5, (50, 3))
     found = sample_surface(Scene([SeenPoints(points, 0.01)]), 20, np.random.default_rng(1))
     assert len(found) == 20 and all((point == points).all(axis=1).any() for point in found)
+
+
+def test_intrinsics_as_a_mapping_or_a_matrix() -> None:
+    numbers = (460.0, 461.0, 319.5, 239.5)
+    named: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
+    matrix = [[460.0, 0, 319.5], [0, 461.0, 239.5], [0, 0, 1]]
+    each: list[Any] = [numbers, named, matrix, np.array(matrix)]
+    for given in each:
+        assert DepthView(np.ones((2, 2)), given, np.eye(4)).intrinsics == numbers
+    with pytest.raises(InputError, match=r"view\.intrinsics has \['fx'\]; it must have fx, fy, cx, cy"):
+        DepthView(np.ones((2, 2)), {"fx": 1.0}, np.eye(4))
+    with pytest.raises(InputError, match="without skew"):
+        DepthView(np.ones((2, 2)), [[460.0, 1, 319.5], *matrix[1:]], np.eye(4))

@@ -31,7 +31,7 @@ BEYOND, ABOVE = (
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     view = ray_cast(WALL, BEYOND, INTRINSICS, (160, 120), PANDA, START)
-    return Problem(PANDA, Scene(), START, GOAL, views=(view,))
+    return Problem(PANDA, Scene(), START, GOAL, views=(view,), unknown="optimistic")
 
 
 @pytest.fixture(scope="module")

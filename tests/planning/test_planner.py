@@ -1,6 +1,7 @@
 """Properties of every planner in the table: solved means verified, anything else comes with a reason."""
 
 import inspect
+import re
 from dataclasses import fields
 
 import numpy as np
@@ -20,6 +21,8 @@ from robotdiffuse.validation.validator import verify, verify_trajectory
 
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 GOAL = START + np.array([1.2, 0.3, 0.0, 0.4, 0.0, 0.0, 0.0])
+OTHER_ARGUMENTS = ("self", "problem", "planner", "settings")
+"""Arguments of `plan` that are not of the request."""
 
 
 @pytest.fixture(params=PLANNERS)
@@ -85,5 +88,30 @@ def test_plan_takes_the_fields_of_a_request() -> None:
     request = [(field.name, field.default) for field in fields(PlanRequest)]
     for function in (plan, Planner.plan):
         arguments = list(inspect.signature(function).parameters.values())
-        arguments = [argument for argument in arguments if argument.name not in ("self", "problem")]
+        arguments = [argument for argument in arguments if argument.name not in OTHER_ARGUMENTS]
         assert [(argument.name, argument.default) for argument in arguments] == request
+
+
+def test_plan_with_a_planner_and_settings_by_name() -> None:
+    problem = Problem(load_robot("panda"), Scene(), START, GOAL)
+    first = plan(problem, planner="aorrtc", settings={"range": 0.5, "keep_trees": True})
+    assert first.solved and first.planner == "aorrtc"
+    assert (
+        plan(problem, planner="rrt_connect", settings=PLANNERS.defaults("rrt_connect")).planner
+        == "rrt_connect"
+    )
+    nested = load_planner("diffusion", {"guidance": {"margin": 0.03}, "guidance.self_margin": 0.02})
+    assert (nested.settings.guidance.margin, nested.settings.guidance.self_margin) == (0.03, 0.02)  # type: ignore[attr-defined]
+    for wrong, message in (
+        ({"planner": "moon"}, "unknown planner 'moon'; known: a_star"),
+        ({"planner": "aorrtc", "settings": {"rang": 1}}, "aorrtc has no setting 'rang'; it has range=0.7"),
+        ({"planner": "aorrtc", "settings": {"range": -1.0}}, "aorrtc.range is -1.0"),
+        ({"planner": "aorrtc", "settings": "range=1"}, "settings is 'range=1'; it must be a table"),
+    ):
+        with pytest.raises(InputError, match=re.escape(message)):
+            plan(problem, **wrong)  # type: ignore[arg-type]
+
+
+def test_help_names_every_argument_of_plan() -> None:
+    text = inspect.getdoc(plan) or ""
+    assert all(name in text for name in inspect.signature(plan).parameters)

@@ -259,6 +259,7 @@ def test_wrong_goals_are_one_line(case: str, tmp_path: Path) -> None:
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANNERS)
 def test_every_planner_answers_every_request(name: str) -> None:
     """A base, a tool, a held object, tolerances, several goals and a waypoint, all in one problem."""

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from helpers.example_robots import TIPS, example_robot, planar_arm
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_angle, transform
+from robotdiffuse.learning.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot

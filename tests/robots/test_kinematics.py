@@ -8,7 +8,8 @@ import torch
 
 from helpers.example_robots import TIPS, example_robot, planar_arm, urdf_file
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.learning.forward_kinematics import ForwardKinematics
+from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
 
@@ -146,3 +147,30 @@ def test_bad_input() -> None:
         fk.link(torch.zeros(2), "hand")
     with pytest.raises(InputError, match="unknown link 'hand'"):
         link_pose(robot, np.zeros(2), "hand")
+
+
+@pytest.mark.parametrize("name", TIPS)
+def test_a_robot_s_own_kinematics_are_those_of_the_network_s_side(name: str) -> None:
+    robot = example_robot(name)
+    fk, q = ForwardKinematics(robot, torch.float64), configurations(robot, 5)
+    for link in (None, robot.link_names[-1]):
+        where = link or robot.tip
+        np.testing.assert_allclose(robot.fk(q.numpy(), link), fk.link(q, where), atol=1e-12)
+        np.testing.assert_allclose(robot.jacobian(q.numpy(), link), fk.jacobian(q, where), atol=1e-12)
+        np.testing.assert_allclose(robot.fk(q[0].tolist(), link), fk.link(q[0], where), atol=1e-12)
+        assert robot.jacobian(q[0].tolist(), link).shape == (6, robot.dof)
+
+
+def test_inverse_kinematics_of_a_robot_nearest_first() -> None:
+    panda = load_robot("panda")
+    q = np.array([0.3, 0.2, 0.1, -1.8, 0.0, 2.1, 0.8])
+    found = panda.ik(panda.fk(q), count=5, near=q)
+    assert len(found) == 5 and np.abs(panda.fk(found) - panda.fk(q)).max() < 1e-5
+    np.testing.assert_allclose(found[0], q, atol=1e-4)
+    far = np.eye(4)
+    far[0, 3] = 9.0
+    assert panda.ik(far).shape == (0, 7)
+    with pytest.raises(InputError, match=r"q is .* it must be 7 numbers, or rows of them: panda_joint1"):
+        panda.fk([0.0, 1.0])
+    with pytest.raises(InputError, match="unknown link 'moon'"):
+        panda.jacobian(q, "moon")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from helpers.example_robots import TIPS, example_robot, planar_arm
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.learning.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
 

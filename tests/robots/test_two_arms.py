@@ -120,7 +120,9 @@ def test_the_other_arm_keeps_its_values_in_inverse_kinematics() -> None:
     assert len({*found[:, 6]}) == len(found)  # the joint after the link is random
 
 
-@pytest.mark.parametrize("planner", ["rrt_connect", "aorrtc", "robotdiffuse"])
+@pytest.mark.parametrize(
+    "planner", [pytest.param("rrt_connect", marks=pytest.mark.slow), "aorrtc", "robotdiffuse"]
+)
 def test_planners_move_both_arms_past_each_other(planner: str) -> None:
     robot = two_arms()
     start, goal = _crossing(robot)
@@ -215,6 +217,7 @@ def test_a_tool_on_the_second_hand_is_its_tip_and_is_checked() -> None:
     assert robot.with_tool("torso", np.eye(4)).tips == robot.tips
 
 
+@pytest.mark.slow
 def test_added_planned_and_verified_from_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,6 +16,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import read_triangles, read_yaml
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
+from robotdiffuse.scenes.height_map import HeightMap
 from robotdiffuse.scenes.point_cloud import crop, distinct, read_points, voxel_thin
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
@@ -57,7 +58,8 @@ def surface_distance(shape: Shape, points: ndarray) -> ndarray:
 
 
 def test_points_are_drawn_on_every_shape() -> None:
-    assert {*KINDS.values()} == {*DRAWS} == {type(shape) for shape in SHAPES.values()}
+    drawn_by_triangles = {HeightMap}
+    assert {*KINDS.values()} - drawn_by_triangles == {*DRAWS} == {type(shape) for shape in SHAPES.values()}
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -314,7 +316,7 @@ def test_damaged_point_files(form: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("cloud.las", b"x", "known: .csv, .npy, .npz, .pcd, .ply, .xyz"),
+        ("cloud.las", b"x", "known: .bt, .csv, .npy, .npz, .pcd, .ply, .xyz"),
         ("cloud.ply", None, "does not exist"),
         ("cloud.ply", b"", "is empty"),
         ("cloud.csv", b"1,2\n3,4\n", "an array of 2 x 2; it must be n x 3"),
@@ -392,3 +394,18 @@ def test_shapes_from_files_are_written_as_names_of_files(tmp_path: Path) -> None
 def test_yaml_numbers_with_exponents(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("[1e-3, 2.5e3, -1E+2, .5e1, 1e, e1, 3]")
     assert read_yaml(tmp_path / "a.yaml") == [1e-3, 2500.0, -100.0, 5.0, "1e", "e1", 3]
+
+
+def test_meshes_and_clouds_from_files_with_a_scale(tmp_path: Path) -> None:
+    trimesh.creation.box((200, 200, 200)).export(tmp_path / "cube.stl")
+    np.save(tmp_path / "cloud.npy", np.array([[100.0, 0, 0], [np.nan, 0, 0]]))
+    mesh = Mesh.from_file(tmp_path / "cube.stl", xyz=[0.5, 0, 0], scale=0.001, name="cube")
+    assert mesh.name == "cube" and mesh.file is None
+    np.testing.assert_allclose(mesh.bounds, [[0.4, -0.1, -0.1], [0.6, 0.1, 0.1]])
+    assert Mesh.from_file(tmp_path / "cube.stl").file == str(tmp_path / "cube.stl")
+    with pytest.warns(UserWarning, match="1 of 2 points are not finite"):
+        cloud = PointCloud.from_file(tmp_path / "cloud.npy", 0.02, scale=0.001)
+    np.testing.assert_allclose(cloud.points, [[0.1, 0, 0]])
+    assert cloud.point_radius == 0.02
+    with pytest.raises(InputError, match=r"mesh\.scale is 0; it must be a positive number"):
+        Mesh.from_file(tmp_path / "cube.stl", scale=0)

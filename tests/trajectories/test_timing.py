@@ -1,5 +1,6 @@
 """Timing: limits, rest at both ends, geometry that stays on verified ground."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,11 +16,18 @@ from robotdiffuse.trajectories import speed_limits
 from robotdiffuse.trajectories.corner_rounding import BLEND_DEVIATION, BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import MIN_JERK, TimingSettings, symmetric_bounds, timing_grid
 from robotdiffuse.trajectories.timing import SAME_WAYPOINT_DISTANCE, time_parameterize
-from robotdiffuse.trajectories.timing_kernel import fastest_speeds, slowdown
+from robotdiffuse.trajectories.timing_kernel import (
+    estimated_time,
+    fastest_speeds,
+    least_time,
+    rounded_line,
+    slowdown,
+)
 from robotdiffuse.validation.rates import RateTolerances, rate_violations
 
 VELOCITY = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
 ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+NO_JERK_LIMIT = TimingSettings(jerk=np.inf, sample_time=1e-4)
 VALIDATOR = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
 
 
@@ -129,7 +137,7 @@ def test_one_joint_against_the_closed_form() -> None:
     """Bang-bang: 2 sqrt(d / a) below the velocity limit, d / v + v / a above it."""
     robot = arm((2.0,), (8.0,))
     for d, expected in ((0.125, 2 * np.sqrt(0.125 / 8)), (3.0, 3.0 / 2 + 2.0 / 8)):
-        t = time_parameterize(robot, path(robot, [[0.0], [d]]), always, always)
+        t = time_parameterize(robot, path(robot, [[0.0], [d]]), always, always, NO_JERK_LIMIT)
         assert t.duration == pytest.approx(expected, rel=0.01)
 
 
@@ -137,17 +145,17 @@ def test_halved_scales_are_slower_by_their_factor() -> None:
     robot = arm((2.0,), (8.0,))
     p = path(robot, [[0.0], [0.1]])
     fast, slow = (
-        time_parameterize(robot, p, always, always, TimingSettings(acceleration_scale=a)).duration
+        time_parameterize(robot, p, always, always, replace(NO_JERK_LIMIT, acceleration_scale=a)).duration
         for a in (1.0, 0.25)
     )
-    assert slow == pytest.approx(2 * fast, rel=1e-3)
+    assert slow == pytest.approx(2 * fast, rel=2e-3)
 
 
 def test_path_of_length_zero_is_two_rows_at_rest() -> None:
     robot = arm()
     for rows in (1, 2, 5):
         t = time_parameterize(robot, path(robot, np.full((rows, 7), 0.3)), always, always)
-        assert t.times.tolist() == [0.0, 0.01]
+        assert t.times.tolist() == [0.0, TimingSettings().sample_time]
         assert (t.positions == 0.3).all() and not t.velocities.any() and not t.accelerations.any()
 
 
@@ -199,7 +207,7 @@ def test_only_the_corner_that_fails_is_tightened() -> None:
 
     t = time_parameterize(robot, p, valid, valid)
     assert valid(t)
-    assert cuts(t.positions, 1) < 0.03
+    assert cuts(t.positions, 1) < 0.05
     assert cuts(t.positions, 2) > 0.09
 
 
@@ -245,30 +253,31 @@ def test_a_limit_of_jerk_is_kept_with_the_others(
     answer = never if stops else always
     t = time_parameterize(robot, path(robot, q), answer, answer, settings)
     steps = np.diff(t.times)[:, None]
-    assert steps.min() > 0 and steps.max() <= 1.1 * sample_time + 1e-9
+    assert steps.min() > 0 and steps.max() <= sample_time + 1e-9
     assert np.abs(np.diff(t.accelerations, axis=0) / steps).max() <= jerk * (1 + 1e-6)
     assert (np.abs(t.velocities) <= robot.velocity * (1 + 1e-9)).all()
     assert (np.abs(t.accelerations) <= robot.acceleration * (1 + 1e-9)).all()
     assert np.array_equal(t.positions[0], q[0]) and np.array_equal(t.positions[-1], q[-1])
     assert not t.velocities[[0, -1]].any() and np.abs(t.accelerations[[0, -1]]).max() < 1e-9
-    # rates are those of the positions: second differences agree to what the jerk does in two steps
-    middle = 0.5 * (t.velocities[1:] + t.velocities[:-1])
-    assert np.abs(np.diff(t.positions, axis=0) / steps - middle).max() < jerk * sample_time**2 + 1e-6
+    # the jerk is constant between rows, so that limits hold at every time
+    q, v, a = t.positions, t.velocities, t.accelerations
+    assert np.abs(v[:-1] + steps / 2 * (a[1:] + a[:-1]) - v[1:]).max() < 1e-9
+    assert np.abs(q[:-1] + steps * v[:-1] + steps**2 / 6 * (2 * a[:-1] + a[1:]) - q[1:]).max() < 1e-9
     if stops:
         assert distance_to_polyline(t.positions, q).max() < 1e-8
 
 
 def test_a_limit_of_jerk_costs_what_it_must() -> None:
-    """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs a row or two."""
+    """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs a row at most."""
     robot = arm((20.0,), (80.0,))
     p = path(robot, [[0.0], [1.0]])
     free, gentle, slight = (
         time_parameterize(robot, p, always, always, TimingSettings(jerk=jerk)).duration
-        for jerk in (None, 50.0, 1e5)
+        for jerk in (np.inf, 50.0, 1e5)
     )
     least = (32 / 50.0) ** (1 / 3)
     assert least <= gentle < 1.4 * least
-    assert slight == pytest.approx(free, abs=0.016)  # 1.5 rows of 10 ms and a step of 1 ms
+    assert slight == pytest.approx(free, abs=0.004)
 
 
 def test_fine_rows_keep_the_limits_to_the_letter() -> None:
@@ -321,12 +330,25 @@ def toppra_duration(robot: Robot, line: BlendedPolyline, settings: TimingSetting
 def test_durations_are_those_of_toppra(seed: int, deviation: float) -> None:
     rng, robot = np.random.default_rng(seed), arm()
     q = np.cumsum(rng.normal(0, 0.4, (rng.integers(2, 8), 7)), axis=0)
-    settings = TimingSettings(corner_deviation=deviation)
+    settings = replace(NO_JERK_LIMIT, corner_deviation=deviation)
     ours = time_parameterize(robot, path(robot, q), always, always, settings).duration
     parts = [q] if deviation else [q[i : i + 2] for i in range(len(q) - 1)]
     lines = [BlendedPolyline(w, half_widths(w, np.full(len(w) - 2, deviation))) for w in parts]
     theirs = sum(toppra_duration(robot, line, settings) for line in lines)
-    assert ours == pytest.approx(theirs, rel=1e-3)
+    assert ours == pytest.approx(theirs + len(lines) * 2 * settings.sample_time, rel=1e-3)
+
+
+@given(seed=st.integers(0, 2**32 - 1), narrow=st.sampled_from([0.0, 1e-4]))
+def test_the_estimated_time_is_near_the_exact_one(seed: int, narrow: float) -> None:
+    """It was 7 % short where a rounded corner began just after the start."""
+    rng = np.random.default_rng(seed)
+    q = np.cumsum(rng.normal(0, 0.4, (rng.integers(3, 8), 7)), axis=0)
+    deviations = 10 ** rng.uniform(-2, 0, len(q) - 2)
+    line = rounded_line(q, deviations)
+    line[3][0] *= 1 - narrow
+    velocity, acceleration = rng.uniform(1, 3, 7), rng.uniform(5, 20, 7)
+    ratio = estimated_time(line, velocity, acceleration) / least_time(line, velocity, acceleration, 16, 128)
+    assert 0.97 < ratio < 1.1
 
 
 TORSO = (0.1, 1.25, 1.45, 1.57, 1.52, 1.57, 2.26, 2.26)
@@ -410,7 +432,7 @@ def test_rows_of_a_motion_without_end_are_counted(jerk: float | None) -> None:
     robot = arm((1e-6,), (1.0,))
     t = time_parameterize(robot, path(robot, [[0.0], [1.0]]), always, always, TimingSettings(jerk=jerk))
     assert t.duration == pytest.approx(1e6, rel=0.05)
-    assert len(t.times) <= speed_limits.MAX_ROWS + 1
+    assert len(t.times) <= speed_limits.MAX_ROWS + 3
     assert rate_violations(robot, t, VALIDATOR) == []
 
 
@@ -428,3 +450,60 @@ def test_the_least_limit_of_jerk_costs_little_more_than_it_must() -> None:
     t = time_parameterize(robot, path(robot, [[0.0], [1.0]]), always, always, TimingSettings(jerk=MIN_JERK))
     least = (32 / MIN_JERK) ** (1 / 3)
     assert least <= t.duration < 1.4 * least
+
+
+def test_a_dense_path_is_driven_without_stops() -> None:
+    """46 of 46 waypoints of a sampled path were stops: its rows did not tell its accelerations."""
+    rng, robot = np.random.default_rng(3), arm()
+    along = np.linspace(0, 1, 48)[:, None]
+    q = (
+        along * rng.normal(0, 1, 7)
+        + np.sin(np.pi * along) * rng.normal(0, 0.4, 7)
+        + rng.normal(0, 2e-3, (48, 7))
+    )
+    p = path(robot, q)
+
+    def valid(t: Trajectory) -> bool:
+        return rate_violations(robot, t, VALIDATOR) == []
+
+    t = time_parameterize(robot, p, valid, always)
+    assert valid(t) and len(t.stops) == 0
+    stopping = time_parameterize(robot, p, never, never)
+    assert t.duration < 0.5 * stopping.duration
+
+
+def test_a_corner_in_a_narrow_passage_is_no_stop() -> None:
+    """A corner that was not free after two reductions of its rounding became a stop."""
+    robot = arm()
+    p = corner(robot)
+
+    def free(piece: Path | Trajectory) -> bool:
+        return bool(distance_to_polyline(piece.positions, p.positions).max() < 1e-3)
+
+    t = time_parameterize(robot, p, free, free)
+    assert free(t) and len(t.stops) == 0
+
+
+def test_joints_without_a_jerk_limit_have_the_stated_default() -> None:
+    robot = arm()
+    assert speed_limits.jerk_limits(robot, TimingSettings()).tolist() == [10 * a for a in ACCELERATION]
+    t = time_parameterize(robot, corner(robot), always, always)
+    jerk = np.diff(t.accelerations, axis=0) / np.diff(t.times)[:, None]
+    assert (np.abs(jerk) <= 10 * np.array(ACCELERATION) * (1 + 1e-9)).all()
+
+
+def test_a_corner_that_its_neighbour_leaves_more_room_is_checked_again() -> None:
+    """The second corner, accepted beside a wide neighbour, grew when that shrank, and left the clearance."""
+    robot, q = arm(), np.zeros((4, 7))
+    q[1:, 0], q[2:, 1], q[3, 2] = 1.0, 1.0, 1.0
+    p = path(robot, q)
+
+    def keeps(corner: np.ndarray) -> bool:
+        near = corner[np.linalg.norm(corner - q[1], axis=1) < 0.3]
+        return (
+            distance_to_polyline(corner, q).max() < 0.12
+            and distance_to_polyline(near, q).max(initial=0) < 0.01
+        )
+
+    t = time_parameterize(robot, p, always, always, keeps=keeps)
+    assert keeps(t.positions)

@@ -16,10 +16,13 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.trajectories.speed_limits import TimingSettings
+from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
 from robotdiffuse.validation.validator import (
     Report,
@@ -341,6 +344,13 @@ def test_trajectories() -> None:
     assert 1.0 < found.time < 2.0
 
 
+def test_verify_validates_the_times_of_a_trajectory() -> None:
+    """`verify` took a trajectory for a path and called it valid at any speed."""
+    problem, path = problem_and_path(SWING)
+    assert verify(problem, path).valid and verify(problem, trajectory(2.0)).valid
+    refused(verify(problem, trajectory(0.5)), "acceleration")
+
+
 def test_trajectories_that_jump_or_run_backwards() -> None:
     problem, _ = problem_and_path(SWING)
     good = trajectory(2.0)
@@ -505,3 +515,23 @@ def test_settings_are_checked() -> None:
         VerifySettings(tightness=1.0)
     with pytest.raises(InputError, match="contact is 0"):
         VerifySettings(contact=0.0)
+
+
+def test_jerk_is_reported_and_not_required() -> None:
+    robot = load_robot("ur5e")
+    rows = np.array([[0.0, -1.5, 1.5, -1.5, -1.5, 0.0], [1.0, -1.2, 1.0, -1.5, -1.0, 0.0]])
+    problem = Problem(robot, Scene(), rows[0], JointGoal(rows[-1:]))
+    reports = [
+        verify(
+            problem,
+            time_parameterize(robot, Path(robot.joint_names, rows), yes, yes, TimingSettings(jerk=jerk)),
+        )
+        for jerk in (None, np.inf)
+    ]
+    limited, free = [report.jerk_share for report in reports]
+    assert all(report.valid for report in reports) and limited is not None and free is not None
+    assert 0.5 < limited <= 1 + 1e-6 < 5 < free
+
+
+def yes(_: object) -> bool:
+    return True

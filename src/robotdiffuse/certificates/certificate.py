@@ -15,6 +15,7 @@ from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof,
 from robotdiffuse.core.bounds import MAX_RATE, numbers, within
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_json
+from robotdiffuse.core.one_line import one_line
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
@@ -27,6 +28,9 @@ STRETCH_FIELDS = ("start", "stop", "by_planes", "clearance", "displacement")
 @dataclass(frozen=True, eq=False)
 class Certificate(MotionProof):
     """A motion, what was proved of it, and the proof, which can be checked and saved."""
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def check(self, problem: Problem | None = None, at_most: Tolerances | None = None) -> Findings:
         """Re-check everything for a problem, by default the one in the certificate.
@@ -88,6 +92,7 @@ def _record(certificate: Certificate) -> dict[str, Any]:
         "constraints": [list(one) for one in certificate.constraints],
         "looks": certificate.torque_samples.tolist(),
         "torques": [list(one) for one in certificate.torques],
+        "jerks": [list(one) for one in certificate.jerks],
     }
 
 
@@ -139,6 +144,7 @@ def _certificate(record: dict[str, Any]) -> Certificate:
         _named_bounds(record.get("constraints", [])),
         _vector("looks", record.get("looks", [])),
         _named_bounds(record.get("torques", [])),
+        _named_bounds(record.get("jerks", [])),
     )
 
 

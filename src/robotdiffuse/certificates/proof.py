@@ -89,3 +89,6 @@ class MotionProof:
     """Places between the rows at which torques are computed besides the rows, given as `between`."""
     torques: tuple[tuple[str, float], ...] = ()
     """For each joint its name and an upper bound of its torque with the payload all along [N m] or [N]."""
+    jerks: tuple[tuple[str, float], ...] = ()
+    """For each joint its name and its largest jerk, accelerations being linear between rows [rad/s³] or
+    [m/s³]; empty for a path, and where accelerations jump at the ends."""

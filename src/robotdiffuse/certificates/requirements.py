@@ -84,8 +84,27 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
         begins = np.zeros(robot.dof) if problem.start_velocity is None else problem.start_velocity
         yield from _rate_errors(robot, motion, certificate, begins)
         yield from frame_speed_errors(problem, motion, tolerances.rate_slack)
+        yield from _jerk_errors(motion, certificate)
     yield from _constraint_errors(problem, certificate, q)
     yield from _torque_errors(problem, certificate)
+
+
+def _jerk_errors(motion: Trajectory, certificate: MotionProof) -> Iterator[str]:
+    """Jerks, where the proof states them, that are larger than it says."""
+    said = dict(certificate.jerks)
+    if not said:
+        return
+    if [*said] != [*motion.joint_names]:
+        yield "jerks: their joints are not those of the motion"
+        return
+    steps = np.diff(motion.times)[:, None]
+    ends = np.abs(motion.accelerations[[0, -1]]).max(axis=0)
+    most = np.abs(np.diff(motion.accelerations, axis=0) / steps).max(axis=0, initial=0.0)
+    for name, jerk, end in zip(said, most, ends, strict=True):
+        if not jerk <= said[name] * (1 + BOUND_TOLERANCE):
+            yield f"jerks: that of {name} is {jerk:.6g}, not {said[name]:.6g}"
+        if end != 0:
+            yield f"jerks: the acceleration of {name} jumps at the start or the end"
 
 
 def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:

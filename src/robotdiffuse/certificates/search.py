@@ -25,7 +25,7 @@ from robotdiffuse.certificates.torques import torque_bounds
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
-from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify, verify_trajectory
+from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify
 
 CLEARANCE_SHARE = 0.5
 """The proof shows this share of the clearances that the validator certifies; a larger one needs more
@@ -61,8 +61,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     unsupported = not_covered(problem, motion)
     if unsupported:
         raise InputError(f"certificates prove nothing about {', '.join(unsupported)}, which the problem has")
-    validator = verify_trajectory if isinstance(motion, Trajectory) else verify
-    report = validator(problem, motion, settings)  # type: ignore[arg-type]
+    report = verify(problem, motion, settings)
     if report.violation is not None:
         raise NotValidError(
             f"the motion is not valid: {report.violation.message} (at {report.violation.time:.3f})"
@@ -102,7 +101,15 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         bounds,
         samples,
         torques,
+        _jerks(motion),
     )
+
+
+def _jerks(motion: Path | Trajectory) -> tuple[tuple[str, float], ...]:
+    """See `MotionProof.jerks`."""
+    if not isinstance(motion, Trajectory) or not np.isfinite(motion.peak_jerks).all():
+        return ()
+    return tuple(zip(motion.joint_names, motion.peak_jerks.tolist(), strict=True))
 
 
 def _prove_constraints(
@@ -211,6 +218,7 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
             by_planes[rows] = better - less > clearance[rows] - displacement[rows]
             chosen = by_planes[rows]
             clearance[rows[chosen]], displacement[rows[chosen]] = better[chosen], less[chosen]
+            _check_parts_are_apart(prover, todo.some(rows[better <= 0]))
         proved = clearance - displacement >= target
         done.append(_proved_part(todo, proved, by_planes, clearance, displacement, planes))
         total += n
@@ -218,6 +226,17 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
             raise InputError(f"no proof of less than {MAX_STRETCHES:,} stretches was found for the motion")
         todo = _cut(todo, clearance, displacement, target, ~proved)
     return _join(prover, done)
+
+
+def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
+    """Raise InputError if one of these stretches, without separating planes, is of a grazing pair."""
+    for k in stretches.claim.tolist():
+        claim = prover.claims[k]
+        if frozenset((claim.link, claim.against)) in prover.robot.grazing:
+            raise InputError(
+                f"no proof exists: {claim.link} and {claim.against} are apart only by their exact surfaces, "
+                f"and proofs use the convex parts around them, which touch"
+            )
 
 
 def _renumbered(planes: list[Plane], rows: ndarray) -> list[Plane]:

@@ -14,6 +14,7 @@ from robotdiffuse import __version__
 from robotdiffuse.cli import (
     bench,
     certificate,
+    completion,
     data,
     demo,
     export,
@@ -28,9 +29,9 @@ from robotdiffuse.cli import (
     verify,
     view,
 )
+from robotdiffuse.cli.exit_status import BAD_INPUT, STOPPED, WRITE_FAILED
 from robotdiffuse.core.errors import InputError
-
-SOLVED, NO_PLAN, BAD_INPUT, WRITE_FAILED, STOPPED = 0, 1, 2, 3, 130
+from robotdiffuse.core.registry import import_modules
 
 COMMANDS = (
     plan.add,
@@ -48,6 +49,8 @@ COMMANDS = (
     train.add,
     bench.add,
     serve.add,
+    completion.add_schema,
+    completion.add,
 )
 """Each function adds one command to the parser and sets its `run` function."""
 
@@ -76,6 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _prepare_streams()
     try:
         arguments = build_parser().parse_args(argv)
+        import_modules(getattr(arguments, "modules", ()))
         status = arguments.run(arguments)
         sys.stdout.flush()
         return status
@@ -86,10 +90,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("robotdiffuse: stopped", file=sys.stderr)
         return STOPPED
     except BrokenPipeError:
-        return _write_failed("its reader has closed the pipe")
+        return _write_failed()
     except SystemExit as stop:
         if isinstance(stop.__context__, BrokenPipeError):  # from rich, which would exit with status 1
-            return _write_failed("its reader has closed the pipe")
+            return _write_failed()
         raise
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
@@ -109,11 +113,14 @@ def _prepare_streams() -> None:
             stream.reconfigure(errors="replace")
 
 
-def _write_failed(why: str) -> int:
-    """Report the failure, and redirect standard output to /dev/null so that flushing it at exit cannot
-    fail."""
+def _write_failed(why: str = "") -> int:
+    """Report the failure, and redirect standard output to /dev/null so that flushing it at exit cannot fail.
+
+    why: empty where the reader has closed the pipe, as head does, which is no news.
+    """
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     with suppress(OSError):
-        print(f"robotdiffuse: the output could not be written: {why}", file=sys.stderr)
+        if why:
+            print(f"robotdiffuse: the output could not be written: {why}", file=sys.stderr)
     return WRITE_FAILED

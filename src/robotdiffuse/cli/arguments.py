@@ -8,6 +8,19 @@ IGNORE_JOINTS = (
 )
 
 
+def add_import_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option --import; `main` imports the modules before it runs the command."""
+    parser.add_argument(
+        "--import",
+        dest="modules",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="import a module first, of the current folder too, which may add planners, families or "
+        "costs to their tables; repeatable",
+    )
+
+
 def _number(text: str) -> float:
     """The text as a number; nan if it is not one."""
     try:
@@ -22,6 +35,11 @@ def positive(text: str) -> float:
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
     return value
+
+
+def jerk_limit(text: str) -> float:
+    """A positive number, or infinity for "none"."""
+    return math.inf if text == "none" else positive(text)
 
 
 def natural(text: str) -> int:

@@ -4,8 +4,9 @@ import argparse
 import os
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import count, positive
+from robotdiffuse.cli.arguments import add_import_option, count, positive
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.learning import need_packages
 from robotdiffuse.problems.families import FAMILIES
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--workers", type=count, metavar="N", help="planners that run at once (default: half of the cores)"
     )
     run.add_argument("--cluster", metavar="NAME", help="ray: use the Ray cluster at RAY_ADDRESS")
+    add_import_option(run)
     run.set_defaults(run=run_run)
     report = actions.add_parser(
         "report",
@@ -294,6 +296,7 @@ def run_confirm(arguments: argparse.Namespace) -> int:
 def run_ablation(arguments: argparse.Namespace) -> int:
     import sys
 
+    need_packages("the ablation", "torch")
     from robotdiffuse.evaluation import ablation
     from robotdiffuse.evaluation.tables import show
 

@@ -29,6 +29,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run_check(arguments: argparse.Namespace) -> int:
     from robotdiffuse.certificates.certificate import load_certificate
+    from robotdiffuse.cli.console import clearances
     from robotdiffuse.problems.files import load_problem
 
     certificate = load_certificate(arguments.file)
@@ -37,6 +38,5 @@ def run_check(arguments: argparse.Namespace) -> int:
     for line in found:
         print(line)
     if not found:
-        scene, itself = 1e3 * certificate.scene_clearance, 1e3 * certificate.self_clearance
-        print(f"holds: at least {scene:.1f} mm to the scene, {itself:.1f} mm between links")
+        print(f"holds: {clearances(certificate)}")
     return FAILS if found else HOLDS

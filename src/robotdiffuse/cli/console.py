@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.status import Status
 
+    from robotdiffuse.certificates.certificate import Certificate
     from robotdiffuse.core.results import PlanResult
     from robotdiffuse.problems.problem import Problem
     from robotdiffuse.validation.validator import Report
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 
 SPINNER_DELAY = 2.0
 """Time until the spinner appears [s]."""
+CAP_TOLERANCE = 1e-4
+"""A clearance this close to the largest one that is measured is printed as larger [m]."""
 ASSUMPTION_TEXTS = {"as seen": "what was seen", "unknown is occupied": "all that was not seen free"}
 """How `print_result` words some assumptions about unknown space."""
 
@@ -50,21 +53,33 @@ class Spinner:
         self._status.start()
 
 
-def clearances(motion: "PlanResult | Report") -> str:
-    """The smallest clearance [mm] and, if known, those to the scene and between links."""
-    names = ("min_clearance", "scene_clearance", "self_clearance")
-    least, scene, itself = (f"{1e3 * (getattr(motion, name) or 0.0):.1f} mm" for name in names)
-    return (
-        least if motion.scene_clearance is None else f"{least} (to the scene {scene}, between links {itself})"
-    )
+def clearances(motion: "PlanResult | Report | Certificate", asked: float | None = None) -> str:
+    """The certified clearances to the scene, beside the requested one [m], and between links."""
+    if motion.scene_clearance is None or motion.self_clearance is None:
+        return _certified(getattr(motion, "min_clearance", None) or 0.0)
+    wanted = "" if asked is None else f" (asked: {1e3 * asked:g} mm)"
+    between = f", {_certified(motion.self_clearance)} between links"
+    return f"{_certified(motion.scene_clearance)} to the scene{wanted}{between}"
 
 
-def print_result(result: "PlanResult") -> None:
-    """Print the result of plan() as a table; without a plan, its status and reason."""
+def _certified(clearance: float) -> str:
+    """A certified lower bound [m]; the validator measures no distance beyond CLEARANCE_CAP."""
+    from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
+
+    capped = clearance > CLEARANCE_CAP - CAP_TOLERANCE
+    return f"> {CLEARANCE_CAP:g} m" if capped else f"at least {1e3 * clearance + 0.0:.1f} mm"
+
+
+def print_result(result: "PlanResult", asked: float | None = None) -> None:
+    """Print the result of plan() as a table; without a plan, its status and reason.
+
+    asked: the requested clearance, or the default one [m]; None: the planner keeps none.
+    """
     from robotdiffuse.evaluation.tables import Table, show
 
     rows = [
         ("reason", result.reason),
+        *(("note", note) for note in result.notes),
         ("planner", f"{result.planner} ({result.stage})" if result.stage else result.planner),
         ("planning time", f"{1e3 * result.planning_time:.1f} ms"),
     ]
@@ -81,10 +96,9 @@ def print_result(result: "PlanResult") -> None:
         low, high = (", ".join(f"{at:.2f}" for at in corner) for corner in result.unknown_region)
         rows.append(("crosses unknown", f"from ({low}) to ({high}) m"))
     if result.min_clearance is not None:
-        rows.append(("clearance", f"at least {clearances(result)}"))
+        rows.append(("clearance", f"certified {clearances(result, asked)}"))
     if result.trajectory is not None:
         rows.append(("motion", f"{result.trajectory.duration:.2f} s, {len(result.trajectory.times)} rows"))
-    rows += [("note", note) for note in result.notes]
     rows.append(("seed", str(result.seed)))
     show(Table.pairs(f"{result.robot}: {result.status.value}", rows))
 

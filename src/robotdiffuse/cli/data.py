@@ -8,7 +8,15 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import count, natural, not_negative, positive, share, shares
+from robotdiffuse.cli.arguments import (
+    add_import_option,
+    count,
+    natural,
+    not_negative,
+    positive,
+    share,
+    shares,
+)
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families import FAMILIES
 
@@ -108,6 +116,7 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
         help="processes (default: all cores)",
     )
     parser.add_argument("--cluster", metavar="NAME", help="ray: use the Ray cluster at RAY_ADDRESS")
+    add_import_option(parser)
     parser.set_defaults(run=run_generate)
 
 
@@ -327,7 +336,8 @@ def run_view(arguments: argparse.Namespace) -> int:
 def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[GalleryEntry]":
     """Random motions, in the order of the shards."""
     from robotdiffuse.datasets.manifest import read_manifest
-    from robotdiffuse.datasets.shards import motion_of, random_rows, scenes_of
+    from robotdiffuse.datasets.motion_rows import motion_of, scenes_of
+    from robotdiffuse.datasets.shards import random_rows
     from robotdiffuse.visualization.gallery import GalleryEntry
 
     manifest = read_manifest(folder)
@@ -345,8 +355,9 @@ def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "I
 def run_export(arguments: argparse.Namespace) -> int:
     from robotdiffuse.datasets.robot_npz import export_npz
 
-    made = export_npz(arguments.folder, arguments.file)
-    print(f"wrote {arguments.file}: {made:,} motions")
+    made, left_out = export_npz(arguments.folder, arguments.file)
+    others = f"; left out {left_out:,}, whose scenes are not exactly two spheres" if left_out else ""
+    print(f"wrote {arguments.file}: {made:,} motions{others}")
     return 0
 
 

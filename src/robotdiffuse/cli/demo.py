@@ -5,9 +5,11 @@ from dataclasses import replace
 from importlib.resources import as_file, files
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.console import print_result
+from robotdiffuse.cli.console import Spinner, print_result
 from robotdiffuse.cli.drawing import ENDINGS, draw
-from robotdiffuse.cli.plan import load_and_plan
+from robotdiffuse.cli.exit_status import NO_PLAN
+from robotdiffuse.cli.plan import asked_clearance, load_and_plan
+from robotdiffuse.core.types import FIRST
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
@@ -15,6 +17,8 @@ if TYPE_CHECKING:
 PROBLEM_FILE, FAMILY = "shelf.yaml", "shelf"
 TIME_LIMIT = 10.0
 """Time limit for planning [s]."""
+MAX_DRAWS, DRAW_TIME_LIMIT = 50, 1.0
+"""Problems that are drawn for another arm, and the time limit of the search that tries each [s]."""
 CAMERA_POSITION, CAMERA_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
 """Position and target of the camera of `demo --camera` [m]."""
 IMAGE_SIZE, FOCAL_LENGTH = (640, 480), 460.0
@@ -58,9 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
         outputs.append(check_output("demo_true.png", ENDINGS))
         problem = seen_by_camera(true)
     result = load_and_plan(problem, DEFAULT_PLANNER, time_limit=TIME_LIMIT)
-    print_result(result)
+    print_result(result, asked_clearance(problem, DEFAULT_PLANNER))
     if result.trajectory is None or result.path is None:
-        return 1
+        return NO_PLAN
     if arguments.camera:
         from robotdiffuse.validation.validator import verify
 
@@ -73,14 +77,25 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def shelf_problem(robot: str) -> "Problem":
-    """A problem of the family shelf for another arm. Raises InputError if none can be drawn for it."""
+    """A problem of the family shelf for another arm that the straight line does not solve and a search does.
+
+    Raises InputError if none can be drawn for it.
+    """
     import numpy as np
 
-    from robotdiffuse.problems.families import load_family
+    from robotdiffuse.planning import load_planner
+    from robotdiffuse.problems.families.scaled import family_for
     from robotdiffuse.robots import load_robot
 
-    arm = load_robot(robot)
-    return load_family(FAMILY).draw(arm, np.random.default_rng(0)).problem(arm)
+    arm, rng, search = load_robot(robot), np.random.default_rng(0), load_planner("aorrtc")
+    family = family_for(FAMILY, arm)
+    with Spinner(f"drawing a problem for {arm.name}"):
+        for _ in range(MAX_DRAWS):
+            problem = family.draw(arm, rng).problem(arm)
+            found = search.plan(problem, DRAW_TIME_LIMIT, until=FIRST)
+            if found.solved and found.stage != "straight_line":
+                return problem
+    return problem
 
 
 def seen_by_camera(problem: "Problem") -> "Problem":

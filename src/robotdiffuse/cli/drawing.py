@@ -24,7 +24,7 @@ def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
         from robotdiffuse.visualization.replay_page import write_replay as write
     else:
         from robotdiffuse.visualization.picture import write_picture as write
-    if problem.views and problem.unknown == "predicted":
+    if problem.views and _predicted(problem):
         from robotdiffuse.planning.pipeline.unknown_space import predicted_obstacles
         from robotdiffuse.scenes.scene import Scene
 
@@ -32,6 +32,13 @@ def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
         problem = replace(problem, scene=seen, views=())
     robot, scene = problem.standing()
     write(robot, scene, motion, file, result=result)
+
+
+def _predicted(problem: "Problem") -> bool:
+    """Whether the policy for unknown space is `predicted`."""
+    from robotdiffuse.planning.pipeline.unknown_space import policy_for
+
+    return policy_for(problem)[0] == "predicted"
 
 
 def show(file: Path) -> None:

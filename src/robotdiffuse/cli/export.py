@@ -22,6 +22,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--out", action="append", required=True, metavar="FILE", help="file to write; repeatable"
     )
+    parser.add_argument(
+        "--rate", type=float, metavar="HZ", help="resample the motion, and validate it so, for a controller"
+    )
     parser.set_defaults(run=run)
 
 
@@ -29,15 +32,15 @@ def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.interop import check_export, write_motion
 
     outputs = [check_export(file) for file in arguments.out]
-    problem, trajectory = validated_motion(arguments.result)
+    problem, trajectory = validated_motion(arguments.result, arguments.rate)
     for file in outputs:
         write_motion(problem, trajectory, file)
         print(f"wrote {file}")
     return 0
 
 
-def validated_motion(file: str) -> "tuple[Problem, Trajectory]":
-    """The problem and the motion of a result file.
+def validated_motion(file: str, rate: float | None = None) -> "tuple[Problem, Trajectory]":
+    """The problem and the motion of a result file, resampled at `rate` [Hz] if it is given.
 
     Raises InputError if it holds no timed motion, and if the validator rejects the motion, because other
     programs may execute it.
@@ -48,7 +51,8 @@ def validated_motion(file: str) -> "tuple[Problem, Trajectory]":
     result, problem = read_solved(file)
     if result.trajectory is None:
         raise InputError(f"{file} holds a path without times; plan again to get a trajectory")
-    violation = verify_trajectory(problem, result.trajectory).violation
+    trajectory = result.trajectory if rate is None else result.trajectory.resample(rate)
+    violation = verify_trajectory(problem, trajectory).violation
     if violation is not None:
         raise InputError(f"{file} is not exported: its motion is not valid: {violation.message}")
-    return problem, result.trajectory
+    return problem, trajectory

@@ -9,6 +9,7 @@ import threading
 from typing import NoReturn
 
 from robotdiffuse.cli.arguments import positive
+from robotdiffuse.cli.exit_status import STOPPED
 from robotdiffuse.core.errors import InputError
 
 LOOPBACK = "127.0.0.1"
@@ -60,7 +61,6 @@ def run(arguments: argparse.Namespace) -> NoReturn:
         raise InputError("live needs viser: pip install 'robotdiffuse[live]'") from None
     from rich.console import Console
 
-    from robotdiffuse.cli import STOPPED
     from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
     from robotdiffuse.visualization.live.access import is_loopback, listen, new_token
     from robotdiffuse.visualization.live.files import first_problem

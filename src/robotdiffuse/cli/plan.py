@@ -5,10 +5,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotdiffuse.cli.arguments import IGNORE_JOINTS, natural, not_negative, positive, share
+from robotdiffuse.cli.arguments import (
+    IGNORE_JOINTS,
+    add_import_option,
+    jerk_limit,
+    natural,
+    not_negative,
+    positive,
+    share,
+)
 from robotdiffuse.cli.console import Spinner, print_next_view, print_result
 from robotdiffuse.cli.drawing import ENDINGS, draw, show
-from robotdiffuse.core.types import CONVERGED, UNTIL
+from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
+from robotdiffuse.core.types import CONVERGED, OBJECTIVES, TIME, UNTIL
 from robotdiffuse.interop import WRITERS
 
 if TYPE_CHECKING:
@@ -17,7 +26,18 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
 
 RESULT_ENDINGS = (".json", ".csv", *ENDINGS, *WRITERS)
-REQUEST = (*("time_limit", "seed", "until", "clearance", "velocity_scaling", "acceleration_scaling", "jerk"),)
+REQUEST = (
+    *(
+        "time_limit",
+        "seed",
+        "until",
+        "clearance",
+        "velocity_scaling",
+        "acceleration_scaling",
+        "jerk",
+        "objective",
+    ),
+)
 """Options that are arguments of `Planner.plan`."""
 
 
@@ -61,13 +81,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--clearance",
         type=not_negative,
         metavar="M",
-        help="distance to obstacles to keep where possible (default: the problem's, or 0.01 m)",
+        help="distance to obstacles to keep where possible, up to 0.5 m (default: the problem's, or 0.01 m)",
     )
     parser.add_argument(
         "--unknown",
         metavar="POLICY",
         help="policy for space that the problem's views do not show: optimistic (free), padded, predicted or "
-        "occupied (default: the problem's, or optimistic)",
+        "occupied (default: the problem's; else predicted where the network covers the arm's reach, or "
+        "padded)",
     )
     parser.add_argument("--ignore-joints", action="store_true", help=IGNORE_JOINTS)
     parser.add_argument(
@@ -85,9 +106,15 @@ def add(commands: argparse._SubParsersAction) -> None:
         )
     parser.add_argument(
         "--jerk",
-        type=positive,
+        type=jerk_limit,
         metavar="J",
-        help="jerk limit of each joint, at least 0.01 rad/s³ (default: none)",
+        help="jerk limit of each joint, at least 0.01 rad/s³, or none (default: the robot's limits)",
+    )
+    parser.add_argument(
+        "--objective",
+        choices=OBJECTIVES,
+        default=TIME,
+        help="what searches minimize: the path's length or the motion's duration (default: time)",
     )
     parser.add_argument(
         "--blend",
@@ -106,6 +133,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "programs .mcap (Foxglove, ROS 2), .rosbag2, .rrd (Rerun) or .yaml (JointTrajectory); repeatable",
     )
     parser.add_argument("--view", action="store_true", help="write a replay (.html) and open it")
+    add_import_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -119,7 +147,7 @@ def run(arguments: argparse.Namespace) -> int:
     problem = _problem(arguments)
     request = {option: getattr(arguments, option) for option in REQUEST}
     result = load_and_plan(problem, name, settings, arguments.weights, **request)
-    print_result(result)
+    print_result(result, asked_clearance(problem, name, arguments.clearance))
     if arguments.next_view and result.path is not None:
         print_next_view(problem, result)
     for file in outputs:
@@ -127,7 +155,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"wrote {file}")
     if arguments.view and result.trajectory is not None:
         show(outputs[-1])
-    return 0 if result.solved else 1
+    return SOLVED if result.solved else NO_PLAN
 
 
 def _outputs(arguments: argparse.Namespace) -> list[Path]:
@@ -171,6 +199,17 @@ def _write(problem: "Problem", result: "PlanResult", file: Path) -> bool:
     else:
         write_motion(problem, result.trajectory, file)
     return True
+
+
+def asked_clearance(problem: "Problem", planner: str, clearance: float | None = None) -> float | None:
+    """The clearance that a call asks for, the problem's or the default one [m]; None for a planner that keeps
+    none."""
+    from robotdiffuse.planning import CLEARANCE, PLANNERS
+    from robotdiffuse.planning.context import requested_clearance
+
+    if CLEARANCE not in PLANNERS.entry(planner).supports:
+        return None
+    return requested_clearance(problem, clearance)
 
 
 def with_policy(problem: "Problem", unknown: str) -> "Problem":

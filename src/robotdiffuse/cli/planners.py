@@ -2,6 +2,8 @@
 
 import argparse
 
+from robotdiffuse.cli.arguments import add_import_option
+
 
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
@@ -10,6 +12,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         description="List the planners, or the settings of one for `robotdiffuse plan --set`.",
     )
     parser.add_argument("planner", nargs="?", metavar="NAME", help="list the settings of this planner")
+    add_import_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -18,7 +21,7 @@ def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.planning import PLANNERS, planner_settings
 
     if arguments.planner is None:
-        rows = [(name, entry.kind, entry.description) for name, entry in PLANNERS.items()]
+        rows = [(name, one.kind, one.description) for name, one in PLANNERS.load_installed().items()]
         show(Table.of("", ("planner", Column("kind", left=True), Column("description", left=True)), rows))
         return 0
     settings = planner_settings(arguments.planner, ())

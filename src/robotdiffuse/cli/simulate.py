@@ -3,6 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
 from robotdiffuse.cli.view import read_solved
 from robotdiffuse.core.errors import InputError
 
@@ -55,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         with Console(stderr=True).status(f"drawing {file}"):
             write(robot, scene, done, file)
         print(f"wrote {file}")
-    return 0 if done.free else 1
+    return SOLVED if done.free else NO_PLAN
 
 
 def print_replay(robot: str, duration: float, done: "Replay") -> None:

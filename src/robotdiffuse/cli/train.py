@@ -1,12 +1,14 @@
-"""The commands `robotdiffuse train encoder`, `completion`, `planner` and `baseline`."""
+"""The commands `robotdiffuse train encoder`, `completion`, `planner`, `baseline` and `export`."""
 
 import argparse
 import os
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from robotdiffuse.cli.arguments import count, names, natural, positive, share
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.learning import need_packages
 
 TRAINING_OPTIONS = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
 MODEL_OPTIONS = (
@@ -78,8 +80,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     planner.add_argument(
         "--encoder",
         metavar="FOLDER",
-        help="folder of a trained encoder; or pointnet or dgcnn, which are trained with the planner. "
-        "Required with --data unless the config names one (default: the bundled encoder)",
+        help="folder of a trained encoder; or pointnet or dgcnn, which are trained with the planner "
+        "(default: that of the config, or the bundled one)",
     )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (default: panda)")
     planner.add_argument(
@@ -127,6 +129,15 @@ def add(commands: argparse._SubParsersAction) -> None:
     _add_shared(baseline)
     baseline.set_defaults(run=run_baseline)
 
+    export = kinds.add_parser(
+        "export",
+        help="write the ONNX files of trained weights anew",
+        description="Write the ONNX files that planning runs, from trained weights. Training writes them "
+        "too; weights of earlier versions lack them.",
+    )
+    export.add_argument("folder", metavar="FOLDER", help="folder with weights")
+    export.set_defaults(run=run_export)
+
 
 def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> None:
     default = "" if out_required else "; without --data also for the data (default: beside the user's robots)"
@@ -156,6 +167,7 @@ def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, o
 
 
 def run_encoder(arguments: argparse.Namespace) -> int:
+    need_packages("training", "torch")
     from robotdiffuse.learning.training.config import EncoderTraining
     from robotdiffuse.learning.training.encoder import train_encoder
 
@@ -168,6 +180,7 @@ def run_encoder(arguments: argparse.Namespace) -> int:
 
 
 def run_completion(arguments: argparse.Namespace) -> int:
+    need_packages("training", "torch")
     from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
 
     given = _given(arguments, ("families", "robot", "workers", "device", *TRAINING_OPTIONS))
@@ -179,6 +192,7 @@ def run_completion(arguments: argparse.Namespace) -> int:
 
 
 def run_planner(arguments: argparse.Namespace) -> int:
+    need_packages("training", "torch")
     from robotdiffuse.learning.denoisers import DENOISERS
     from robotdiffuse.learning.training.configs import CONFIGS, planner_training
     from robotdiffuse.learning.training.planner import train_planner
@@ -197,6 +211,13 @@ def run_planner(arguments: argparse.Namespace) -> int:
     for option in ("trajectories", "workers"):
         if getattr(arguments, option) is not None:
             raise InputError(f"--{option} is for data to be generated; --data names existing data")
+    named = {**CONFIGS[arguments.config].changes, **given}
+    if (
+        "encoder" not in named and int(os.environ.get("WORLD_SIZE", "1")) == 1
+    ):  # several would write it at once
+        from robotdiffuse.cli.train_robot import copy_bundled_encoder
+
+        given["encoder"] = str(copy_bundled_encoder(Path(arguments.out) / "encoder"))
     _print_report(train_planner(planner_training(arguments.config, given), arguments.out), arguments.out)
     return 0
 
@@ -220,6 +241,7 @@ def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
 
 
 def run_baseline(arguments: argparse.Namespace) -> int:
+    need_packages("training", "torch")
     from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
     from robotdiffuse.learning.training.configs import planner_training
     from robotdiffuse.learning.training.planner import train_planner
@@ -230,6 +252,14 @@ def run_baseline(arguments: argparse.Namespace) -> int:
     else:
         report = train_baseline(baseline_training(arguments.name, given), arguments.out)
     _print_report(report, arguments.out)
+    return 0
+
+
+def run_export(arguments: argparse.Namespace) -> int:
+    need_packages("the export", "torch")
+    from robotdiffuse.learning.checkpoint import export_weights
+
+    print(f"wrote the ONNX files of {', '.join(export_weights(arguments.folder))} into {arguments.folder}")
     return 0
 
 

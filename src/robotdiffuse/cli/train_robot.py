@@ -97,15 +97,12 @@ def train_for_robot(
     _say(f"{robot.name}: {data.trajectories:,} motions, then training; all in {work}")
     generate_with_progress(data, work / "data", workers)
     if "encoder" not in given:
-        _copy_encoder(work / "encoder")
+        copy_bundled_encoder(work / "encoder")
     report = train_planner(settings, str(work))
     network = "trajectory_prior" if settings.encoder is None else "model"
-    for ending in (
-        "safetensors",
-        "json",
-    ):  # the description last: its presence means that the weights are complete
-        file = f"{network}.{ending}"
-        write_atomically(kept / file, (work / file).read_bytes(), make_folder=True)
+    # the description last: its presence means that the weights are complete
+    for file in sorted(work.glob(f"{network}.*"), key=lambda file: file.suffix == ".json"):
+        write_atomically(kept / file.name, file.read_bytes(), make_folder=True)
     return report, kept
 
 
@@ -121,16 +118,17 @@ def _check_disk(work: Path, motions: int) -> None:
         )
 
 
-def _copy_encoder(folder: Path) -> None:
-    """Save the encoder of the bundled weights in the form that the training reads."""
+def copy_bundled_encoder(folder: Path) -> Path:
+    """Save the encoder of the bundled weights in the form that the training reads; returns the folder."""
     from robotdiffuse.learning.checkpoint import load_model, save_encoder
     from robotdiffuse.learning.weights_registry import BUNDLED
 
     if (folder / "encoder.json").is_file():
-        return
+        return folder
     encoder = load_model(BUNDLED / "panda").encoder
     assert encoder is not None
     save_encoder(encoder, folder, {"from": "the weights that come with the package for panda"})
+    return folder
 
 
 def _say(text: str) -> None:

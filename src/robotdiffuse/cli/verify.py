@@ -1,6 +1,7 @@
 """The command `robotdiffuse verify`."""
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,13 +78,12 @@ def _validated(
     problem: "Problem", what: str, motion: "types.Path | types.Trajectory", everything: bool
 ) -> bool:
     """Whether the motion is valid; prints its clearance, or its violations."""
-    from robotdiffuse.core.types import Trajectory
-    from robotdiffuse.validation.validator import verify, verify_trajectory
+    from robotdiffuse.validation.validator import verify
 
-    timed = isinstance(motion, Trajectory)
-    report = verify_trajectory(problem, motion) if timed else verify(problem, motion)
+    report = verify(problem, motion)
     if report.violation is None:
-        print(f"{what}: valid, clearance at least {clearances(report)}")
+        jerk = "" if report.jerk_share is None else f"; {_jerk(report.jerk_share)}"
+        print(f"{what}: valid, clearance certified {clearances(report)}{jerk}")
         return True
     found = (report.violation,)
     if everything:
@@ -93,6 +93,13 @@ def _validated(
     for violation in found:
         print(f"{what}: not valid: {violation.message} (at {violation.time:.3f})")
     return False
+
+
+def _jerk(share: float) -> str:
+    """The largest jerk beside its limit, in words."""
+    if math.isinf(share):
+        return "accelerations jump at the ends, which some controllers refuse"
+    return f"jerk at most {100 * share:.0f} % of the limits"
 
 
 def _stored_problem(file: str) -> "Problem":
@@ -131,11 +138,11 @@ def _read(
     elif arguments.problem is not None:
         problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     else:
-        from robotdiffuse.problems.files.moveit import read_noted_moveit_scene
+        from robotdiffuse.problems.files.moveit import read_moveit_scene
         from robotdiffuse.robots import load_robot
 
         robot = load_robot(arguments.robot)
-        scene, more = read_noted_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
+        scene, more = read_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
         problem = problem_of_motion(recorded, robot, scene)
     try:
         fit = motion_of_robot(recorded, problem.robot)

@@ -17,6 +17,9 @@ from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
+SURFACES_BELOW = 0.002
+"""Distance of the convex parts of two grazing links below which their surfaces decide [m]."""
+
 
 class Check(NamedTuple):
     """A collision check: a link against the scene (`other` is None), or two links against each other."""
@@ -87,6 +90,11 @@ def checks_of(robot: Robot) -> tuple[Check, ...]:
         if robot.link_frame(a) != robot.link_frame(b) and frozenset((a, b)) not in robot.allowed_collisions
     )
     return (*moving, *pairs)
+
+
+def surfaces_decide(robot: Robot, check: Check) -> bool:
+    """Whether the surfaces of two links decide where their convex parts touch; see `Robot.grazing`."""
+    return check.other is not None and frozenset(check) in robot.grazing
 
 
 @once_per_robot

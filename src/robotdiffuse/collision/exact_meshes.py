@@ -1,7 +1,8 @@
 """Exact distances between the robot's convex meshes and the scene, by Coal: the validator's geometry.
 
 It does not use the covering spheres, so they can be tested against it. Only a link without meshes is
-represented by its spheres. Distances are signed [m]: negative inside, by penetration depth.
+represented by its spheres. Where convex parts of two grazing links touch, their surfaces decide
+(`collision/surface_pairs.py`). Distances are signed [m]: negative inside, by penetration depth.
 """
 
 # Coal's Python module has no type information.
@@ -18,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import (
+    SURFACES_BELOW,
     Check,
     Part,
     Solid,
@@ -27,6 +29,7 @@ from robotdiffuse.collision.convex_geometry import (
     solids_of,
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
+from robotdiffuse.collision.surface_pairs import MAX_OVERLAP, SurfacePair, surface_pairs
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.transforms import transform
@@ -160,6 +163,9 @@ class _Candidates:
     lower: Callable[[ndarray], ndarray]
     """Lower bounds [n, firsts * seconds] of the signed distances, from frames [n, dof + 1, 4, 4]."""
 
+    surfaces: SurfacePair | None = None
+    """Surfaces of two grazing links; None if the convex parts decide alone."""
+
     def pair(self, index: int) -> tuple[_Piece, _Piece | _Obstacle]:
         return self.firsts[index // len(self.seconds)], self.seconds[index % len(self.seconds)]
 
@@ -207,7 +213,10 @@ class ExactCollision:
         if check.other is not None:
             others, other_balls = self._pieces[check.other], _balls(self.robot)[check.other]
             return _Candidates(
-                firsts, others, lambda frames: kernel.pair_bounds(frames, *balls, *other_balls)
+                firsts,
+                others,
+                lambda frames: kernel.pair_bounds(frames, *balls, *other_balls),
+                surface_pairs(self.robot).get(check),
             )
         if not self._obstacles:
             return _Candidates(firsts, (), lambda frames: np.zeros((len(frames), 0)))
@@ -263,6 +272,13 @@ class ExactCollision:
         names: list[str | None] = [None] * len(q)
         for i, (check, best) in enumerate(zip(checks.tolist(), cutoffs.tolist(), strict=True)):
             candidates = self._candidates[check]
+            if candidates.surfaces is not None:
+                best = distances[i] = self._grazing_distance(candidates, frames[i], best, stop == -np.inf)
+                if best < cutoffs[i]:
+                    names[i] = self.checks[check].other
+                if best <= stop:
+                    break
+                continue
             lower = candidates.lower(frames[i : i + 1])[0]
             for candidate in lower.argsort().tolist():
                 if lower[candidate] >= best or best <= stop:
@@ -276,6 +292,25 @@ class ExactCollision:
             if best <= stop:
                 break
         return distances, names
+
+    def _grazing_distance(
+        self, candidates: _Candidates, frames: ndarray, cutoff: float, depth: bool
+    ) -> float:
+        """Signed distance of two grazing links [m], at most `cutoff`: of their convex parts, or of their
+        surfaces where the parts are nearly apart and neither surface touches or encloses the other.
+
+        Without `depth`, the penetration may be too small, but the sign is right.
+        """
+        assert candidates.surfaces is not None
+        best, lower = cutoff, candidates.lower(frames[None])[0]
+        for candidate in lower.argsort().tolist():
+            if lower[candidate] >= best or (best < -MAX_OVERLAP and not depth):
+                break
+            best = min(best, self._signed(*candidates.pair(candidate), frames, best, depth=True))
+        if not -MAX_OVERLAP <= best < SURFACES_BELOW:
+            return best
+        apart = candidates.surfaces.distance(frames, cutoff)
+        return best if apart is None else min(max(best, apart), cutoff)
 
     def link_distances(self, q: Float[ndarray, "dof"]) -> tuple[Distance, ...]:
         """Signed distance of every moving link to the nearest obstacle (infinite in an empty scene)."""
@@ -319,8 +354,9 @@ class ExactCollision:
             undecided = np.flatnonzero(~hit)
             lower = candidates.lower(frames[undecided])
             rows, columns = np.nonzero(lower <= 0)
+            apart = np.zeros(len(q), bool)  # by their surfaces
             for row, column in zip(undecided[rows].tolist(), columns.tolist(), strict=True):
-                if hit[row]:
+                if hit[row] or apart[row]:
                     continue
                 piece, other = candidates.pair(column)
                 if isinstance(other, _Obstacle) and other.inflation > 0:
@@ -331,6 +367,10 @@ class ExactCollision:
                 result.clear()
                 coal.collide(piece.geometry, T_piece, other.geometry, T_other, self._collide, result)
                 hit[row] = result.isCollision()
+                if hit[row] and candidates.surfaces is not None:
+                    distance = self._grazing_distance(candidates, frames[row], CLEAR_DISTANCE, depth=False)
+                    apart[row] = distance > 0
+                    hit[row] = not apart[row]
         return hit
 
 

@@ -305,7 +305,7 @@ def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, ra
 
 
 def _round(shapes: Sequence[Cylinder | Capsule], reach: float) -> ndarray:
-    """The rows of cylinders or capsules."""
+    """`SceneArrays.cylinders` or `SceneArrays.capsules`."""
     half = np.array([[shape.radius, shape.radius, shape.height / 2] for shape in shapes]).reshape(-1, 3)
     return np.ascontiguousarray(_oriented(shapes, half, (2,), reach)[:, [*range(13), 14, 11]])
 

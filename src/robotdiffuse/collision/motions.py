@@ -20,7 +20,15 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.checker import CollisionChecker
-from robotdiffuse.collision.convex_geometry import Check, checks_of, hulls_of, solid_arrays, solids_of
+from robotdiffuse.collision.convex_geometry import (
+    SURFACES_BELOW,
+    Check,
+    checks_of,
+    hulls_of,
+    solid_arrays,
+    solids_of,
+    surfaces_decide,
+)
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import motion_certificate as kernel
 from robotdiffuse.collision.kernels.motion_certificate import (
@@ -262,6 +270,7 @@ def _checks(robot: Robot) -> Checks:
         np.array(common, np.int64),
         np.array(second, np.int64),
         of_checks,
+        np.array([SURFACES_BELOW if surfaces_decide(robot, check) else 0.0 for check in checks]),
     )
 
 

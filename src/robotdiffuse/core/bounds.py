@@ -8,6 +8,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.one_line import one_line
 
 MAX_COORDINATE = 1e4
 """Largest absolute coordinate, size or joint value [m] or [rad]: ten kilometres. At this distance float32
@@ -30,6 +31,18 @@ class Value:
     to is copied, so that whoever gave it keeps it as it was. Subclasses with a `__post_init__` of their own
     call this one at its end.
     """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "__repr__" not in cls.__dict__:  # else dataclass writes one with whole arrays
+            cls.__repr__ = Value.__repr__
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def __dir__(self) -> list[str]:
+        """Without what is prepared for the value and kept in its `__dict__` under a module's name."""
+        return [name for name in super().__dir__() if "." not in name]
 
     def __post_init__(self) -> None:
         for name in (field.name for field in fields(self)):  # type: ignore[arg-type]

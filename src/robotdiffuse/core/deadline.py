@@ -56,8 +56,11 @@ def check_left() -> None:
 
 
 def check_timing(step: str, seconds: float = 0.0) -> None:
-    """`check_time` for a step of timing. A path in hand is timed until LONG after the end of the time: its
-    planner kept so much back for it as that took of late."""
+    """`check_time` for a step of timing, which may run up to LONG past the time limit.
+
+    Planners reserve the time that timing took in earlier calls, so it exceeds the limit rarely; then a path
+    that was found late is still returned.
+    """
     _check(step, seconds, TIMING, LONG)
 
 

@@ -50,7 +50,7 @@ def shortened(text: str) -> str:
 
 
 def joined(names: Iterable[object], most: int = MAX_NAMES) -> str:
-    """Foreign names as one line, each shortened; beyond `most` only their number."""
+    """Names from a user's input as one line: the first `most`, each shortened, and how many more follow."""
     short = [shortened(str(name)) for name in names]
     more = f" and {len(short) - most} more" if len(short) > most else ""
     return ", ".join(short[:most]) + more

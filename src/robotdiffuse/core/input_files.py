@@ -118,7 +118,7 @@ def read_text(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) ->
         raise InputError(f"{what} {file} cannot be read: {why}".strip()) from None
 
 
-def read_triangles(file: str | Path, what: str = "mesh file", merge: bool = False) -> tuple[ndarray, ndarray]:
+def read_triangles(file: str | Path, merge: bool = False) -> tuple[ndarray, ndarray]:
     """Vertices [v, 3] and faces [f, 3] of a mesh file, in the units of the file.
 
     `merge` joins vertices at the same place. Raises InputError as `input_file` does, for other formats, and
@@ -126,20 +126,20 @@ def read_triangles(file: str | Path, what: str = "mesh file", merge: bool = Fals
     """
     import trimesh
 
-    path = input_file(file, what)
+    path = input_file(file, "mesh file")
     if path.suffix.lower() not in MESH_FORMATS:
         raise unknown_name(f"mesh format of {file}:", path.suffix, MESH_FORMATS)
     if path.stat().st_size == 0:
-        raise InputError(f"{what} {file} is empty")
+        raise InputError(f"mesh file {file} is empty")
     try:
         with np.errstate(all="ignore"):
             mesh = trimesh.load_mesh(path, process=merge, resolver=_beside(path))
     except InputError as error:
-        raise InputError(f"{what} {file}: {error}") from None
+        raise InputError(f"mesh file {file}: {error}") from None
     except Exception as error:  # trimesh raises many kinds of errors for a damaged file
-        raise InputError(f"{what} {file} cannot be read: {shortened(str(error))}") from None
+        raise InputError(f"mesh file {file} cannot be read: {shortened(str(error))}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"{what} {file} holds no triangles")
+        raise InputError(f"mesh file {file} holds no triangles")
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
@@ -158,13 +158,13 @@ def _beside(mesh: Path) -> Any:
     return RegularFiles(str(mesh))
 
 
-def read_arrays(file: str | Path, what: str = "") -> dict[str, ndarray]:
+def read_arrays(file: str | Path) -> dict[str, ndarray]:
     """The arrays of an .npz file by name; that of an .npy file under the name "".
 
     Raises InputError as `input_file` does, for damaged files, and for archives that unpack to more than
     MAX_FILE_SIZE.
     """
-    path = input_file(file, what)
+    path = input_file(file)
     try:
         if path.suffix.lower() != ".npz":
             return {"": np.load(path, allow_pickle=False)}
@@ -174,14 +174,14 @@ def read_arrays(file: str | Path, what: str = "") -> dict[str, ndarray]:
             with np.load(path, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
     except Exception as error:  # NumPy, zipfile and zlib raise many kinds of errors for a damaged file
-        raise InputError(f"{what} {file} is damaged: {shortened(str(error))}".strip()) from None
+        raise InputError(f"{file} is damaged: {shortened(str(error))}") from None
     most = MAX_FILE_SIZE // MEGABYTE
-    raise InputError(f"{what} {file} unpacks to {size // MEGABYTE} MB; at most {most} MB are read".strip())
+    raise InputError(f"{file} unpacks to {size // MEGABYTE} MB; at most {most} MB are read")
 
 
-def read_json(file: str | Path, what: str = "") -> Any:
+def read_json(file: str | Path) -> Any:
     """The content of a JSON file. Raises InputError as `read_text` and `parse_json` do."""
-    return parse_json(read_text(file, what), str(file))
+    return parse_json(read_text(file), str(file))
 
 
 def parse_json(text: str, where: str) -> Any:

@@ -1,4 +1,4 @@
-"""Worker processes on this machine or on a Ray cluster, and how Ctrl-C ends them.
+"""Worker processes on this machine, and how Ctrl-C ends them.
 
 Only the process that the user started handles Ctrl-C; it ends its workers. Workers also exit when their
 parent dies, even if it is killed.
@@ -6,13 +6,9 @@ parent dies, even if it is killed.
 
 import atexit
 import fcntl
-import logging
 import multiprocessing
 import os
-import select
 import signal
-import socket
-import subprocess
 import sys
 import threading
 import time
@@ -26,7 +22,6 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NoReturn
 
-from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import AddedEntries, added_entries, adopt_entries
 
@@ -34,10 +29,6 @@ Results = Generator[tuple[int, Any], None, None]
 """Results in order of completion, each with the index of its call. Close the generator to stop the calls."""
 TERMINATE_TIMEOUT = 5.0
 """Time from asking a process to end until it is killed [s]."""
-CONNECT_TIMEOUT = 5.0
-"""Time for a Ray cluster to answer [s]; Ray itself would try for minutes."""
-MAX_RETRIES = 20
-"""How often a call is repeated on another node of a Ray cluster after its node is lost."""
 RERUN_HINT = "run the same command again"
 GUARD = 'if __name__ == "__main__":'
 
@@ -221,33 +212,6 @@ def on_this_machine(call: Callable[..., Any], calls: Sequence[tuple], workers: i
         yield from pool.each(call, calls)
 
 
-def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
-    """Run the calls on a Ray cluster, one core each; calls of a lost node are repeated on another.
-
-    See `ray_cluster`. The nodes need this package, and files under the same paths.
-    """
-    left, running = list(enumerate(calls))[::-1], {}
-    with ray_cluster() as ray:
-        task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_on_node)
-        while left or running:
-            most = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
-            while left and len(running) < most:
-                number, arguments = left.pop()
-                running[task.remote(added_entries(), call, arguments)] = number
-            done, _ = ray.wait(list(running), num_returns=1)
-            for reference in done:
-                yield running.pop(reference), ray.get(reference)
-
-
-def _on_node(entries: AddedEntries, call: Callable[..., Any], arguments: tuple) -> Any:
-    adopt_entries(entries)
-    return call(*arguments)
-
-
-CLUSTERS: dict[str, Callable[[Callable[..., Any], Sequence[tuple]], Results]] = {"ray": on_ray}
-"""Cluster backends by the name that --cluster takes."""
-
-
 def in_order(results: Results) -> Iterator[Any]:
     """The results in the order of the calls."""
     early: dict[int, Any] = {}
@@ -370,140 +334,3 @@ def terminate(processes: Iterable[BaseProcess], by: signal.Signals, patience: fl
         if process.is_alive():
             process.kill()
         process.join()
-
-
-class LineProcess:
-    """A subprocess that reads lines on stdin and answers with lines on stdout; its crash does not affect this
-    one.
-
-    Use it from one thread at a time, except `close`, which any thread may call.
-    """
-
-    def __init__(self, command: Sequence[str], log: Path) -> None:
-        """`log`: its standard error is appended to this file."""
-        self._command, self._log = command, log
-        self._process: subprocess.Popen[bytes] | None = None
-        self._unread = b""
-        self._closed = False
-
-    @property
-    def runs(self) -> bool:
-        """Whether the subprocess is running."""
-        return self._process is not None and self._process.poll() is None
-
-    def start(self) -> None:
-        """Start or restart the subprocess."""
-        self._unread = b""
-        self._log.parent.mkdir(parents=True, exist_ok=True)
-        with self._log.open("ab") as log:
-            self._process = subprocess.Popen(
-                self._command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env=os.environ | {"OMP_NUM_THREADS": "1"},
-                start_new_session=True,  # so that Ctrl-C reaches only this process
-            )
-        if self._closed:  # meanwhile, by another thread that saw only the old process
-            self._process.kill()
-
-    def tell(self, line: str) -> bool:
-        """Send a line; returns whether the subprocess was there to take it."""
-        assert self._process is not None and self._process.stdin is not None
-        try:
-            self._process.stdin.write(line.encode() + b"\n")
-            self._process.stdin.flush()
-        except BrokenPipeError:
-            return False
-        return True
-
-    def answer(self, patience: float) -> bytes | None:
-        """Its next line; None if it ends or writes nothing within `patience` [s]."""
-        assert self._process is not None and self._process.stdout is not None
-        out, until = self._process.stdout, time.monotonic() + patience
-        while b"\n" not in self._unread:
-            ready, _, _ = select.select([out], [], [], max(until - time.monotonic(), 0.0))
-            part = os.read(out.fileno(), 1 << 20) if ready else b""
-            if not part:
-                return None
-            self._unread += part
-        line, _, self._unread = self._unread.partition(b"\n")  # more than one line may have arrived
-        return line
-
-    def ended(self) -> str | None:
-        """How the subprocess ended, and its last line on standard error; None if it had to be killed."""
-        assert self._process is not None
-        try:
-            code = self._process.wait(timeout=1.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-            return None
-        how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
-        lines = self._log.read_text(errors="replace").strip().splitlines()
-        return f"{how}: {lines[-1][:300]}" if lines else how
-
-    def close(self) -> None:
-        """Kill the subprocess, even while another thread waits for it."""
-        self._closed = True
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-
-
-@contextmanager
-def ray_cluster() -> Iterator[Any]:
-    """The module ray, connected to the cluster at RAY_ADDRESS, or to a new local one with all cores.
-
-    Raises InputError if Ray is not installed, if its cluster cannot be reached or fails, if a task raises
-    InputError, and if a node lacks this package.
-    """
-    # Ray reads these on import. Its messages about a lost node are pages long, except the one about the task
-    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray
-        from ray.exceptions import RayError, RayTaskError
-    except ImportError:
-        raise InputError('a Ray cluster needs ray: pip install "robotdiffuse[cluster]"') from None
-    started_here = not ray.is_initialized()
-    if started_here:
-        _check_reachable(os.environ.get("RAY_ADDRESS", ""))
-    connected = False
-    try:
-        if started_here:
-            ray.init(log_to_driver=False, logging_level=logging.CRITICAL)
-        connected = True
-        yield ray
-    except RayTaskError as error:
-        if isinstance(error.cause, InputError):
-            raise InputError(str(error.cause)) from None
-        if "No module named 'robotdiffuse'" in str(error):
-            raise InputError(
-                f"a node of the Ray cluster cannot import robotdiffuse; install {__version__} on all"
-            ) from None
-        raise
-    except RayError as error:
-        raise InputError(f"the Ray cluster failed: {_line(error)}; {RERUN_HINT}") from None
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        if connected:
-            raise
-        raise InputError(f"no Ray cluster: {_line(error)}") from None
-    finally:
-        if started_here:
-            ray.shutdown()
-
-
-def _check_reachable(address: str) -> None:
-    """Raises InputError if nothing listens at the address HOST:PORT or ray://HOST:PORT."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdecimal():
-        return
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT).close()
-    except (OSError, OverflowError) as error:
-        raise InputError(f"no Ray cluster at {address}, the value of RAY_ADDRESS: {error}") from None
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())

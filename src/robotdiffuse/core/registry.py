@@ -1,10 +1,19 @@
-"""Registries: tables of planners, encoders, problem families and so on by name, imported on first use."""
+"""Registries: tables of planners, encoders, problem families and so on by name, imported on first use.
 
+Installed packages add entries by entry points, see `Registry.group`; modules add their own when they are
+imported.
+"""
+
+import os
+import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, shortened, unknown_name
 
 
 @dataclass(frozen=True)
@@ -16,7 +25,7 @@ class Entry:
     description: str
     """What it is or does, in one line."""
     settings: str = ""
-    """Name of its settings class in the same module; empty for none."""
+    """Name of its settings class in the same module, or module:name; empty for none."""
     kind: str = ""
     """Category within its registry, e.g. search, learned or hybrid for planners."""
     supports: frozenset[str] = frozenset()
@@ -51,16 +60,52 @@ class Registry(dict[str, Entry]):
     Worker processes get them too.
     """
 
-    def __init__(self, what: str, entries: dict[str, Entry]) -> None:
-        """`what`: the kind of entry in error messages, e.g. "planner"."""
+    def __init__(self, what: str, entries: dict[str, Entry], group: str = "") -> None:
+        """
+        what: the kind of entry in error messages, e.g. "planner".
+        group: the group of entry points by which installed packages add an Entry each, e.g.
+            "robotdiffuse.planners"; empty for none.
+        """
         super().__init__(entries | _adopted.get(what, {}))
-        self.what, self.own = what, entries
+        self.what, self.own, self.group = what, entries, group
         _tables[what] = self
+
+    @cached_property
+    def _installed(self) -> dict[str, EntryPoint]:
+        """Entry points of installed packages by name. Looking for them takes 20 ms, so it is done late."""
+        return {point.name: point for point in entry_points(group=self.group)} if self.group else {}
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or name in self._installed
+
+    def __missing__(self, name: str) -> Entry:
+        """The entry that an installed package gives. Raises InputError if it cannot be loaded."""
+        point = self._installed[name]
+        try:
+            entry = point.load()
+        except Exception as error:  # an import may raise anything
+            why = f"{type(error).__name__}: {shortened(str(error))}"
+            raise InputError(
+                f"{self.what} {name}: its entry point {point.value} cannot be loaded: {why}"
+            ) from None
+        if not isinstance(entry, Entry):
+            kind = type(entry).__name__
+            raise InputError(
+                f"{self.what} {name}: its entry point {point.value} is a {kind}; it must be an Entry"
+            )
+        self[name] = entry
+        return entry
+
+    def load_installed(self) -> "Registry":
+        """The registry with the entries of all installed packages, for listing."""
+        for name in self._installed:
+            self[name]
+        return self
 
     def entry(self, name: object) -> Entry:
         """The entry of a name. Raises InputError, listing the known names, for an unknown one."""
         if not isinstance(name, str) or name not in self:
-            raise unknown_name(self.what, name, self)
+            raise unknown_name(self.what, name, {*self, *self._installed})
         return self[name]
 
     def load(self, name: str) -> Any:
@@ -73,7 +118,9 @@ class Registry(dict[str, Entry]):
         entry = self.entry(name)
         if not entry.settings:
             return None
-        return getattr(import_module(entry.location.partition(":")[0]), entry.settings)
+        own = entry.location.partition(":")[0]
+        module, _, found = entry.settings.rpartition(":")
+        return getattr(import_module(module or own), found)
 
     def defaults(self, name: str) -> Any:
         """The default settings of an entry; None if it has none."""
@@ -93,3 +140,18 @@ class Registry(dict[str, Entry]):
             takes = "takes none" if wanted is None else f"takes {wanted.__name__}"
             raise InputError(f"settings are {type(settings).__name__}; {self.what} {name} {takes}")
         return kind(settings)
+
+
+def import_modules(names: Iterable[str]) -> None:
+    """Import modules, from the current folder too, that add entries to the registries.
+
+    Raises InputError for one that cannot be imported.
+    """
+    for name in names:
+        if os.getcwd() not in sys.path:
+            sys.path.insert(0, os.getcwd())
+        try:
+            import_module(name)
+        except Exception as error:  # an import may raise anything
+            why = f"{type(error).__name__}: {shortened(str(error))}"
+            raise InputError(f"module {name!r} cannot be imported: {why}") from None

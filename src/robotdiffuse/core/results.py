@@ -14,6 +14,8 @@ from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.types import ROWS, Path, Status, Trajectory, Tree
 
+PROBLEM_ENDINGS = (".yaml", ".yml", ".jsonl")
+"""Endings of problem files that no result has."""
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
 
 
@@ -65,6 +67,13 @@ class PlanResult:
     problem: Any = field(default=None, repr=False)
     """The `Problem`, for `rd.show`; None in results read from files."""
 
+    def __repr__(self) -> str:
+        planned = f"{self.planner} in {1e3 * self.planning_time:.3g} ms"
+        if self.path is None:
+            return f"PlanResult({self.status.value}, {planned}: {self.reason})"
+        notes = f", {len(self.notes)} notes" if self.notes else ""
+        return f"PlanResult({self.status.value}, {planned}: {self.path!r}, {self.trajectory!r}{notes})"
+
     @property
     def solved(self) -> bool:
         return self.status is Status.SOLVED
@@ -72,6 +81,16 @@ class PlanResult:
     @property
     def path_length(self) -> float | None:
         return None if self.path is None else self.path.length
+
+    @property
+    def duration(self) -> float | None:
+        """Duration of the motion [s]; None without a trajectory."""
+        return None if self.trajectory is None else self.trajectory.duration
+
+    @property
+    def stops(self) -> int | None:
+        """Number of times that the arm rests between start and goal; None without a trajectory."""
+        return None if self.trajectory is None else len(self.trajectory.stops)
 
     def save(self, file: str | FilePath, problem: dict[str, Any] | None = None) -> None:
         """Write .json (everything, and the problem as in a problem file) or .csv (the trajectory alone).
@@ -106,9 +125,14 @@ def load_result(file: str | FilePath) -> ResultFile:
     Raises InputError for a file that cannot be read and for fields that are missing, of the wrong shape or
     not finite.
     """
+    planned = f"it is a problem; `robotdiffuse plan {file} --out result.json` makes a result of it"
+    if FilePath(str(file)).suffix.lower() in PROBLEM_ENDINGS:
+        raise InputError(f"{file} is not a result file: {planned}")
     record = read_json(file)
     if not isinstance(record, dict):
         raise InputError(f"{file} is not a result file: it must hold one JSON object")
+    if "scene" in record and "status" not in record:
+        raise InputError(f"{file} is not a result file: {planned}")
     missing = [name for name in REQUIRED if name not in record]
     if missing:
         raise InputError(f"{file} is not a result file: {', '.join(missing)} missing")
@@ -129,6 +153,8 @@ def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any
         "verified": result.solved,
         "seed": result.seed,
         "path_length": result.path_length,
+        "duration": result.duration,
+        "stops": result.stops,
         "min_clearance": result.min_clearance,
         "scene_clearance": result.scene_clearance,
         "self_clearance": result.self_clearance,

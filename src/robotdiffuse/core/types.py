@@ -13,10 +13,16 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import Value
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.one_line import one_line
 from robotdiffuse.core.output_files import check_output, write_atomically
 
 ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
+REST = 1e-3
+"""Speed, as a share of a motion's greatest one, at which the arm rests."""
+TIME_TOLERANCE = 1e-9
+"""Times this far outside of a trajectory [s] are taken as its ends; rows are no closer when resampled."""
 
 
 class Status(Enum):
@@ -40,6 +46,9 @@ class Status(Enum):
 FIRST, CONVERGED, TIME_LIMIT = UNTIL = ("first", "converged", "time_limit")
 """When planning ends: at the first verified motion, when paths stop getting shorter, or at the time limit."""
 
+LENGTH, TIME = OBJECTIVES = ("length", "time")
+"""What anytime planners minimize: the length of the path in joint space, or the duration of the motion."""
+
 
 @dataclass(frozen=True, eq=False)
 class Path(Value):
@@ -48,6 +57,12 @@ class Path(Value):
     joint_names: tuple[str, ...]
     positions: Float[ndarray, "n dof"]
     """[rad], [m] for prismatic joints."""
+
+    def __repr__(self) -> str:
+        if getattr(self.positions, "ndim", 0) != 2:  # a motion is checked when it is used
+            return one_line(self)
+        rows, joints = self.positions.shape
+        return f"Path({joints} joints, {rows} waypoints, {self.length:.3f} rad)"
 
     @property
     def length(self) -> float:
@@ -67,9 +82,22 @@ class Tree(NamedTuple):
     """Row of each node's parent, which precedes its own; -1 for roots."""
 
 
+class State(NamedTuple):
+    """Where a trajectory is at one time [dof] or at several [n, dof]."""
+
+    positions: Float[ndarray, "*n dof"]
+    velocities: Float[ndarray, "*n dof"]
+    accelerations: Float[ndarray, "*n dof"]
+    jerks: Float[ndarray, "*n dof"]
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory(Value):
-    """Positions, velocities and accelerations over time."""
+    """Positions, velocities and accelerations over time.
+
+    Between rows, positions lie on the cubics through the rows' positions and velocities, as they do for the
+    validator and for certificates.
+    """
 
     joint_names: tuple[str, ...]
     times: Float[ndarray, "n"]
@@ -78,18 +106,79 @@ class Trajectory(Value):
     velocities: Float[ndarray, "n dof"]
     accelerations: Float[ndarray, "n dof"]
 
+    def __repr__(self) -> str:
+        if not isinstance(self.times, ndarray) or self.times.ndim != 1 or not self.times.size:
+            return one_line(self)
+        return f"Trajectory({len(self.joint_names)} joints, {len(self.times)} rows, {self.duration:.3g} s)"
+
     @property
     def duration(self) -> float:
         """Time of the last row [s]."""
         return float(self.times[-1])
 
-    def save(self, file: str | FilePath) -> None:
-        """Write .json or .csv, by the file's ending.
+    @property
+    def stops(self) -> Float[ndarray, "k"]:
+        """Times [s] at which the whole arm rests between start and end; a wait counts once, at its middle.
+
+        Looks at the rows alone: ask before resampling, which may have no row at a stop.
+        """
+        speed = np.linalg.norm(self.velocities, axis=1)
+        edges = np.diff((speed <= REST * speed.max()).astype(int), prepend=0, append=0)
+        first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+        inside = (first > 0) & (last < len(speed) - 1)
+        return (self.times[first[inside]] + self.times[last[inside]]) / 2
+
+    @property
+    def peak_jerks(self) -> Float[ndarray, "dof"]:
+        """The largest jerk of each joint [rad/s³] or [m/s³], with accelerations linear between the rows;
+        infinite for a joint whose acceleration is not 0 at the start or the end, where it jumps."""
+        steps = np.diff(self.times)[:, None]
+        between = np.abs(np.diff(self.accelerations, axis=0) / steps).max(axis=0, initial=0.0)
+        return np.where((self.accelerations[[0, -1]] == 0).all(axis=0), between, np.inf)
+
+    def at(self, time: float | int | Float[ndarray, "n"]) -> State:
+        """The state at a time or at several [s].
+
+        Positions are on the cubics, velocities are their derivatives; accelerations are linear between rows
+        and jerks are their slopes, at a row that of the step after it. At rows, the first three are the rows'
+        own. Raises InputError for a time outside of [0, duration].
+        """
+        asked = np.asarray(time, np.float64)
+        outside = ~((asked >= -TIME_TOLERANCE) & (asked <= self.duration + TIME_TOLERANCE))
+        if outside.any():
+            raise InputError(f"time is {asked[outside].flat[0]:g} s; it must be in [0, {self.duration:g}]")
+        row = np.clip(np.searchsorted(self.times, asked, side="right") - 1, 0, len(self.times) - 2)
+        h = np.asarray(self.times[row + 1] - self.times[row])[..., None]
+        u = np.clip(np.asarray(asked - self.times[row])[..., None] / h, 0.0, 1.0)
+        (q0, v0, a0), (q1, v1, a1) = (tuple(getattr(self, name)[i] for name in ROWS) for i in (row, row + 1))
+        # Hermite's basis and its derivative
+        rise, slope = u * u * (3 - 2 * u), 6 * u * (1 - u) / h
+        positions = (1 - rise) * q0 + rise * q1 + h * u * (1 - u) * ((1 - u) * v0 - u * v1)
+        velocities = slope * (q1 - q0) + (1 - u) * (1 - 3 * u) * v0 + u * (3 * u - 2) * v1
+        return State(positions, velocities, (1 - u) * a0 + u * a1, (a1 - a0) / h + 0 * u)
+
+    def resample(self, rate: float | int) -> "Trajectory":
+        """Rows of `at` at each multiple of 1 / `rate` [Hz], and the last row, which ends the motion.
+
+        The new rows lie on this motion; between them the motion may differ from it where its rows were
+        closer, so validate it again. Raises InputError for a rate that is not positive and finite.
+        """
+        if not 0 < rate < np.inf:
+            raise InputError(f"rate is {rate}; it must be a positive number [Hz]")
+        count = int(np.ceil((self.duration - TIME_TOLERANCE) * rate))
+        times = np.append(np.arange(max(count, 1)) / rate, self.duration)
+        state = self.at(times)
+        return Trajectory(self.joint_names, times, state.positions, state.velocities, state.accelerations)
+
+    def save(self, file: str | FilePath, rate: float | int | None = None) -> None:
+        """Write .json or .csv, by the file's ending; resampled at `rate` [Hz] if it is given.
 
         The CSV header is time, then <joint>_position, <joint>_velocity and <joint>_acceleration. Raises
         InputError for another ending or a file that cannot be written.
         """
         path = check_output(file, (".json", ".csv"))
+        if rate is not None:
+            return self.resample(rate).save(path)
         if path.suffix.lower() == ".json":
             write_atomically(path, json.dumps(self.record(), allow_nan=False) + "\n")
         else:

@@ -9,20 +9,24 @@ from math import pi
 from pathlib import Path as FilePath
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Int8
 from numpy import ndarray
-from torch import Tensor
-from torch.utils.data import Dataset, get_worker_info
+
+try:
+    import torch
+    from torch import Tensor
+    from torch.utils.data import Dataset, get_worker_info
+except ImportError:
+    raise ImportError('RopDataset needs torch, not installed: pip install "robotdiffuse[train]"') from None
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.datasets.rows import read_rows
 from robotdiffuse.datasets.shards import SPLITS
+from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.surface_clouds import surface_clouds
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
 VIEWS = ("full", "partial")

@@ -6,7 +6,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.input_files import file_name
+from robotdiffuse.core.input_files import file_name, input_file
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.settings import Count, Natural, Settings
 from robotdiffuse.robots.fingerprint import robot_fingerprint
@@ -94,6 +94,8 @@ def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
 def read_manifest(folder: str | FilePath) -> Manifest:
     """Read manifest.json. Raises InputError if it is missing, damaged or of another version of the format."""
     file = file_name(folder, "folder") / MANIFEST
+    if file.exists():
+        input_file(file)
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -6,6 +6,7 @@ target's position is our interpretation of the 23. float32.
 """
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path as FilePath
 
@@ -14,17 +15,16 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse import __version__
-from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.motions import motions_free
-from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
-from robotdiffuse.datasets.shards import Row, check_shapes, read_shard, row_of, shard_indices, write_shard
+from robotdiffuse.datasets.motion_rows import Row
+from robotdiffuse.datasets.own_motions import measured_row
+from robotdiffuse.datasets.shards import check_shapes, read_shard, shard_indices, write_shard
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
-from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
@@ -36,13 +36,13 @@ SPHERE_RADIUS = 0.25
 """[m]; that of the authors' planner. Their loader and viewer use 0.2, which leaves a margin of 5 cm."""
 END_TOLERANCE = 1e-4
 """Largest difference of start and goal from the first and last waypoint [rad]."""
-RESOLUTION = 0.02
-"""No point of the arm moves further than this between two checks of the straight line [m]."""
 ARRAYS_READ = ("trajectories", "start", "target_pose", "obstacle_kinds", "obstacle_params")
 
 
-def export_npz(folder: str | FilePath, file: str | FilePath) -> int:
-    """Write the trajectories of all scenes with exactly two spheres, atomically; returns their number.
+def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
+    """Write the trajectories of all scenes with exactly two spheres, atomically.
+
+    Returns their number, and the number of those that were left out.
 
     Raises InputError if there is no data set, it has no such scene, other numbers of waypoints or joints, or
     the file cannot be written.
@@ -54,9 +54,11 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> int:
             f"robot.npz holds {WAYPOINTS} waypoints of {DOF} joints"
         )
     x, y = [np.zeros((0, WAYPOINTS, DOF), np.float32)], [np.zeros((0, CONDITION_NUMBERS), np.float32)]
+    total = 0
     for index in shard_indices(folder):
         shard = read_shard(folder, index, ARRAYS_READ)
         check_shapes(folder, shard, manifest)
+        total += len(shard["trajectories"])
         kinds = shard["obstacle_kinds"]
         rows = np.flatnonzero(((kinds == SPHERE).sum(1) == 2) & ((kinds != NONE).sum(1) == 2))
         q, kinds = shard["trajectories"][rows], kinds[rows]
@@ -75,7 +77,7 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> int:
         raise InputError(f"cannot write {file}: {error.strerror or error}") from None
     finally:
         fresh.unlink(missing_ok=True)
-    return len(x_train)
+    return len(x_train), total - len(x_train)
 
 
 def import_npz(
@@ -139,32 +141,16 @@ def _row(
     radius: float,
     number: int,
 ) -> Row:
-    floor, ends = manifest.floor(0), q[[0, -1]]
+    floor = manifest.floor(0)
     assert floor is not None
     scene = Scene([floor, *(Sphere(center, radius) for center in centers)])
-    checker = CollisionChecker(robot, scene)
-    line = motions_free(search_space(checker, RESOLUTION), ends)
-    cost = float(np.linalg.norm(np.diff(q.astype(np.float64), axis=0), axis=1).sum())
-    return row_of(
-        PackedScenes.pack([scene], manifest.slots, floor=True),
-        q,
-        checker.link_clearances(q).min(axis=1, initial=1.0),
-        goals=q[-1:],
-        goal_costs=np.array([cost]),
-        goal_index=0,
-        T_base_tip=link_pose(robot, q[-1].astype(np.float64), robot.tip),
-        family=0,
-        cost=cost,
-        safety_distance=0.0,
-        line_free=bool(line[0] and checker.free(ends[:1])[0]),
-        seed=number,
-        most_goals=1,
-    )
+    return measured_row(robot, scene, PackedScenes.pack([scene], manifest.slots, floor=True), q, number)
 
 
 def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[ndarray, "n 2 3"]]:
     """The motions, and the centres of the two spheres of each."""
     wanted = {"x_train": (WAYPOINTS, DOF), "y_train": (CONDITION_NUMBERS,)}
+    input_file(file, largest=sys.maxsize)
     try:
         with np.load(file, allow_pickle=False) as stored:
             x, y = (np.asarray(stored[name], np.float32) for name in wanted)

@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from robotdiffuse.datasets.augmentation import turned
 from robotdiffuse.datasets.manifest import read_manifest
+from robotdiffuse.datasets.motion_rows import scenes_of
 from robotdiffuse.datasets.shards import (
     SPLITS,
     Shard,
@@ -17,7 +18,6 @@ from robotdiffuse.datasets.shards import (
     check_shard,
     existing_shards,
     read_shard,
-    scenes_of,
     split_of,
 )
 from robotdiffuse.robots.robot import Robot

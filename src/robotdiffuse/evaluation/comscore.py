@@ -34,8 +34,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
-
 
 @dataclass(frozen=True)
 class Indicators:
@@ -49,21 +47,6 @@ class Indicators:
     """Path length; in the paper that of all links, without a unit."""
     time: float
     """Time per problem [s]."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """The weights w_i of ComScore, which sum to 1; equal in the paper."""
-
-    success: float = 0.25
-    collision: float = 0.25
-    length: float = 0.25
-    time: float = 0.25
-
-    def __post_init__(self) -> None:
-        values = astuple(self)
-        if min(values) < 0 or abs(sum(values) - 1) > 1e-9:
-            raise InputError(f"weights are {values}; they must sum to 1, and none may be negative")
 
 
 HIGHER_IS_BETTER = np.array([True, False, False, False])
@@ -88,9 +71,10 @@ def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
     return np.where(np.isnan(values), 0.0, share)
 
 
-def comscores(rows: Sequence[Indicators], weights: Weights | None = None) -> Float[ndarray, "n"]:
-    """The ComScore of each row, in [0, 1]. It depends on which rows are compared."""
-    return normalized(rows) @ np.array(astuple(weights or Weights()))
+def comscores(rows: Sequence[Indicators]) -> Float[ndarray, "n"]:
+    """The ComScore of each row, in [0, 1], with the paper's equal weights. It depends on which rows are
+    compared."""
+    return normalized(rows).mean(axis=1)
 
 
 @dataclass(frozen=True)

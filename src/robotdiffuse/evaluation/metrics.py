@@ -14,6 +14,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.trajectories.straight_line import straight_line_time
 from robotdiffuse.validation.validator import Report
 
 STEP = 0.02
@@ -40,25 +41,25 @@ class Kinematics:
 
     def __init__(self, robot: Robot) -> None:
         moving = [link for link in robot.link_names if robot.link_frame(link) > 0]
-        self._robot = robot
+        self.robot = robot
         self._frames = [robot.link_frame(link) for link in moving]
         self._origins = np.stack([robot.T_frame_link(link)[:, 3] for link in moving])
 
     def link_length(self, q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
         """The paper's path length: the sum over all moving links of the path lengths of their origins [m]."""
-        T = forward_frames(self._robot, np.asarray(q, np.float64).reshape(-1, q.shape[-1]))
+        T = forward_frames(self.robot, np.asarray(q, np.float64).reshape(-1, q.shape[-1]))
         at = np.einsum("nlij,lj->nli", T[:, self._frames, :3], self._origins)
         at = at.reshape(*q.shape[:2], *at.shape[1:])
         return np.linalg.norm(np.diff(at, axis=1), axis=-1).sum(axis=(1, 2))
 
     def tip_length(self, q: Float[ndarray, "waypoints dof"]) -> float:
         """Path length of the origin of the robot's tip [m]."""
-        tip = link_origins(self._robot, q, self._robot.tip)
+        tip = link_origins(self.robot, q, self.robot.tip)
         return float(np.linalg.norm(np.diff(tip, axis=0), axis=1).sum())
 
     def tip_speed(self, motion: Trajectory) -> Float[ndarray, "n"]:
         """Speed of the origin of the robot's tip at each row [m/s]."""
-        robot, q = self._robot, motion.positions
+        robot, q = self.robot, motion.positions
         joints = list(robot.chain(robot.tip))
         T = forward_frames(robot, q)[:, [j + 1 for j in joints]]
         tip = link_origins(robot, q, robot.tip)
@@ -117,6 +118,34 @@ def _duration(motion: Motion) -> float | None:
     return None if motion.trajectory is None else motion.trajectory.duration
 
 
+def _stops(motion: Motion) -> float | None:
+    return None if motion.trajectory is None else float(len(motion.trajectory.stops))
+
+
+def _over_straight_line(motion: Motion) -> float | None:
+    """Duration over the least time from the first row to the last along the straight line, obstacles and
+    limits of jerk aside."""
+    robot = motion.kinematics.robot
+    if motion.trajectory is None or min(robot.velocity.min(), robot.acceleration.min()) <= 0:
+        return None
+    q = motion.trajectory.positions
+    least = float(straight_line_time(q[0], q[-1], robot.velocity, robot.acceleration))
+    return motion.trajectory.duration / least if least > 0 else None
+
+
+def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Callable[[Motion], float | None]:
+    """A metric of the jerks between rows, of the joint where each is largest, and of the steps' times."""
+
+    def value(motion: Motion) -> float | None:
+        if motion.trajectory is None or len(motion.trajectory.times) < 2:
+            return None
+        steps = np.diff(motion.trajectory.times)
+        jerks = np.abs(np.diff(motion.trajectory.accelerations, axis=0)) / steps[:, None]
+        return float(of(jerks.max(axis=1), steps))
+
+    return value
+
+
 def _jerk(motion: Motion) -> float | None:
     return None if motion.trajectory is None else log_dimensionless_jerk(motion.trajectory)
 
@@ -148,6 +177,11 @@ _METRICS = (
     Metric("scene_clearance", "mm", "more", ".1f", _clearance("scene_clearance"), 1000.0),
     Metric("self_clearance", "mm", "more", ".1f", _clearance("self_clearance"), 1000.0),
     Metric("duration", "s", "less", ".2f", _duration),
+    Metric("over_straight_line", "", "less", ".3f", _over_straight_line),
+    Metric("stops", "", "less", ".2f", _stops),
+    Metric("peak_jerk", "rad/s³", "less", ".0f", _joint_jerk(lambda j, _: j.max())),
+    Metric("mean_jerk", "rad/s³", "less", ".0f", _joint_jerk(lambda j, dt: np.average(j, weights=dt))),
+    # logarithm of the dimensionless jerk
     Metric("jerk", "", "less", ".2f", _jerk),
     Metric("sparc_joint", "", "more", ".2f", _sparc_joint),
     Metric("sparc_tip", "", "more", ".2f", _sparc_tip),

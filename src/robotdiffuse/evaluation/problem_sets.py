@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path as FilePath
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import LENGTH, Path
 from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import load_problems
@@ -31,7 +31,7 @@ def search(problem: Problem) -> float | None:
     """The reference length of a problem, that of a short path [rad]; None if search does not solve it in
     time."""
     planner = AORRTC(AORRTCSettings(gain=0.001, patience=REFERENCE_ITERATIONS))
-    return planner.plan(problem, SEARCH_TIME, seed=1, clearance=0.0).path_length
+    return planner.plan(problem, SEARCH_TIME, seed=1, clearance=0.0, objective=LENGTH).path_length
 
 
 def case_file(folder: FilePath | None, name: str) -> CaseFile:

@@ -14,8 +14,8 @@ TIE = 1e-6
 """Lengths below this [rad] or [m] count as this; logarithms of ratios within this of 0 are ties."""
 
 
-def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The interval of a share by its score test (E. B. Wilson 1927); (0, 1) without trials.
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+    """The 95 % interval of a share by its score test (E. B. Wilson 1927); (0, 1) without trials.
 
     Unlike the interval by the standard error it stays within 0 and 1 and has a width at shares of 0 and 1.
     """
@@ -23,11 +23,9 @@ def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[f
 
     if not 0 <= successes <= n:
         raise InputError(f"successes is {successes}; of {n} trials it must lie in 0 to {n}")
-    if not 0 < confidence < 1:
-        raise InputError(f"confidence is {confidence}; it must lie between 0 and 1, both excluded")
     if n == 0:
         return 0.0, 1.0
-    z, p = float(norm.ppf((1 + confidence) / 2)), successes / n
+    z, p = float(norm.ppf(0.975)), successes / n
     middle, half = p + z**2 / (2 * n), z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
     low, high = ((middle + side * half) / (1 + z**2 / n) for side in (-1, 1))
     return max(low, 0.0), min(high, 1.0)

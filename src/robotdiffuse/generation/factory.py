@@ -12,7 +12,8 @@ from typing import Any
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
-from robotdiffuse.core.processes import CLUSTERS, delay_interrupts, on_this_machine
+from robotdiffuse.core.processes import delay_interrupts, on_this_machine
+from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
 from robotdiffuse.datasets.shards import remove_leftovers, shard_indices, write_shard
 from robotdiffuse.generation.settings import GenerationSettings

@@ -13,8 +13,8 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path
+from robotdiffuse.datasets.motion_rows import Row, row_of
 from robotdiffuse.datasets.rows import resample
-from robotdiffuse.datasets.shards import Row, row_of
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearch
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.solvers import SEARCHES

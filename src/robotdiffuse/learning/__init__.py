@@ -1,0 +1,12 @@
+"""Networks: their training, by PyTorch, and what planning needs of them, by NumPy and ONNX Runtime."""
+
+from importlib.util import find_spec
+
+from robotdiffuse.core.errors import InputError, joined
+
+
+def need_packages(what: str, *packages: str) -> None:
+    """Raises InputError, naming the extra `train`, unless these packages are installed. what: needs them."""
+    missing = [package for package in packages if find_spec(package) is None]
+    if missing:
+        raise InputError(f'{what} needs {joined(missing)}, not installed: pip install "robotdiffuse[train]"')

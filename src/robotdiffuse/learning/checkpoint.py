@@ -1,16 +1,19 @@
-"""Trained networks in files: NAME.safetensors and NAME.json hold all that planning needs.
+"""Trained networks in files, as training writes and reads them; `weight_files` says what they hold.
 
 All networks are written and read in the same way: the diffusion model, the baselines' networks, the encoder
 that is trained alone and the completion network; the last two belong to no robot. A file is written whole or
 not at all.
 """
 
+import copy
 import hashlib
 import json
 import struct
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from operator import methodcaller
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -22,17 +25,18 @@ from torch import Tensor, nn
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.learning.completion.network import CompletionNetwork, CompletionSettings
+from robotdiffuse.learning.completion.export import completion_exports
+from robotdiffuse.learning.completion.network import CompletionNetwork
+from robotdiffuse.learning.completion.volume import CompletionSettings
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Encoder
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.network import Network
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.weights_registry import BUNDLED, check_weights, no_weights_error, weights_for
+from robotdiffuse.learning.weight_files import FORMAT, checked_bytes, read_description
+from robotdiffuse.learning.weights_registry import BUNDLED, completion_folder, weights_folder
 from robotdiffuse.robots.robot import Robot
-
-FORMAT = 2
 
 
 def versions() -> dict[str, str]:
@@ -74,38 +78,36 @@ def fingerprint(module: nn.Module) -> str:
 
 
 def _pack(module: nn.Module) -> dict[str, Tensor]:
-    """The weights to store: matrices of layers in fp16, finer than the bf16 they are used in; others
-    unchanged."""
+    """The weights to store: matrices of layers in fp16, others unchanged."""
     kinds = (nn.Linear, nn.Conv3d)
     half = {f"{name}.weight" for name, part in module.named_modules() if isinstance(part, kinds)}
     return {name: t.half() if name in half else t for name, t in module.state_dict().items()}
 
 
-def _save(module: nn.Module, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
-    """Write STEM.safetensors, and STEM.json with its SHA-256."""
-    digest = write_tensors(folder / f"{stem}.safetensors", _pack(module), {})
-    about = {"format": FORMAT, **about, "weights_sha256": digest}
+def _save(
+    module: nn.Module,
+    folder: FilePath,
+    stem: str,
+    about: dict[str, Any],
+    exports: Callable[[Any], dict[str, bytes]],
+) -> None:
+    """Write STEM.safetensors, the exported parts, and last STEM.json with the SHA-256 of all."""
+    packed = _pack(module)
+    digest = write_tensors(folder / f"{stem}.safetensors", packed, {})
+    stored = copy.deepcopy(module).cpu()
+    stored.load_state_dict(packed)  # exported as it will be read
+    parts = exports(stored)
+    for ending, data in parts.items():
+        write_atomically(folder / f"{stem}{ending}", data)
+    onnx = {ending: hashlib.sha256(data).hexdigest() for ending, data in parts.items()}
+    about = {"format": FORMAT, **about, "weights_sha256": digest} | ({"onnx_sha256": onnx} if onnx else {})
     write_atomically(folder / f"{stem}.json", json.dumps(about, indent=1) + "\n", make_folder=True)
 
 
 def _read(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights and description from files of `_save`. Raises InputError if they are missing or damaged."""
-    file = folder / f"{stem}.json"
-    try:
-        about = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{folder} holds no trained model: {file.name} is missing") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{file} is damaged: {error}") from None
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise InputError(f"{file} is not a model description of format {FORMAT}")
-    weights = folder / f"{stem}.safetensors"
-    try:
-        digest = hashlib.sha256(weights.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(f"cannot read {weights}: {error.strerror}") from None
-    if digest != about.get("weights_sha256"):
-        raise InputError(f"{weights} is damaged or does not belong to {file.name}: its SHA-256 differs")
+    about, weights = read_description(folder, stem), folder / f"{stem}.safetensors"
+    checked_bytes(weights, about.get("weights_sha256"), f"{stem}.json")
     return read_tensors(weights)[0], about
 
 
@@ -125,7 +127,7 @@ def save_encoder(encoder: Encoder, folder: str | FilePath, training: dict[str, A
         "settings": encoder.settings.to_json(),
         "training": training,
     }
-    _save(encoder, FilePath(folder), "encoder", about)
+    _save(encoder, FilePath(folder), "encoder", about, lambda _: {})  # planning runs no encoder alone
 
 
 def load_encoder(folder: str | FilePath) -> Encoder:
@@ -141,7 +143,7 @@ def load_encoder(folder: str | FilePath) -> Encoder:
 def save_completion(network: CompletionNetwork, folder: str | FilePath, training: dict[str, Any]) -> None:
     """Write completion.safetensors and completion.json. training: a record of the training, for readers."""
     about = {"network": "completion", "settings": network.settings.to_json(), "training": training}
-    _save(network, FilePath(folder), "completion", about)
+    _save(network, FilePath(folder), "completion", about, completion_exports)
 
 
 def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
@@ -149,12 +151,7 @@ def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
 
     Raises InputError for damaged files, and if there is none, naming the command that trains it.
     """
-    place = BUNDLED / "completion" if folder is None else FilePath(folder)
-    if not (place / "completion.json").is_file():
-        raise InputError(
-            f"{place} holds no weights of the completion network; train them: robotdiffuse train completion "
-            "--out FOLDER"
-        )
+    place = completion_folder(folder)
     tensors, about = _read(place, "completion")
     where = str(place / "completion.json")
     network = CompletionNetwork(CompletionSettings.from_json(about.get("settings"), f"{where}: settings"))
@@ -173,7 +170,7 @@ def save_network(name: str, network: Network, folder: str | FilePath, training: 
         "settings": network.settings.to_json(),
         "training": training,
     }
-    _save(network, FilePath(folder), name, about)
+    _save(network, FilePath(folder), name, about, methodcaller("exports"))
 
 
 def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
@@ -182,12 +179,7 @@ def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
     Raises InputError if there is none, naming the command that trains it, and for files that are damaged or
     made for another robot.
     """
-    check_weights(name, folder)
-    place = (weights_for(name, robot) or BUNDLED / robot.name) if folder is None else FilePath(folder)
-    if not (place / f"{name}.json").is_file():
-        raise no_weights_error(
-            name, f"no weights of the network {name} come with the package for {robot.name}"
-        )
+    place = weights_folder(name, folder, robot)
     network = _loaded(name, place)
     network.robot.check(robot, str(place / f"{name}.json"))
     return network
@@ -219,8 +211,8 @@ def _load(name: str, folder: FilePath) -> Network:
     return network.for_inference()
 
 
-def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionModel:
-    """The diffusion model of a folder, or the bundled one of a robot with this name, ready for sampling.
+def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionNetwork:
+    """The diffusion model of a folder, or the bundled one of a robot with this name, as a PyTorch module.
 
     Raises InputError, naming the file, if it is missing, damaged, or made for another robot than `robot`.
     """
@@ -228,7 +220,29 @@ def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionMode
     if not folder.is_dir() and (BUNDLED / folder.name).is_dir():
         folder = BUNDLED / folder.name
     model = _load("model", folder)
-    assert isinstance(model, MotionModel)
+    assert isinstance(model, MotionNetwork)
     if robot is not None:
         model.robot.check(robot, str(folder / "model.json"))
     return model
+
+
+def export_weights(folder: str | FilePath) -> list[str]:
+    """Write the exported parts of all networks in a folder anew, from their weights. Returns the names of the
+    networks.
+
+    Raises InputError if the folder holds none, or one is damaged.
+    """
+    place, written = FilePath(folder), list[str]()
+    for name in ("completion", *NETWORKS):
+        if not (place / f"{name}.json").is_file():
+            continue
+        about = read_description(place, name)
+        about = {key: about[key] for key in about if not key.endswith("_sha256")}
+        if name == "completion":
+            _save(load_completion(place), place, name, about, completion_exports)
+        else:
+            _save(_load(name, place), place, name, about, methodcaller("exports"))
+        written.append(name)
+    if not written:
+        raise InputError(f"{folder} holds no trained network")
+    return written

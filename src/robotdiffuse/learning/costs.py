@@ -22,7 +22,7 @@ CostStep = Callable[
 """From trajectories [rad] and the strength of the cost to the trajectories after one step down the cost.
 Guidance puts back the ends and what leaves the limits."""
 
-COSTS = Registry("guidance cost", {})
+COSTS = Registry("guidance cost", {}, group="robotdiffuse.costs")
 """Functions of the type CostStep by name."""
 
 

@@ -1,28 +1,26 @@
-"""MotionModel: encoder, denoiser and sampler put together; all that planning needs of the learned part."""
+"""MotionModel: encoder, denoiser and sampler put together; all that planning needs of the learned part.
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+Everything here is NumPy. The encoder and the denoiser are functions that a subclass provides: exported
+networks in planning (`exported_model`), PyTorch modules in training (`motion_network`).
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import ceil
 from typing import Annotated
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
-from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, OneOf, Positive, Settings, SettingsOf
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.base import Denoiser, DenoiserSettings
-from robotdiffuse.learning.denoisers.layers import Linear
-from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.denoisers.settings import DenoiserSettings, TransformerSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
-from robotdiffuse.learning.encoders import ENCODERS, make_encoder
-from robotdiffuse.learning.encoders.base import EncoderSettings
-from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
-from robotdiffuse.learning.network import Network
+from robotdiffuse.learning.encoders import ENCODERS
+from robotdiffuse.learning.encoders.settings import EncoderSettings, PointAutoencoderSettings
 from robotdiffuse.learning.objectives import OBJECTIVES, Objective
 from robotdiffuse.learning.representation import TARGETS, Reference, TrajectoryRepresentation
 from robotdiffuse.learning.robot_identity import RobotIdentity
@@ -124,38 +122,46 @@ class MotionModelSettings(ModelParts, name="model"):
         return 0 if self.encoder_settings is None else self.encoder_settings.code
 
 
-class MotionModel(TrajectoryRepresentation, Network):
+class MotionModel(TrajectoryRepresentation):
     """The diffusion model over trajectories, represented as in `TrajectoryRepresentation`."""
-
-    settings: MotionModelSettings
-    null_condition: nn.Parameter | None
 
     def __init__(self, robot: RobotIdentity, settings: MotionModelSettings) -> None:
         super().__init__(robot.normalizer(), settings.target, settings.waypoints)
         self.robot, self.settings = robot, settings
         self.schedule = NoiseSchedule(settings.schedule)
         self.objective: Objective = OBJECTIVES.make(settings.objective)
-        self.encoder = (
-            None if settings.encoder is None else make_encoder(settings.encoder, settings.encoder_settings)
-        )
-        condition = 1 if self.encoder is None else settings.code + 2 * self.dof
-        features = (1 if self.is_unit_joints else 2) * self.dof
-        features += len(robot.links) if settings.clearance_features else 0
-        features += self.dof if settings.clearance_gradients else 0
-        self.denoiser: Denoiser = DENOISERS.load(settings.denoiser)(
-            settings.denoiser_settings, self.waypoints, self.dof, features, condition
-        )
-        null = nn.Parameter(torch.zeros(condition)) if settings.null_condition else None
-        self.register_parameter("null_condition", null)
 
-    def for_inference(self) -> "MotionModel":
-        """Freeze, and keep the denoiser's matrices in bf16 where the CPU multiplies it fast. Returns self."""
-        super().for_inference()
-        if torch.cpu._is_avx512_bf16_supported():
-            for module in self.denoiser.modules():
-                if isinstance(module, Linear):
-                    module.to(torch.bfloat16)
-        return self
+    @property
+    def feature_count(self) -> int:
+        """Numbers per waypoint that the denoiser is given, see `features`."""
+        settings = self.settings
+        clearances = len(self.robot.links) if settings.clearance_features else 0
+        gradients = self.dof if settings.clearance_gradients else 0
+        return (1 if self.is_unit_joints else 2) * self.dof + clearances + gradients
+
+    @property
+    def condition_count(self) -> int:
+        """Numbers of the condition, see `condition`."""
+        return 1 if self.settings.encoder is None else self.settings.code + 2 * self.dof
+
+    @abstractmethod
+    def denoised(
+        self,
+        features: Float32[ndarray, "batch waypoints features"],
+        level: Float32[ndarray, "batch"],
+        condition: Float32[ndarray, "batch condition"],
+        dropped: Bool[ndarray, "batch"] | None = None,
+    ) -> Float32[ndarray, "batch waypoints dof"]:
+        """The denoiser's output, which `objective` converts to the clean trajectory.
+
+        dropped: samples whose condition is hidden from the denoiser (Ho and Salimans 2022; paper: C is
+            randomly masked). The ends and clearances in their features stay. Only for models with
+            `null_condition`.
+        """
+
+    @abstractmethod
+    def code_of(self, cloud: Float32[ndarray, "points 3"]) -> Float32[ndarray, "code"]:
+        """z of a cloud by the encoder, which there must be; an empty cloud is allowed."""
 
     def encode(
         self, points: Float[ndarray, "n 3"], rng: np.random.Generator | None = None
@@ -164,16 +170,16 @@ class MotionModel(TrajectoryRepresentation, Network):
 
         z of a model without an encoder has no numbers.
         """
-        if self.encoder is None:
+        of_encoder = self.settings.encoder_settings
+        if of_encoder is None:
             return np.zeros(0, np.float32)
         points = np.asarray(points, np.float32).reshape(-1, 3)
-        points = points[self.encoder.settings.region.holds(points)]
-        most = MAX_POINTS if self.encoder.any_size else self.encoder.settings.cloud
+        points = points[of_encoder.region.holds(points)]
+        most = MAX_POINTS if of_encoder.any_size else of_encoder.cloud
         if len(points) > most:
             rng = np.random.default_rng(0) if rng is None else rng
             points = points[rng.choice(len(points), most, replace=False)]
-        with torch.inference_mode(), one_thread():
-            return self.encoder(torch.from_numpy(points)[None])[0].numpy()
+        return self.code_of(points)
 
     def features(
         self, x: Float[ndarray, "batch waypoints dof"], reference: Reference, clearances: ClearanceFn
@@ -201,50 +207,31 @@ class MotionModel(TrajectoryRepresentation, Network):
     ) -> Float[ndarray, "*batch condition"]:
         """C = [z, start, goal], normalised; a single zero without an encoder, since denoisers need a
         number."""
-        if self.encoder is None:
+        if self.settings.encoder is None:
             return np.zeros((*np.shape(start)[:-1], 1), np.float32)
         ends = [self.normalizer.to_unit(np.asarray(q, np.float32)) for q in (start, goal)]
-        return np.concatenate([code, *ends], axis=-1)
+        return np.concatenate([code, *ends], axis=-1, dtype=np.float32)
 
-    def denoise(
+    def denoised_guided(
         self,
-        features: Float[Tensor, "batch waypoints features"],
-        level: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        dropped: Bool[Tensor, "batch"] | None = None,
-    ) -> Float[Tensor, "batch waypoints dof"]:
-        """The denoiser's output, which `objective` converts to the clean trajectory.
-
-        dropped: samples whose condition is hidden from the denoiser (Ho and Salimans 2022; paper: C is
-            randomly masked). The ends and clearances in their features stay. Raises InputError unless the
-            settings have `null_condition`.
-        """
-        if dropped is not None:
-            if self.null_condition is None:
-                raise InputError("null_condition of the model is False; its condition cannot be dropped")
-            condition = torch.where(dropped[:, None], self.null_condition, condition)
-        return self.denoiser(features, level, condition)
-
-    def denoise_guided(
-        self,
-        features: Float[Tensor, "batch waypoints features"],
-        level: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
+        features: Float32[ndarray, "batch waypoints features"],
+        level: Float32[ndarray, "batch"],
+        condition: Float32[ndarray, "batch condition"],
         scale: float,
-    ) -> Float[Tensor, "batch waypoints dof"]:
+    ) -> Float32[ndarray, "batch waypoints dof"]:
         """Classifier-free guidance: u + scale (c - u), of the predictions c with the condition and u without.
 
         A scale of 1 is c and one of 0 is u, at the cost of one prediction; others take a batch of twice the
         size.
         """
         if scale == 1.0:
-            return self.denoise(features, level, condition)
+            return self.denoised(features, level, condition)
         if scale == 0.0:
-            return self.denoise(features, level, condition, torch.ones_like(level, dtype=torch.bool))
-        dropped = torch.arange(2 * len(level), device=level.device) >= len(level)
-        twice = torch.cat([features] * 2), torch.cat([level] * 2), torch.cat([condition] * 2)
-        conditional, unconditional = self.denoise(*twice, dropped).chunk(2)
-        return unconditional + scale * (conditional - unconditional)
+            return self.denoised(features, level, condition, np.ones(len(level), np.bool_))
+        dropped = np.arange(2 * len(level)) >= len(level)
+        features, level, condition = (np.concatenate([part] * 2) for part in (features, level, condition))
+        conditional, unconditional = np.split(self.denoised(features, level, condition, dropped), 2)
+        return unconditional + np.float32(scale) * (conditional - unconditional)
 
     def sample(
         self,
@@ -256,7 +243,7 @@ class MotionModel(TrajectoryRepresentation, Network):
         settings: SamplingSettings | None = None,
         guide: GuideFn | None = None,
     ) -> Float[ndarray, "samples waypoints dof"]:
-        """Trajectories from start to goal [rad], float64 with exact ends, of a model from `load_model`.
+        """Trajectories from start to goal [rad], float64 with exact ends.
 
         code: z of the scene, from `encode`; None: the condition is hidden, as by a guidance_scale of 0.
         clearances: see ClearanceFn.
@@ -290,14 +277,7 @@ class MotionModel(TrajectoryRepresentation, Network):
                 clean = self.normalize(improved, reference)
             return clean
 
-        with torch.inference_mode(), one_thread():
-            x = draw(
-                predict,
-                self.schedule,
-                lambda: self.draw_noise(settings.samples, rng),
-                steps,
-                settings.eta,
-            )
+        x = draw(predict, self.schedule, lambda: self.draw_noise(settings.samples, rng), steps, settings.eta)
         q = self.joints(x, reference).astype(np.float64)
         np.clip(q, self.robot.lower, self.robot.upper, out=q)
         q[:, 0], q[:, -1] = start, goal
@@ -312,30 +292,17 @@ class MotionModel(TrajectoryRepresentation, Network):
     ) -> Predict:
         """The function that samplers call: from a noisy x to the predicted clean x, the ends held in both.
 
-        guidance_scale: see `denoise_guided`. To be called in inference mode.
+        guidance_scale: see `denoised_guided`.
         """
         signal, noise = (a.astype(np.float32) for a in (self.schedule.signal, self.schedule.noise))
-        condition_tensor = torch.from_numpy(condition)
 
         def predict(x: ndarray, level: int) -> ndarray:
             x = self.hold_ends(x.copy(), reference)
-            inputs = torch.from_numpy(self.features(x, reference, clearances))
-            at = torch.full((len(x),), level / self.schedule.steps)
-            conditions = condition_tensor.expand(len(x), -1)
-            output = self.denoise_guided(inputs, at, conditions, guidance_scale).numpy()
+            inputs = self.features(x, reference, clearances)
+            at = np.full(len(x), level / self.schedule.steps, np.float32)
+            conditions = np.array(np.broadcast_to(condition, (len(x), condition.shape[-1])))
+            output = self.denoised_guided(inputs, at, conditions, guidance_scale)
             clean = self.objective.clean(x, output, signal[level], noise[level])
             return self.hold_ends(self.clipped(clean), reference)
 
         return predict
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Runs PyTorch on one thread. For batches this small, synchronising a second thread costs more than it
-    saves, and where other processes keep the cores busy it takes a hundred times as long."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

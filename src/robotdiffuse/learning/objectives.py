@@ -12,13 +12,12 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from torch import Tensor
 
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.learning.diffusion import NoiseSchedule
 
-Array = TypeVar("Array", ndarray, Tensor)
-"""Clean trajectories, noise, noisy trajectories and network outputs, all of one type and of the shape
+Array = TypeVar("Array", bound=Any)
+"""Clean trajectories, noise, noisy trajectories and network outputs, all arrays or all tensors, of the shape
 [..., waypoints, dof]."""
 
 

@@ -7,16 +7,15 @@ nothing is taken from the data, as in MPD and EDMP. The first and the last waypo
 are written over the ends of x at every step (the paper's noise interpolation).
 """
 
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy import ndarray
-from torch import Tensor, nn
 
 from robotdiffuse.core.errors import unknown_name
-from robotdiffuse.learning.diffusion import noise_factor, white_noise_factor
+from robotdiffuse.learning.diffusion import white_noise_factor
 from robotdiffuse.robots.normalizer import JointNormalizer
 
 TARGETS = ("residual", "absolute", "limits")
@@ -33,42 +32,37 @@ class Reference(NamedTuple):
     """The last waypoint of x."""
 
 
-class TrajectoryRepresentation(nn.Module):
-    """Converts between joint values and x, and holds the statistics of the data that this takes."""
+class Statistics(NamedTuple):
+    """What a representation takes from the training data; float32."""
 
-    residual_scale: Tensor
-    residual_mean: Tensor
-    noise_factor: Tensor
+    residual_scale: Float[ndarray, "dof"]
+    """Standard deviation of the trajectories about their reference, in units of the joint limits."""
+    residual_mean: Float[ndarray, "dof"]
+    """Their mean, for the target `absolute`; else zero."""
+    noise_factor: Float[ndarray, "waypoints waypoints"]
+    """The matrix that makes noise of white noise, see `diffusion.noise_factor`."""
+
+    @staticmethod
+    def without_data(waypoints: int, dof: int) -> "Statistics":
+        """Those of the target `limits`, and of the others before training."""
+        white = white_noise_factor(waypoints).astype(np.float32)
+        return Statistics(np.ones(dof, np.float32), np.zeros(dof, np.float32), white)
+
+
+class TrajectoryRepresentation(ABC):
+    """Converts between joint values and x."""
 
     def __init__(self, normalizer: JointNormalizer, target: str, waypoints: int) -> None:
-        super().__init__()
         if target not in TARGETS:
             raise unknown_name("target", target, TARGETS)
         self.normalizer, self.target, self.waypoints = normalizer, target, waypoints
         self.dof = len(normalizer.middle)
-        fitted = target != "limits"
-        self.register_buffer("residual_scale", torch.ones(self.dof), persistent=fitted)
-        self.register_buffer("residual_mean", torch.zeros(self.dof), persistent=target == "absolute")
-        white = torch.from_numpy(white_noise_factor(waypoints).astype(np.float32))
-        self.register_buffer("noise_factor", white, persistent=fitted)
         self._fractions = np.linspace(0.0, 1.0, waypoints, dtype=np.float32)[:, None]
 
-    def fit_statistics(self, q: Float[ndarray, "n waypoints dof"], smooth_noise: bool) -> None:
-        """Set scale, mean and covariance of the noise from trajectories [rad].
-
-        The target `limits` has no such statistics: nothing happens.
-        """
-        if self.target == "limits":
-            return
-        self.residual_scale.fill_(1.0)
-        self.residual_mean.fill_(0.0)
-        if self.target == "absolute":
-            x = self.normalize(q, self.reference(q[:, 0], q[:, -1]))
-            self.residual_mean.copy_(torch.from_numpy(x[:, 1:-1].mean((0, 1))))
-        x = self.normalize(q, self.reference(q[:, 0], q[:, -1]))
-        scale = np.maximum(np.sqrt((x[:, 1:-1] ** 2).mean((0, 1))), 1e-4)
-        self.residual_scale.copy_(torch.from_numpy(scale))
-        self.noise_factor.copy_(torch.from_numpy(noise_factor(x / scale, smooth_noise)))
+    @property
+    @abstractmethod
+    def statistics(self) -> Statistics:
+        """The statistics of the training data."""
 
     @property
     def is_unit_joints(self) -> bool:
@@ -79,10 +73,6 @@ class TrajectoryRepresentation(nn.Module):
         """A predicted x within the joint limits where x is in units of them; other targets: x as it is."""
         return np.clip(x, -1.0, 1.0) if self.is_unit_joints else x
 
-    @property
-    def _scale(self) -> ndarray:
-        return self.residual_scale.numpy()
-
     def reference(self, start: Float[ndarray, "*batch dof"], goal: Float[ndarray, "*batch dof"]) -> Reference:
         """The reference of trajectories from start to goal [rad]."""
         a, b = (self.normalizer.to_unit(np.asarray(q, np.float32))[..., None, :] for q in (start, goal))
@@ -90,16 +80,16 @@ class TrajectoryRepresentation(nn.Module):
             base = a + (b - a) * self._fractions
             zero = np.zeros((*base.shape[:-2], 1, self.dof), np.float32)
             return Reference(base, zero, zero)
-        mean = self.residual_mean.numpy()
+        scale, mean = self.statistics[:2]
         base = np.broadcast_to(mean, (*a.shape[:-2], self.waypoints, self.dof))
-        return Reference(base, (a - mean) / self._scale, (b - mean) / self._scale)
+        return Reference(base, (a - mean) / scale, (b - mean) / scale)
 
     def normalize(
         self, q: Float[ndarray, "*batch waypoints dof"], reference: Reference
     ) -> Float[ndarray, "*batch waypoints dof"]:
         """x of trajectories [rad]; its ends are those of the reference."""
         unit = self.normalizer.to_unit(q.astype(np.float32, copy=False))
-        return self.hold_ends((unit - reference.base) / self._scale, reference)
+        return self.hold_ends((unit - reference.base) / self.statistics.residual_scale, reference)
 
     def joints(
         self, x: Float[ndarray, "*batch waypoints dof"], reference: Reference
@@ -111,7 +101,7 @@ class TrajectoryRepresentation(nn.Module):
         self, x: Float[ndarray, "*batch waypoints dof"], reference: Reference
     ) -> Float[ndarray, "*batch waypoints dof"]:
         """Joint values of x in units of their limits."""
-        return reference.base + x * self._scale
+        return reference.base + x * self.statistics.residual_scale
 
     def hold_ends(
         self, x: Float[ndarray, "*batch waypoints dof"], reference: Reference
@@ -123,13 +113,4 @@ class TrajectoryRepresentation(nn.Module):
     def draw_noise(self, count: int, rng: np.random.Generator) -> Float[ndarray, "count waypoints dof"]:
         """Standard noise of the forward process; zero at both ends."""
         white = rng.standard_normal((count, self.waypoints, self.dof), dtype=np.float32)
-        return self.noise_factor.numpy() @ white
-
-    def joints_at(
-        self,
-        x: Float[Tensor, "n waypoints dof"],
-        base: Float[Tensor, "n waypoints dof"],
-        at: list[int],
-    ) -> Float[Tensor, "n {len(at)} dof"]:
-        """Joint values [rad] of the waypoints with these indices, differentiable in x."""
-        return self.normalizer.from_unit(base[:, at] + x[:, at] * self.residual_scale)
+        return self.statistics.noise_factor @ white

@@ -1,17 +1,14 @@
 """Identifies the robot that a network's weights were trained for."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotdiffuse.collision.kernel_arrays import robot_groups
 from robotdiffuse.core.errors import InputError, joined, shortened
 from robotdiffuse.core.settings import Settings
+from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.robots.robot import Robot, once_per_robot
-
-if TYPE_CHECKING:
-    from robotdiffuse.robots.normalizer import JointNormalizer
 
 DIMENSION_TOLERANCE = 1e-3
 """Robots are the same if their dimensions [m] and entries of rotations differ by less than this."""
@@ -61,9 +58,7 @@ class RobotIdentity(Settings):
     def dof(self) -> int:
         return len(self.joint_names)
 
-    def normalizer(self) -> "JointNormalizer":
-        from robotdiffuse.robots.normalizer import JointNormalizer  # loads PyTorch
-
+    def normalizer(self) -> JointNormalizer:
         return JointNormalizer(np.array(self.lower), np.array(self.upper))
 
     def difference(self, robot: Robot) -> str:

@@ -56,6 +56,38 @@ def check_weights(name: str, folder: str | FilePath | None) -> None:
         raise no_weights_error(name, what)
 
 
+def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> FilePath:
+    """The folder with weights of a network: the given one, or that of `weights_for`.
+
+    Raises InputError if it holds none, naming the command that trains them.
+    """
+    check_weights(name, folder)
+    if folder is not None:
+        return FilePath(folder)
+    found = weights_for(name, robot)
+    if found is None and (BUNDLED / robot.name / f"{name}.json").is_file():
+        return BUNDLED / robot.name  # made for another arm of that name, which the caller finds
+    if found is None:
+        raise no_weights_error(
+            name, f"no weights of the network {name} come with the package for {robot.name}"
+        )
+    return found
+
+
+def completion_folder(folder: str | FilePath | None) -> FilePath:
+    """The folder with weights of the completion network; None: of those that come with the package.
+
+    Raises InputError if it holds none, naming the command that trains them.
+    """
+    place = BUNDLED / "completion" if folder is None else FilePath(folder)
+    if not (place / "completion.json").is_file():
+        raise InputError(
+            f"{place} holds no weights of the completion network; train them: robotdiffuse train completion "
+            "--out FOLDER"
+        )
+    return place
+
+
 def no_weights_error(name: str, what: str) -> InputError:
     """The error for missing weights: `what` is missing, and the command that trains it."""
     how = NETWORKS[name].kind or f"baseline {name} --data FOLDER --out FOLDER"

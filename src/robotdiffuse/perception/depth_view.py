@@ -3,6 +3,7 @@
 As with shapes, the constructor checks its arguments itself: see `no_type_check` in scenes/shapes.py.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, no_type_check
 
@@ -17,6 +18,7 @@ from robotdiffuse.scenes.shapes import PointCloud
 
 MIN_FOCAL_LENGTH = 1e-3
 """Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""
+INTRINSICS = ("fx", "fy", "cx", "cy")
 MAX_CLOUD_WIDTH, MAX_CLOUD_HEIGHT = 320, 240
 """Maximum size of the image that is made of a point cloud; sparse clouds get coarser images [pixels]."""
 
@@ -34,7 +36,8 @@ class DepthView(Value):
     depth: Float32[ndarray, "h w"]
     """Distance along the optical axis [m]."""
     intrinsics: tuple[float, float, float, float]
-    """fx, fy, cx, cy [pixels]; pixel centres have integer coordinates."""
+    """fx, fy, cx, cy [pixels]; pixel centres have integer coordinates. A mapping of these names, and a camera
+    matrix of 3 x 3, are taken too."""
     T_base_camera: Float[ndarray, "4 4"]
     """x to the right in the image, y down, z ahead: the optical frame of ROS and OpenCV."""
     configuration: Float[ndarray, "dof"] | None = None
@@ -49,7 +52,7 @@ class DepthView(Value):
         if depth is None or depth.ndim != 2 or depth.size == 0:
             form = "not numbers" if depth is None else f"an array of {' x '.join(map(str, depth.shape))}"
             raise InputError(f"view.depth is {form}; it must be an image of height x width")
-        intrinsics = vector("view", "intrinsics", self.intrinsics, 4, MAX_RATE)
+        intrinsics = vector("view", "intrinsics", _four_intrinsics(self.intrinsics), 4, MAX_RATE)
         if min(intrinsics[:2]) < MIN_FOCAL_LENGTH:
             least = f"fx and fy must be at least {MIN_FOCAL_LENGTH:g} [pixels]"
             raise InputError(f"view.intrinsics is {shown(intrinsics)}; {least}")
@@ -73,7 +76,7 @@ class DepthView(Value):
         def __init__(
             self,
             depth: ArrayLike,
-            intrinsics: ArrayLike,
+            intrinsics: ArrayLike | Mapping[str, float],
             T_base_camera: ArrayLike,
             configuration: ArrayLike | None = None,
             cloud: Float[ndarray, "n 3"] | None = None,
@@ -132,6 +135,23 @@ class DepthView(Value):
         intrinsics = (1 / pixel, 1 / pixel, -low[0] / pixel, -low[1] / pixel)
         image = np.where(np.isfinite(depth), depth, 0.0).reshape(height, width)
         return cls(image, intrinsics, T, configuration, points, source)
+
+
+def _four_intrinsics(given: object) -> object:
+    """fx, fy, cx, cy of a mapping or a camera matrix; anything else is returned as it is."""
+    if isinstance(given, Mapping):
+        if {*given} != {*INTRINSICS}:
+            raise InputError(f"view.intrinsics has {shown([*given])}; it must have {', '.join(INTRINSICS)}")
+        return [given[name] for name in INTRINSICS]
+    matrix = numbers(given)
+    if matrix is None or matrix.shape != (3, 3):
+        return given
+    fx, skew, cx, _, fy, cy = matrix[:2].ravel()
+    if skew != 0 or matrix[1, 0] != 0 or not np.array_equal(matrix[2], (0, 0, 1)):
+        raise InputError(
+            f"view.intrinsics is {shown(matrix)}; it must be fx 0 cx, 0 fy cy, 0 0 1, without skew"
+        )
+    return [fx, fy, cx, cy]
 
 
 class SeenPoints(PointCloud):

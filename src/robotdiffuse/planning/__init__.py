@@ -1,14 +1,13 @@
 """The planners by name. A new planner is one file and one line in PLANNERS."""
 
-from collections.abc import Iterable
-from functools import cache
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import CONVERGED
+from robotdiffuse.core.types import CONVERGED, TIME
 
 if TYPE_CHECKING:
     from robotdiffuse.core.results import PlanResult
@@ -111,13 +110,18 @@ PLANNERS = Registry(
         "ompl_bit_star": _ompl("BITStar", "BIT*, to the end of the time"),
         "ompl_aorrtc": _ompl("AORRTC", "AORRTC, to the end of the time"),
     },
+    group="robotdiffuse.planners",
 )
 DEFAULT_PLANNER = "robotdiffuse"
+MAX_LOADED = 8
+"""Planners with different settings that `plan` keeps loaded."""
 
 
 def load_planner(name: str, settings: object | None = None, weights: str | None = None) -> "Planner":
-    """The planner of a name, with the given settings (of its own dataclass) or its default ones.
+    """The planner of a name.
 
+    settings: of its own dataclass, or a table of those that differ from the defaults, such as {"range": 0.5};
+        None: the defaults.
     weights: folder with weights for a learned planner, in place of those that come with the package. With
     settings, name the folder there instead.
 
@@ -130,7 +134,9 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
         if PLANNERS.entry(name).kind == SEARCH:
             learned = ", ".join(other for other, its in PLANNERS.items() if its.kind != SEARCH)
             raise InputError(f"planner {name} has no weights; those that have: {learned}")
-        settings = PLANNERS.settings(name)(weights=str(file_name(weights, "weights")))  # type: ignore[misc]
+        settings = {"weights": str(file_name(weights, "weights"))}
+    if isinstance(settings, Mapping):
+        settings = _default_settings(name).replaced(settings)
     return PLANNERS.make(name, settings)
 
 
@@ -139,10 +145,14 @@ def planner_settings(name: str, assignments: Iterable[str]) -> Settings:
 
     Raises InputError for an unknown planner, an unknown setting and a value out of bounds.
     """
-    kind = PLANNERS.settings(name)
-    if kind is None:
+    return _default_settings(name).changed(assignments)
+
+
+def _default_settings(name: str) -> Settings:
+    defaults = PLANNERS.defaults(name)
+    if defaults is None:
         raise InputError(f"planner {name} has no settings")
-    return kind().changed(assignments)
+    return defaults
 
 
 def planners_that_support(what: str) -> list[str]:
@@ -150,9 +160,17 @@ def planners_that_support(what: str) -> list[str]:
     return [name for name, entry in PLANNERS.items() if what in entry.supports]
 
 
-@cache
-def _default() -> "Planner":
-    return load_planner(DEFAULT_PLANNER)
+_planners: dict[tuple[str, str], "Planner"] = {}
+
+
+def _loaded(name: str, settings: Settings | None) -> "Planner":
+    """The planner of a name and settings, loaded once; the oldest goes when there are too many."""
+    key = name, repr(settings)
+    if key not in _planners:
+        while len(_planners) >= MAX_LOADED:
+            _planners.pop(next(iter(_planners)), None)
+        _planners[key] = load_planner(name, settings)
+    return _planners[key]
 
 
 def plan(
@@ -164,11 +182,38 @@ def plan(
     velocity_scaling: float = 1.0,
     acceleration_scaling: float = 1.0,
     jerk: float | None = None,
+    objective: str = TIME,
+    *,
+    planner: str = DEFAULT_PLANNER,
+    settings: "Settings | Mapping[str, object] | None" = None,
 ) -> "PlanResult":
-    """Plan with the default planner, which is loaded once.
+    """Plan a motion. The result holds a verified motion, or a status and a reason why there is none.
 
-    The arguments, and what they mean, are those of `planning.planner.Planner.plan`. The result holds a
-    verified motion, or a status and a reason why there is none.
+    problem: a `rd.Problem`; `rd.load_problem` reads one from a file.
+    time_limit: wall time for the call, without loading weights and compiling kernels [s].
+    seed: seed of all random numbers, at least 0. The same seed gives the same path, unless time runs out.
+    until: "first" returns the first verified motion, "converged" searches on until more time hardly shortens
+        the path, "time_limit" until time runs out.
+    clearance: distance to obstacles that is kept wherever start, goal and passages allow it, up to 0.5 m [m];
+        None: the problem's, or 1 cm.
+    velocity_scaling, acceleration_scaling: parts of the robot's limits that the timed motion uses, from 0.001
+        to 1.
+    jerk: largest jerk of any joint [rad/s³]; None: the robot's limits, infinite: no limit.
+    objective: what searches minimize: "length" of the path, or "time", the motion's duration.
+    planner: a name that `robotdiffuse planners` lists. A planner is loaded once for its settings.
+    settings: of the planner: a table of those that differ from the defaults, such as {"range": 0.5}, or its
+        dataclass.
+
+    Raises InputError, one line, for arguments of the wrong type or out of bounds, unknown planners and
+    settings, and requests that the planner does not support. `planning.planner.Planner.plan` says more on the
+    arguments.
     """
+    if settings is not None and not isinstance(settings, Settings | Mapping):
+        raise InputError(
+            f"settings is {shown(settings)}; it must be a table of settings, such as {{'range': 0.5}}"
+        )
+    PLANNERS.entry(planner)  # unknown names first
+    if isinstance(settings, Mapping):
+        settings = _default_settings(planner).replaced(settings)
     limits = velocity_scaling, acceleration_scaling, jerk
-    return _default().plan(problem, time_limit, seed, until, clearance, *limits)
+    return _loaded(planner, settings).plan(problem, time_limit, seed, until, clearance, *limits, objective)

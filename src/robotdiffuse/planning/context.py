@@ -12,12 +12,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import compile_seconds
-from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.deadline import OutOfTimeError, check_left, deadline
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural, OneOf, Settings
-from robotdiffuse.core.types import CONVERGED, UNTIL, Path, Status, Trajectory
-from robotdiffuse.problems.problem import Problem, check_problem
+from robotdiffuse.core.types import CONVERGED, OBJECTIVES, TIME, UNTIL, Path, Status, Trajectory
+from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem
+from robotdiffuse.problems.units import unit_notes
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
     NO_EXTRA_LIMITS,
@@ -51,10 +51,17 @@ class PlanRequest(Settings):
     time_limit: Annotated[float, Bound(above=0.0, most=1e9)] = 1.0
     seed: Natural = 0
     until: Annotated[str, OneOf(UNTIL)] = CONVERGED
-    clearance: Annotated[float, Bound(least=0.0, most=MAX_COORDINATE)] | None = None
+    clearance: Annotated[float, Bound(least=0.0, most=MAX_CLEARANCE)] | None = None
     velocity_scaling: Scaling = 1.0
     acceleration_scaling: Scaling = 1.0
     jerk: Jerk | None = None
+    objective: Annotated[str, OneOf(OBJECTIVES)] = TIME
+
+
+def requested_clearance(problem: Problem, clearance: float | None) -> float:
+    """The clearance of a call; if it gives none, the problem's, or the default one [m]."""
+    wanted = (clearance, problem.clearance, DEFAULT_CLEARANCE)
+    return next(value for value in wanted if value is not None)
 
 
 @lru_cache
@@ -82,15 +89,14 @@ class PlanningContext:
         self.started, self._compiled = time.perf_counter(), compile_seconds()
         check_problem(problem)
         self.planner_name, self.problem, self.request = planner_name, problem, request
-        wanted = (request.clearance, problem.clearance, DEFAULT_CLEARANCE)
-        self.clearance = next(value for value in wanted if value is not None)
+        self.clearance = requested_clearance(problem, request.clearance)
         """Distance to obstacles that paths keep where they can [m]."""
         scalings = request.velocity_scaling, request.acceleration_scaling
         self.timing = _timing(*scalings, request.jerk, constrained=bool(problem.constraints))
         expected = _validation_seconds.get(problem.robot.name, 0.0)
         self._reserved = min(expected, MAX_RESERVED_FRACTION * request.time_limit)
         self.validator = verifier(problem)
-        self.notes = list(problem.notes)
+        self.notes = [*unit_notes(problem), *problem.notes]
         """Notes of the result, on what was changed or ignored; planners may add to them."""
         self._progress: list[tuple[float, float]] = []
         self._refused = ""
@@ -244,6 +250,9 @@ class PlanningContext:
             if timed.violation.kind == "time":  # too long to validate, like any other motion of this problem
                 self._ended = Status.NO_PATH, timed.violation.message
             return self._refuse(timed.violation)
+        stops = ", ".join(f"{at:.3g} s" for at in trajectory.stops)
+        if stops:
+            notes = (*notes, f"the motion stops on its way, at {stops}: corners there could not be rounded")
         scene = _least(report.scene_clearance, timed.scene_clearance)
         itself = _least(report.self_clearance, timed.self_clearance)
         # the time at which the search noted this length; the shorter paths that it noted were refused

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.settings import Settings
+from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.weights_registry import check_weights
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.robots.robot import Robot
@@ -38,9 +39,13 @@ class LearnedPlanner(Planner[LearnedPlannerSettings]):
         check_weights(self.network_name, self.settings.weights)
 
     def network(self, robot: Robot) -> Any:
-        """The trained network for a robot. Raises InputError, naming the command that trains one, if there is
-        none."""
-        from robotdiffuse.learning.checkpoint import load_network  # imports PyTorch
+        """The trained network for a robot, here as a PyTorch module.
+
+        Raises InputError, naming the command that trains one, if there is none, and if PyTorch is not
+        installed.
+        """
+        need_packages(f"the planner {self.name}", "torch")
+        from robotdiffuse.learning.checkpoint import load_network
 
         return load_network(self.network_name, self.settings.weights, robot)
 

@@ -14,7 +14,7 @@ from robotdiffuse.perception.assumptions import FINE_VOXEL_SIZE, refined, voxels
 from robotdiffuse.perception.observed_volume import LOW, observe
 from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.perception.visibility_kernel import seen_weights
-from robotdiffuse.planning.pipeline.unknown_space import unknown_space_of
+from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
 from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
@@ -73,7 +73,7 @@ def next_view(
         raise InputError("next_view: poses is empty; at least one camera pose is needed")
     volume = observe(problem.views, problem.robot, problem.start)
     predicted = None
-    if problem.unknown == PREDICTED:
+    if policy_for(problem)[0] == PREDICTED:
         from robotdiffuse.learning.completion import predict
 
         predicted = predict(volume)

@@ -134,5 +134,4 @@ def _plan(robot: int, values: dict[str, Any]) -> PlanResult:
     if problem.robot not in _state.warm:
         _state.planner.warm_up(problem)
         _state.warm.add(problem.robot)
-    _state.planner.load_wanted(problem.robot)
     return replace(_state.planner.plan(problem, **vars(_state.request)), problem=None)  # the caller has it

@@ -9,7 +9,7 @@ from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import CONVERGED, FIRST
+from robotdiffuse.core.types import CONVERGED, FIRST, TIME
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, planners_that_support
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.pipeline import pipeline_for
@@ -49,6 +49,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         velocity_scaling: float = 1.0,
         acceleration_scaling: float = 1.0,
         jerk: float | None = None,
+        objective: str = TIME,
     ) -> PlanResult:
         """Plan a motion within `time_limit` [s] of wall time.
 
@@ -58,15 +59,18 @@ class Planner(ABC, Generic[PlannerSettings]):
         time_limit: wall time for the call, without loading weights and compiling kernels [s].
         seed: seed of all random numbers, at least 0.
         until: "first" returns the first verified motion, "converged" searches on until more time hardly
-            shortens the path, "time_limit" until time runs out; planners that cannot improve a path return
+            improves it, "time_limit" until time runs out; planners that cannot improve a path return
             their first.
         clearance: distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
             and passages allow it [m]; where they do not, the distance is smaller, and a note says so. None:
             the problem's, or 1 cm. The other planners have their own settings and refuse a clearance.
         velocity_scaling, acceleration_scaling: parts of the robot's limits that the timed motion uses, from
             0.001 to 1.
-        jerk: largest jerk of any joint of the timed motion [rad/s³], at least 0.01. None: no limit, the
-            fastest motion.
+        jerk: largest jerk of any joint of the timed motion [rad/s³], at least 0.01. None: the robot's jerk
+            limits, or 10 / s times the acceleration limit of joints without one; infinite: no limit.
+        objective: what aorrtc, rrt_connect and robotdiffuse minimize in calls that improve a path: "time",
+            the motion's duration, or "length" of the path in joint space. Under path constraints always the
+            length; ignored by planners that return their first path.
 
         Problems may also have, for every planner:
 
@@ -85,7 +89,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         """
         check_problem(problem)
         request = PlanRequest(
-            time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk
+            time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk, objective
         )
         self._check_support(problem, request)
         self.prepare(problem.robot)
@@ -102,14 +106,14 @@ class Planner(ABC, Generic[PlannerSettings]):
     def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
         """Compile or load the kernels now, so that the first call does not spend its time limit on it.
 
-        On a new machine this takes about a minute. `until` is that of the calls to come: unless it is
-        "first", what only long calls need is loaded too, which takes seconds once in a process: Coal, and the
-        network of the hybrid planner.
+        On a new machine this takes about a minute. `until` is that of the calls to come.
 
         Returns the results of the calls that it makes: without obstacles, with balls on the straight line,
         and a very short one with one small obstacle of each kind in the problem's scene. The problem's own
         scene is compiled within the time of its own call.
         """
+        from robotdiffuse.collision.exact_meshes import warm_up as load_coal
+
         robot, start, goal = problem.robot, problem.start, problem.goal
         goals = goal.positions[:1] if isinstance(goal, JointGoal) else []
         on_line = [start + share * (end - start) for end in goals for share in (0.5, 0.35)]
@@ -119,24 +123,12 @@ class Planner(ABC, Generic[PlannerSettings]):
             kinds = replace(kinds, scene=one_of_each(problem.scene))
         easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]
         calls = [*((easier, EASY_TIME_LIMIT) for easier in easy), (kinds, SHORT_TIME_LIMIT)]
-        if until != FIRST:
-            self._load_rarely_needed(robot)
+        load_coal(robot)
         return [self.plan(task, seconds, until=until) for task, seconds in calls]
 
     def prepare(self, robot: Robot) -> None:
         """Do what does not count as planning time: learned planners load their weights for the robot, and
         raise InputError if there are none."""
-
-    def load_wanted(self, robot: Robot) -> None:
-        """Load what earlier calls had no time to load, and Coal. Programs that make many calls call this
-        between them."""
-        from robotdiffuse.collision.exact_meshes import warm_up  # imports Coal
-
-        warm_up(robot)
-
-    def _load_rarely_needed(self, robot: Robot) -> None:
-        """Load what only some calls need."""
-        self.load_wanted(robot)
 
     @abstractmethod
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:

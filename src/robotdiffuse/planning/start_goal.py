@@ -15,6 +15,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
+from robotdiffuse.problems.units import arm_in_cloud_note
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -195,6 +196,8 @@ def _usable_goals(
     if not checker.free(start[None])[0]:
         collision = _explained(robot, scene, start)
         if collision is not None:
+            note = arm_in_cloud_note(robot, scene, start)
+            context.notes[:0] = [note] if note else []
             return context.fail(Status.INVALID_START, f"the start is in collision: {collision}")
     constraints = context.validator.constraints
     wrong = None if constraints is None else constraints.worst_violation(start)

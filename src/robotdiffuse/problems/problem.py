@@ -5,7 +5,6 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from dataclasses import replace as dataclass_replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, ClassVar, TypedDict, Unpack, no_type_check
 
@@ -14,26 +13,36 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, Value, numbers, rigid_transform
+from robotdiffuse.core.bounds import Value, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
+from robotdiffuse.core.one_line import short
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
-from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
+from robotdiffuse.problems.constraints import CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
 from robotdiffuse.problems.goals import Goal, OneGoal, moved_goal
 from robotdiffuse.problems.goals import JointGoal as JointGoal
 from robotdiffuse.problems.goals import PoseGoal as PoseGoal
 from robotdiffuse.problems.goals import PosesGoal as PosesGoal
-from robotdiffuse.robots.dynamics import check_dynamics
+from robotdiffuse.problems.problem_fields import (
+    base_pose,
+    blend_radii,
+    checked_configuration,
+    checked_goal,
+    checked_payload,
+    depth_views,
+    moving_obstacles,
+    path_constraints,
+    velocity_at_start,
+    waypoint_goals,
+)
 from robotdiffuse.robots.inertias import Payload
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 
-LIMIT_SLACK = 1e-5
-"""Configurations beyond a joint limit by at most this are clamped to it, with a note [rad] or [m]."""
-MIN_BLEND, MAX_BLEND = 1e-3, 10.0
-"""Bounds of a `Problem.blend` that is not 0 [rad] or [m]."""
+MAX_CLEARANCE = 0.5
+"""Largest clearance that can be requested [m]: hardly any motion of an arm keeps more."""
 OPTIMISTIC, PADDED, PREDICTED, OCCUPIED = "optimistic", "padded", "predicted", "occupied"
 UNKNOWN_POLICIES = (OPTIMISTIC, PADDED, PREDICTED, OCCUPIED)
 """Policies for space that no view observed. It is assumed to be: free; free, except near observed surfaces;
@@ -59,7 +68,7 @@ class ProblemOptions(TypedDict, total=False):
     notes: tuple[str, ...]
     clearance: float | None
     views: Sequence[DepthView]
-    unknown: str
+    unknown: str | None
     waypoints: Sequence[ArrayLike | Goal | Sequence[OneGoal]]
     constraints: Sequence[Constraint]
     moving: Sequence[MovingObstacle]
@@ -73,7 +82,8 @@ class ProblemOptions(TypedDict, total=False):
 class Problem(Value):
     """A planning problem. Lengths in [m], angles in [rad], poses in the frame of the robot's base.
 
-    `goal` accepts a configuration, a list of configurations, a JointGoal, a PoseGoal, a PosesGoal, or a list
+    `start` accepts a configuration, or the name of a pose of the robot (`robot.poses`), such as "ready".
+    `goal` accepts these, a list of configurations, a JointGoal, a PoseGoal, a PosesGoal, or a list
     of goals, any of which may be reached. Each waypoint accepts the same.
 
     Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note. Values of continuous joints are
@@ -96,8 +106,9 @@ class Problem(Value):
     call's default."""
     views: tuple[DepthView, ...] = ()
     """Depth images of the scene."""
-    unknown: str = OPTIMISTIC
-    """Policy for space that no view observed, one of UNKNOWN_POLICIES; ignored without views."""
+    unknown: str | None = None
+    """Policy for space that no view observed, one of UNKNOWN_POLICIES; None: predicted where the completion
+    network covers the arm's reach, else padded. Ignored without views."""
     T_world_base: Float[ndarray, "4 4"] | None = None
     """Pose of the base in the world, for files and pictures; None: the base's frame is the world's. Scene,
     goal and views of a Problem are always in the base's frame; `in_world` accepts them in the world's."""
@@ -118,26 +129,27 @@ class Problem(Value):
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
-            check_clearance("clearance", self.clearance)
-        check_unknown("unknown", self.unknown)
+            check_clearance(self.clearance)
+        if self.unknown is not None:
+            check_unknown("unknown", self.unknown)
         if not isinstance(self.robot, Robot):
             raise InputError(f"robot is {shown(self.robot)}; it must be a Robot, e.g. rd.load_robot('panda')")
         if not isinstance(self.scene, Scene):
             raise InputError(f"scene is {shown(self.scene)}; it must be a Scene, e.g. rd.Scene([shape, ...])")
         notes = list(self.notes)
         checked: dict[str, Any] = {
-            "start": _configuration(self.robot, "start", self.start, notes),
-            "goal": _goal(self.robot, "goal", self.goal, notes),
-            "waypoints": _waypoints(self.robot, self.waypoints, notes),
-            "payload": _payload(self.robot, self.payload),
-            "constraints": _constraints(self.robot, self.constraints),
-            "views": _views(self.robot, self.views),
-            "moving": _moving(self.moving, self.scene),
-            "start_velocity": _start_velocity(self.robot, self.start_velocity),
-            "T_world_base": _base(self.T_world_base),
+            "start": checked_configuration(self.robot, "start", self.start, notes),
+            "goal": checked_goal(self.robot, "goal", self.goal, notes),
+            "waypoints": waypoint_goals(self.robot, self.waypoints, notes),
+            "payload": checked_payload(self.robot, self.payload),
+            "constraints": path_constraints(self.robot, self.constraints),
+            "views": depth_views(self.robot, self.views),
+            "moving": moving_obstacles(self.moving, self.scene),
+            "start_velocity": velocity_at_start(self.robot, self.start_velocity),
+            "T_world_base": base_pose(self.T_world_base),
             "notes": tuple(notes),
         }
-        checked["blend"] = _blend(self.blend, len(checked["waypoints"]))
+        checked["blend"] = blend_radii(self.blend, len(checked["waypoints"]))
         _check_combinations(checked)
         if checked["views"]:
             start, goal = checked["start"], checked["goal"]
@@ -145,6 +157,12 @@ class Problem(Value):
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         super().__post_init__()
+
+    def __repr__(self) -> str:
+        more = ("views", "waypoints", "constraints", "moving")
+        counts = "".join(f", {len(getattr(self, name))} {name}" for name in more if getattr(self, name))
+        ends = f"start={short(self.start)}, goal={short(self.goal)}"
+        return f"Problem({self.robot.name!r}, {self.scene!r}, {ends}{counts})"
 
     if TYPE_CHECKING:
 
@@ -188,6 +206,25 @@ class Problem(Value):
         T = self.T_world_base
         return (self.robot, self.scene) if T is None else (self.robot.placed_in_world(T), self.scene.moved(T))
 
+    def clearance_at(self, q: ArrayLike) -> float | Float[ndarray, "n"]:
+        """Lower bound on the distance of the arm to obstacles and between its links [m], at most 1 m.
+
+        q: a configuration [dof], or several [n, dof]. Positive: free of collision. The bound is of the
+        spheres that cover the links: it may be negative by some millimetres where the links are apart.
+        Distances to point clouds and meshes count as at most 0.3 m; moving obstacles are ignored.
+
+        Returns a number, or one for each row. Raises InputError for q of the wrong shape.
+        """
+        from robotdiffuse.collision import CollisionChecker  # compiled code
+        from robotdiffuse.robots.kinematic_methods import configurations
+
+        rows = configurations(self.robot, q)
+        checker = CollisionChecker(self.robot, self.scene)
+        batch = np.atleast_2d(rows)
+        each = np.hstack([checker.link_clearances(batch), checker.pair_clearances(batch)])
+        least = each.min(axis=1, initial=1.0).astype(np.float64)
+        return float(least[0]) if rows.ndim == 1 else least
+
     @property
     def known_scene(self) -> Scene:
         """The scene as it was given: without the points that the views observed."""
@@ -206,11 +243,11 @@ def check_problem(problem: object, field: str = "problem") -> None:
     check_type(field, problem, Problem, f"a Problem: {how}")
 
 
-def check_clearance(field: str, value: object) -> float:
-    """The value as a distance [m]; InputError unless it is a finite number from 0 on."""
+def check_clearance(value: object) -> float:
+    """The value as a distance [m]; InputError unless it is from 0 to MAX_CLEARANCE."""
     clearance = numbers(value)
-    if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= MAX_COORDINATE:
-        raise InputError(f"{field} is {shown(value)}; it must be a distance from 0 to {MAX_COORDINATE:g} m")
+    if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= MAX_CLEARANCE:
+        raise InputError(f"clearance is {shown(value)}; it must be a distance from 0 to {MAX_CLEARANCE:g} m")
     return float(clearance)
 
 
@@ -254,166 +291,3 @@ def _scene_with_views(
 
     goals = goal.positions if isinstance(goal, JointGoal) else start[None]
     return Scene([*known.shapes, *seen_shapes(views, robot, known, start, goals)])
-
-
-def _base(T_world_base: object) -> Float[ndarray, "4 4"] | None:
-    return None if T_world_base is None else rigid_transform("T_world_base", T_world_base)
-
-
-def _waypoints(robot: Robot, waypoints: object, notes: list[str]) -> tuple[Goal, ...]:
-    if not isinstance(waypoints, list | tuple):
-        raise InputError(f"waypoints is {shown(waypoints)}; it must be a list of goals")
-    return tuple(_goal(robot, f"waypoints[{i}]", goal, notes) for i, goal in enumerate(waypoints))
-
-
-def _views(robot: Robot, views: object) -> tuple[DepthView, ...]:
-    if not isinstance(views, list | tuple) or not all(isinstance(view, DepthView) for view in views):
-        raise InputError(f"views is {shown(views)}; it must be a list of rd.DepthView")
-    for i, view in enumerate(views):
-        if view.configuration is not None and len(view.configuration) != robot.dof:
-            raise InputError(
-                f"views[{i}].configuration has {len(view.configuration)} values; {robot.name} has "
-                f"{robot.dof} planned joints: {', '.join(robot.joint_names)}"
-            )
-    return tuple(views)
-
-
-def _constraints(robot: Robot, constraints: object) -> tuple[Constraint, ...]:
-    kinds = tuple(CONSTRAINTS.values())
-    if not isinstance(constraints, list | tuple) or not all(isinstance(one, kinds) for one in constraints):
-        known = ", ".join(f"rd.{kind.__name__}" for kind in kinds)
-        raise InputError(f"constraints is {shown(constraints)}; it must be a list of {known}")
-    for i, one in enumerate(constraints):
-        _check_planned_joint_moves(robot, f"constraints[{i}].frame", one.frame)
-    return tuple(constraints)
-
-
-def _payload(robot: Robot, payload: object) -> Payload | None:
-    if payload is None:
-        return None
-    if not isinstance(payload, Payload):
-        raise InputError(f"payload is {shown(payload)}; it must be a rd.Payload")
-    check_dynamics(robot)
-    _check_planned_joint_moves(robot, "payload.link", robot.tip if payload.link is None else payload.link)
-    return payload
-
-
-def _blend(value: object, count: int) -> tuple[float, ...]:
-    """One blend for each of `count` waypoints."""
-    blends = numbers(value)
-    if blends is not None and blends.ndim == 0 and count:
-        blends = np.full(count, blends)
-    given = blends is not None and blends.size > 0
-    if given and not count:
-        raise InputError(f"blend is {shown(value)}; there are no waypoints")
-    if blends is None or (given and blends.shape != (count,)) or not _is_blend(blends).all():
-        raise InputError(
-            f"blend is {shown(value)}; it must be one number for all {count} waypoints, or one for each: 0 "
-            f"to stop there, or from {MIN_BLEND:g} to {MAX_BLEND:g}"
-        )
-    return tuple(blends.tolist()) if given else (0.0,) * count
-
-
-def _is_blend(blends: ndarray) -> ndarray:
-    return (blends == 0) | ((blends >= MIN_BLEND) & (blends <= MAX_BLEND))
-
-
-def _check_planned_joint_moves(robot: Robot, field: str, frame: str) -> None:
-    """Raises InputError unless a planned joint moves the link."""
-    moved = [link for link in robot.link_names if robot.link_frame(link) > 0]
-    if frame not in robot.link_names:
-        raise unknown_name(f"link in {field}:", frame, moved)
-    if frame not in moved:
-        raise InputError(f"{field}: no planned joint moves {frame!r}; they move {', '.join(moved)}")
-
-
-def _moving(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]:
-    """The obstacles, renamed where a shape of the scene has the same name."""
-    if not isinstance(moving, list | tuple) or not all(isinstance(one, MovingObstacle) for one in moving):
-        raise InputError(f"moving is {shown(moving)}; it must be a list of rd.MovingObstacle")
-    shapes = Scene([*scene.shapes, *(one.shape for one in moving)]).shapes[len(scene.shapes) :]
-    return tuple(
-        one if one.shape is shape else dataclass_replace(one, shape=shape)
-        for one, shape in zip(moving, shapes, strict=True)
-    )
-
-
-def _start_velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
-    """A velocity within limits; None if it is zero, or nearly."""
-    if value is None:
-        return None
-    velocity = numbers(value)
-    names = ", ".join(robot.joint_names)
-    if velocity is None or velocity.shape != (robot.dof,) or not np.isfinite(velocity).all():
-        raise InputError(
-            f"start_velocity is {shown(value)}; it must be {robot.dof} finite numbers [rad/s]: {names}"
-        )
-    beyond = np.flatnonzero((np.abs(velocity) > robot.velocity) & (robot.velocity > 0))
-    if len(beyond):
-        j = int(beyond[0])
-        raise InputError(
-            f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; its velocity limit is "
-            f"{robot.velocity[j]:g}"
-        )
-    return velocity if (np.abs(velocity) >= MIN_RATE).any() else None
-
-
-def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
-    """The goal as an object of its class, with its configurations within limits."""
-    if isinstance(goal, list | tuple) and any(isinstance(one, OneGoal) for one in goal):
-        goal = AnyGoal(tuple(goal))
-    if isinstance(goal, AnyGoal):
-        fields = (f"{field}.goals[{i}]" for i in range(len(goal.goals)))
-        each = [_goal(robot, *of, notes) for of in zip(fields, goal.goals, strict=True)]
-        return AnyGoal(tuple(each))  # type: ignore[arg-type]
-    if isinstance(goal, PoseGoal):
-        _check_planned_joint_moves(robot, f"{field}.frame", goal.frame)
-        return goal
-    if isinstance(goal, PosesGoal):
-        _check_independent_links(robot, field, goal)
-        return goal
-    rows = goal.positions if isinstance(goal, JointGoal) else JointGoal(goal).positions  # type: ignore[arg-type]
-    fields = [field] if len(rows) == 1 else [f"{field}[{i}]" for i in range(len(rows))]
-    return JointGoal(np.stack([_configuration(robot, *row, notes) for row in zip(fields, rows, strict=True)]))
-
-
-def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
-    """Raises InputError unless planned joints move each link, and any two relative to each other."""
-    parts = dict[int, str]()
-    for pose in goal.poses:
-        _check_planned_joint_moves(robot, f"{field}.poses", pose.frame)
-        other = parts.setdefault(robot.link_frame(pose.frame), pose.frame)
-        if other != pose.frame:
-            raise InputError(
-                f"{field}.poses: {other} and {pose.frame} are one rigid part; give the pose of one of them"
-            )
-
-
-def _configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:
-    """The configuration, clamped where it is within LIMIT_SLACK of the limits; `notes` says where."""
-    q = numbers(value)
-    names = ", ".join(robot.joint_names)
-    if q is None or q.ndim != 1:
-        raise InputError(f"{field} is {shown(value)}; it must be a list of {robot.dof} numbers: {names}")
-    if len(q) != robot.dof:
-        raise InputError(f"{field} has {len(q)} values; {robot.name} has {robot.dof} planned joints: {names}")
-    return np.array([_position(field, *pair, notes) for pair in zip(robot.planned_joints, q, strict=True)])
-
-
-def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float:
-    unit = "m" if joint.kind == "prismatic" else "rad"
-    if not abs(value) <= MAX_COORDINATE:
-        raise InputError(
-            f"{field}: {joint.name} is {value}; "
-            f"it must be a finite number within ±{MAX_COORDINATE:g} [{unit}]"
-        )
-    if joint.kind == "continuous":
-        return float(value)
-    within = float(np.clip(value, joint.lower, joint.upper))
-    if abs(value - within) > LIMIT_SLACK:
-        raise InputError(
-            f"{field}: {joint.name} is {value:g} {unit}; its limits are {joint.lower:g} to {joint.upper:g}"
-        )
-    if value != within:
-        notes.append(f"{field}: {joint.name} clamped from {float(value)!r} to its limit {within!r} {unit}")
-    return within

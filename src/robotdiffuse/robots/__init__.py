@@ -9,12 +9,17 @@ from robotdiffuse.core.errors import InputError, check_type, unknown_name
 from robotdiffuse.core.input_files import is_file
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.joints import Joint
+from robotdiffuse.robots.kinematic_methods import fk, ik, jacobian
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, read_robot_folder, read_source
+from robotdiffuse.robots.surface_files import SURFACE_FILE
 from robotdiffuse.robots.user_data_dir import user_robots
 
 __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
 
+Robot.fk = fk  # type: ignore[method-assign]
+Robot.jacobian = jacobian  # type: ignore[method-assign]
+Robot.ik = ik  # type: ignore[method-assign]
 DATA = Path(__file__).parent / "data"
 ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}")))
 """Names of the bundled robots."""
@@ -58,7 +63,8 @@ def _by_name(name: str) -> Robot:
 
 def _read(folder: Path, source: str | None) -> Robot:
     """The robot in a folder; a cached one if its files are unchanged."""
-    return _read_state(folder.resolve(), source, _state(folder / ROBOT_FILE), _state(folder / MESH_FILE))
+    states = (_state(folder / name) for name in (ROBOT_FILE, MESH_FILE, SURFACE_FILE))
+    return _read_state(folder.resolve(), source, *states)
 
 
 def _state(file: Path) -> tuple[int, int, int] | None:

@@ -20,6 +20,14 @@ class ConvexMesh(Value):
     faces: Int[ndarray, "f 3"]
 
 
+@dataclass(frozen=True, eq=False)
+class Surface(Value):
+    """A triangle mesh in the frame of its link [m]; it may be open."""
+
+    vertices: Float[ndarray, "v 3"]
+    faces: Int[ndarray, "f 3"]
+
+
 @runtime_checkable
 class RigidShape(Protocol):
     """Interface of shapes that a robot can hold; the shapes of scenes implement it."""

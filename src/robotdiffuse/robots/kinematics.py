@@ -22,19 +22,42 @@ def _motion(robot: Robot, j: int, q: float) -> Float[ndarray, "4 4"]:
     return transform(Z * q) if robot.prismatic[j] else transform(0 * Z, rotation_about(Z, q))
 
 
+def _motions(robot: Robot, j: int, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 4 4"]:
+    """The motion of planned joint j about or along its z axis, at each configuration."""
+    motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
+    if robot.prismatic[j]:
+        motion[:, 2, 3] = q[:, j]
+    else:
+        motion[:, 0, 0] = motion[:, 1, 1] = np.cos(q[:, j])
+        motion[:, 1, 0] = np.sin(q[:, j])
+        motion[:, 0, 1] = -motion[:, 1, 0]
+    return motion
+
+
 def link_poses(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 4 4"]:
     """T_base_link at a batch of configurations; raises InputError for an unknown link."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for j in robot.chain(link):
-        motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
-        if robot.prismatic[j]:
-            motion[:, 2, 3] = q[:, j]
-        else:
-            motion[:, 0, 0] = motion[:, 1, 1] = np.cos(q[:, j])
-            motion[:, 1, 0] = np.sin(q[:, j])
-            motion[:, 0, 1] = -motion[:, 1, 0]
-        T = T @ robot.frame_offsets[j] @ motion
+        T = T @ robot.frame_offsets[j] @ _motions(robot, j, q)
     return T @ robot.T_frame_link(link)
+
+
+def link_jacobians(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 6 dof"]:
+    """Geometric Jacobians of a link at a batch of configurations; raises InputError for an unknown link.
+
+    Rows are linear, then angular, in the axes of the base frame; the linear ones are of the link's origin.
+    """
+    origins, J = link_origins(robot, q, link), np.zeros((len(q), 6, robot.dof))
+    T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    for j in robot.chain(link):
+        T = T @ robot.frame_offsets[j] @ _motions(robot, j, q)
+        axis = T[:, :3, 2]
+        if robot.prismatic[j]:
+            J[:, :3, j] = axis
+        else:
+            J[:, :3, j] = np.cross(axis, origins - T[:, :3, 3])
+            J[:, 3:, j] = axis
+    return J
 
 
 def link_origins(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 3"]:

@@ -4,16 +4,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache, reduce, wraps
 from numbers import Real
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, Value, read_only
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, rotation_z_to, transform
-from robotdiffuse.robots.bodies import TOOL, AttachedBody, BodyContent, ConvexMesh, RigidShape
+from robotdiffuse.robots.bodies import TOOL, AttachedBody, BodyContent, ConvexMesh, RigidShape, Surface
 from robotdiffuse.robots.inertias import Inertia
 from robotdiffuse.robots.joints import MIMIC_SLACK, MOVING_KINDS, Joint, with_mimics
 from robotdiffuse.robots.link_pair_tables import TURN, LinkPairTable
@@ -73,6 +74,27 @@ class Robot(Value):
     tables: tuple[LinkPairTable, ...] = ()
     """For pairs of links that pass closer than spheres can resolve: the joint values at which they do not
     collide."""
+    surfaces: dict[str, Surface] = field(default_factory=dict)
+    """Collision meshes as the URDF gives them, of the links in `grazing`. `meshes` contain them."""
+    grazing: frozenset[frozenset[str]] = frozenset()
+    """Pairs of links whose `meshes` can overlap where their `surfaces` are apart; see
+    `collision.surface_pairs`."""
+
+    if TYPE_CHECKING:  # assigned by the package: kinematics imports robots, not the reverse
+
+        def fk(self, q: ArrayLike, link: str | None = None) -> ndarray: ...
+
+        def jacobian(self, q: ArrayLike, link: str | None = None) -> ndarray: ...
+
+        def ik(
+            self,
+            pose: ArrayLike,
+            link: str | None = None,
+            *,
+            count: int = 10,
+            near: ArrayLike | None = None,
+            seed: int = 0,
+        ) -> ndarray: ...
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
@@ -422,6 +444,9 @@ class Robot(Value):
         return self.__dict__.get("_unlocked", self)
 
     def __repr__(self) -> str:
+        return f"Robot({self.name!r}, {self.dof} planned joints, {self.base} to {' and '.join(self.tips)})"
+
+    def __str__(self) -> str:
         def row(values: ndarray) -> str:
             return ", ".join(f"{value:.4g}" for value in values)
 

@@ -1,8 +1,10 @@
-"""Reads and writes robot folders: robot.json (human-readable) and meshes.npz (convex collision meshes)."""
+"""Reads and writes robot folders: robot.json (human-readable), meshes.npz (convex collision meshes) and, if
+links graze each other, surfaces.npz."""
 
 import io
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,14 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, unit_quaternion, within
 from robotdiffuse.core.errors import InputError, shortened, shown
-from robotdiffuse.core.input_files import read_arrays, read_json
+from robotdiffuse.core.input_files import is_file, read_arrays, read_json
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.inertias import inertia_of
 from robotdiffuse.robots.joints import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic
 from robotdiffuse.robots.link_pair_tables import LinkPairTable
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.surface_files import SURFACE_FILE, pack_surfaces, read_surfaces
 
 FORMAT = 2
 """Version of the format."""
@@ -29,7 +32,8 @@ LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
 def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
-    """Write robot.json and meshes.npz into a folder, each file atomically; other files in the folder stay.
+    """Write robot.json, meshes.npz and, for grazing links, surfaces.npz into a folder, each file atomically;
+    other files in the folder stay.
 
     `source` describes the origin: urdf, sha256, licence, and, if preparation measured them, `free`, the
     fraction of free configurations, and `refused`, the fraction of these with false collisions of spheres.
@@ -41,8 +45,11 @@ def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any])
     text = _dump(_to_json(robot, source)) + "\n"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        (folder / SURFACE_FILE).unlink(missing_ok=True)  # it may belong to other meshes
         _replace(folder / MESH_FILE, meshes.getvalue())
         _replace(folder / ROBOT_FILE, text.encode())
+        if robot.grazing:
+            _replace(folder / SURFACE_FILE, pack_surfaces(robot.surfaces, robot.grazing, robot.meshes))
     except OSError as error:
         raise InputError(f"cannot write the robot folder {folder}: {error.strerror}") from None
 
@@ -72,7 +79,11 @@ def read_robot_folder(folder: str | Path) -> Robot:
         raise InputError(
             f"{Path(folder) / ROBOT_FILE} is damaged: {type(error).__name__}: {shortened(str(error))}"
         ) from None
-    return robot
+    file = Path(folder) / SURFACE_FILE
+    if not is_file(file):
+        return robot
+    surfaces, grazing = read_surfaces(file, meshes)
+    return replace(robot, surfaces=surfaces, grazing=grazing)
 
 
 def _check_tree(robot: Robot) -> None:

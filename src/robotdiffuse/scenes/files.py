@@ -7,27 +7,35 @@ from typing import Any
 
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.input_files import read_triangles
-from robotdiffuse.scenes.point_cloud import read_points
+from robotdiffuse.core.input_files import read_arrays, read_triangles
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
+from robotdiffuse.scenes.height_map import HeightMap
+from robotdiffuse.scenes.point_cloud import default_radius, read_points
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 
 SHAPES: dict[str, type[Shape]] = {
-    shape.kind: shape for shape in (Sphere, Box, Cylinder, Capsule, Mesh, PointCloud)
+    shape.kind: shape for shape in (Sphere, Box, Cylinder, Capsule, Mesh, PointCloud, HeightMap)
 }
-FILE_CONTENT = {"mesh": ("vertices", "faces"), "point_cloud": ("points",)}
+FILE_CONTENT = {"mesh": ("vertices", "faces"), "point_cloud": ("points",), "height_map": ("heights",)}
 """For each shape that may be read from a file, the fields that the file contains."""
 
 
 def check_fields(
     where: str, data: object, required: Iterable[str], optional: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """The data itself. Raises InputError unless it is a mapping with all required and no unknown fields."""
+    """The data, with a field `rpy` as `wxyz`.
+
+    Raises InputError unless it is a mapping with all required and no unknown fields.
+    """
     required = tuple(required)
     known = (*required, *optional)
     if not isinstance(data, dict):
         raise InputError(f"{where} is {shown(data)}; it must be a mapping with the fields {', '.join(known)}")
+    if "rpy" in data and "wxyz" in known:
+        data = _without_rpy(where, data)
     for name in data:
         if name not in known:
             raise unknown_name(f"field of {where}:", name, known)
@@ -35,6 +43,15 @@ def check_fields(
     if missing:
         raise InputError(f"{where} has no {' and no '.join(missing)}; known fields: {', '.join(known)}")
     return data
+
+
+def _without_rpy(where: str, data: dict[str, Any]) -> dict[str, Any]:
+    """The data with its roll, pitch, yaw [rad], in the order of URDFs, as a quaternion."""
+    if "wxyz" in data:
+        raise InputError(f"{where} has wxyz and rpy; it must have one of them")
+    rotation = rotation_from_rpy(*vector(where, "rpy", data["rpy"], 3))
+    rest = {name: value for name, value in data.items() if name != "rpy"}
+    return rest | {"wxyz": quaternion_from_rotation(rotation).tolist()}
 
 
 def read_scene(entries: object, folder: Path, field: str = "scene") -> tuple[Scene, tuple[str, ...]]:
@@ -69,13 +86,16 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
     optional = [f.name for f in fields(kind) if f.name not in required]  # type: ignore[arg-type]
     if isinstance(values, dict) and "file" in values:
         content = FILE_CONTENT.get(kind.kind, ())
-        required, optional = ["file"], [name for name in optional if name != "file"]
+        required = ["file", *(name for name in required if name not in content)]
+        optional = [name for name in optional if name != "file"]
         values = dict(check_fields(where, values, required, optional))
         if not isinstance(values["file"], str) or not values["file"]:
             raise InputError(f"{where}.file is {shown(values['file'])}; it must be the name of a file")
         values["file"] = str(folder / values["file"])
         try:
-            arrays = read_triangles(values["file"]) if kind is Mesh else _points(values["file"], notes)
+            if kind is PointCloud:
+                values.setdefault("point_radius", default_radius(values["file"]))
+            arrays = _content(kind, values["file"], notes)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
         values |= dict(zip(content, arrays, strict=True))
@@ -87,7 +107,14 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
         raise InputError(f"{where.removesuffix(kind.kind)}{error}") from None
 
 
-def _points(file: str, notes: list[str]) -> tuple[ndarray]:
+def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, ...]:
+    """The arrays of FILE_CONTENT in a file."""
+    if kind is Mesh:
+        return read_triangles(file)
+    if kind is HeightMap:
+        if Path(file).suffix.lower() not in (".npy", ".npz"):
+            raise unknown_name(f"height map format of {file}:", Path(file).suffix, (".npy", ".npz"))
+        return (next(iter(read_arrays(file).values())),)
     points, new_notes = read_points(file)
     notes.extend(new_notes)
     return (points,)

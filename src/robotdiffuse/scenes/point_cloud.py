@@ -9,7 +9,10 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_arrays
+from robotdiffuse.scenes.octomap import cover_radius, read_octomap
 
+POINT_RADIUS = 0.01
+"""Radius of points, unless another is given [m]."""
 MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 """Odd numbers with many bits, by which coordinates are mixed into a hash."""
 
@@ -56,7 +59,7 @@ def crop(points: Float[ndarray, "n 3"], center: Float[ndarray, "3"], reach: floa
 
 
 def read_points(file: str | Path) -> tuple[Float[ndarray, "n 3"], tuple[str, ...]]:
-    """The points of a .ply, .pcd, .xyz, .csv, .npy or .npz file [m], and notes on removed points.
+    """The points of a .ply, .pcd, .xyz, .csv, .npy, .npz or .bt file [m], and notes on removed points.
 
     Points that are not finite (missing returns of a depth camera) are removed, with a note. Columns after the
     third are ignored. Raises InputError if the file is missing, empty or does not contain points.
@@ -158,4 +161,10 @@ READERS: dict[str, Callable[[Path], ndarray]] = {
     ".csv": _read_text,
     ".npy": lambda file: read_arrays(file)[""],
     ".npz": _read_npz,
+    ".bt": lambda file: read_octomap(file)[0],
 }
+
+
+def default_radius(file: str | Path) -> float:
+    """Radius of the points of a file [m]: POINT_RADIUS, or that of the spheres around an octomap's voxels."""
+    return cover_radius(read_octomap(file)[1]) if Path(file).suffix.lower() == ".bt" else POINT_RADIUS

@@ -10,11 +10,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import Value
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, joined, unknown_name
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Shape
+
+SHOWN_NAMES = 5
+"""Names of shapes in the text of a scene."""
 
 
 @no_type_check
@@ -40,6 +43,11 @@ class Scene(Value):
             last[shape.name] = number
             named.append(shape if name == shape.name else dataclass_replace(shape, name=name))  # type: ignore[type-var]
         object.__setattr__(self, "shapes", tuple(named))
+
+    def __repr__(self) -> str:
+        count = f"{len(self.shapes)} shape" + ("" if len(self.shapes) == 1 else "s")
+        names = joined((shape.name for shape in self.shapes), SHOWN_NAMES)
+        return f"Scene({count}: {names})" if names else f"Scene({count})"
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Scene":
         """The scene after the rigid motion T."""

@@ -4,9 +4,11 @@ The constructors check their arguments themselves and raise InputError. `no_type
 run-time type checks of the tests off these classes.
 """
 
+import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, no_type_check
 
 import numpy as np
@@ -26,9 +28,10 @@ from robotdiffuse.core.bounds import (
     vector,
 )
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.input_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.scenes.point_cloud import distinct, voxel_thin
+from robotdiffuse.scenes.point_cloud import POINT_RADIUS, default_radius, distinct, read_points, voxel_thin
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
@@ -55,9 +58,7 @@ class Shape(Value, ABC):
     @property
     def T_base_shape(self) -> Float[ndarray, "4 4"]:
         """Pose of the shape's own frame. Raises InputError for shapes without one, such as point clouds."""
-        raise InputError(
-            f"{self.name!r} is a {self.kind}; it must be one of sphere, box, cylinder, capsule and mesh"
-        )
+        raise self._not_solid()
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
         """The shape after the rigid motion T. A point cloud forgets the file that it was read from.
@@ -70,12 +71,17 @@ class Shape(Value, ABC):
         """T_base_shape, and convex meshes in the shape's own frame that enclose it, for a robot to hold.
 
         The mesh of a box is exact; round shapes get a polyhedron around them. Raises InputError for point
-        clouds.
+        clouds and height maps.
         """
         return self.T_base_shape, self._convex_meshes()
 
     def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
-        raise NotImplementedError
+        raise self._not_solid()
+
+    def _not_solid(self) -> InputError:
+        return InputError(
+            f"{self.name!r} is a {self.kind}; it must be one of sphere, box, cylinder, capsule and mesh"
+        )
 
 
 class Triangulated(Shape):
@@ -95,7 +101,23 @@ class Triangulated(Shape):
         return self.mesh.bounds
 
 
-def _set(shape: Shape, **values: object) -> None:
+class PosedTriangles(Triangulated):
+    """Triangles in a frame of their own, which `xyz` and `wxyz` place in the base frame."""
+
+    xyz: Float[ndarray, "3"]
+    wxyz: Float[ndarray, "4"]
+
+    @property
+    def T_base_shape(self) -> Float[ndarray, "4 4"]:
+        return transform(self.xyz, rotation_from_quaternion(self.wxyz))
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+        T = T @ self.T_base_shape
+        return replace(self, xyz=T[:3, 3], wxyz=quaternion_from_rotation(T[:3, :3]))  # type: ignore[type-var]
+
+
+def set_fields(shape: Shape, **values: object) -> None:
+    """Set checked values in the constructor of a shape, read-only. Raises InputError for a bad name."""
     if not isinstance(shape.name, str) or not shape.name:
         raise InputError(f"{shape.kind}.name is {shown(shape.name)}; it must be a non-empty string")
     for key, value in values.items():
@@ -105,13 +127,20 @@ def _set(shape: Shape, **values: object) -> None:
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Sphere(Shape):
+    """A ball.
+
+    center: its middle, x y z in the frame of the robot's base [m].
+    radius: [m].
+    name: by which results and commands refer to it; a scene appends a number to names that are not unique.
+    """
+
     center: Float[ndarray, "3"]
     radius: float
     name: str = "sphere"
     kind: ClassVar[str] = "sphere"
 
     def __post_init__(self) -> None:
-        _set(
+        set_fields(
             self,
             center=vector("sphere", "center", self.center, 3),
             radius=positive("sphere", "radius", self.radius),
@@ -164,6 +193,14 @@ class _Oriented(Shape):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Box(_Oriented):
+    """A box of any orientation.
+
+    center: its middle, x y z in the frame of the robot's base [m].
+    size: full edge lengths along its own x, y and z [m].
+    wxyz: its orientation as a quaternion, scalar first; default: along the axes of the base.
+    name: by which results and commands refer to it; a scene appends a number to names that are not unique.
+    """
+
     center: Float[ndarray, "3"]
     size: Float[ndarray, "3"]
     """Full edge lengths [m]."""
@@ -178,7 +215,7 @@ class Box(_Oriented):
                 f"box.size is {shown(self.size)}; edge lengths must be positive, at least {MIN_SIZE:g} m"
             )
         center = vector("box", "center", self.center, 3)
-        _set(self, center=center, size=size, wxyz=unit_quaternion("box", self.wxyz))
+        set_fields(self, center=center, size=size, wxyz=unit_quaternion("box", self.wxyz))
 
     if TYPE_CHECKING:
 
@@ -213,7 +250,7 @@ class _Axial(_Oriented):
     wxyz: Float[ndarray, "4"] = field(default=IDENTITY)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        _set(
+        set_fields(
             self,
             center=vector(self.kind, "center", self.center, 3),
             radius=positive(self.kind, "radius", self.radius),
@@ -225,7 +262,13 @@ class _Axial(_Oriented):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Cylinder(_Axial):
-    """A cylinder about its own z axis, `height` long."""
+    """A cylinder about its own z axis.
+
+    center: its middle, x y z in the frame of the robot's base [m].
+    radius, height: [m].
+    wxyz: its orientation as a quaternion, scalar first; default: upright.
+    name: as of Box.
+    """
 
     name: str = "cylinder"
     kind: ClassVar[str] = "cylinder"
@@ -260,7 +303,14 @@ class Cylinder(_Axial):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Capsule(_Axial):
-    """A cylinder about its own z axis, `height` long, with a half sphere at each end, outside `height`."""
+    """A cylinder about its own z axis with a half sphere at each end.
+
+    center: its middle, x y z in the frame of the robot's base [m].
+    radius: of the cylinder and its ends [m].
+    height: of the cylinder, without its ends [m].
+    wxyz: its orientation as a quaternion, scalar first; default: upright.
+    name: as of Box.
+    """
 
     name: str = "capsule"
     kind: ClassVar[str] = "capsule"
@@ -293,8 +343,14 @@ class Capsule(_Axial):
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Mesh(Triangulated):
-    """A triangle mesh. Only its surface counts for collision."""
+class Mesh(PosedTriangles):
+    """A triangle mesh. Only its surface counts for collision. `Mesh.from_file` reads one.
+
+    vertices: n x 3, in the mesh's own frame [m].
+    faces: n x 3 indices of vertices, from 0.
+    xyz, wxyz: pose of the mesh's frame in the frame of the robot's base.
+    name: as of Box.
+    """
 
     vertices: Float[ndarray, "v 3"]
     """In the mesh's own frame [m]."""
@@ -315,7 +371,7 @@ class Mesh(Triangulated):
                 f"mesh.faces holds values from {faces.min():g} to {faces.max():g}; "
                 f"they must be indices of the {len(vertices)} vertices"
             )
-        _set(
+        set_fields(
             self,
             vertices=vertices,
             faces=faces.astype(np.int64),
@@ -334,6 +390,28 @@ class Mesh(Triangulated):
             file: str | None = None,
             name: str = "mesh",
         ) -> None: ...
+
+    @classmethod
+    def from_file(
+        cls,
+        file: str | Path,
+        xyz: ArrayLike = (0.0, 0.0, 0.0),
+        wxyz: ArrayLike = IDENTITY,
+        scale: float = 1.0,
+        name: str = "mesh",
+    ) -> "Mesh":
+        """The mesh of a file that trimesh reads (.stl, .obj, .ply, .dae, .glb, ...).
+
+        xyz, wxyz: pose of the file's frame in the frame of the robot's base.
+        scale: metres per unit of the file: 0.001 for millimetres.
+
+        Raises InputError for a file that cannot be read and a scale that is not positive.
+        """
+        vertices, faces = read_triangles(file)
+        scale = positive("mesh", "scale", scale)
+        if scale == 1:
+            return cls(vertices, faces, xyz, wxyz, str(Path(file).absolute()), name)
+        return cls(scale * vertices, faces, xyz, wxyz, name=name)  # files of problems have no scale
 
     @property
     def mesh(self) -> "Mesh":
@@ -356,14 +434,6 @@ class Mesh(Triangulated):
     def bounds(self) -> Float[ndarray, "2 3"]:
         return np.stack([self.world_vertices.min(axis=0), self.world_vertices.max(axis=0)])
 
-    @property
-    def T_base_shape(self) -> Float[ndarray, "4 4"]:
-        return transform(self.xyz, rotation_from_quaternion(self.wxyz))
-
-    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
-        T = T @ self.T_base_shape
-        return replace(self, xyz=T[:3, 3], wxyz=quaternion_from_rotation(T[:3, :3]))
-
     def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
         from robotdiffuse.scenes.convex_solids import mesh_parts
 
@@ -373,17 +443,22 @@ class Mesh(Triangulated):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class PointCloud(Shape):
-    """Points, each a small sphere. The cloud may be empty."""
+    """Points, each a small sphere. The cloud may be empty. `PointCloud.from_file` reads one.
+
+    points: n x 3, in the frame of the robot's base [m].
+    point_radius: radius of the sphere around each point [m].
+    name: as of Box.
+    """
 
     points: Float[ndarray, "n 3"]
-    point_radius: float = 0.01
+    point_radius: float = POINT_RADIUS
     """Radius of the sphere around each point [m]."""
     file: str | None = None
     name: str = "point_cloud"
     kind: ClassVar[str] = "point_cloud"
 
     def __post_init__(self) -> None:
-        _set(
+        set_fields(
             self,
             points=points("point_cloud", "points", self.points),
             point_radius=positive("point_cloud", "point_radius", self.point_radius),
@@ -394,10 +469,36 @@ class PointCloud(Shape):
         def __init__(
             self,
             points: ArrayLike,
-            point_radius: float = 0.01,
+            point_radius: float = POINT_RADIUS,
             file: str | None = None,
             name: str = "point_cloud",
         ) -> None: ...
+
+    @classmethod
+    def from_file(
+        cls,
+        file: str | Path,
+        point_radius: float | None = None,
+        scale: float = 1.0,
+        name: str = "point_cloud",
+    ) -> "PointCloud":
+        """The cloud of a .ply, .pcd, .xyz, .csv, .npy or .npz file, or the occupied voxels of an octomap
+        (.bt), in the frame of the robot's base.
+
+        point_radius: radius of the sphere around each point [m]; None: 1 cm, around a voxel of an octomap.
+        scale: metres per unit of the file: 0.001 for millimetres.
+
+        Points that are not finite are left out, with a warning. Raises InputError for a file that cannot be
+        read and a scale that is not positive.
+        """
+        points, notes = read_points(file)
+        for note in notes:
+            warnings.warn(note, stacklevel=2)
+        scale = positive("point_cloud", "scale", scale)
+        point_radius = scale * default_radius(file) if point_radius is None else point_radius
+        if scale == 1:
+            return cls(points, point_radius, str(Path(file).absolute()), name)
+        return cls(scale * points, point_radius, name=name)  # files of problems have no scale
 
     @cached_property
     def distinct_points(self) -> Float[ndarray, "m 3"]:

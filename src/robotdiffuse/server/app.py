@@ -2,7 +2,7 @@
 
 import asyncio
 import secrets
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from ipaddress import ip_address
 from math import ceil
@@ -23,6 +23,15 @@ from robotdiffuse import __version__
 from robotdiffuse.core.errors import shown
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.server.answers import (
+    CLIENT_GONE,
+    LINES,
+    StreamedResponse,
+    answer_of,
+    plan_tasks,
+    send_lines,
+    wait_for_disconnect,
+)
 from robotdiffuse.server.schemas import (
     Cancelled,
     Error,
@@ -46,12 +55,10 @@ ABOUT = (
     'An error is one line of JSON: {"error": "..."}. The header X-Request-ID names a request, so that '
     "DELETE /requests/{name} can cancel it; closing the connection cancels it too."
 )
-JSON, LINES = "application/json", "application/x-ndjson"
+JSON = "application/json"
 REQUEST_ID = "X-Request-ID"
 MAX_REQUEST_ID = 100
 """Longest request ID [characters]."""
-CLIENT_GONE = 499
-"""Status code, for the metrics only, of a request whose client closed the connection."""
 ERRORS = {
     400: "the request is wrong",
     401: "the token is missing or wrong",
@@ -167,7 +174,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
             body = await _read(request, settings.max_request_size, JSON)
             task = asyncio.ensure_future(pool.run(endpoint, body))
             with _cancellable(name, running, [task]):
-                answer = await _wait(task, asyncio.ensure_future(_disconnected(request)))
+                answer = await answer_of(task, asyncio.ensure_future(wait_for_disconnect(request)))
                 return Response(answer.body, answer.code, media_type=JSON)
 
     @app.post(
@@ -214,11 +221,11 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
                     )
                 at_once = min(len(lines), settings.workers)
                 with pool.admit(at_once - 1):
-                    tasks = _tasks(pool, lines, at_once)
+                    tasks = plan_tasks(pool, lines, at_once)
                     with _cancellable(name, running, tasks):
-                        await _write(send, tasks, asyncio.ensure_future(_disconnected(request)))
+                        await send_lines(send, tasks, asyncio.ensure_future(wait_for_disconnect(request)))
 
-        return _StreamedResponse(write)
+        return StreamedResponse(write)
 
     @app.delete(
         "/requests/{name}",
@@ -246,7 +253,7 @@ def _add_lists(app: FastAPI, pool: WorkerPool, robots: dict[str, Robot]) -> None
     async def list_planners() -> list[PlannerInfo]:
         return [
             PlannerInfo(name=name, kind=of.kind, description=of.description, default=name == DEFAULT_PLANNER)
-            for name, of in PLANNERS.items()
+            for name, of in PLANNERS.load_installed().items()
         ]
 
     @app.get(
@@ -305,60 +312,6 @@ def _cancellable(
         if running.get(name) is cancel:
             del running[name]
         cancel()
-
-
-async def _disconnected(request: Request) -> None:
-    """Returns when the client has closed the connection."""
-    while (await request.receive())["type"] != "http.disconnect":
-        pass
-
-
-async def _wait(task: asyncio.Task[Answer], disconnected: asyncio.Future[None]) -> Answer:
-    """The answer of the task, or an error if it is cancelled or the client disconnects first."""
-    try:
-        await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        disconnected.cancel()
-    if not task.done():
-        return failed(CLIENT_GONE, "the client closed the connection")
-    return failed(409, "the request was cancelled") if task.cancelled() else task.result()
-
-
-def _tasks(pool: WorkerPool, lines: list[bytes], at_once: int) -> list[asyncio.Task[Answer]]:
-    """A task for each line; at most `at_once` of them are in the pool at a time."""
-    limit = asyncio.Semaphore(at_once)
-
-    async def one(line: bytes) -> Answer:
-        async with limit:
-            return await pool.run(PLAN, line)
-
-    return [asyncio.ensure_future(one(line)) for line in lines]
-
-
-async def _write(send: Send, tasks: list[asyncio.Task[Answer]], disconnected: asyncio.Future[None]) -> None:
-    """Send the answers in the order of the tasks."""
-    try:
-        headers = [(b"content-type", LINES.encode())]
-        await send({"type": "http.response.start", "status": 200, "headers": headers})
-        for task in tasks:
-            await asyncio.wait({task, disconnected}, return_when=asyncio.FIRST_COMPLETED)
-            if disconnected.done():
-                return
-            answer = failed(409, "the request was cancelled") if task.cancelled() else task.result()
-            await send({"type": "http.response.body", "body": answer.body, "more_body": True})
-        await send({"type": "http.response.body", "body": b""})
-    finally:
-        disconnected.cancel()
-
-
-class _StreamedResponse(Response):
-    """A response that `write` sends piece by piece; errors before the first piece still get a status code."""
-
-    def __init__(self, write: Callable[[Send], Awaitable[None]]) -> None:
-        self.write, self.background = write, None
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        await self.write(send)
 
 
 async def _read(request: Request, max_size: int, kind: str) -> bytes:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from robotdiffuse.core.types import CONVERGED, Status
+from robotdiffuse.core.types import CONVERGED, TIME, Status
 from robotdiffuse.planning import DEFAULT_PLANNER
 
 PROBLEM: dict[str, Any] = {
@@ -43,10 +43,13 @@ class PlanRequest(_Request):
     time_limit: float = Field(1.0, gt=0, description="[s]")
     seed: int = Field(0, ge=0)
     until: Literal["first", "converged", "time_limit"] = CONVERGED
-    clearance: float | None = Field(None, ge=0, description="distance to keep where possible [m]")
+    clearance: float | None = Field(None, ge=0, le=0.5, description="distance to keep where possible [m]")
     velocity_scaling: Scaling = 1.0
     acceleration_scaling: Scaling = 1.0
-    jerk: float | None = Field(None, gt=0, description="largest jerk of any joint [rad/s³]")
+    objective: Literal["length", "time"] = TIME
+    jerk: float | None = Field(
+        None, gt=0, description="largest jerk of any joint [rad/s³]; null: the robot's limits"
+    )
 
 
 class PathMotion(_Request):

@@ -164,7 +164,6 @@ def answer_plan(state: _State, body: bytes) -> Answer:
         raise InputError(f"seed is {shown(seed)}; it must be an integer from 0 to {MAX_SEED}")
     planner = _planner(asked.get("planner", DEFAULT_PLANNER))
     planner.prepare(problem.robot)
-    planner.load_wanted(problem.robot)
     PlanRequest(**given)
     _warm_up_once(planner, problem, asked["problem"]["robot"])
     state.shared.due = time.monotonic() + time_limit + GRACE_TIME

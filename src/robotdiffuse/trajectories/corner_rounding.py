@@ -4,10 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.trajectories.timing_kernel import evaluate
-
-BLEND_DEVIATION = 3.0 / 16.0
-"""b(0): the distance from corner to blend, divided by the half width times the change of direction."""
+from robotdiffuse.trajectories.timing_kernel import BLEND_DEVIATION, evaluate, rounded_line
 
 
 class BlendedPolyline:
@@ -20,8 +17,8 @@ class BlendedPolyline:
     """
 
     def __init__(self, waypoints: Float[ndarray, "n dof"], half_widths: Float[ndarray, "corners"]) -> None:
-        """`waypoints`: at least two, no two neighbours equal. `half_widths`: one for each inner waypoint, at
-        most half of the shorter neighbouring segment."""
+        """`waypoints`: at least two, no two neighbours equal. `half_widths`: one for each inner waypoint; no
+        two rounded corners overlap, and none reaches beyond an end."""
         self.waypoints = waypoints
         steps = waypoints[1:] - waypoints[:-1]
         lengths = np.linalg.norm(steps, axis=1)
@@ -49,12 +46,7 @@ def half_widths(
 ) -> Float[ndarray, "corners"]:
     """Half widths of the widest blends that leave the polyline by at most the deviations and do not
     overlap."""
-    steps = waypoints[1:] - waypoints[:-1]
-    lengths = np.linalg.norm(steps, axis=1)
-    directions = steps / lengths[:, None]
-    turn = np.linalg.norm(directions[1:] - directions[:-1], axis=1)
-    room = 0.5 * np.minimum(lengths[:-1], lengths[1:])
-    return np.minimum(room, deviations / np.maximum(BLEND_DEVIATION * turn, 1e-12))
+    return rounded_line(np.asarray(waypoints, float), np.asarray(deviations, float))[3]
 
 
 def corner_middle(path: Float[ndarray, "n dof"], row: int, deviation: float) -> Float[ndarray, "dof"]:

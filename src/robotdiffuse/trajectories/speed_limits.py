@@ -13,35 +13,31 @@ from robotdiffuse.core.deadline import check_timing
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Settings
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.trajectories import timing_kernel
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline
-from robotdiffuse.trajectories.jerk_kernel import moving_average
 from robotdiffuse.trajectories.timing_kernel import fastest_speeds, sample_rows, slowdown
 
-JERK_TIME_STEP = 0.001
-"""Time step at which motions with a jerk limit are computed [s]."""
 MAX_ROWS = 200_000
-"""Rows of a motion between two stops at most; longer motions have larger steps."""
-MAX_JERK_ROWS = 1_000_000
-"""The same for the rows from which a motion with a jerk limit is computed."""
+"""Rows of a motion between two stops at most, before a jerk limit makes it longer; longer motions have larger
+steps."""
 SECONDS_PER_ROW = 5e-6
 """Time for sampling and validating a row [s]."""
 MIN_STEPS = 4
 """Steps of a motion between two stops at least: with fewer, its rows would miss that it speeds up and
 brakes."""
-ACCELERATION_SHARES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
-"""Shares of the acceleration limits that are tried for a motion with a jerk limit; the fastest result is
-taken. While the smallest share is the fastest, further ones follow, each FURTHER_SHARE_FACTOR times the one
-before."""
-FURTHER_SHARE_FACTOR = 0.7
-MIN_WINDOW_ROWS = 1.5
-"""Rows over which a change of acceleration is spread at least, however high the jerk limit: over less than
-one, the velocities of the rows would not agree with their accelerations."""
+ACCELERATION_FACTOR = 0.7
+"""Factor of the accelerations that are tried next for a motion that its jerk limits slow down."""
+WINDOW_FRACTIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+"""Fractions tried of the window over which a motion is averaged that keeps the jerk limits in any case."""
+DEFAULT_JERK_RATIO = 10.0
+"""Jerk limit over acceleration limit of joints that state no jerk limit: full acceleration after 0.1 s
+[1/s]."""
 MIN_SCALING = 1e-3
 """Smallest velocity and acceleration scale: a motion with less would be over a thousand times slower."""
 MIN_JERK = 0.01
 """Smallest jerk limit [rad/s³] or [m/s³], with which a joint takes 15 s to turn by 1 rad."""
 Scaling = Annotated[float, Bound(least=MIN_SCALING, most=1.0)]
-Jerk = Annotated[float, Bound(least=MIN_JERK)]
+Jerk = Annotated[float, Bound(least=MIN_JERK, infinite=True)]
 SAMPLES_PER_INTERVAL = 8
 """Parts of a grid interval at whose ends frame speeds and torques are checked."""
 MIN_TORQUE_SHARE = 2e-3
@@ -58,21 +54,23 @@ class TooFastError(RuntimeError):
 class TimingSettings(Settings, name="timing"):
     """Settings of the timing of paths."""
 
-    sample_time: Annotated[float, Bound(least=1e-4, most=1.0)] = 0.01
-    """Time between the rows of a trajectory [s]; the step before a stop is 0.1 to 1.1 times as long. Motions
-    that would have more than MAX_ROWS rows have longer steps."""
+    sample_time: Annotated[float, Bound(least=1e-4, most=1.0)] = 0.004
+    """Time between the rows of a trajectory at most [s], unless it would have more than MAX_ROWS rows. Each
+    motion from stop to stop takes two of these steps longer than the fastest one without a jerk limit."""
     velocity_scale: Scaling = 1.0
     """Scale of the robot's velocity limits, in (0, 1]."""
     acceleration_scale: Scaling = 1.0
     """Scale of the robot's acceleration limits, in (0, 1]."""
     jerk: Jerk | None = None
-    """Jerk limit of every joint [rad/s³] or [m/s³]; None: accelerations may jump."""
-    corner_deviation: NotNegative = 0.1
+    """Jerk limit of every joint [rad/s³] or [m/s³]; None: the robot's own limits, see `jerk_limits`;
+    infinite: none."""
+    corner_deviation: NotNegative = 0.3
     """How far a rounded corner may leave the path where it stays valid [rad, joint-space L2]."""
     corner_intervals: Count = 8
-    """Grid intervals in a rounded corner; more use the limits better and take longer."""
+    """Grid intervals in a rounded corner at least; wide ones have as many as a straight part of their
+    length."""
     line_intervals: Count = 64
-    """Grid intervals of all straight parts together, distributed by length."""
+    """Grid intervals of the whole motion, distributed by length."""
 
 
 DEFAULT = TimingSettings()
@@ -100,24 +98,9 @@ NO_EXTRA_LIMITS = ExtraLimits()
 
 
 def timing_grid(line: BlendedPolyline, settings: TimingSettings) -> Float[ndarray, "m"]:
-    """Values of s: equal parts of every rounded corner, and parts of the straight lines by their lengths.
-
-    Along a straight line s̈ is piecewise constant, which any grid represents exactly except at the switching
-    points. Rounded corners need points of their own because the limits on ṡ change along them.
-    """
-    inner, widths = line.knots[1:-1], line.half_widths
-    grid = [np.array([0.0])]
-    s = 0.0
-    for low, high in zip([*(inner - widths), line.length], [*(inner + widths), line.length], strict=True):
-        if low - s > 1e-12:
-            count = max(2, round(settings.line_intervals * (low - s) / line.length))
-            grid.append(np.linspace(s, low, count + 1)[1:])
-        if high - low > 0:
-            grid.append(np.linspace(low, high, settings.corner_intervals + 1)[1:])
-        s = high
-    joined = np.concatenate(grid)
-    joined[-1] = line.length
-    return joined
+    """Values of s at which the limits of a motion along a line are applied; see the kernel."""
+    counts = settings.corner_intervals, settings.line_intervals
+    return timing_kernel.timing_grid(line.knots, line.half_widths, *counts)
 
 
 Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]
@@ -133,79 +116,97 @@ def time_line(
 ) -> Rows:
     """The fastest motion along a line that begins with ṡ = `start_speed` and ends at rest.
 
-    A motion with a jerk limit begins at rest. Raises OutOfTimeError if the deadline leaves no time for it,
-    and TooFastError if it cannot stop from its start speed.
+    A motion from rest has constant jerk between its rows, within the limits; its accelerations are 0 at both
+    ends. With a start speed, accelerations may jump, since the motion before is not known. Raises
+    OutOfTimeError if the deadline leaves no time for it, and TooFastError if it cannot stop from its start
+    speed.
     """
-    grid, limits = timing_grid(line, settings), _scaled_limits(robot, settings)
-    if settings.jerk is not None:
-        return _time_with_jerk_limit(line, grid, *limits, settings, settings.jerk, extra)
-    speeds = _fastest_speeds(line, grid, *limits, start_speed, extra)
-    speeds = _slow_to_extra_limits(line, grid, speeds, extra)
-    duration = _duration(grid, speeds)
-    step = min(_row_spacing(duration, settings.sample_time, MAX_ROWS), duration / MIN_STEPS)
-    _check_rows(duration, step)
-    return sample_rows(line.arrays, grid, speeds, step)
-
-
-class _SlowedMotion(NamedTuple):
-    """The fastest motion with a share of the acceleration limits, before it is averaged over a window."""
-
-    duration: float
-    """Of the average [s]."""
-    speeds: Float[ndarray, "m"]
-    """ṡ on the grid, slowed so that the motion takes a whole number of steps."""
-    window: int
-    """[steps]"""
-
-
-def _time_with_jerk_limit(
-    line: BlendedPolyline,
-    grid: Float[ndarray, "m"],
-    velocity: Float[ndarray, "dof"],
-    acceleration: Float[ndarray, "dof"],
-    settings: TimingSettings,
-    jerk: float,
-    extra: ExtraLimits,
-) -> Rows:
-    """A motion from rest to rest: the moving average of the fastest motion with a share of the
-    accelerations."""
-
-    def slowed(share: float, step: float) -> _SlowedMotion:
-        window = int(np.ceil(max(2 * share * acceleration.max() / jerk / step, MIN_WINDOW_ROWS * every)))
-        speeds = _fastest_speeds(line, grid, velocity, share * acceleration, extra=extra)
+    grid, (velocity, acceleration) = timing_grid(line, settings), scaled_limits(robot, settings)
+    if start_speed > 0:
+        speeds = _fastest_speeds(line, grid, velocity, acceleration, start_speed, extra)
+        speeds = _slow_to_extra_limits(line, grid, speeds, extra)
+        return sample_rows(line.arrays, grid, speeds, _row_spacing(_duration(grid, speeds), settings))
+    jerk, best, share = jerk_limits(robot, settings), None, 1.0
+    while True:
+        limits = velocity, share * acceleration
+        speeds = _fastest_speeds(line, grid, *limits, extra=extra)
         speeds = _slow_to_extra_limits(line, grid, speeds, extra)
         duration = _duration(grid, speeds)
-        slower = np.ceil(duration / step) * step / duration
-        return _SlowedMotion(duration * slower + window * step, speeds / slower, window)
-
-    every = max(round(settings.sample_time / JERK_TIME_STEP), 1)
-    step = settings.sample_time / every
-    found = {share: slowed(share, step) for share in ACCELERATION_SHARES}
-    best = min(found, key=lambda share: found[share].duration)
-    while best == min(found):
-        found[FURTHER_SHARE_FACTOR * best] = slowed(FURTHER_SHARE_FACTOR * best, step)
-        best = min(found, key=lambda share: found[share].duration)
-    motion, wider = found[best], _row_spacing(found[best].duration, step, MAX_JERK_ROWS)
-    if wider > step:
-        step, motion = wider, slowed(best, wider)
-    every = max(every, round(_row_spacing(motion.duration, every * step, MAX_ROWS) / step))
-    _check_rows(motion.duration, step)
-    rows = sample_rows(line.arrays, grid, motion.speeds, step)[1:]
-    times, q, v, a = moving_average(*rows, step, motion.window, every)
-    # The average of a motion within the torque limits may exceed them slightly.
-    slower = 1.0 if extra.dynamics is None else _torque_slowdown(extra.dynamics, q, v, a)
-    return (times * slower, q, v / slower, a / slower**2) if slower > 1 else (times, q, v, a)
+        if 2 * (limits[1] / jerk).max() > duration:  # then lower accelerations make a shorter motion
+            share *= ACCELERATION_FACTOR
+            continue
+        controls = sample_rows(line.arrays, grid, speeds, _row_spacing(duration, settings))[1]
+        step = duration / (len(controls) - 1)
+        window = _window(controls, step, limits[1], jerk)
+        rows = _spline_rows(controls, step, window)
+        if best is not None and rows[0][-1] >= best[0][-1]:
+            break
+        best, share = rows, ACCELERATION_FACTOR * share
+        if window == 1:
+            break
+    times, q, v, a = best
+    # The mean of motions within the extra limits may exceed them slightly.
+    slower = 1.0 if extra is NO_EXTRA_LIMITS else _extra_slowdown(extra, q, v, a)
+    return times * slower, q, v / slower, a / slower**2
 
 
-def _row_spacing(duration: float, step: float, max_rows: int) -> float:
-    """Time between the rows of a motion [s]: `step`, or more so that it has no more than `max_rows`."""
-    return max(step, duration / max_rows)
+def jerk_limits(robot: Robot, settings: TimingSettings = DEFAULT) -> Float[ndarray, "dof"]:
+    """The jerk limit of each joint: that of the settings, else the robot's, else DEFAULT_JERK_RATIO times the
+    acceleration limit [rad/s³] or [m/s³]."""
+    if settings.jerk is not None:
+        return np.full(robot.dof, settings.jerk)
+    return np.where(robot.jerk > 0, robot.jerk, DEFAULT_JERK_RATIO * robot.acceleration)
 
 
-def _check_rows(duration: float, step: float) -> None:
-    """Raises OutOfTimeError if the deadline leaves no time for the rows of a motion."""
-    count = int(np.ceil(duration / step))
+def _spline_rows(controls: Float[ndarray, "m dof"], step: float, window: int) -> Rows:
+    """The uniform cubic B-spline whose control points are moving averages of the configurations of a motion
+    from rest to rest, `step` [s] apart, over `window` of them.
+
+    Velocities and accelerations are weighted means of the motion's, and so within the same limits at every
+    time; jerks are constant between rows. The spline leaves the motion's path by no more than about a sixth
+    of the acceleration times `step` squared, and stays on straight lines.
+    """
+    moved = np.concatenate(
+        [
+            np.zeros((window + 2, controls.shape[1])),
+            controls - controls[0],
+            np.repeat(controls[-1:] - controls[0], window + 1, axis=0),
+        ]
+    )
+    total = np.cumsum(moved, axis=0)
+    points = (total[window:] - total[:-window]) / window
+    before, at, after = points[:-2], points[1:-1], points[2:]
+    q = controls[0] + (before + 4 * at + after) / 6
+    v, a = (after - before) / (2 * step), (after - 2 * at + before) / step**2
+    q[0], q[-1] = controls[0], controls[-1]
+    v[[0, -1]], a[[0, -1]] = 0.0, 0.0
+    return step * np.arange(len(q)), q, v, a
+
+
+def _window(
+    controls: Float[ndarray, "m dof"],
+    step: float,
+    acceleration: Float[ndarray, "dof"],
+    jerk: Float[ndarray, "dof"],
+) -> int:
+    """The number of configurations over which `_spline_rows` must average to keep the jerk limits."""
+    enough = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
+    tried = sorted({1, *(int(np.ceil(fraction * enough)) for fraction in WINDOW_FRACTIONS)} - {enough})
+    for window in tried:
+        accelerations = _spline_rows(controls, step, window)[3]
+        if (np.abs(np.diff(accelerations, axis=0)) <= step * jerk).all():
+            return window
+    return enough
+
+
+def _row_spacing(duration: float, settings: TimingSettings) -> float:
+    """Time between the rows of a motion, which divides its duration [s].
+
+    Raises OutOfTimeError if the deadline leaves no time for that many rows.
+    """
+    count = min(max(int(np.ceil(duration / settings.sample_time)), MIN_STEPS), MAX_ROWS)
     check_timing(f"the {count} rows of a motion of {duration:.3g} s", SECONDS_PER_ROW * count)
+    return duration / count
 
 
 def _duration(grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"]) -> float:
@@ -216,7 +217,7 @@ def _duration(grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"]) -> float:
 def can_begin(robot: Robot, line: BlendedPolyline, settings: TimingSettings, start_speed: float) -> bool:
     """Whether a motion along the line with this start speed keeps the limits and can stop at the end."""
     try:
-        _fastest_speeds(line, timing_grid(line, settings), *_scaled_limits(robot, settings), start_speed)
+        _fastest_speeds(line, timing_grid(line, settings), *scaled_limits(robot, settings), start_speed)
     except TooFastError:
         return False
     return True
@@ -296,21 +297,28 @@ def _slow_to_extra_limits(
     """The speeds, slowed down so that frame speeds and torques keep their limits between grid points too."""
     if extra is NO_EXTRA_LIMITS:
         return speeds
-    slower, intervals = 1.0, np.repeat(np.arange(len(grid) - 1), SAMPLES_PER_INTERVAL + 1)
+    intervals = np.repeat(np.arange(len(grid) - 1), SAMPLES_PER_INTERVAL + 1)
     share = np.tile(np.linspace(0.0, 1.0, SAMPLES_PER_INTERVAL + 1), len(grid) - 1)
     s = grid[intervals] + share * np.diff(grid)[intervals]
     squared = speeds[intervals] ** 2 + share * np.diff(speeds**2)[intervals]
     q, first = line(s, 0), line(s, 1)
     rates = first * np.sqrt(squared)[:, None]
+    pull = (np.diff(speeds**2) / (2 * np.diff(grid)))[intervals]
+    accelerations = first * pull[:, None] + line(s, 2) * squared[:, None]
+    return speeds / _extra_slowdown(extra, q, rates, accelerations)
+
+
+def _extra_slowdown(
+    extra: ExtraLimits, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
+) -> float:
+    """How many times slower a motion must be, at least 1, to keep the extra limits."""
+    slower = 1.0
     if extra.frame_speeds is not None:
-        slower = max(
-            slower, float((extra.frame_speeds.speeds(q, rates) / extra.frame_speeds.limits).max(initial=0.0))
-        )
+        speeds = extra.frame_speeds.speeds(q, v)
+        slower = max(slower, float((speeds / extra.frame_speeds.limits).max(initial=0.0)))
     if extra.dynamics is not None:
-        pull = (np.diff(speeds**2) / (2 * np.diff(grid)))[intervals]
-        accelerations = first * pull[:, None] + line(s, 2) * squared[:, None]
-        slower = max(slower, _torque_slowdown(extra.dynamics, q, rates, accelerations))
-    return speeds / slower
+        slower = max(slower, _torque_slowdown(extra.dynamics, q, v, a))
+    return slower
 
 
 def _torque_slowdown(
@@ -324,6 +332,6 @@ def _torque_slowdown(
     return float(np.sqrt((np.abs(own) / room).max(initial=1.0)))
 
 
-def _scaled_limits(robot: Robot, settings: TimingSettings) -> tuple[ndarray, ndarray]:
+def scaled_limits(robot: Robot, settings: TimingSettings) -> tuple[ndarray, ndarray]:
     """Velocity and acceleration limits [dof] with the scales of the settings."""
     return settings.velocity_scale * robot.velocity, settings.acceleration_scale * robot.acceleration

@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MIN_RATE
@@ -15,6 +15,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
+    MIN_SCALING,
     NO_EXTRA_LIMITS,
     ExtraLimits,
     TimingSettings,
@@ -22,9 +23,14 @@ from robotdiffuse.trajectories.speed_limits import (
     time_line,
 )
 
-DEVIATION_FACTORS = (0.25, 0.25, 0.0)
-"""Factors by which the deviation of a corner shrinks each time its rounding fails; 0: the motion stops
-there."""
+SHRINK_FACTOR = 0.5
+"""Factor by which the deviation of a corner shrinks each time its rounding fails."""
+MIN_DEVIATION = 2e-4
+"""A corner that cannot be rounded with this deviation is a stop [rad, joint-space L2]."""
+MAX_TIMINGS = 8
+"""Times that a motion is timed and validated before it stops at every corner."""
+MAX_SLOWER_TIMINGS = 4
+"""Of these, the first ones, which may lower the accelerations of a motion whose corners are each free."""
 CORNER_SAMPLES = 17
 """Configurations of a rounded corner that are checked."""
 SAME_WAYPOINT_DISTANCE = 1e-6
@@ -45,18 +51,20 @@ def time_parameterize(
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
 
     Corners of the path are rounded so that the motion need not stop there. If `valid` rejects the whole
-    motion, `free` checks the corners one by one, and those that fail are rounded less; in the end the motion
-    stops at them. With stops at all corners the rows lie on the path itself, so a free path always has a
-    trajectory; that one is returned without validation.
+    motion, `free` checks the corners one by one, and each that fails is rounded half as far until it is free.
+    Only a corner that is not free with a deviation of MIN_DEVIATION becomes a stop. With stops at all corners
+    the rows lie on the path itself, so a free path always has a trajectory; that one is returned without
+    validation.
 
     `valid`: validates the whole motion. `free`: whether a path is free of collision. `keeps`: whether
     configurations [n, dof] along a rounded corner keep what the path keeps, such as a clearance; corners that
-    do not are rounded less from the start. `start_speed` [rad/s, joint-space L2]: the speed at the beginning,
-    along the first straight line, which must be long enough to stop on. `extra`: further limits, of motions
-    that begin at rest. `deviations`: how far the motion may leave each waypoint [rad], instead of
-    `settings.corner_deviation`.
+    do not are rounded less from the start, but at least by MIN_DEVIATION. `start_speed` [rad/s, joint-space
+    L2]: the speed at the beginning, along the first straight line, which must be long enough to stop on.
+    `extra`: further limits, of motions that begin at rest. `deviations`: how far the motion may leave each
+    waypoint [rad], instead of `settings.corner_deviation`.
 
-    A jerk limit costs time at both ends of the motion and at each stop, and may cut corners slightly more.
+    Motions from rest have constant jerk between rows, within the limits of `jerk_limits`. A low jerk limit
+    costs time at both ends of the motion and at each stop, and cuts corners slightly more.
 
     Times start at 0 and strictly increase; the first and last rows are the first and last waypoint exactly.
     A path of length zero becomes two equal rows at rest.
@@ -107,28 +115,60 @@ def _round_and_time(
 ) -> tuple[Float[ndarray, "corners"], Trajectory]:
     """By how much each corner is rounded, at most by the deviations, and the resulting motion; see
     `time_parameterize`."""
-    bad = deviations > 0
-    for shrink in DEVIATION_FACTORS:
-        corners = zip(bad, _corner_configurations(waypoints, deviations), strict=True)
-        bad = np.array([asked and not keeps(corner) for asked, corner in corners], dtype=bool)
-        if not bad.any():
+    deviations = _shrunk(waypoints, deviations, keeps, MIN_DEVIATION)
+    while start_speed and deviations[:1].any():
+        if _can_begin(robot, waypoints, deviations, settings, start_speed):
             break
-        deviations = np.where(bad, shrink * deviations, deviations)
-    for shrink in DEVIATION_FACTORS:
-        if not start_speed or _can_begin(robot, waypoints, deviations, settings, start_speed):
-            break
-        deviations[:1] *= shrink
-    for shrink in DEVIATION_FACTORS:
-        trajectory = _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
+        deviations[:1] = _smaller(deviations[:1])
+    slower = settings
+    for attempt in range(MAX_TIMINGS):
+        trajectory = _time_segments(robot, path, waypoints, deviations, slower, start_speed, extra)
         if not deviations.any() or valid(trajectory):
             return deviations, trajectory
-        bad = _bad_corners(path, waypoints, deviations, free)
-        deviations = np.where(bad, shrink * deviations, deviations)
-    trajectory = _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
-    if not deviations.any() or valid(trajectory):
-        return deviations, trajectory
+        less = _shrunk(waypoints, deviations, lambda corner: free(replace(path, positions=corner)))
+        if (less < deviations).any():
+            deviations = less
+        elif attempt < MAX_SLOWER_TIMINGS and not start_speed:
+            # Averaging for the jerk limits cuts corners, by an eighth with half of the accelerations.
+            scale = max(SHRINK_FACTOR * slower.acceleration_scale, MIN_SCALING)
+            slower = replace(slower, acceleration_scale=scale)
+        else:  # the motion as a whole is refused: every corner is in doubt
+            deviations = _smaller(deviations)
     deviations = np.zeros(len(waypoints) - 2)
     return deviations, _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
+
+
+def _smaller(deviations: Float[ndarray, "corners"]) -> Float[ndarray, "corners"]:
+    """The next deviations to try: 0, a stop, below MIN_DEVIATION."""
+    less = SHRINK_FACTOR * deviations
+    return np.where(less < MIN_DEVIATION, 0.0, less)
+
+
+def _shrunk(
+    waypoints: Float[ndarray, "n dof"],
+    deviations: Float[ndarray, "corners"],
+    accepts: Callable[[ndarray], bool],
+    least: float = 0.0,
+) -> Float[ndarray, "corners"]:
+    """The deviations, each shrunk until the configurations of its rounded corner are accepted, but not below
+    `least`."""
+    deviations, accepted = deviations.copy(), np.zeros(len(deviations))
+    while True:
+        # a corner becomes wider where its neighbour leaves it more of their segment
+        widths = half_widths(waypoints, deviations)
+        doubtful = (deviations > 0) & (widths > accepted * (1 + 1e-9))
+        if not doubtful.any():
+            break
+        corners = _corner_configurations(waypoints, deviations)
+        smaller = np.maximum(_smaller(deviations), np.minimum(deviations, least))
+        for i in np.flatnonzero(doubtful):
+            if accepts(corners[i]):
+                accepted[i] = widths[i]
+            elif smaller[i] < deviations[i]:
+                deviations[i] = smaller[i]
+            else:
+                accepted[i] = np.inf
+    return deviations
 
 
 def _check_limits(robot: Robot) -> None:
@@ -169,19 +209,6 @@ def _corner_configurations(
     along = line.knots[1:-1, None] + widths[:, None] * np.linspace(-1, 1, CORNER_SAMPLES)
     rounded = line(along.ravel(), 0).reshape(-1, CORNER_SAMPLES, waypoints.shape[1])
     return [rounded[i] if d > 0 else waypoints[i + 1 : i + 2] for i, d in enumerate(widths)]
-
-
-def _bad_corners(
-    path: Path,
-    waypoints: Float[ndarray, "n dof"],
-    deviations: Float[ndarray, "corners"],
-    free: Callable[[Path], bool],
-) -> Bool[ndarray, "corners"]:
-    """Marks the corners that are not free; all of them if each one is free, since the motion as a whole is
-    not."""
-    corners = zip(deviations, _corner_configurations(waypoints, deviations), strict=True)
-    bad = np.array([d > 0 and not free(replace(path, positions=corner)) for d, corner in corners], dtype=bool)
-    return bad if bad.any() else np.ones(len(bad), dtype=bool)
 
 
 def _can_begin(

@@ -21,6 +21,11 @@ NEGLIGIBLE_DERIVATIVE = 1e-7
 NEGLIGIBLE_SHARE = 1e-8
 """If the next speed contributes less than this share of an acceleration limit, its contribution is
 ignored."""
+BLEND_DEVIATION = 3.0 / 16.0
+"""b(0) of `BlendedPolyline`: the distance from corner to blend, divided by the half width times the change of
+direction."""
+CORNER_INTERVALS, LINE_INTERVALS = 8, 32
+"""The grid of `estimated_time`."""
 MIN_SPEED_RATIO = 0.01
 """Each ṡ² is at least this share of the previous one and of the greatest possible one. Where a joint's q'
 changes sign, the limits would otherwise allow a speed that only a stop can follow."""
@@ -38,9 +43,12 @@ def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
         else:
             high = middle
     segment, dof = low, waypoints.shape[1]
-    corner = segment - 1 if s < 0.5 * (knots[segment] + knots[segment + 1]) else segment
-    corner = min(max(corner, 0), len(half_widths) - 1)
-    if corner >= 0 and abs(s - knots[corner + 1]) < half_widths[corner]:
+    corner = -1
+    if segment > 0 and s - knots[segment] < half_widths[segment - 1]:
+        corner = segment - 1
+    elif segment < len(half_widths) and knots[segment + 1] - s < half_widths[segment]:
+        corner = segment
+    if corner >= 0:
         d = half_widths[corner]
         u = (s - knots[corner + 1]) / d
         if order == 0:
@@ -76,6 +84,124 @@ def evaluate(line, s, order):
     for i in range(len(s)):
         evaluate_at(waypoints, knots, directions, half_widths, s[i], order, out[i])
     return out
+
+
+@njit(cache=True)
+def rounded_line(waypoints, deviations):
+    """The polyline through waypoints [n, dof] with the widest blends that leave it by at most the deviations
+    [n - 2] and do not overlap, as the arguments of `evaluate`."""
+    n, dof = waypoints.shape
+    lengths, knots, directions = np.empty(n - 1), np.zeros(n), np.empty((n - 1, dof))
+    for i in range(n - 1):
+        directions[i] = waypoints[i + 1] - waypoints[i]
+        lengths[i] = np.sqrt((directions[i] ** 2).sum())
+        directions[i] /= lengths[i]
+        knots[i + 1] = knots[i] + lengths[i]
+    wanted, widths = np.empty(n - 2), np.empty(n - 2)
+    for i in range(n - 2):
+        turn = np.sqrt(((directions[i + 1] - directions[i]) ** 2).sum())
+        wanted[i] = deviations[i] / max(BLEND_DEVIATION * turn, 1e-12)
+    # A segment between two corners is shared: each gets half, or what the other does not want. A segment at
+    # an end belongs to its only corner.
+    for i in range(n - 2):
+        before, after = lengths[i], lengths[i + 1]
+        if i > 0:
+            before = max(0.5 * before, before - wanted[i - 1])
+        if i < n - 3:
+            after = max(0.5 * after, after - wanted[i + 1])
+        widths[i] = min(min(before, after), wanted[i])
+    return waypoints, knots, directions, widths
+
+
+@njit(cache=True)
+def timing_grid(knots, half_widths, corner_intervals, line_intervals):
+    """Values of s: equal parts of every rounded corner, and parts of the straight lines by their lengths.
+
+    Along a straight line s̈ is piecewise constant, which any grid represents exactly except at the switching
+    points. Rounded corners need points of their own because the limits on ṡ change along them.
+    """
+    length, corners = knots[-1], len(half_widths)
+    grid = np.zeros(1 + line_intervals + (2 + corner_intervals) * (corners + 1) + corners + 1)
+    count, s = 0, 0.0
+    for i in range(corners + 1):
+        low = knots[i + 1] - half_widths[i] if i < corners else length
+        high = knots[i + 1] + half_widths[i] if i < corners else length
+        for end, least, negligible in ((low, 2, 1e-12), (high, corner_intervals, 0.0)):
+            if end - s > negligible:
+                intervals = max(least, int(np.round(line_intervals * (end - s) / length)))
+                step = (end - s) / intervals
+                for k in range(1, intervals):
+                    grid[count + k] = s + k * step
+                count += intervals
+                grid[count] = end
+            s = end
+    grid[count] = length
+    return grid[: count + 1].copy()
+
+
+@njit(cache=True)
+def least_time(line, velocity, acceleration, corner_intervals, line_intervals):
+    """Duration of the fastest motion along a line from rest to rest, without limits of jerk [s]."""
+    grid = timing_grid(line[1], line[3], corner_intervals, line_intervals)
+    first, second = evaluate(line, grid, 1), evaluate(line, grid, 2)
+    highest = np.empty_like(first)
+    highest[:] = acceleration
+    speeds = fastest_speeds(first, second, grid, velocity, -highest, highest)
+    duration = 0.0
+    for i in range(len(grid) - 1):
+        duration += 2 * (grid[i + 1] - grid[i]) / (speeds[i] + speeds[i + 1])
+    return duration * slowdown(line, grid, speeds, velocity, acceleration)
+
+
+@njit(cache=True)
+def estimated_time(line, velocity, acceleration):
+    """About the least duration of a motion along a line from rest to rest, without limits of jerk [s]: on
+    random lines 0.7 % more, with a standard deviation of 0.5 %.
+
+    In each interval the greatest s̈ is that at its slower end, in one backward and one forward pass. Where
+    that exceeds a limit at the other end, the interval takes longer. That is a tenth of the work of
+    `fastest_speeds`.
+    """
+    grid = timing_grid(line[1], line[3], CORNER_INTERVALS, LINE_INTERVALS)
+    first, second = evaluate(line, grid, 1), evaluate(line, grid, 2)
+    n, dof = first.shape
+    x = np.empty(n)
+    for i in range(n):
+        most = np.inf
+        for j in range(dof):
+            if first[i, j] != 0:
+                most = min(most, (velocity[j] / first[i, j]) ** 2)
+            if second[i, j] != 0:
+                most = min(most, acceleration[j] / abs(second[i, j]))
+        x[i] = most
+    x[0] = x[n - 1] = 0.0
+    for i in range(n - 1, 0, -1):
+        most = x[i] + 2 * (grid[i] - grid[i - 1]) * _greatest_pull(first, second, i, x[i], -1.0, acceleration)
+        x[i - 1] = min(x[i - 1], most)
+    for i in range(n - 1):
+        most = x[i] + 2 * (grid[i + 1] - grid[i]) * _greatest_pull(first, second, i, x[i], 1.0, acceleration)
+        x[i + 1] = min(x[i + 1], most)
+    duration = 0.0
+    for i in range(n - 1):
+        width = grid[i + 1] - grid[i]
+        pull, worst = (x[i + 1] - x[i]) / (2 * width), 1.0
+        for j in range(dof):
+            for k in range(2):
+                rate = abs(first[i + k, j] * pull + second[i + k, j] * x[i + k])
+                worst = max(worst, rate / acceleration[j])
+        duration += 2 * width / (np.sqrt(x[i]) + np.sqrt(x[i + 1])) * np.sqrt(worst)
+    return duration
+
+
+@njit(cache=True)
+def _greatest_pull(first, second, i, x, sign, acceleration):
+    """The greatest |s̈| of a sign with which accelerations are within their limits at grid point i."""
+    most = np.inf
+    for j in range(first.shape[1]):
+        if first[i, j] != 0:
+            pull, curve = sign * first[i, j], second[i, j] * x
+            most = min(most, (acceleration[j] - (curve if pull > 0 else -curve)) / abs(pull))
+    return most
 
 
 @njit(cache=True)

@@ -4,7 +4,7 @@ Freedom from collision between waypoints is certified, not sampled: see collisio
 trajectory are computed from its positions and times: see rates.py. The validator does not depend on planners.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ from robotdiffuse.core.errors import InputError, check_type, joined, shown
 from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
+from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, first_place_within, goal_error
 from robotdiffuse.validation.torques import Pieces, first_excess, static_pieces, trajectory_pieces
@@ -63,6 +64,10 @@ class Report:
     at most 1 m. None for an invalid motion."""
     self_clearance: float | None
     """The same between links that are checked against each other [m]."""
+    jerk_share: float | None = None
+    """The largest jerk of a valid trajectory as a share of the joint's limit (`jerk_limits`); infinite if
+    accelerations jump at the ends. Not a requirement: above 1 the motion is valid, but some controllers
+    refuse it."""
     found: tuple[Violation, ...] = ()
     """All violations that were found, the first of each kind; `violations` also finds every contact."""
 
@@ -74,13 +79,16 @@ class Report:
         return min(self.scene_clearance, self.self_clearance)
 
 
-def verify(problem: Problem, path: Path, settings: VerifySettings = DEFAULT) -> Report:
-    """Validate a path for a problem, with respect to everything but moving obstacles, since a path has no
-    times.
+def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT) -> Report:
+    """Validate a motion for a problem: a trajectory as `verify_trajectory` does; a path with respect to
+    everything but moving obstacles, since it has no times.
 
-    Raises InputError if the path's joints are not those of the robot, or its shape is wrong.
+    Raises InputError if the motion's joints are not those of the robot, or its shapes are wrong.
     """
-    return _verifier(problem, settings).path(path)
+    if isinstance(motion, Trajectory):
+        return verify_trajectory(problem, motion, settings)
+    check_motion("motion", motion, (Path, Trajectory))
+    return _verifier(problem, settings).path(motion)
 
 
 def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
@@ -119,7 +127,7 @@ class Verifier:
 
     def path(self, path: Path) -> Report:
         """See `verify`."""
-        check_motion("path", path, (Path, Trajectory))
+        check_motion("path", path, (Path,))
         self._check_shape(path.joint_names, path.positions)
         found = []
         if self.dynamics is not None and within(path.positions):
@@ -167,7 +175,10 @@ class Verifier:
         if self.constraints is not None:
             found += self._too_fast(trajectory)
             along = sample_cubics(trajectory, self.settings.constraint_chord) if not found else None
-        return self._report(positions, times, found, np.isin(times, trajectory.times[still]), along)
+        report = self._report(positions, times, found, np.isin(times, trajectory.times[still]), along)
+        if not report.valid:
+            return report
+        return replace(report, jerk_share=float((trajectory.peak_jerks / jerk_limits(self.robot)).max()))
 
     def collision_free(self, path: Path) -> bool:
         """Whether a path is certified free of collision and keeps the path constraints. Start, goal and
@@ -228,7 +239,7 @@ class Verifier:
         scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
         if scene is not None and moving is not None:
             scene = min(scene, moving.clearance)
-        return Report(valid, violation, scene, itself, tuple(dict.fromkeys((*found, *every))))
+        return Report(valid, violation, scene, itself, found=tuple(dict.fromkeys((*found, *every))))
 
     def _start(self, q: ndarray) -> Violation | None:
         difference = np.abs(q[0] - self.problem.start)

@@ -31,6 +31,8 @@ KEY_DIRECTION = np.array([0.35, -0.45, 0.82])
 """Direction towards the main light, in a frame whose x axis points from the scene to the camera."""
 KEY_SPREAD = 0.075
 """Angular radius of the main light [rad], for soft shadows."""
+TUBE_SIDES = 10
+"""Corners of the cross-section of the trace."""
 TUBE_RADIUS = 0.006
 """Radius of the trace [m]."""
 GROUND_RADIUS = 3.2
@@ -206,7 +208,7 @@ def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tup
     return maps, axes, scale, center, size, 2.0 / scale
 
 
-def _tube(points: Float[ndarray, "n 3"], sides: int = 10) -> Surface:
+def _tube(points: Float[ndarray, "n 3"]) -> Surface:
     """A round tube along a polyline, coloured from START to GOAL, with spheres at both ends."""
     import trimesh
 
@@ -232,14 +234,15 @@ def _tube(points: Float[ndarray, "n 3"], sides: int = 10) -> Surface:
         previous = previous - along[i] * (along[i] @ previous)
         previous = previous / max(float(np.linalg.norm(previous)), 1e-9)
         across[i] = previous
-    angle = np.arange(sides) * (2 * np.pi / sides)
+    angle = np.arange(TUBE_SIDES) * (2 * np.pi / TUBE_SIDES)
     normals = (
         np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * np.cross(along, across)[:, None]
     )
     t = np.linspace(0, 1, n)[:, None, None]
     colors = np.broadcast_to(((1 - t) * START + t * GOAL) / 255.0, normals.shape)
-    i, j = np.arange(n - 1)[:, None] * sides, np.arange(sides)
-    quad = [i + j, i + (j + 1) % sides, i + sides + j, i + sides + (j + 1) % sides]
+    i, j = np.arange(n - 1)[:, None] * TUBE_SIDES, np.arange(TUBE_SIDES)
+    following = (j + 1) % TUBE_SIDES
+    quad = [i + j, i + following, i + TUBE_SIDES + j, i + TUBE_SIDES + following]
     faces = np.concatenate([np.stack(quad[:3], -1).reshape(-1, 3), np.stack(quad[1:], -1).reshape(-1, 3)])
     vertices = points[:, None] + TUBE_RADIUS * normals
     tube = Surface(vertices.reshape(-1, 3), normals.reshape(-1, 3), colors.reshape(-1, 3), faces)

@@ -20,10 +20,10 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.transformer import TransformerSettings
-from robotdiffuse.learning.denoisers.unet import UNetSettings
-from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.denoisers.settings import TransformerSettings, UNetSettings
+from robotdiffuse.learning.encoders.settings import PointAutoencoderSettings
+from robotdiffuse.learning.exported_model import exported_model
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.objectives import OBJECTIVES
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.sampling import SamplingSettings
@@ -169,7 +169,7 @@ def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
         data, denoiser=denoiser, denoiser_settings=None, losses=losses, condition_drop=0.5
     )
     encoder = load_encoder(data.parent / "encoder")
-    model = MotionModel(RobotIdentity.of(arm), training.model_settings(settings, encoder))
+    model = MotionNetwork(RobotIdentity.of(arm), training.model_settings(settings, encoder))
     loaded = load_data(str(data), arm, encoder, WAYPOINTS, lambda text: None)
 
     def far(scenes, q):
@@ -205,6 +205,7 @@ def test_training_without_accelerate_names_the_extra(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["encoder", "planner"])
+@pytest.mark.usefixtures("no_export")
 def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
     def train(out):
         if kind == "encoder":
@@ -241,7 +242,7 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
     train_planner(planner_settings(data, samples=16 * 60, **changes), str(out))
     losses = [float(row["loss"]) for row in read_log(out)]
     assert np.mean(losses[-3:]) < losses[0]
-    model = load_model(out, arm)
+    model = exported_model("model", out, arm)
     start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
     z = model.encode(np.zeros((0, 3)))
 
@@ -268,7 +269,7 @@ def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, 
     encoder = load_encoder(data.parent / "encoder")
     loaded = load_data(str(data), arm, None, WAYPOINTS, print)
     settings = planner_settings(data, objective=objective)
-    model = MotionModel(RobotIdentity.of(arm), training.model_settings(settings, encoder))
+    model = MotionNetwork(RobotIdentity.of(arm), training.model_settings(settings, encoder))
     batches = Batches(loaded, model, lambda _, q: np.zeros((*q.shape[:2], 3), np.float32), 0.1, 5.0)
     levels = np.arange(1, model.schedule.steps + 1)
     batch = batches.at(np.zeros(len(levels), np.int64), levels, np.random.default_rng(0))
@@ -280,6 +281,7 @@ def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, 
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_export")
 def test_planner_learns_which_side(tmp_path, data, arm):
     out = tmp_path / "out"
     report = train_planner(
@@ -311,12 +313,14 @@ def test_planner_learns_which_side(tmp_path, data, arm):
         np.testing.assert_allclose(bow.mean(), 0.5 * side, atol=0.2)
 
 
+@pytest.mark.usefixtures("no_export")
 def test_other_settings_need_another_folder(tmp_path, data):
     train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
     with pytest.raises(InputError, match=r"learning_rate = 0\.003, now it is 0\.1"):
         train_planner(planner_settings(data, learning_rate=0.1), str(tmp_path / "out"))
 
 
+@pytest.mark.usefixtures("no_export")
 def test_damaged_checkpoint_is_named(tmp_path, data):
     train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
     file = tmp_path / "out" / "training.safetensors"
@@ -330,6 +334,7 @@ def test_length_is_given_once():
         EncoderTraining(minutes=3.0, samples=4)
 
 
+@pytest.mark.usefixtures("no_export")
 def test_trains_without_some_conditions(data, tmp_path):
     """The stand-in for a dropped condition is trained, and a guidance scale has an effect afterwards."""
     small = UNetSettings(width=8, multiples=(1, 2), kernel=3, condition_width=16)

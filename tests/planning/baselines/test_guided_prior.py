@@ -23,9 +23,9 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.learning.checkpoint import load_network, save_network
-from robotdiffuse.learning.denoisers.unet import UNetSettings
+from robotdiffuse.learning.denoisers.settings import UNetSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import Batches, TrajectoryData
 from robotdiffuse.learning.training.configs import planner_training
@@ -69,7 +69,7 @@ def bumps(waypoints: int) -> Float[ndarray, "inner inner"]:
     return waves @ waves.T + 1e-6 * np.eye(waypoints - 2)
 
 
-class Gaussian(MotionModel):
+class Gaussian(MotionNetwork):
     """The exact denoiser of straight lines with Gaussian bumps."""
 
     def denoise(
@@ -111,7 +111,7 @@ def stay(q: ndarray, _left: int) -> ndarray:
 
 def test_the_loss_falls() -> None:
     torch.manual_seed(0)
-    network, data, rng = MotionModel(RANGES, SMALL), data_of(32), np.random.default_rng(0)
+    network, data, rng = MotionNetwork(RANGES, SMALL), data_of(32), np.random.default_rng(0)
     batches = Batches(data, network, lambda _scenes, _q: np.zeros(0), 0.1, None)
     loss_of = PlannerLoss(network, PANDA, TRAINING, Processes("cpu"))
     optimizer = torch.optim.AdamW(network.parameters(), lr=4e-3)
@@ -157,7 +157,7 @@ def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> N
 
 def test_samples_hold_their_ends_exactly() -> None:
     torch.manual_seed(0)
-    network, rng = MotionModel(RANGES, SMALL), np.random.default_rng(0)
+    network, rng = MotionNetwork(RANGES, SMALL), np.random.default_rng(0)
     starts, goals = (rng.uniform(PANDA.lower, PANDA.upper, (3, PANDA.dof)).astype(np.float32) for _ in "ab")
 
     def guide(q: ndarray, left: int) -> ndarray:
@@ -353,15 +353,17 @@ def test_missing_weights(kind: type[MPD | EDMP], tmp_path) -> None:
 
 def test_weights_survive_a_file(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    network = MotionModel(RANGES, SMALL)
+    network = MotionNetwork(RANGES, SMALL)
     torch.nn.init.normal_(network.denoiser.out.weight, std=0.1)
     save_network("trajectory_prior", network, tmp_path, {})
     loaded = load_network("trajectory_prior", str(tmp_path), PANDA)
-    assert isinstance(loaded, MotionModel) and loaded.settings == SMALL
+    assert isinstance(loaded, MotionNetwork) and loaded.settings == SMALL
     given = torch.randn(2, WAYPOINTS, PANDA.dof), torch.full((2,), 0.3), torch.zeros(2, 1)
     with torch.no_grad():
         assert torch.allclose(loaded.denoise(*given), network.denoise(*given), atol=0.05)
-    assert MPD(MPDSettings(weights=str(tmp_path))).network(PANDA) is loaded
+    exported = MPD(MPDSettings(weights=str(tmp_path))).network(PANDA)
+    arrays = [part.numpy() for part in given]
+    np.testing.assert_allclose(exported.denoised(*arrays), loaded.denoised(*arrays), atol=1e-5)
 
 
 def test_training_stopped_and_continued_ends_the_same(

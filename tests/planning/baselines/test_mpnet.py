@@ -23,7 +23,7 @@ from robotdiffuse.learning.networks.mpnet import (
 )
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
-from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_code
+from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_cloud
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -155,7 +155,7 @@ def test_gradients_of_the_contractive_penalty_are_those_of_finite_differences() 
 
 def test_waypoints_are_a_step_apart_or_the_goal() -> None:
     net, data = network(replace(SMALL, step=0.5)), motions()
-    here, following, goal = net._samples(data.q, np.random.default_rng(0))
+    here, following, goal = net.training_samples(data.q, np.random.default_rng(0))
     moved = np.linalg.norm(following - here, axis=1)
     at_goal = (following == goal).all(1)
     assert len(here) == len(data) * SMALL.waypoints and 0 < at_goal.mean() < 0.7
@@ -174,8 +174,8 @@ def test_the_order_of_the_points_does_not_matter_and_no_points_are_zeros() -> No
     steps = (near[:, 1:] - near[:, :-1]).norm(dim=-1).mean()
     assert steps < 0.7 * (cloud[:, 1:] - cloud[:, :-1]).norm(dim=-1).mean(), "neighbours are near each other"
     assert not sorted_along_curve(torch.zeros(1, 40, 3), net.region).any()
-    empty = scene_code(net, CollisionChecker(PANDA, Scene([])), rng)
-    torch.testing.assert_close(empty, net.encode(torch.zeros(1, 40, 3)))
+    empty = scene_cloud(net, CollisionChecker(PANDA, Scene([])), rng)
+    torch.testing.assert_close(net.code_of(empty), net.encode(torch.zeros(1, 40, 3))[0])
 
 
 def test_dropout_is_on_in_planning_and_drawn_from_the_generator(weights: str) -> None:

@@ -8,8 +8,10 @@ import pytest
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Status
-from robotdiffuse.learning.encoders.dgcnn import DGCNNSettings
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.encoders.settings import DGCNNSettings
+from robotdiffuse.learning.exported_model import ExportedModel
+from robotdiffuse.learning.motion_model import MotionModelSettings
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -58,11 +60,11 @@ def test_the_straight_line_is_not_tried() -> None:
 def test_weights_are_used_with_their_own_sampler_and_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     levels: list[float] = []
 
-    def denoise(self, features, level, *rest, own=MotionModel.denoise):
+    def denoised(self, features, level, *rest, own=ExportedModel.denoised):
         levels.append(float(level[0]))
         return own(self, features, level, *rest)
 
-    monkeypatch.setattr(MotionModel, "denoise", denoise)
+    monkeypatch.setattr(ExportedModel, "denoised", denoised)
     model = Diffusion().model(PANDA)  # the one that planners will be given
     assert model is not None
     for steps, calls in ((None, model.settings.sampling_steps), (3, 3)):
@@ -124,7 +126,7 @@ def test_settings_are_checked() -> None:
 
 def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = DGCNNSettings(code=8, cloud=50, neighbours=4, edges=(8,), embedding=16, head=(16,))
-    model = MotionModel(
+    model = MotionNetwork(
         RobotIdentity.of(PANDA), MotionModelSettings(encoder="dgcnn", encoder_settings=settings)
     )
     sizes: list[int] = []

@@ -9,21 +9,22 @@ import pytest
 from helpers.box_arm import box_arm
 from helpers.small_model import small_model
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.motions import path_length
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
-from robotdiffuse.learning.checkpoint import load_model
+from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.planning.diffusion import hybrid
 from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planning.diffusion.hybrid import (
     BATCH_WORK,
     RobotDiffuse,
     RobotDiffuseSettings,
-    _Batches,
     unlearned_starts,
 )
-from robotdiffuse.planning.search.anytime import CLOCK_INTERVAL, AnytimeSearch
+from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.search.anytime import AnytimeSearch
 from robotdiffuse.planning.search.aorrtc import AORRTCSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
@@ -49,11 +50,7 @@ def planner():
 @pytest.fixture
 def no_search(monkeypatch):
     """The search counts its iterations and finds nothing, so that only the network's batches find paths."""
-
-    def idle(self):
-        self.work, self._tried = self.work + CLOCK_INTERVAL, self._tried + CLOCK_INTERVAL
-
-    monkeypatch.setattr(AnytimeSearch, "_iterate", idle)
+    monkeypatch.setattr(rrt_kernel, "search", lambda *_: np.empty((0, 7), np.float32))
 
 
 def test_the_network_solves_and_the_validator_agrees(planner, no_search):
@@ -147,35 +144,29 @@ def test_the_first_path_comes_before_the_network_runs(monkeypatch):
         return draw(self, *arguments)
 
     planner = RobotDiffuse(RobotDiffuseSettings(network_share=0.9))  # which is due soon after the path
-    planner.plan(PROBLEM, time_limit=10.0)
+    planner.plan(PROBLEM, time_limit=10.0, objective="length")
     monkeypatch.setattr(RobotDiffuse, "draw", late)
     start = time.perf_counter()
-    result = planner.plan(PROBLEM, time_limit=2.0, until="time_limit")
+    result = planner.plan(PROBLEM, time_limit=2.0, until="time_limit", objective="length")
     assert result.path is not None and verify(PROBLEM, result.path).valid
     (first, longest), *_, (_, shortest) = result.progress
     assert first < began[0] and result.path.length == pytest.approx(shortest) and shortest <= longest
 
 
-def test_a_call_loads_the_network_in_its_own_time_or_not_at_all(monkeypatch):
-    """Regression: the second call of a process was late by the loading time, which was before the clock
-    started."""
-    loaded, model = [], RobotDiffuse.model
-    monkeypatch.setattr(RobotDiffuse, "model", lambda self, robot: loaded.append(robot) or model(self, robot))
+def test_the_network_is_loaded_before_the_clock_starts(monkeypatch):
+    """So it has its turn from the first call on, however short the limit, and costs that call nothing."""
+    order, model, solve = [], RobotDiffuse.model, RobotDiffuse.solve
+    monkeypatch.setattr(
+        RobotDiffuse, "model", lambda self, robot: order.append("model") or model(self, robot)
+    )
+    monkeypatch.setattr(
+        RobotDiffuse, "solve", lambda self, *given: order.append("solve") or solve(self, *given)
+    )
+    drawn, draw = [], RobotDiffuse.draw
+    monkeypatch.setattr(RobotDiffuse, "draw", lambda *given: drawn.append(1) or draw(*given))
     planner = RobotDiffuse(RobotDiffuseSettings(network_share=0.9))  # which is due soon after the path
-    for _ in range(2):
-        assert planner.plan(PROBLEM, time_limit=0.5, until="time_limit").stage == "aorrtc"
-    assert not loaded
-    planner.load_wanted(PANDA)
-    assert loaded == [PANDA]
-    planner.plan(PROBLEM, time_limit=0.5, until="time_limit")
-    assert len(loaded) > 1, "once loaded, it is used"
-    loaded.clear()
-    fresh = RobotDiffuse()
-    fresh.load_wanted(PANDA)
-    fresh.warm_up(PROBLEM)
-    assert not loaded, "nothing wanted it"
-    fresh.warm_up(PROBLEM, "converged")
-    assert loaded
+    planner.plan(PROBLEM, time_limit=2.0, until="time_limit", objective="length")
+    assert order[:2] == ["model", "solve"] and drawn
 
 
 def test_batches_get_their_part_of_the_work(monkeypatch):
@@ -186,7 +177,7 @@ def test_batches_get_their_part_of_the_work(monkeypatch):
     for share in (0.0, 0.5):
         drawn.clear()
         settings = RobotDiffuseSettings(network_share=share, search=AORRTCSettings(patience=40_000))
-        assert RobotDiffuse(settings).plan(PROBLEM, time_limit=60.0).solved
+        assert RobotDiffuse(settings).plan(PROBLEM, time_limit=60.0, objective="length").solved
         counts[share] = len(drawn)
     assert counts[0.0] == 0 and counts[0.5] >= 40_000 // BATCH_WORK - 1
 
@@ -210,6 +201,8 @@ def test_a_robot_without_weights_is_planned_by_search_and_noise(planner):
     result = planner.plan(Problem(stranger, Scene([BALL]), LEFT, JointGoal(RIGHT[None])), time_limit=10.0)
     assert result.stage in ("aorrtc", "smooth_noise") and result.solved
     assert any("no weights" in note for note in result.notes)
+    straight = planner.plan(Problem(stranger, Scene(), LEFT, JointGoal(RIGHT[None])))
+    assert straight.stage == "straight_line" and not straight.notes  # neither was needed
 
 
 STRANGER = Problem(replace(PANDA, name="stranger"), Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
@@ -219,14 +212,18 @@ STRANGER = Problem(replace(PANDA, name="stranger"), Scene([BALL]), LEFT, JointGo
 @pytest.fixture
 def noise_at(monkeypatch):
     """The iterations of search before each batch of smooth noise, and whether there was a path."""
-    drawn = []
+    drawn, searches = [], []
 
-    def draw(self):
-        drawn.append((self.search.work, self.search.best is not None))
-        plain(self)
+    def search(*arguments):
+        searches.append(AnytimeSearch(*arguments))
+        return searches[-1]
 
-    plain = _Batches._draw
-    monkeypatch.setattr(_Batches, "_draw", draw)
+    def noise(*arguments):
+        drawn.append((searches[-1].work, searches[-1].best is not None))
+        return smooth_noise(*arguments)
+
+    monkeypatch.setattr(hybrid, "AnytimeSearch", search)
+    monkeypatch.setattr(hybrid, "smooth_noise", noise)
     return drawn
 
 
@@ -239,24 +236,20 @@ def test_no_smooth_noise_before_search_has_a_path(planner, no_search, noise_at):
 
 def test_smooth_noise_keeps_to_its_share_of_the_work(noise_at):
     settings = RobotDiffuseSettings(network_share=0.5, search=AORRTCSettings(patience=40_000))
-    assert RobotDiffuse(settings).plan(STRANGER, time_limit=60.0).solved
+    assert RobotDiffuse(settings).plan(STRANGER, time_limit=60.0, objective="length").solved
     assert noise_at and all(there for _, there in noise_at)
     assert all(work >= k * BATCH_WORK for k, (work, _) in enumerate(noise_at, start=1))
 
 
 def test_smooth_noise_shortens_and_the_validator_agrees(monkeypatch):
     """The search finds one long detour and then nothing."""
-
-    def detour(self):
-        self.work, self._tried = self.work + CLOCK_INTERVAL, self._tried + CLOCK_INTERVAL
-        if self.best is None:
-            up = np.array([0.0, -1.0, 0.0, -1.9, 0.0, 2.2, 0.785])
-            path = np.array([LEFT, up, RIGHT], np.float32)
-            self._take(path, float(path_length(path)), "aorrtc")
-
-    monkeypatch.setattr(AnytimeSearch, "_iterate", detour)
-    settings = RobotDiffuseSettings(search=AORRTCSettings(patience=5 * BATCH_WORK))
-    result = RobotDiffuse(settings).plan(STRANGER, time_limit=10.0)
+    up = [0.0, -1.0, 0.0, -1.9, 0.0, 2.2, 0.785]
+    paths = [np.array([LEFT, up, RIGHT], np.float32)]
+    none = np.empty((0, 7), np.float32)
+    monkeypatch.setattr(rrt_kernel, "search", lambda *_: paths.pop() if paths else none)
+    search = AORRTCSettings(patience=5 * BATCH_WORK, smoothings=0, tightenings=0)
+    settings = RobotDiffuseSettings(search=search)
+    result = RobotDiffuse(settings).plan(STRANGER, time_limit=10.0, objective="length")
     assert result.stage == "smooth_noise" and result.path is not None and verify(STRANGER, result.path).valid
 
 
@@ -268,8 +261,7 @@ def test_invalid_start(planner):
 
 def test_encodings_distinguish_scenes():
     """Encodings z of two clouds of one scene are nearer to each other than those of two scenes."""
-    model = load_model("panda")
-    assert model is not None
+    model = exported_model("model", None, PANDA)
     rng = np.random.default_rng(0)
     near = CollisionChecker(PANDA, Scene([BALL]))
     far = CollisionChecker(PANDA, Scene([Box([-0.4, 0.4, 0.5], [0.2, 0.2, 0.2])]))
@@ -286,8 +278,7 @@ def test_unlearned_starts_keep_ends_and_limits():
 
 
 def test_the_guidance_scale_reaches_the_network():
-    checker, model = CollisionChecker(PANDA, PROBLEM.scene), load_model("panda")
-    assert model is not None
+    checker, model = CollisionChecker(PANDA, PROBLEM.scene), exported_model("model", None, PANDA)
     code = encode(model, checker, 320, np.random.default_rng(0))
     plain, same, strong = (
         RobotDiffuse(RobotDiffuseSettings(samples=2, guidance_steps=0, guidance_scale=scale)).draw(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from robotdiffuse.learning.checkpoint import load_model
+from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.planning.diffusion.smooth_noise import MAX_HALF_RANGE, SPREAD, smooth_noise
 from robotdiffuse.robots import load_robot
 
@@ -25,8 +25,7 @@ def test_its_covariance_is_about_that_of_the_pandas_weights() -> None:
     half = np.minimum(0.5 * (PANDA.upper - PANDA.lower), MAX_HALF_RANGE)
     rows = np.moveaxis(q / half, 1, 2).reshape(-1, 48)
     assert np.sqrt((rows**2).mean()) == np.float32(SPREAD).round(6) or abs(rows.std() - SPREAD) < 0.005
-    model = load_model("panda")
-    assert model is not None
-    factor = model.noise_factor.numpy().astype(np.float64)
+    model = exported_model("model", None, PANDA)
+    factor = model.statistics.noise_factor.astype(np.float64)
     shares = [np.linalg.eigvalsh(c)[::-1] / np.trace(c) for c in (rows.T @ rows, factor @ factor.T)]
     assert np.abs(shares[0] - shares[1]).max() < 0.012

@@ -31,7 +31,12 @@ from robotdiffuse.perception.swept_voxels_kernel import sweep
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.attempt import attempt
 from robotdiffuse.planning.context import PlanRequest
-from robotdiffuse.planning.pipeline.unknown_space import AS_SEEN, assumptions_of, plan_with_unknown_space
+from robotdiffuse.planning.pipeline.unknown_space import (
+    AS_SEEN,
+    assumptions_of,
+    plan_with_unknown_space,
+    policy_for,
+)
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -169,3 +174,24 @@ def test_result_files_keep_the_assumption_and_its_confidence(planner: Planner, t
     for name in ("assumption", "confidence", "swept_probability", "unknown_region"):
         assert getattr(again, name) == getattr(result, name)
     assert again.unknown_region is not None and len(again.unknown_region[0]) == 3
+
+
+def test_the_default_policy_is_prediction_where_the_network_covers_the_reach() -> None:
+    problem = replace(partial("padded"), unknown=None)
+    assert policy_for(problem) == ("predicted", "")
+    assert policy_for(partial("optimistic")) == ("optimistic", "")
+    arm = load_robot("ur10")
+    far = Problem(arm, Scene(), np.zeros(6), np.zeros(6), views=[replace(taken(DEEP), configuration=None)])
+    policy, note = policy_for(far)
+    assert policy == "padded" and "ur10 reaches farther" in note
+
+
+def test_a_fallback_to_another_assumption_is_a_note(planner: Planner) -> None:
+    everywhere = np.ones(FINE_SHAPE, np.float32)
+    result = plan_with_unknown_space(planner, partial("predicted"), REQUEST, everywhere)
+    assert result.assumption == AS_SEEN
+    assert "predicted, p > 0.1" in result.notes[-1] and "unknown space taken as free" in result.notes[-1]
+    late = plan_with_unknown_space(planner, partial("predicted"), PlanRequest(0.02), everywhere)
+    assert not late.solved or "unknown space taken as free" in late.notes[-1]
+    usual = plan_with_unknown_space(planner, partial("predicted"), REQUEST, 0 * everywhere)
+    assert usual.assumption == "predicted, p > 0.1" and not usual.notes

@@ -163,3 +163,33 @@ def test_the_replanner_refuses_what_it_does_not_support(what: str) -> None:
     problem = rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], **UNSUPPORTED[what])
     with pytest.raises(InputError, match=rf"problem\.{what}: the replanner does not support it"):
         rd.Replanner(problem)
+
+
+@pytest.mark.parametrize("goal", ["start", "pose", "here"])
+def test_a_new_goal_is_reached_from_where_the_motion_ends(goal: str) -> None:
+    replanner = loop(np.array([[0.0, -3.0, 0.5]]))
+    seen, command, before = {"sphere": [0.0, -3.0, 0.5]}, None, None
+    pose = rd.PoseGoal("panda_hand", PANDA.fk(START))
+    for k in range(600):
+        command = replanner.step(seen, k * PERIOD)
+        if before is not None:
+            at = command.begins - before.begins
+            goes_on = [np.interp(at, before.motion.times, column) for column in before.motion.positions.T]
+            assert np.allclose(command.motion.positions[0], goes_on, atol=2e-3)
+        before = command
+        if k == 15:
+            assert not command.arrived and np.abs(command.motion.velocities).max() > 0.1
+            rest = command.motion.positions[-1]
+            replanner.set_goal({"start": START, "pose": pose, "here": rest}[goal])
+        if command.arrived:
+            break
+    assert command is not None and command.arrived and k > 15
+    reached = PANDA.fk(command.motion.positions[-1])
+    assert np.allclose(reached, PANDA.fk(rest if goal == "here" else START), atol=1e-4)
+
+
+def test_a_goal_in_collision_leaves_the_old_one() -> None:
+    replanner = loop(np.array([[0.0, -3.0, 0.5]]))
+    with pytest.raises(InputError, match="cannot take this goal: the goal is in collision"):
+        replanner.set_goal([0, 1.5, 0, -0.5, 0, 2.1, 0.8])
+    assert np.allclose(replanner.problem.goal.positions, END)  # type: ignore[union-attr]

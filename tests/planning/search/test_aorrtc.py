@@ -1,7 +1,9 @@
 """AORRTC: paths below the bound, shorter with time; until, clearance and scaling of a request."""
 
+import time
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +13,10 @@ from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Status
+from robotdiffuse.core.types import Status, Trajectory
 from robotdiffuse.planning import context
 from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.search.anytime import usual_clearances
 from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.held_out import held_out_problem
@@ -22,6 +25,7 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.trajectories.simplification import simplify, tighten
+from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")
@@ -106,7 +110,8 @@ def test_samples_are_in_the_spheroid_of_a_goal() -> None:
 def test_more_time_gives_no_longer_paths(planner: AORRTC | RRTConnect) -> None:
     planner.plan(AROUND, 1e-3)  # compiles
     first, short, limit = (
-        planner.plan(AROUND, 1.0, seed=3, until=until) for until in ("first", "converged", "time_limit")
+        planner.plan(AROUND, 1.0, seed=3, until=until, objective="length")
+        for until in ("first", "converged", "time_limit")
     )
     assert first.path_length is not None and short.path_length is not None and limit.path_length is not None
     assert limit.path_length <= short.path_length <= first.path_length
@@ -145,12 +150,18 @@ def test_the_clearance_is_kept_or_a_note_says_otherwise() -> None:
     assert narrow.solved and any("not 30 cm" in note for note in narrow.notes)
 
 
+def test_a_clearance_above_the_default_falls_back_through_it() -> None:
+    assert usual_clearances(0.1) == pytest.approx([0.1, 0.05, 0.025, 0.01, 0.005, 0.0025, 0.002, 0.0])
+    with pytest.raises(InputError, match=r"clearance is 5\.0; it must be between 0 and 0\.5"):
+        AORRTC().plan(AROUND, clearance=5.0)
+
+
 def test_the_clearance_of_a_call_overrides_that_of_the_problem() -> None:
     wide = Problem(PANDA, WALL, LEFT, RIGHT, clearance=0.05)
     kept, less = AORRTC().plan(wide, 5.0), AORRTC().plan(wide, 5.0, clearance=0.0)
     assert kept.path_length is not None and less.path_length is not None
     assert kept.path_length > less.path_length
-    with pytest.raises(InputError, match=r"clearance is -0\.1; it must be a distance from 0 to 10000 m"):
+    with pytest.raises(InputError, match=r"clearance is -0\.1; it must be a distance from 0 to 0.5 m"):
         Problem(PANDA, WALL, LEFT, RIGHT, clearance=-0.1)
 
 
@@ -204,9 +215,17 @@ def test_a_short_limit_is_a_time_out() -> None:
 def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: a first call, which loaded kernels, validated for a second; shorter calls then ended at
     once."""
-    monkeypatch.setitem(context._validation_seconds, "panda", 1.0)
-    assert AORRTC().plan(AROUND, 0.3, until="time_limit").solved
-    assert context._validation_seconds["panda"] < 1.0
+
+    def slow(*arguments: Any, **others: Any) -> Trajectory:
+        time.sleep(1.0)
+        return time_parameterize(*arguments, **others)
+
+    AORRTC().plan(AROUND)
+    with monkeypatch.context() as patch:
+        patch.setattr(context, "time_parameterize", slow)
+        AORRTC().plan(AROUND, 3.0)
+    for _ in range(2):
+        assert AORRTC().plan(AROUND, 0.3, until="time_limit").solved
 
 
 def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:

@@ -64,8 +64,8 @@ def test_around_a_wall_and_the_same_again():
 
 def test_longer_optimisation_does_not_lengthen():
     problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
-    once = RRTConnect().plan(problem, 5.0)
-    longer = RRTConnect(RRTConnectSettings(optimize_time=0.3)).plan(problem, 5.0)
+    once = RRTConnect().plan(problem, 5.0, objective="length")
+    longer = RRTConnect(RRTConnectSettings(optimize_time=0.3)).plan(problem, 5.0, objective="length")
     assert once.path_length is not None and longer.path_length is not None
     assert longer.path_length <= once.path_length + 1e-6
 

@@ -136,7 +136,7 @@ def test_the_tree_stays_a_tree() -> None:
     for _ in range(5):
         search.round()
     assert search.nodes > 64
-    consistent(search._tree)
+    consistent(search.tree)
     for g, cost in enumerate(search.goal_costs):
         path = search.path(g)
         if path is not None:

@@ -36,7 +36,7 @@ from robotdiffuse.robots import Robot, load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
-from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Sphere
 
 FOLDER = Path(__file__).parents[2] / "files" / "motion_bench_maker"
 Z = np.array([0.0, 0.0, 1.0])
@@ -59,7 +59,7 @@ def ball(**more: object) -> dict[str, Any]:
 
 
 def test_scene_as_motion_bench_maker_writes_it() -> None:
-    can, board = read_moveit_scene(FOLDER / "scene0001.yaml").shapes
+    can, board = read_moveit_scene(FOLDER / "scene0001.yaml")[0].shapes
     assert isinstance(can, Cylinder) and (can.name, can.height, can.radius) == ("can", 0.14, 0.03)
     assert can.center.tolist() == [0.5, -0.4, 0.3]
     assert isinstance(board, Box) and board.size.tolist() == [1.2, 0.8, 0.04]
@@ -323,15 +323,38 @@ def test_meshes(tmp_path: Path) -> None:
     assert (triangle.name, cube.name) == ("things", "things_2")
 
 
+def octomap(data: list[int]) -> dict[str, object]:
+    message = {"binary": True, "id": "OcTree", "resolution": 0.1, "data": data}
+    origin = {"position": [0, 0, 1], "orientation": [0, 0, 0, 1]}
+    return {"world": {"octomap": {"header": {"frame_id": "world"}, "origin": origin, "octomap": message}}}
+
+
+def test_cones_planes_and_octomaps() -> None:
+    place = {"position": [1, 0, 0], "orientation": [0, 0, 0, 1]}
+    data = scene_data(**ball(primitives=[CONE], primitive_poses=[place]))
+    [cone] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    assert isinstance(cone, Mesh)
+    np.testing.assert_allclose(cone.bounds, [[0.9, -0.1, -0.2], [1.1, 0.1, 0.2]], atol=1e-3)
+    flat = {"id": "ground", "planes": [{"coef": [0, 0, 2, -1]}], "plane_poses": [place]}
+    data = scene_data(**flat)
+    [ground] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    assert isinstance(ground, Box) and ground.name == "ground"
+    np.testing.assert_allclose(ground.bounds[1], [11, 10, 0.5])
+    data = octomap([-1 & 3, 0] + 14 * [3, 0] + [2, 0])  # the voxel at the lower end of everything
+    [cloud] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    assert isinstance(cloud, PointCloud) and cloud.point_radius == pytest.approx(0.05 * 3**0.5)
+    np.testing.assert_allclose(cloud.points, [np.array([0, 0, 1]) - 0.1 * (2**15 - 0.5)])
+
+
 CONE = {"type": "cone", "dimensions": [0.4, 0.1]}
 SHORT = {"type": "box", "dimensions": [0.4, 0.1]}
 WRONG_SCENES: dict[str, tuple[object, str]] = {
     "number": (3, "a planning scene is 3; it must be a mapping"),
-    "cone": (
-        scene_data(**ball(primitives=[CONE])),
-        "object ball: unknown type of .*'cone'; known: box, cylinder",
+    "prism": (
+        scene_data(**ball(primitives=[CONE | {"type": 5}])),
+        "object ball: unknown type of .*'prism'; known: box, cone, cylinder",
     ),
-    "cone by number": (scene_data(**ball(primitives=[CONE | {"type": 4}])), "'cone'; known"),
+    "cone": (scene_data(**ball(primitives=[CONE | {"dimensions": [0, 1]}])), "must be positive"),
     "dimensions": (scene_data(**ball(primitives=[SHORT])), r"primitives\[0\].dimensions .* 3 finite numbers"),
     "poses": (scene_data(**ball(primitive_poses=[])), "has 1 primitives and 0 primitive_poses"),
     "quaternion": (
@@ -343,12 +366,13 @@ WRONG_SCENES: dict[str, tuple[object, str]] = {
         scene_data(**ball(header={"frame_id": "moon"})),
         "unknown frame_id of header: 'moon'; known: world",
     ),
-    "plane": (scene_data(**ball(planes=[{"coef": [0, 0, 1, 0]}])), "planes are not supported"),
+    "plane": (scene_data(**ball(planes=[{"coef": [0, 0, 0, 1]}])), "must not all be zero"),
     "package": (
         scene_data(**ball(meshes=[{"resource": "package://a/b.stl"}], mesh_poses=ball()["primitive_poses"])),
         r"object ball: meshes\[0\].resource is package://a/b.stl",
     ),
-    "objects": ({"world": {"collision_objects": {}, "octomap": {"octomap": {"data": [1]}}}}, "octomap"),
+    "objects": ({"world": {"collision_objects": {}, "octomap": {"octomap": {"data": [1]}}}}, "not binary"),
+    "octomap": (octomap([3, 0]), "world.octomap: the tree ends too soon"),
     "objects a text": ({"world": {"collision_objects": "ball"}}, "'ball'; it must be a list"),
     "attached": ({"robot_state": {"attached_collision_objects": [1]}}, "attached_collision_objects"),
 }
@@ -476,7 +500,7 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
             ["start_state", "attached_collision_objects"],
             [{"link_name": "panda_hand", "object": {"planes": [1], "header": {"frame_id": "panda_hand"}}}],
         ),
-        r"attached_collision_objects\[0\].object: planes are not supported",
+        r"attached_collision_objects\[0\].object: planes\[0\] is 1; it must be a mapping",
     ),
     "positions": (
         change(request_data(), ["start_state", "joint_state", "position"], [0]),

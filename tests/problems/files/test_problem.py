@@ -1,6 +1,7 @@
 """Problems: what the constructor refuses and repairs; problem files, and all that can be wrong in them."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.transforms import rotation_about, rotation_from_rpy, transform
 from robotdiffuse.problems.files import (
     load_problem,
     load_problems,
@@ -20,7 +21,7 @@ from robotdiffuse.problems.files import (
     problem_record,
     save_problem,
 )
-from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.problems.problem import AnyGoal, JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.scene import Scene
@@ -234,14 +235,14 @@ WRONG: dict[str, tuple[object, str]] = {
         "start has 3 values; panda has 7 planned joints: panda_joint1,",
     ),
     "NaN": (GOOD | {"start": [float("nan"), *READY[1:]]}, "start: panda_joint1 is nan"),
-    "start a text": (GOOD | {"start": "home"}, "start is 'home'"),
+    "start a text": (GOOD | {"start": "home"}, "unknown pose in start: .home.; known: extended, ready"),
     "out of limits": (
         GOOD | {"goal": {"joints": [9, *READY[1:]]}},
         "goal: panda_joint1 is 9 rad; its limits are -2.8",
     ),
     "goal a list": (
-        GOOD | {"goal": READY},
-        "goal is .* one of joints, joint_set, pose, poses, any",
+        GOOD | {"goal": 7.0},
+        "goal is 7.0; it must be one of joints, joint_set, pose, poses, any, or a configuration",
     ),
     "unknown goal": (
         GOOD | {"goal": {"place": []}},
@@ -456,3 +457,59 @@ def test_a_request_of_others_is_a_file_too() -> None:
     record = {"robot": "panda", "scene": [], "request": "/etc/passwd"}
     with pytest.raises(InputError, match="files are not read here"):
         problem_from_record(record, {"panda": load_robot("panda")})
+
+
+NAMED = [0.0, -np.pi / 4, 0.0, -0.75 * np.pi, 0.0, np.pi / 2, np.pi / 4]
+BASIC = {"robot": "panda", "scene": [], "start": "ready", "goal": [0.0] * 3 + [-1.0] + [0.0] + [1.0, 0.0]}
+
+
+@pytest.mark.parametrize(
+    ("goal", "rows"),
+    [
+        (NAMED, [NAMED]),
+        ([NAMED, NAMED], [NAMED, NAMED]),
+        ("ready", [NAMED]),
+        ({"joints": "ready"}, [NAMED]),
+    ],
+)
+def test_goals_are_given_as_in_python(goal: object, rows: list[list[float]]) -> None:
+    problem = problem_from_record(BASIC | {"goal": goal})
+    assert isinstance(problem.goal, JointGoal)
+    np.testing.assert_allclose(problem.goal.positions, rows)
+    np.testing.assert_allclose(problem.start, NAMED)
+    assert np.array_equal(Problem(problem.robot, Scene(), "ready", "ready").start, problem.start)
+
+
+def test_any_of_a_list_of_goals() -> None:
+    pose = {"pose": {"frame": "panda_hand", "xyz": [0.5, 0, 0.4], "rpy": [np.pi, 0, 0]}}
+    goal = problem_from_record(BASIC | {"goal": [pose, "ready"]}).goal
+    assert isinstance(goal, AnyGoal)
+    np.testing.assert_allclose(goal.goals[0].T_base_frame[:3, :3], np.diag([1, -1, -1]), atol=1e-12)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"start": "home"}, "unknown pose in start: 'home'; known: extended, ready"),
+        ({"goal": {"joints": "home"}}, "unknown pose in goal.joints: 'home'"),
+        ({"robot": "iiwa14", "start": "home"}, "(iiwa14 has no named poses)"),
+        (
+            {
+                "scene": [
+                    {"box": {"center": [1, 0, 0], "size": [1, 1, 1], "rpy": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}
+                ]
+            },
+            "scene[0].box has wxyz and rpy; it must have one of them",
+        ),
+        ({"base": {"rpy": [0, 0]}}, "base.rpy is [0, 0]; it must be 3 finite numbers"),
+    ],
+)
+def test_wrong_names_and_angles(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)):
+        problem_from_record(BASIC | changes)
+
+
+def test_roll_pitch_yaw_are_in_the_order_of_urdfs() -> None:
+    box = {"center": [0.9, 0, 0], "size": [0.1, 0.2, 0.3], "rpy": [0.1, 0.2, 0.3]}
+    [shape] = problem_from_record(BASIC | {"scene": [{"box": box}]}).scene.shapes
+    np.testing.assert_allclose(shape.T_base_shape[:3, :3], rotation_from_rpy(0.1, 0.2, 0.3), atol=1e-12)

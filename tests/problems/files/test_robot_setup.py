@@ -55,7 +55,7 @@ def written(folder: Path, record: dict[str, Any]) -> Path:
 def test_a_held_cup_makes_the_arm_go_higher(tmp_path: Path) -> None:
     bare = load_problem(written(tmp_path, PLAIN))
     held = load_problem(written(tmp_path, PLAIN | {"attached": [CUP]}))
-    low, high = (rd.plan(problem, time_limit=10.0) for problem in (bare, held))
+    low, high = (rd.plan(problem, time_limit=10.0, objective="length") for problem in (bare, held))
     assert low.path is not None and high.path is not None
     found = verify(held, low.path).violation
     assert found is not None and (found.subject, found.other) == ("cup", "wall")
@@ -167,7 +167,7 @@ def test_commands_plan_verify_simulate_and_draw(tmp_path: Path, monkeypatch: pyt
 
 WRONG = {
     "base of MoveIt": ({"base": {}, "scene": "scene.yaml"}, "base cannot be combined with MoveIt files"),
-    "base": ({"base": {"rpy": [0, 0, 0]}}, "unknown field of base: 'rpy'; known: wxyz, xyz"),
+    "base": ({"base": {"euler": [0, 0, 0]}}, "unknown field of base: .euler.; known: wxyz, xyz"),
     "base xyz": ({"base": {"xyz": [0, 0]}}, r"base.xyz is \[0, 0\]; it must be 3 finite numbers"),
     "tool link": ({"tool": {"xyz": [0, 0, 0]}}, "tool has no link"),
     "unknown tool link": ({"tool": {"link": "hand"}}, "unknown link in tool.link: 'hand'"),

@@ -12,13 +12,13 @@ from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fitting.add import AddReport
 from robotdiffuse.robots.fitting.allowed_collisions import (
-    Links,
     PairReport,
     SamplingSettings,
     allowed_pairs,
     find_allowed_collisions,
 )
 from robotdiffuse.robots.fitting.false_collisions import FalseCollisions
+from robotdiffuse.robots.fitting.sampled_links import Links
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 
 QUICK = SamplingSettings(samples=1500)

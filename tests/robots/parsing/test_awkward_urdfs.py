@@ -112,7 +112,7 @@ def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
     for finer in (False, True):
         with coarse_grids(), pytest.MonkeyPatch.context() as patch:
             if not finer:
-                patch.setattr(preparation, "_with_finer_parts", lambda *_: None)
+                patch.setattr(preparation, "with_finer_parts", lambda *_: None)
             report = add_robot(urdf, tip="j3_link", out=tmp_path / str(finer), settings=settings)
         refused.append(report.false_collisions.by_parts)
         assert all(made.covered for made in report.links)

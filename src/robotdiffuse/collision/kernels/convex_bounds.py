@@ -177,9 +177,9 @@ def _support_of_part(hulls, p, posture, sign, row):
 
 
 @njit(cache=True)
-def _support_of_solid(solids, o, posture, row):
+def _support_of_solid(solids, o, posture):
     """Writes the point of an obstacle, without its rounding, that is furthest along points[0] to
-    points[row]."""
+    points[2]."""
     R, points = solids.rotation[o], posture.points
     x, y, z = points[0, 0], points[0, 1], points[0, 2]
     a = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
@@ -190,7 +190,7 @@ def _support_of_solid(solids, o, posture, row):
     b = np.copysign(solids.half[o, 1], b) + disc * b
     c = np.copysign(solids.half[o, 2], c)
     for r in range(3):
-        points[row, r] = R[0, r] * a + R[1, r] * b + R[2, r] * c + solids.middle[o, r]
+        points[2, r] = R[0, r] * a + R[1, r] * b + R[2, r] * c + solids.middle[o, r]
 
 
 @njit(cache=True)
@@ -247,7 +247,7 @@ def separation(hulls, p, solids, other, base, posture):
     middle = _least(hulls.vertices, first, last, lx, ly, lz, offset, 0.0, 0.0, 0.0, 0.0)
     reach = 0.0
     if other >= 0:
-        _support_of_solid(solids, other, posture, 2)
+        _support_of_solid(solids, other, posture)
         reach = solids.rounding[other]
     else:
         _support_of_part(hulls, -1 - other, posture, 1.0, 2)
@@ -340,7 +340,7 @@ def find_plane(hulls, p, solids, other, posture):
     for _ in range(MAX_GJK_STEPS):
         _support_of_part(hulls, p, posture, -1.0, 1)
         if other >= 0:
-            _support_of_solid(solids, other, posture, 2)
+            _support_of_solid(solids, other, posture)
         else:
             _support_of_part(hulls, -1 - other, posture, 1.0, 2)
         for r in range(3):

@@ -80,6 +80,9 @@ class Checks(NamedTuple):
     motion_radii: np.ndarray
     """[checks, dof] bound on the motion of any point of the link, or of either link of a pair, per unit of
     joint motion, seen from `common`."""
+    undecided: np.ndarray
+    """[checks] distance of the convex parts up to which Coal decides by the surfaces [m]; 0 where the parts
+    decide."""
 
 
 class Motion(NamedTuple):
@@ -353,7 +356,7 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
                 middle, along, measured = meshes.best_plane(
                     hulls, p, solids, other, common, tightness * best + rest, posture.planes[p, slot], posture
                 )
-                if measured and middle <= contact:
+                if measured and middle <= max(contact, checks.undecided[c]):
                     touching = True
                 elif measured:
                     best = min(best, middle)

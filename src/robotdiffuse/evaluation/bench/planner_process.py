@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import TextIO
 
-from robotdiffuse.core.processes import LineProcess
+from robotdiffuse.core.line_process import LineProcess
 from robotdiffuse.core.registry import Entry, added_entries, adopt_entries
 from robotdiffuse.core.types import CONVERGED
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec

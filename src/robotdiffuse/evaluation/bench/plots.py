@@ -130,7 +130,7 @@ def length_over_time(section: Section, planners: Sequence[str]) -> str:
             ends[curve.planner] = middle, last
     _time_axis(axes, low, high)
     axes.set_ylim(1 - 0.035 * (top - 1), top)
-    axes.set_ylabel("length / best known")
+    axes.set_ylabel("joint length / best known")
     axes.grid(axis="y", color=FAINT, linewidth=0.8)
     axes.spines[["left"]].set_visible(False)
     _names_at_right(axes, ends, planners)

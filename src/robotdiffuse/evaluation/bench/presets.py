@@ -8,6 +8,8 @@ from pathlib import Path as FilePath
 from robotdiffuse.core.errors import unknown_name
 from robotdiffuse.evaluation.bench.runner import BenchSettings
 
+BY_LENGTH = ":objective=length"
+"""Suffix of planners that compete in the length of paths."""
 NONTRIVIAL_ROP = ("rop_nontrivial", "rop_dense_nontrivial")
 
 
@@ -48,8 +50,8 @@ PRESETS: dict[str, Preset] = {
         (
             Stage(
                 (
-                    *("robotdiffuse", "aorrtc", "rrt_connect", "shared_tree_rrt_star"),
-                    *("diffusion", "mpd", "edmp", "mpnet", "mpinets"),
+                    *(name + BY_LENGTH for name in ("robotdiffuse", "aorrtc", "rrt_connect")),
+                    *("shared_tree_rrt_star", "diffusion", "mpd", "edmp", "mpnet", "mpinets"),
                 ),
                 1.0,
                 30,
@@ -61,8 +63,29 @@ PRESETS: dict[str, Preset] = {
         "what the network adds: the paper's method and the hybrid beside search, with 0.1 and 0.3 s",
         (*NONTRIVIAL_ROP, "shelf_nontrivial"),
         tuple(
-            Stage(("robotdiffuse", "diffusion", "aorrtc", "shared_tree_rrt_star"), limit, 150, True)
+            Stage(
+                ("robotdiffuse" + BY_LENGTH, "diffusion", "aorrtc" + BY_LENGTH, "shared_tree_rrt_star"),
+                limit,
+                150,
+                equal_time=True,
+            )
             for limit in (0.1, 0.3)
+        ),
+    ),
+    "durations": Preset(
+        "durations of motions with 0.1 and 1 s: by time, by length, and the timed paths of OMPL",
+        ("shelf_nontrivial", "crate_nontrivial", "table_nontrivial", "kitchen_nontrivial", "rop_nontrivial"),
+        tuple(
+            Stage(
+                (
+                    *("aorrtc", "robotdiffuse", "diffusion"),
+                    *(name + BY_LENGTH for name in ("aorrtc", "robotdiffuse")),
+                    *("ompl_rrt_connect", "ompl_aorrtc"),
+                ),
+                limit,
+                100,
+            )
+            for limit in (0.1, 1.0)
         ),
     ),
     "anytime": Preset(
@@ -70,7 +93,7 @@ PRESETS: dict[str, Preset] = {
         NONTRIVIAL_ROP,
         (
             Stage(
-                ("shared_tree_rrt_star", "aorrtc", "ompl_aorrtc", "ompl_informed_rrt_star"),
+                ("shared_tree_rrt_star", "aorrtc" + BY_LENGTH, "ompl_aorrtc", "ompl_informed_rrt_star"),
                 1.0,
                 100,
                 equal_time=True,
@@ -80,7 +103,7 @@ PRESETS: dict[str, Preset] = {
     "restarts": Preset(
         "the hybrid beside restarts of RRT-Connect until the same limit",
         (*NONTRIVIAL_ROP, "shelf_nontrivial"),
-        (Stage(("robotdiffuse", "rrt_connect"), 1.0, 100, equal_time=True),),
+        (Stage(("robotdiffuse" + BY_LENGTH, "rrt_connect" + BY_LENGTH), 1.0, 100, equal_time=True),),
     ),
 }
 

@@ -9,6 +9,7 @@ from robotdiffuse.evaluation.bench.figures import ROP, Comparison, Row, Section
 from robotdiffuse.evaluation.bench.outcomes import FAILURES
 from robotdiffuse.evaluation.bench.run_folder import Bench, base_name, plain_name
 from robotdiffuse.evaluation.comscore import PAPER_TABLE_1, Indicators, comscores
+from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.records import RESTARTED
 from robotdiffuse.evaluation.statistics import Paired
 from robotdiffuse.evaluation.tables import Cell, Column, Figure, Table, plain, tex
@@ -42,12 +43,12 @@ NOTES = (
     "and validation follows.",
     "collision: share of problems on which the validator refused the planner's last path because it "
     "collides.",
-    "length: the paper's, the path lengths of all links together, mean over the problems that the planner "
-    "itself solved; planners that solve only easy problems seem short. If a call continued and returned a "
-    "shorter path, its length by the limit is that of the returned path, scaled by the joint-space "
-    "lengths.",
-    "ratio: median of joint-space length over that of the reference, on problems that both solve, with "
-    "its 95 % interval (bootstrap over problems), at equal time: for planners that use up the limit. "
+    "link length: the paper's, the path lengths of all links together, mean over the problems that the "
+    "planner itself solved; planners that solve only easy problems seem short. If a call continued and "
+    "returned a shorter path, its length by the limit is that of the returned path, scaled by the "
+    "lengths in joint space.",
+    "ratio: median of the length in joint space over that of the reference, on problems that both solve, "
+    "with its 95 % interval (bootstrap over problems), at equal time: for planners that use up the limit. "
     "restarted: a planner that ends earlier is called again with other seeds until its calls have used up "
     "the limit together, and the shortest path counts; the time for timing the other motions does not.",
     "first: median time to the first path of solved problems. returns: mean time until the planner "
@@ -57,12 +58,14 @@ NOTES = (
     "with restarts are left out. Beside the paper's Table 1 it is computed among the paper's rows alone; "
     "the hybrid's is computed in place of the paper's method.",
     "Quality: means over the solved problems of the motions that the calls returned. clearance: a lower "
-    "bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. bending: the "
-    "integral of the squared second derivative of the path, over its squared length. jerk: logarithm of "
-    "the dimensionless jerk, lower is smoother; sparc: spectral arc length of the joints' and the tip's "
-    "speed, closer to 0 is smoother.",
-    "p of success: McNemar's exact test; p of length: Wilcoxon's signed ranks; neither is corrected for "
-    "the number of comparisons. With several seeds, a problem counts as solved if more than half of them "
+    "bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. over straight "
+    "line: duration over the least time along the straight line, obstacles and limits of jerk aside. stops: "
+    "times that the whole arm rests on the way. peak and mean jerk: of the joint where it is largest. "
+    "bending: the integral of the squared second derivative of the path, over its squared length. jerk: "
+    "logarithm of the dimensionless jerk, lower is smoother; sparc: spectral arc length of the joints' and "
+    "the tip's speed, closer to 0 is smoother.",
+    "p of success: McNemar's exact test; p of joint length: Wilcoxon's signed ranks; neither is corrected "
+    "for the number of comparisons. With several seeds, a problem counts as solved if more than half of them "
     "are.",
 )
 
@@ -117,8 +120,9 @@ def main_table(section: Section, comparison: Comparison, reference: str) -> Tabl
         (Column("success", "%", ".1f", "more", scale=100.0, bar=True), lambda row: row.success),
         (Column("95 %", dim=True), lambda row: percents(row.success_interval)),
         (Column("collision", "%", ".1f", "less", scale=100.0), lambda row: row.collision),
-        (Column("length", "m", ".2f"), lambda row: row.link_length),
+        (Column("link length", "m", ".2f"), lambda row: row.link_length),
         *_ratio(comparison, reference),
+        _metric(METRICS["duration"]),
         (Column("first", "s", better="less"), lambda row: seconds(row.first)),
         (Column("returns", "s", better="less"), lambda row: seconds(row.returned)),
         (Column("ComScore", "", ".3f", "more"), lambda row: row.comscore),
@@ -167,16 +171,16 @@ def _ratio(comparison: Comparison, reference: str) -> Spec:
     return (Column(f"ratio to {named(reference)}"), ratio), (Column("95 % ", dim=True), of_ratio)
 
 
+def _metric(metric: Metric) -> tuple[Column, Callable[[Row], Cell]]:
+    """A column with the mean of a metric over the solved problems."""
+    column = Column(metric.heading, metric.unit, metric.format, metric.better, scale=metric.scale)
+    return column, lambda row: row.measures[metric.name].value
+
+
 def quality_table(section: Section, comparison: Comparison) -> Table:
     """All metrics of the motions, and memory."""
     spec: Spec = (
-        *(
-            (
-                Column(metric.heading, metric.unit, metric.format, metric.better, scale=metric.scale),
-                lambda row, name=metric.name: row.measures[name].value,
-            )
-            for metric in comparison.metrics
-        ),
+        *map(_metric, comparison.metrics),
         (Column("memory", "MB", ".0f", "less"), lambda row: row.memory),
     )
     return _table("Quality of the motions", section, comparison, spec)
@@ -196,7 +200,7 @@ def paired_table(section: Section, comparison: Comparison, reference: str) -> Ta
         (Column("neither"), lambda row: row.paired and row.paired.neither),
         (Column("p of success"), lambda row: row.paired and probability(row.paired.p_success)),
         *_ratio(comparison, reference),
-        (Column("p of length"), lambda row: row.paired and p_of_length(row.paired)),
+        (Column("p of joint length"), lambda row: row.paired and p_of_length(row.paired)),
     )
     return _table(f"Against {named(reference)}, in pairs", section, others, spec)
 
@@ -242,7 +246,12 @@ def paper_table(section: Section, comparison: Comparison) -> Table | None:
                 *(scores[planner], paper and paper.comscore),
             )
         )
-    names = (("success", "%", ".1f"), ("collision", "%", ".1f"), ("length", "m", ".2f"), ("returns", "s", ""))
+    names = (
+        ("success", "%", ".1f"),
+        ("collision", "%", ".1f"),
+        ("link length", "m", ".2f"),
+        ("returns", "s", ""),
+    )
     columns = [
         column
         for name, unit, digits in (*names, ("ComScore", "", ".3f"))

@@ -20,7 +20,7 @@ from robotdiffuse.evaluation.runs import Run, execute_runs, runs_of
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.held_out import Case
 
-PACKAGES = ("numpy", "numba", "torch", "ompl")
+PACKAGES = ("numpy", "numba", "onnxruntime", "ompl")
 """Packages whose versions are kept with the results."""
 
 

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core import processes
+from robotdiffuse.core import ray_cluster
 from robotdiffuse.evaluation.bench.planner_process import PlannerProcess
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.records import RESTARTED, Record
@@ -94,7 +94,7 @@ def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Recor
 
 
 def on_ray(specs: PlannerSpecs, restarts: bool, session: str, logs: FilePath) -> Executor:
-    """An executor on a Ray cluster, where each task starts a process for some runs; see `processes.on_ray`.
+    """An executor on a Ray cluster, where each task starts a process for some runs; see `ray_cluster.on_ray`.
 
     The nodes need this package, and weights and files at the same paths.
     """
@@ -108,7 +108,7 @@ def on_ray(specs: PlannerSpecs, restarts: bool, session: str, logs: FilePath) ->
             for i in range(0, len(t), RUNS_PER_TASK)
         ]
         calls = [(specs[label], task, restarts) for label, task in tasks]
-        for number, (answers, said) in processes.on_ray(_run_task, calls):
+        for number, (answers, said) in ray_cluster.on_ray(_run_task, calls):
             label, task = tasks[number]
             if said:
                 logs.mkdir(parents=True, exist_ok=True)

@@ -17,16 +17,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.processes import Workers, in_order
 from robotdiffuse.core.types import Path
 from robotdiffuse.datasets.manifest import Manifest, read_manifest
-from robotdiffuse.datasets.shards import (
-    Shard,
-    check_shard,
-    existing_shards,
-    path_of,
-    pick_rows,
-    problem_of,
-    read_shard,
-    scenes_of,
-)
+from robotdiffuse.datasets.motion_rows import path_of, problem_of, scenes_of
+from robotdiffuse.datasets.shards import Shard, check_shard, existing_shards, pick_rows, read_shard
 from robotdiffuse.evaluation.tables import Column, Table
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot

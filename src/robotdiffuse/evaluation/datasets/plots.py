@@ -85,7 +85,8 @@ def detours(figure: "Figure", data: DataFigures) -> None:
     values = data.all["detour"]
     end = max(1.5, _end(values[blocked])) if blocked.any() else 2.0
     _histogram(axes, data, values, np.linspace(1, end, BINS), blocked)
-    axes.set_yscale("log")
+    if blocked.any():  # an empty histogram has no logarithm
+        axes.set_yscale("log")
     percent_axis(axes)
     axes.set_xlabel("length / straight line")
 

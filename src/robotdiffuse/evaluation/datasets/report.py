@@ -10,7 +10,8 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.manifest import Manifest, read_manifest
-from robotdiffuse.datasets.shards import SPLITS, existing_shards, read_shard, scenes_of, shard_path, split_of
+from robotdiffuse.datasets.motion_rows import scenes_of
+from robotdiffuse.datasets.shards import SPLITS, existing_shards, read_shard, shard_path, split_of
 from robotdiffuse.evaluation.tables import Column, Table
 
 QUANTITIES = {

@@ -7,49 +7,19 @@ There is no normalisation, nor anything else that needs single precision: one su
 in bf16 several times. Features are the last axis in memory, which is the fast layout for bf16.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped, UInt8
-from numpy import ndarray
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor, nn
 
-from robotdiffuse.core.settings import Count, Settings
 from robotdiffuse.learning.completion.samples import BITS, DEPTH_STEP, FREE
-from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL
+from robotdiffuse.learning.completion.volume import CompletionSettings, reachable, voxel_centers
 
 CHANNELS = 7
 """Occupied, free, shadow of the arm, out of view, depth behind a surface, height, distance from the base's
 axis."""
-DEPTH_UNIT = 0.5
-"""Depths behind surfaces are divided by this [m]."""
-SHOULDER = (0.0, 0.0, 0.33)
-"""Of a Panda, in the base frame [m]."""
-REACH = 1.0
-"""Voxels count within this distance of the shoulder [m]: no point of a Panda gets farther."""
-
-
-@dataclass(frozen=True)
-class CompletionSettings(Settings, name="completion"):
-    """Sizes of the network."""
-
-    channels: tuple[Count, Count, Count] = (32, 64, 128)
-    """Features of cells of 8, 16 and 32 cm."""
-    blocks: tuple[Count, Count, Count] = (1, 1, 2)
-    """Residual blocks at each size: as many on the way down as on the way up; those of the last size occur
-    once."""
-
-
-def voxel_centers() -> Float[ndarray, "56 56 32 3"]:
-    """Centres of the voxels of an observed volume [m]."""
-    axes = [(np.arange(n) + 0.5) * VOXEL + low for n, low in zip(SHAPE, LOW, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-
-
-def reachable() -> Bool[ndarray, "56 56 32"]:
-    """The voxels that the arm can reach."""
-    return np.linalg.norm(voxel_centers() - SHOULDER, axis=-1) <= REACH
+DEPTH_SCALE = DEPTH_STEP / 0.5
+"""Stored depths behind surfaces are multiplied by this: half a metre becomes 1."""
 
 
 def _position_inputs() -> Float[Tensor, "28 28 16 16"]:
@@ -125,7 +95,7 @@ class CompletionNetwork(nn.Module):
         parts = out.split(8, dim=-1)
         for part, bit in zip(parts[: len(BITS)], BITS, strict=True):
             part.copy_((seen & bit) != 0)
-        parts[len(BITS)].copy_(behind).mul_(DEPTH_STEP / DEPTH_UNIT)
+        parts[len(BITS)].copy_(behind).mul_(DEPTH_SCALE)
         out[..., -self.places.shape[-1] :] = self.places
         return out.permute(0, 4, 1, 2, 3)
 

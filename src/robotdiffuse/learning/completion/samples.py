@@ -124,11 +124,9 @@ def unpack_fine(truth: UInt8[ndarray, "*b"]) -> Bool[ndarray, "*b 8"]:
     return (truth[..., None] >> np.arange(8, dtype=np.uint8) & 1).astype(np.bool_)
 
 
-def camera_view(
-    scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Generator, cameras: CameraPlaces = CAMERAS
-) -> DepthView:
+def camera_view(scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Generator) -> DepthView:
     """A depth view of the scene from a random pose."""
-    T, angle = cameras.draw(scene, rng)
+    T, angle = CAMERAS.draw(scene, rng)
     focal = IMAGE_SIZE[1] / 2 / np.tan(angle / 2)
     intrinsics = (focal, focal, (IMAGE_SIZE[0] - 1) / 2, (IMAGE_SIZE[1] - 1) / 2)
     return ray_cast(scene, T, intrinsics, IMAGE_SIZE, robot, q)

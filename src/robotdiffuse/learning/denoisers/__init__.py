@@ -16,23 +16,26 @@ accurate to about 20 %.
 from robotdiffuse.core.registry import Entry, Registry
 
 _PACKAGE = "robotdiffuse.learning.denoisers."
+_SETTINGS = _PACKAGE + "settings:"
 DENOISERS = Registry(
     "denoiser",
     {
         "transformer": Entry(
             _PACKAGE + "transformer:Transformer",
             "encoder-only transformer, the paper's",
-            "TransformerSettings",
+            _SETTINGS + "TransformerSettings",
         ),
         "encoder_decoder": Entry(
             _PACKAGE + "encoder_decoder:EncoderDecoder",
             "encoder-decoder transformer",
-            "EncoderDecoderSettings",
+            _SETTINGS + "EncoderDecoderSettings",
         ),
         "decoder_only": Entry(
-            _PACKAGE + "decoder_only:DecoderOnly", "decoder-only transformer", "DecoderOnlySettings"
+            _PACKAGE + "decoder_only:DecoderOnly",
+            "decoder-only transformer",
+            _SETTINGS + "DecoderOnlySettings",
         ),
-        "unet": Entry(_PACKAGE + "unet:UNet", "temporal U-Net", "UNetSettings"),
+        "unet": Entry(_PACKAGE + "unet:UNet", "temporal U-Net", _SETTINGS + "UNetSettings"),
     },
 )
 """By the name in settings and checkpoints."""

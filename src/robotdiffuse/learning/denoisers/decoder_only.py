@@ -1,25 +1,18 @@
 """A decoder-only transformer: each waypoint attends to z_tk and the waypoints before it (paper: Table 2)."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from robotdiffuse.learning.denoisers.base import AttentionSettings, Denoiser
+from robotdiffuse.learning.denoisers.base import Denoiser
 from robotdiffuse.learning.denoisers.layers import (
     Block,
     LevelEmbedding,
-    Linear,
     positions,
     start_at_zero,
     two_layers,
 )
-
-
-@dataclass(frozen=True)
-class DecoderOnlySettings(AttentionSettings, name="decoder_only"):
-    """Waypoints of one patch attend to each other."""
+from robotdiffuse.learning.denoisers.settings import DecoderOnlySettings
 
 
 class DecoderOnly(Denoiser):
@@ -36,7 +29,7 @@ class DecoderOnly(Denoiser):
     ) -> None:
         super().__init__(settings, waypoints, dof, features, condition)
         tokens, width = settings.tokens(waypoints), settings.width
-        self.embed = Linear(settings.patch * features, width)
+        self.embed = nn.Linear(settings.patch * features, width)
         self.condition = two_layers(condition, 2 * width, width)
         self.level = LevelEmbedding(width)
         self.blocks = nn.ModuleList(
@@ -44,7 +37,7 @@ class DecoderOnly(Denoiser):
             for _ in range(settings.layers)
         )
         self.norm = nn.LayerNorm(width)
-        self.out = Linear(width, settings.patch * dof)
+        self.out = nn.Linear(width, settings.patch * dof)
         start_at_zero(self.out)
         self.register_buffer("positions", positions(1 + tokens, width), persistent=False)
 

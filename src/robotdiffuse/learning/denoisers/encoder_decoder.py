@@ -1,40 +1,19 @@
 """An encoder-decoder transformer: the condition is encoded, the waypoints attend to it (paper: Table 2)."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from robotdiffuse.core.settings import Count
-from robotdiffuse.learning.denoisers.base import AttentionSettings, Denoiser
+from robotdiffuse.learning.denoisers.base import Denoiser
 from robotdiffuse.learning.denoisers.layers import (
     Block,
     CrossBlock,
     LevelEmbedding,
-    Linear,
     positions,
     start_at_zero,
     two_layers,
 )
-
-
-@dataclass(frozen=True)
-class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
-    width: Count = 144
-    """Size of a token; even."""
-    layers: Count = 4
-    """Blocks of the decoder."""
-    encoder_layers: Count = 2
-    """Blocks of the encoder."""
-    heads: Count = 4
-    """Attention heads; a divisor of width."""
-    hidden: Count = 432
-    """Size of the hidden layer of each feed-forward network."""
-
-    @classmethod
-    def paper_size(cls) -> "EncoderDecoderSettings":
-        return cls(512, 4, 4, 1024, patch=1)
+from robotdiffuse.learning.denoisers.settings import EncoderDecoderSettings
 
 
 class EncoderDecoder(Denoiser):
@@ -56,12 +35,12 @@ class EncoderDecoder(Denoiser):
             Block(width, heads, hidden, settings.encoder_layers) for _ in range(settings.encoder_layers)
         )
         self.norm_encoded = nn.LayerNorm(width)
-        self.embed = Linear(settings.patch * features, width)
+        self.embed = nn.Linear(settings.patch * features, width)
         self.decoder = nn.ModuleList(
             CrossBlock(width, heads, hidden, settings.layers) for _ in range(settings.layers)
         )
         self.norm = nn.LayerNorm(width)
-        self.out = Linear(width, settings.patch * dof)
+        self.out = nn.Linear(width, settings.patch * dof)
         start_at_zero(self.out)
         self.register_buffer("positions", positions(tokens, width), persistent=False)
 

@@ -1,4 +1,4 @@
-"""Layers shared by the denoisers. The residual stream is fp32; the linear layers may be bf16."""
+"""Layers shared by the denoisers. The residual stream is fp32; under autocast the linear layers are bf16."""
 
 import numpy as np
 import torch
@@ -14,16 +14,9 @@ and 6.7, 97 tokens 20 and 20, 128 tokens 42 and 29, 255 tokens 161 and 107; forw
 tokens."""
 
 
-class Linear(nn.Linear):
-    """A linear layer that converts its input to the type of its weights, which may be bf16."""
-
-    def forward(self, input: Tensor) -> Tensor:
-        return functional.linear(input.to(self.weight.dtype), self.weight, self.bias)
-
-
 def two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     """A feed-forward network with one hidden layer."""
-    return nn.Sequential(Linear(inputs, hidden), nn.GELU("tanh"), Linear(hidden, outputs))
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU("tanh"), nn.Linear(hidden, outputs))
 
 
 class LevelEmbedding(nn.Sequential):
@@ -91,11 +84,11 @@ class Block(nn.Module):
         super().__init__()
         self.heads, self.causal = heads, causal
         self.norm_attention = nn.LayerNorm(width)
-        self.qkv = Linear(width, 3 * width)
-        self.merge = Linear(width, width)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.merge = nn.Linear(width, width)
         self.norm_mlp = nn.LayerNorm(width)
-        self.expand = Linear(width, hidden)
-        self.contract = Linear(hidden, width)
+        self.expand = nn.Linear(width, hidden)
+        self.contract = nn.Linear(hidden, width)
         for layer in (self.merge, self.contract):
             start_small(layer, layers)
 
@@ -117,9 +110,9 @@ class CrossBlock(Block):
     def __init__(self, width: int, heads: int, hidden: int, layers: int) -> None:
         super().__init__(width, heads, hidden, layers)
         self.norm_cross = nn.LayerNorm(width)
-        self.query = Linear(width, width)
-        self.key_value = Linear(width, 2 * width)
-        self.merge_cross = Linear(width, width)
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
+        self.merge_cross = nn.Linear(width, width)
         start_small(self.merge_cross, layers)
 
     def forward(

@@ -1,31 +1,18 @@
 """The motion predictor: an encoder-only transformer that predicts the clean trajectory (paper: Method)."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from robotdiffuse.learning.denoisers.base import AttentionSettings, Denoiser
+from robotdiffuse.learning.denoisers.base import Denoiser
 from robotdiffuse.learning.denoisers.layers import (
     Block,
     LevelEmbedding,
-    Linear,
     positions,
     start_at_zero,
     two_layers,
 )
-
-
-@dataclass(frozen=True)
-class TransformerSettings(AttentionSettings, name="transformer"):
-    add_z_tk: bool = True
-    """Whether z_tk is also added to every other token, so that the first layer need not distribute it;
-    otherwise it is only a token (the paper's)."""
-
-    @classmethod
-    def paper_size(cls) -> "TransformerSettings":
-        return cls(512, 8, 4, 1024, patch=1, add_z_tk=False)
+from robotdiffuse.learning.denoisers.settings import TransformerSettings
 
 
 class Transformer(Denoiser):
@@ -38,14 +25,14 @@ class Transformer(Denoiser):
     ) -> None:
         super().__init__(settings, waypoints, dof, features, condition)
         tokens, width = settings.tokens(waypoints), settings.width
-        self.embed = Linear(settings.patch * features, width)
+        self.embed = nn.Linear(settings.patch * features, width)
         self.condition = two_layers(condition, 2 * width, width)
         self.level = LevelEmbedding(width)
         self.blocks = nn.ModuleList(
             Block(width, settings.heads, settings.hidden, settings.layers) for _ in range(settings.layers)
         )
         self.norm = nn.LayerNorm(width)
-        self.out = Linear(width, settings.patch * dof)
+        self.out = nn.Linear(width, settings.patch * dof)
         start_at_zero(self.out)
         self.register_buffer("positions", positions(tokens, width), persistent=False)
 

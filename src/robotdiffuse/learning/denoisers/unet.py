@@ -1,50 +1,21 @@
 """A temporal U-Net: convolutions over the waypoints at several resolutions (paper: Table 2)."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Count, Sizes
-from robotdiffuse.learning.denoisers.base import Denoiser, DenoiserSettings
+from robotdiffuse.learning.denoisers.base import Denoiser
 from robotdiffuse.learning.denoisers.layers import (
     LevelEmbedding,
-    Linear,
     start_at_zero,
     start_small,
     two_layers,
 )
+from robotdiffuse.learning.denoisers.settings import UNetSettings
 
 
-@dataclass(frozen=True)
-class UNetSettings(DenoiserSettings, name="unet"):
-    width: Count = 48
-    """Channels at the full resolution; even."""
-    multiples: Sizes = (1, 2, 4)
-    """Channels at each resolution, in units of `width`; each resolution has half the waypoints of the one
-    before."""
-    kernel: Count = 5
-    """Waypoints that a convolution covers; odd."""
-    condition_width: Count = 128
-    """Size of the vector that carries the condition and the noise level; even."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.kernel % 2 == 0:
-            raise InputError(f"unet.kernel is {self.kernel}; it must be odd")
-        for name, width in (("width", self.width), ("condition_width", self.condition_width)):
-            if width % 2:
-                raise InputError(f"unet.{name} is {width}; it must be even")
-
-    @classmethod
-    def paper_size(cls) -> "UNetSettings":
-        return cls(width=144, multiples=(1, 2, 4), kernel=5, condition_width=512)
-
-
-class Convolution(Linear):
+class Convolution(nn.Linear):
     """Convolution over the waypoints, with zeros beyond the ends.
 
     Computed as a matrix product over shifted copies of the waypoints: at these sizes faster in bf16 on a CPU
@@ -60,7 +31,7 @@ class Convolution(Linear):
         self, input: Float[Tensor, "batch waypoints inputs"]
     ) -> Float[Tensor, "batch waypoints outputs"]:
         waypoints, reach = input.shape[1], self.kernel // 2
-        padded = functional.pad(input.to(self.weight.dtype), (0, 0, reach, reach))
+        padded = functional.pad(input, (0, 0, reach, reach))
         return super().forward(torch.cat([padded[:, i : i + waypoints] for i in range(self.kernel)], -1))
 
 
@@ -74,8 +45,8 @@ class ResidualBlock(nn.Module):
         self.norm_first, self.norm_second = nn.LayerNorm(inputs), nn.LayerNorm(outputs)
         self.first = Convolution(inputs, outputs, kernel)
         self.second = Convolution(outputs, outputs, kernel)
-        self.film = Linear(condition, 2 * outputs)
-        self.skip = Linear(inputs, outputs) if inputs != outputs else nn.Identity()
+        self.film = nn.Linear(condition, 2 * outputs)
+        self.skip = nn.Linear(inputs, outputs) if inputs != outputs else nn.Identity()
         start_small(self.second, blocks)
 
     def forward(
@@ -110,14 +81,14 @@ class UNet(Denoiser):
 
         self.condition = two_layers(condition, 2 * token, token)
         self.level = LevelEmbedding(token)
-        self.embed = Linear(features, widths[0])
+        self.embed = nn.Linear(features, widths[0])
         self.down = nn.ModuleList(blocks(width, width) for width in widths[:-1])
-        self.halving = nn.ModuleList(Linear(2 * widths[i], widths[i + 1]) for i in range(halvings))
+        self.halving = nn.ModuleList(nn.Linear(2 * widths[i], widths[i + 1]) for i in range(halvings))
         self.middle = blocks(widths[-1], widths[-1])
-        self.doubling = nn.ModuleList(Linear(widths[i + 1], 2 * widths[i]) for i in range(halvings))
+        self.doubling = nn.ModuleList(nn.Linear(widths[i + 1], 2 * widths[i]) for i in range(halvings))
         self.up = nn.ModuleList(blocks(2 * width, width) for width in widths[:-1])
         self.norm = nn.LayerNorm(widths[0])
-        self.out = Linear(widths[0], dof)
+        self.out = nn.Linear(widths[0], dof)
         start_at_zero(self.out)
 
     def forward(
@@ -135,7 +106,7 @@ class UNet(Denoiser):
         for blocks, halve in zip(self.down, self.halving, strict=True):
             x = _through(blocks, x, token)
             skips.append(x)
-            x = halve(x.reshape(len(x), x.shape[1] // 2, -1)).float()
+            x = halve(x.reshape(x.shape[0], x.shape[1] // 2, -1)).float()
         x = _through(self.middle, x, token)
         for blocks, double, before in zip(
             reversed(self.up), reversed(self.doubling), reversed(skips), strict=True

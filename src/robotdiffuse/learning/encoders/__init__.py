@@ -6,26 +6,30 @@ from typing import TYPE_CHECKING
 from robotdiffuse.core.registry import Entry, Registry
 
 if TYPE_CHECKING:
-    from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings
+    from robotdiffuse.learning.encoders.base import Encoder
+    from robotdiffuse.learning.encoders.settings import EncoderSettings
 
 _PACKAGE = "robotdiffuse.learning.encoders."
+_SETTINGS = _PACKAGE + "settings:"
 ENCODERS = Registry(
     "encoder",
     {
         "compression_autoencoder": Entry(
             _PACKAGE + "compression_autoencoder:CompressionAutoencoder",
             "the paper's: a perceptron on 1,400 points in a fixed order",
-            "CompressionAutoencoderSettings",
+            _SETTINGS + "CompressionAutoencoderSettings",
             "alone",
         ),
         "point_autoencoder": Entry(
             _PACKAGE + "point_autoencoder:PointAutoencoder",
             "a perceptron on each point, pooled: any number of points in any order",
-            "PointAutoencoderSettings",
+            _SETTINGS + "PointAutoencoderSettings",
             "alone",
         ),
-        "pointnet": Entry(_PACKAGE + "pointnet:PointNet", "PointNet", "PointNetSettings", "jointly"),
-        "dgcnn": Entry(_PACKAGE + "dgcnn:DGCNN", "DGCNN", "DGCNNSettings", "jointly"),
+        "pointnet": Entry(
+            _PACKAGE + "pointnet:PointNet", "PointNet", _SETTINGS + "PointNetSettings", "jointly"
+        ),
+        "dgcnn": Entry(_PACKAGE + "dgcnn:DGCNN", "DGCNN", _SETTINGS + "DGCNNSettings", "jointly"),
     },
 )
 """By the name in settings and checkpoints. Two kinds: "alone" is trained with a loss of its own and then

@@ -2,43 +2,20 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from numpy.random import Generator
 from torch import Tensor, nn
 
-from robotdiffuse.core.settings import Count, Settings
+from robotdiffuse.learning.encoders.settings import EncoderSettings
 from robotdiffuse.learning.max_pool import max_pool
-from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
-
-
-@dataclass(frozen=True)
-class EncoderSettings(Settings, name="encoder"):
-    """Settings that every encoder has."""
-
-    code: Count = 96
-    """Size of z (paper: 60, for two obstacles)."""
-    cloud: Count = 512
-    """Points of an input cloud."""
-    region: VisibleRegion = PANDA_REGION
-    """Points outside are ignored, for the arm does not reach them. Within a large reach whole surfaces
-    count."""
-
-    @classmethod
-    def paper_size(cls) -> "EncoderSettings":
-        """The sizes given by the authors of this encoder, with z of this paper's size."""
-        return cls(code=60)
 
 
 class Encoder(nn.Module, ABC):
     """A network from a point cloud to z. The order of the points does not matter, and a cloud may be
     empty."""
 
-    any_size: ClassVar[bool] = True
-    """Whether clouds of any size work well; otherwise they should have about `settings.cloud` points."""
     settings: EncoderSettings
     center: Tensor
 
@@ -53,6 +30,10 @@ class Encoder(nn.Module, ABC):
 
         Points outside the region are ignored, so that clouds of different size can share a batch.
         """
+
+    def code_of_ordered(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z of clouds that already have the size and order that the settings ask for; for export."""
+        return self(cloud)
 
     def near(self, cloud: Float[Tensor, "batch points 3"]) -> Bool[Tensor, "batch points"]:
         """The points that count: those in the region, without the zeros that `surface_clouds` pads with."""

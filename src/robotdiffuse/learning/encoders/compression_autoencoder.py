@@ -6,7 +6,6 @@ activation is PReLU, as in MPNet (Qureshi et al. 2019), whose encoder has the sa
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -14,27 +13,14 @@ from jaxtyping import Float
 from numpy.random import Generator
 from torch import Tensor, nn
 
-from robotdiffuse.core.settings import Count, Sizes
-from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
-from robotdiffuse.scenes.surface_clouds import sort_points
-
-
-@dataclass(frozen=True)
-class CompressionAutoencoderSettings(EncoderSettings):
-    """The paper's sizes."""
-
-    code: Count = 60
-    """Size of z."""
-    cloud: Count = 1400
-    """Points of an input cloud; the input has three numbers for each."""
-    hidden: Sizes = (786, 512, 256)
-    """Layers of the encoder between the cloud and z; the decoder has the same in reverse order."""
+from robotdiffuse.datasets.surface_clouds import sort_points
+from robotdiffuse.learning.encoders.base import Autoencoder, fp32
+from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings
 
 
 class CompressionAutoencoder(Autoencoder):
     """z = MLP(all points, concatenated)."""
 
-    any_size = False
     settings: CompressionAutoencoderSettings
 
     def __init__(self, settings: CompressionAutoencoderSettings) -> None:
@@ -66,6 +52,9 @@ class CompressionAutoencoder(Autoencoder):
     def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
         with fp32(cloud):
             return self.encoder(self.arrange(cloud.float()).flatten(1))
+
+    def code_of_ordered(self, cloud: Float[Tensor, "batch cloud 3"]) -> Float[Tensor, "batch code"]:
+        return (self.encoder(cloud.flatten(1)) - self.mean) / self.scale
 
     def decode(self, code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch cloud 3"]:
         """Reconstructed points [m], in the order of `arrange`, from z before standardisation."""

@@ -7,7 +7,6 @@ Without a norm on the edges, the maximum commutes with the rest: with h = W [x_i
 B x_j, it is over B x_j alone, and the layer costs two matrix products per point instead of one per edge.
 """
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -15,36 +14,14 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from robotdiffuse.core.settings import Count, Sizes
-from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max, pool_mean
+from robotdiffuse.learning.encoders.base import Encoder, fp32, pool_max, pool_mean
+from robotdiffuse.learning.encoders.settings import DGCNNSettings
 from robotdiffuse.learning.max_pool import max_pool
 
 NEGATIVE_SLOPE = 0.2
 """Slope of the leaky ReLU below zero, as in the original."""
 IGNORED_DISTANCE = 1e9
 """Squared distance that is given to points that do not count."""
-
-
-@dataclass(frozen=True)
-class DGCNNSettings(EncoderSettings):
-    """Sizes for training on a CPU; the original's are in brackets."""
-
-    cloud: Count = 128
-    """Points of an input cloud (1024)."""
-    neighbours: Count = 8
-    """Nearest points that each point is joined with (20)."""
-    edges: Sizes = (32, 32, 64)
-    """Widths of the layers of edge convolution (64, 64, 128, 256)."""
-    embedding: Count = 192
-    """Features of a point, computed from all these layers, that are pooled (1024)."""
-    head: tuple[Count, ...] = (192,)
-    """Layers between the pooled features and z (512, 256)."""
-
-    @classmethod
-    def paper_size(cls) -> "DGCNNSettings":
-        return cls(
-            code=60, cloud=1024, neighbours=20, edges=(64, 64, 128, 256), embedding=1024, head=(512, 256)
-        )
 
 
 def neighbours(
@@ -86,8 +63,6 @@ class EdgeConvolution(nn.Module):
 
 class DGCNN(Encoder):
     """z = MLP(max-pool and mean-pool of MLP(outputs of all edge convolutions))."""
-
-    any_size = False  # distances to neighbours depend on the density of the cloud
 
     def __init__(self, settings: DGCNNSettings) -> None:
         super().__init__(settings)

@@ -5,7 +5,6 @@ point and pools (Qi et al. 2017, PointNet), so that neither the order nor the nu
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -15,28 +14,13 @@ from numpy.random import Generator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from robotdiffuse.core.settings import Count, Natural, NotNegative, Sizes
-from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
+from robotdiffuse.learning.encoders.base import Autoencoder, fp32
+from robotdiffuse.learning.encoders.settings import PointAutoencoderSettings
 
 DISTANCE_QUERIES = 96
 """Positions per cloud at which the distance field is reconstructed."""
 DISTANCE_CAP = 0.5
 """Reconstructed distances are capped at this [m]."""
-
-
-@dataclass(frozen=True)
-class PointAutoencoderSettings(EncoderSettings):
-    points: Sizes = (64, 128, 256)
-    """Layers of the perceptron on each point."""
-    octaves: Natural = 4
-    """Wavelengths (4 m, 2 m, ...) of the sines and cosines of its coordinates that each point is given."""
-    hidden: Count = 384
-    """Width of the layer between the pooled features and z, and of the decoder's."""
-    decoded: Count = 192
-    """Points that the decoder reconstructs."""
-    distance_weight: NotNegative = 4.0
-    """In training: weight of the error of the distance field relative to the Chamfer distance, both in
-    metres."""
 
 
 class PointAutoencoder(Autoencoder):

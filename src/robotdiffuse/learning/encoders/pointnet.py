@@ -8,49 +8,14 @@ dropout, and no loss that keeps the feature transform orthogonal, since the plan
 the transforms start close to the identity.
 """
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from robotdiffuse.core.settings import Count, Sizes
-from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max
-
-
-@dataclass(frozen=True)
-class PointNetSettings(EncoderSettings):
-    """Sizes for training on a CPU; the original's are in brackets."""
-
-    cloud: Count = 256
-    """Points of an input cloud (1024)."""
-    input_transform: bool = True
-    """Whether the coordinates are multiplied by a matrix that a small network predicts from the cloud."""
-    feature_transform: bool = True
-    """Whether the features of the first layers are transformed in the same way."""
-    first: Sizes = (32, 32)
-    """Layers on each point before the feature transform (64, 64)."""
-    second: Sizes = (32, 64, 192)
-    """Layers on each point after it (64, 128, 1024)."""
-    transform: Sizes = (16, 32, 64)
-    """Layers on each point within a transform's network (64, 128, 1024)."""
-    transform_head: tuple[Count, ...] = (32,)
-    """Layers of a transform's network after the maximum (512, 256)."""
-    head: tuple[Count, ...] = (192,)
-    """Layers between the maximum and z (512, 256)."""
-
-    @classmethod
-    def paper_size(cls) -> "PointNetSettings":
-        return cls(
-            code=60,
-            cloud=1024,
-            first=(64, 64),
-            second=(64, 128, 1024),
-            transform=(64, 128, 1024),
-            transform_head=(512, 256),
-            head=(512, 256),
-        )
+from robotdiffuse.learning.encoders.base import Encoder, fp32, pool_max
+from robotdiffuse.learning.encoders.settings import PointNetSettings
 
 
 def layers(sizes: tuple[int, ...]) -> nn.Sequential:

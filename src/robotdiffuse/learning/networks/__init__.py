@@ -7,9 +7,9 @@ NETWORKS = Registry(
     "network",
     {
         "model": Entry(
-            "robotdiffuse.learning.motion_model:MotionModel",
+            "robotdiffuse.learning.motion_network:MotionNetwork",
             "the diffusion model of motions",
-            "MotionModelSettings",
+            "robotdiffuse.learning.motion_model:MotionModelSettings",
             "planner --robot NAME",
         ),
         "mpnet": Entry(
@@ -23,9 +23,9 @@ NETWORKS = Registry(
             "MPiNetsNetworkSettings",
         ),
         "trajectory_prior": Entry(
-            "robotdiffuse.learning.motion_model:MotionModel",
+            "robotdiffuse.learning.motion_network:MotionNetwork",
             "the same model without an encoder, for MPD and EDMP",
-            "MotionModelSettings",
+            "robotdiffuse.learning.motion_model:MotionModelSettings",
             "planner --config trajectory_prior --data FOLDER --out FOLDER",
         ),
     },

@@ -41,6 +41,8 @@ from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings, Share, Sizes
+from robotdiffuse.datasets.surface_clouds import surface_clouds
+from robotdiffuse.learning.forward_kinematics import ForwardKinematics
 from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.networks.pointnet2 import GroupAll, SetAbstraction
 from robotdiffuse.learning.robot_identity import RobotIdentity
@@ -48,10 +50,8 @@ from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.losses import ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.surface_clouds import surface_clouds
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
 DIRECTION_OFFSET = 0.1
@@ -214,11 +214,20 @@ class MPiNetsNetwork(BaselineNetwork):
             at, features = self.first(points, labels.expand(len(q), *labels.shape))
             cloud_code = self.cloud_code(self.together(*self.second(at, features)))
         # bf16 would round configurations to a hundredth of a radian
-        x = self.normalizer.to_unit(q)
-        way = self.normalizer.to_unit(goal) - x
+        x = self.to_unit(q)
+        way = self.to_unit(goal) - x
         direction = 2 * way / (way.norm(dim=-1, keepdim=True) + DIRECTION_OFFSET)
         code = torch.cat([cloud_code.float(), self.joint_code(torch.cat([x, direction], -1))], -1)
-        return self.normalizer.from_unit((x + self.step * self.decoder(code)).clamp(-1, 1))
+        return self.from_unit((x + self.step * self.decoder(code)).clamp(-1, 1))
+
+    def roll_outs(
+        self,
+        clouds: Float32[ndarray, "n points 3"],
+        start: Float32[ndarray, "n dof"],
+        goal: Float32[ndarray, "n dof"],
+    ) -> "RollOuts":
+        """Roll-outs of the policy, in planning."""
+        return RollOuts(self, torch.from_numpy(clouds), start, goal)
 
     def loss(
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator

@@ -36,18 +36,18 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 from torch import Generator, Tensor, nn
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Share, Sizes
+from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.surface_clouds import surface_clouds
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
 CURVE_BITS = 10
@@ -122,7 +122,7 @@ class MPNetNetwork(BaselineNetwork):
         if len(data):
             rng = np.random.default_rng(0)
             rows = data.draw(5_000, self.settings.trivial_share, rng)
-            here, following, _ = self._samples(data.q[rows], rng)
+            here, following, _ = self.training_samples(data.q[rows], rng)
             step = self.normalizer.to_unit(following) - self.normalizer.to_unit(here)
             self.step_scale.fill_(max(float(np.sqrt(np.mean(step**2))), 1e-3))
 
@@ -141,9 +141,30 @@ class MPNetNetwork(BaselineNetwork):
 
         Dropout is drawn from the generator, in training and evaluation mode alike; None: without dropout.
         """
-        x, target = self.normalizer.to_unit(q), self.normalizer.to_unit(goal)
+        x, target = self.to_unit(q), self.to_unit(goal)
         step = self.policy(torch.cat([z, x, target], 1), generator)
-        return self.normalizer.from_unit((x + self.step_scale * step).clamp(-1, 1))
+        return self.from_unit((x + self.step_scale * step).clamp(-1, 1))
+
+    def generator(self, seed: int) -> Generator:
+        """Random numbers for dropout."""
+        return Generator().manual_seed(seed)
+
+    def code_of(self, cloud: Float32[ndarray, "points 3"]) -> Float[Tensor, "code"]:
+        """z of a cloud, in planning."""
+        with torch.inference_mode():
+            return self.encode(torch.from_numpy(cloud)[None])[0]
+
+    def proposals(
+        self,
+        z: Float[Tensor, "code"],
+        q: Float32[ndarray, "n dof"],
+        goal: Float32[ndarray, "n dof"],
+        generator: Generator,
+    ) -> Float32[ndarray, "n dof"]:
+        """`next_states` of arrays in one scene, in planning."""
+        with torch.inference_mode():
+            ends = torch.from_numpy(q), torch.from_numpy(goal)
+            return self.next_states(z.expand(len(q), -1), *ends, generator).numpy()
 
     def loss(
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
@@ -162,10 +183,10 @@ class MPNetNetwork(BaselineNetwork):
             if fraction < of.pretraining:
                 return self.autoencoder_loss(cloud, generator)
             z = self.encode(cloud).repeat_interleave(of.waypoints, 0)
-            q, following, goal = (torch.from_numpy(a) for a in self._samples(data.q[rows], rng))
-            x, target = self.normalizer.to_unit(q), self.normalizer.to_unit(goal)
+            q, following, goal = (torch.from_numpy(a) for a in self.training_samples(data.q[rows], rng))
+            x, target = self.to_unit(q), self.to_unit(goal)
             step = self.policy(torch.cat([z, x.to(z), target.to(z)], 1), generator)
-        wanted = (self.normalizer.to_unit(following) - x) / self.step_scale
+        wanted = (self.to_unit(following) - x) / self.step_scale
         return (step.float() - wanted).square().mean()
 
     def autoencoder_loss(
@@ -207,7 +228,7 @@ class MPNetNetwork(BaselineNetwork):
                 forth, back = back, forth
         return float(found.mean())
 
-    def _samples(
+    def training_samples(
         self, q: Float[ndarray, "scenes waypoints dof"], rng: np.random.Generator
     ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
         """Configurations, the waypoints after them, and goals [rad], along trajectories in a random

@@ -18,13 +18,13 @@ from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.datasets.augmentation import turns_about_vertical
 from robotdiffuse.datasets.rows import read_rows
 from robotdiffuse.datasets.shards import SPLITS, shard_indices
+from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint
 from robotdiffuse.learning.clearance_features import PackedClearanceFn
 from robotdiffuse.learning.encoders.base import Encoder
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
-from robotdiffuse.scenes.surface_clouds import surface_clouds
 
 
 def random_scenes(count: int, max_obstacles: int, rng: np.random.Generator) -> PackedScenes:
@@ -236,7 +236,7 @@ class Batches:
     def __init__(
         self,
         data: TrajectoryData,
-        model: MotionModel,
+        model: MotionNetwork,
         clearances: PackedClearanceFn,
         trivial_share: float,
         weight_limit: float | None,

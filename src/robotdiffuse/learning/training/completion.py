@@ -13,14 +13,9 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
 from robotdiffuse.learning.checkpoint import save_completion
-from robotdiffuse.learning.completion.network import (
-    CompletionNetwork,
-    CompletionSettings,
-    folded,
-    reachable,
-    voxel_centers,
-)
+from robotdiffuse.learning.completion.network import CompletionNetwork, folded
 from robotdiffuse.learning.completion.samples import FREE, OCCUPIED, Samples, draw_samples, unpack_fine
+from robotdiffuse.learning.completion.volume import CompletionSettings, reachable, voxel_centers
 from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSettings
 from robotdiffuse.learning.training.loop import Validation
 from robotdiffuse.learning.training.prefetch import SEED_LIMIT, SamplePrefetcher

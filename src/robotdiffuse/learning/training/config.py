@@ -16,9 +16,9 @@ from robotdiffuse.core.settings import (
     Share,
 )
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.base import DenoiserSettings
+from robotdiffuse.learning.denoisers.settings import DenoiserSettings
 from robotdiffuse.learning.encoders import ENCODERS
-from robotdiffuse.learning.encoders.base import EncoderSettings
+from robotdiffuse.learning.encoders.settings import EncoderSettings
 from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.training.losses import LossSettings

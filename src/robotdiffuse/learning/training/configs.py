@@ -12,8 +12,7 @@ what an encoder loses.
 from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.learning.denoisers.transformer import TransformerSettings
-from robotdiffuse.learning.denoisers.unet import UNetSettings
+from robotdiffuse.learning.denoisers.settings import TransformerSettings, UNetSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import LossSettings

@@ -50,11 +50,11 @@ class _EncoderTask(TrainingTask):
         module = make_encoder(settings.name, settings.encoder)
         assert isinstance(module, Autoencoder)  # by EncoderTraining
         self.module = self._trained = module.to(processes.device)
-        self._most = settings.points if module.any_size else module.settings.cloud
+        self._most = settings.points if module.settings.any_size else module.settings.cloud
 
     def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
         settings, module, most = self.settings, self.module, self._most
-        points = int(rng.integers(max(1, most // 8), most + 1)) if module.any_size else most
+        points = int(rng.integers(max(1, most // 8), most + 1)) if module.settings.any_size else most
         error, _ = self._reconstruction(settings.batch, points, rng)
         theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()
         return error + settings.regularization * theta

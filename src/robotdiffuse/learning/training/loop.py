@@ -29,6 +29,8 @@ from robotdiffuse.learning.training.processes import Processes
 
 FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder", "device")
 """Settings that may differ between the parts of one run."""
+BAR_WIDTH = 24
+"""Of the progress bar [characters]: with its figures it fits into 80; a line that wraps is printed again."""
 LOG_EVERY = 50
 """Steps per row of log.csv."""
 LOG_COLUMNS = ("step", "samples", "minutes", "learning_rate", "loss", "validation", "success", "skipped")
@@ -145,6 +147,7 @@ class TrainingRun:
                     if due:
                         self._checkpoint(validate, progress.console, title)
                         saved = time.monotonic()
+                progress.update(task, completed=self.fraction)
                 self._checkpoint(validate, progress.console, title)
                 if stopped:
                     raise KeyboardInterrupt
@@ -246,6 +249,7 @@ class TrainingRun:
             f"loss {self.rows[-1]['loss']:.4f}, validation {validation.loss:.4f}, {planned}"
             f"{self.at.skipped} steps skipped",
             highlight=False,
+            soft_wrap=True,
         )
 
     def save(self) -> None:
@@ -354,9 +358,9 @@ def _stop_requested() -> Iterator[threading.Event]:
 @contextmanager
 def _progress(shown: bool) -> Iterator[Progress]:
     columns = (
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.1f} %"),
+        TextColumn("{task.description}"), BarColumn(BAR_WIDTH), TextColumn("{task.percentage:.1f} %"),
         TextColumn("{task.fields[rate]}"), TextColumn("loss {task.fields[loss]}"), TimeRemainingColumn(),
     )  # fmt: skip
-    console = Console(stderr=True, soft_wrap=True)
+    console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not shown) as progress:
         yield progress

@@ -16,7 +16,7 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, NotNegative, Settings, Share
 from robotdiffuse.core.transforms import rotation_from_quaternion
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.learning.forward_kinematics import ForwardKinematics
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 
 POINT_UNIT = 0.1

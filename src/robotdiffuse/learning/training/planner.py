@@ -15,7 +15,9 @@ from robotdiffuse.learning.clearance_features import packed_clearances
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Encoder
-from robotdiffuse.learning.motion_model import ModelParts, MotionModel, MotionModelSettings
+from robotdiffuse.learning.forward_kinematics import ForwardKinematics
+from robotdiffuse.learning.motion_model import ModelParts, MotionModelSettings
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData
 from robotdiffuse.learning.training.config import PlannerTraining
@@ -24,7 +26,6 @@ from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.task import MotionTask, train
 from robotdiffuse.learning.training.validation import planning_success
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 
 VALIDATION_SAMPLES = 4
@@ -55,7 +56,7 @@ class PlannerTask(MotionTask):
         if settings.encoder is not None:
             frozen = None if settings.jointly else load_encoder(settings.encoder)
             encoder = frozen or make_encoder(settings.encoder, settings.encoder_settings)
-        model = MotionModel(RobotIdentity.of(robot), model_settings(settings, encoder))
+        model = MotionNetwork(RobotIdentity.of(robot), model_settings(settings, encoder))
         # codes are computed on the CPU: the frozen encoder stays there
         model.encoder = copy.deepcopy(encoder)
         super().__init__(settings, robot, frozen, processes)
@@ -113,7 +114,7 @@ class PlannerLoss:
     """Computes the loss of a batch: that of the objective, L_point and L_collision (paper, eq. L)."""
 
     def __init__(
-        self, model: MotionModel, robot: Robot, settings: PlannerTraining, processes: Processes
+        self, model: MotionNetwork, robot: Robot, settings: PlannerTraining, processes: Processes
     ) -> None:
         self.model, self.settings, self.processes = model, settings.losses, processes
         kinematics = ForwardKinematics(robot, device=processes.device)

@@ -11,8 +11,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.checkpoint import versions
 from robotdiffuse.learning.encoders.base import Encoder
+from robotdiffuse.learning.onnx_export import EXPORT_PACKAGES
 from robotdiffuse.learning.training.batches import TrajectoryData, load_data
 from robotdiffuse.learning.training.config import MotionTraining, TrainingSettings
 from robotdiffuse.learning.training.loop import TrainingRun, Validation
@@ -64,6 +66,7 @@ def train(task: TrainingTask, settings: TrainingSettings, out: str, processes: P
     and get the same result, see `TrainingRun`. Raises InputError if the folder holds a different run, and
     KeyboardInterrupt, after a checkpoint, on Ctrl-C.
     """
+    need_packages("training", *EXPORT_PACKAGES)  # now, and not after hours of training
     run = TrainingRun(task.module, out, settings, task.identity, processes)
     run.loop(lambda rng: task.loss(run.fraction, rng), lambda: task.validate(run.fraction), task.title)
     if not processes.first:

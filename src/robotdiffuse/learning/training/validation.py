@@ -12,7 +12,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.batches import TrajectoryData, encode_scenes
 from robotdiffuse.robots.robot import Robot
@@ -27,7 +27,7 @@ CHECKS_PER_SEGMENT = 6
 
 
 def planning_success(
-    model: MotionModel,
+    model: MotionNetwork,
     robot: Robot,
     data: TrajectoryData,
     problems: int,
@@ -44,7 +44,7 @@ def planning_success(
 
 
 def _sampled_free(
-    model: MotionModel,
+    model: MotionNetwork,
     robot: Robot,
     data: TrajectoryData,
     row: int,

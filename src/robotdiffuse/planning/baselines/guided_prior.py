@@ -29,7 +29,6 @@ from dataclasses import dataclass
 from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
@@ -38,11 +37,12 @@ from robotdiffuse.collision.kernels.motions import Space, motions_free, path_len
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive
-from robotdiffuse.learning.motion_model import MotionModel, one_thread
+from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.samplers.ddpm import ancestral
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.robots.robot import Robot
 
 SAMPLE_RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of a sample [m]."""
@@ -84,6 +84,12 @@ class GuidedPrior(LearnedPlanner[GuidedPriorSettings]):
     """
 
     network_name = "trajectory_prior"
+
+    def network(self, robot: Robot) -> MotionModel:
+        """See `LearnedPlanner`."""
+        from robotdiffuse.learning.exported_model import exported_model  # imports ONNX Runtime
+
+        return exported_model(self.network_name, self.settings.weights, robot)
 
     @abstractmethod
     def draw(
@@ -166,15 +172,14 @@ def sample(
         mean = prior.joints(prior.hold_ends(x, reference), reference)
         return prior.normalize(guide(mean, left), reference)
 
-    with torch.inference_mode(), one_thread():
-        try:
-            x = ancestral(
-                predict, prior.schedule, lambda: prior.draw_noise(len(starts), rng), levels, move, noise_scale
-            )
-            for _ in range(quiet_steps):
-                x = move(predict(x, int(levels[-1])), 0)
-        except _StoppedError:
-            return None
+    try:
+        x = ancestral(
+            predict, prior.schedule, lambda: prior.draw_noise(len(starts), rng), levels, move, noise_scale
+        )
+        for _ in range(quiet_steps):
+            x = move(predict(x, int(levels[-1])), 0)
+    except _StoppedError:
+        return None
     q = prior.joints(prior.clipped(x), reference)
     q[:, 0], q[:, -1] = starts, goals
     return q

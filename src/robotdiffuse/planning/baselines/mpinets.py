@@ -17,23 +17,24 @@ Differences from the paper, besides those of the network:
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float32
 from numpy import ndarray
-from torch import Tensor
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative, Positive
-from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, RollOuts
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.scenes.surface_points import sample_surface
+
+if TYPE_CHECKING:
+    from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork
 
 STANDSTILL = 1e-4
 """A roll-out ends when no joint moves further than this in a step [rad]: the policy would stand still
@@ -87,7 +88,7 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
     def _roll_outs(
         self,
         context: PlanningContext,
-        network: MPiNetsNetwork,
+        network: "MPiNetsNetwork",
         start_goal: StartGoal,
         tried: int,
         count: int,
@@ -103,7 +104,7 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")
         goal = goals[order[np.arange(tried, tried + count) % len(order)]]
         clouds = scene_clouds(network, start_goal.checker, count, rng)
-        roll_outs = RollOuts(network, clouds, np.repeat(start[None], count, 0), goal)
+        roll_outs = network.roll_outs(clouds, np.repeat(start[None], count, 0), goal)
         motions = [_Motion(start, end) for end in goal]
         for step in range(settings.steps + 1):
             near = roll_outs.running & (roll_outs.distances() < settings.near)
@@ -156,8 +157,8 @@ class _Motion:
 
 
 def scene_clouds(
-    network: MPiNetsNetwork, checker: CollisionChecker, count: int, rng: np.random.Generator
-) -> Float32[Tensor, "count points 3"]:
+    network: "MPiNetsNetwork", checker: CollisionChecker, count: int, rng: np.random.Generator
+) -> Float32[ndarray, "count points 3"]:
     """Random clouds of the scene in the size of the network's inputs [m]; zeros if nothing is in reach."""
     points, region = network.settings.scene_points, network.settings.region
     clouds = np.zeros((count, points, 3), np.float32)
@@ -165,4 +166,4 @@ def scene_clouds(
         found = sample_surface(checker.scene, points, rng, region)
         if len(found):
             cloud[:] = found
-    return torch.from_numpy(clouds)
+    return clouds

@@ -21,12 +21,11 @@ divided evenly among the attempts.
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
-from torch import Generator, Tensor
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
@@ -34,13 +33,15 @@ from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
-from robotdiffuse.learning.networks.mpnet import MPNetNetwork
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.trajectories.simplification import shortcut
+
+if TYPE_CHECKING:
+    from robotdiffuse.learning.networks.mpnet import MPNetNetwork
 
 SEARCH_ITERATIONS = 500
 """Iterations of RRT-Connect between two readings of the clock, in hybrid replanning."""
@@ -120,7 +121,7 @@ class NeuralPlanning:
         self,
         context: PlanningContext,
         start_goal: StartGoal,
-        network: MPNetNetwork,
+        network: "MPNetNetwork",
         settings: MPNetPlannerSettings,
         rng: np.random.Generator,
     ) -> None:
@@ -128,12 +129,12 @@ class NeuralPlanning:
         self.space = search_space(
             start_goal.checker, settings.resolution, start_goal.kept_clearance(settings.clearance)
         )
-        self.generator = Generator().manual_seed(int(rng.integers(2**63)))
+        self.generator = network.generator(int(rng.integers(2**63)))
         self.state = random_state(int(rng.integers(2**31)))
         start, goals = start_goal.rows()
         self.starts = np.tile(start, (settings.attempts, 1))
         self.goals = goals[(np.arange(settings.attempts) + rng.integers(len(goals))) % len(goals)]
-        self.z = scene_code(network, start_goal.checker, rng)
+        self.z = network.code_of(scene_cloud(network, start_goal.checker, rng))
         self.replanned = 0
         """How often colliding parts were replanned."""
         self.searched = False
@@ -241,23 +242,18 @@ class NeuralPlanning:
         self, q: Float[ndarray, "n dof"], goal: Float[ndarray, "n dof"]
     ) -> Float[ndarray, "n dof"]:
         """The states that Pnet proposes, with dropout."""
-        with torch.inference_mode():
-            z = self.z.expand(len(q), -1)
-            return self.network.next_states(
-                z, torch.from_numpy(q), torch.from_numpy(goal), self.generator
-            ).numpy()
+        return self.network.proposals(self.z, q, goal, self.generator)
 
 
 def _joined(forth: list[ndarray], back: list[ndarray]) -> Float[ndarray, "n dof"]:
     return np.stack([*forth, *back[::-1]])
 
 
-def scene_code(
-    network: MPNetNetwork, checker: CollisionChecker, rng: np.random.Generator
-) -> Float[Tensor, "1 code"]:
-    """The encoding z of a random cloud of the scene's obstacles; of zeros without obstacles."""
-    cloud = np.zeros((1, network.settings.points, 3), np.float32)
+def scene_cloud(
+    network: "MPNetNetwork", checker: CollisionChecker, rng: np.random.Generator
+) -> Float32[ndarray, "points 3"]:
+    """A random cloud of the scene's obstacles [m]; zeros without obstacles."""
+    cloud = np.zeros((network.settings.points, 3), np.float32)
     points = sample_surface(checker.scene, network.settings.points, rng, network.region)
-    cloud[0, : len(points)] = points
-    with torch.inference_mode():
-        return network.encode(torch.from_numpy(cloud))
+    cloud[: len(points)] = points
+    return cloud

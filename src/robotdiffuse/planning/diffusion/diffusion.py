@@ -16,6 +16,7 @@ network runs without guidance.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -73,9 +74,17 @@ class ModelSampler(LearnedPlanner[SamplerSettings]):
 
         Raises InputError if the settings name weights of another robot, or ones that cannot be read.
         """
-        if self.settings.weights is None and weights_for("model", robot) is None:
-            return None
-        return self.network(robot)
+        weights = self.settings.weights or weights_for(self.network_name, robot)
+        return None if weights is None else self._exported(weights, robot)
+
+    def network(self, robot: Robot) -> "MotionModel":
+        """See `LearnedPlanner`."""
+        return self._exported(self.settings.weights, robot)
+
+    def _exported(self, weights: str | FilePath | None, robot: Robot) -> "MotionModel":
+        from robotdiffuse.learning.exported_model import exported_model  # imports ONNX Runtime
+
+        return exported_model(self.network_name, weights, robot)
 
     def guidance_scale(self, model: "MotionModel") -> float:
         """Scale of classifier-free guidance for a model."""
@@ -129,9 +138,9 @@ def encode(
 ) -> Float[ndarray, "code"]:
     """The encoding z of a scene: its point cloud of `points` points through the frozen encoder, unless the
     encoder has a fixed size."""
-    assert model.encoder is not None  # unconditional priors are not used by these planners
-    of_encoder = model.encoder.settings
-    count = points if model.encoder.any_size else of_encoder.cloud
+    of_encoder = model.settings.encoder_settings
+    assert of_encoder is not None  # unconditional priors are not used by these planners
+    count = points if of_encoder.any_size else of_encoder.cloud
     return model.encode(sample_surface(checker.scene, count, rng, of_encoder.region), rng)
 
 

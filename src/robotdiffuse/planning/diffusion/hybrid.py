@@ -18,10 +18,9 @@ shorter (the mean of 20 upright cups and of 20 lines; median: the same).
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
-from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -33,7 +32,6 @@ from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural
 from robotdiffuse.learning.guidance import CollisionGuidance
-from robotdiffuse.learning.weights_registry import weights_for
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.diffusion.diffusion import GuidedSamplingSettings, ModelSampler, encode
@@ -56,8 +54,6 @@ BATCH_SECONDS = 0.1
 """Expected time of a batch or its refinement before any was measured [s]: the first of a process is slow."""
 BATCH_TIME_FACTOR = 2.0
 """A batch is begun if this many times the expected time is left: scenes differ."""
-LOAD_SECONDS = 3.0
-"""A call loads PyTorch and the network if it needs them and has this much time left [s]."""
 
 
 @dataclass(frozen=True)
@@ -89,39 +85,12 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
     def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
         """Raises InputError if the folder that the settings name holds no weights."""
         super().__init__(settings)
-        self.wanted: set[FilePath] = set()
-        """Folders of weights that a call needed and had no time to load."""
-        self.loaded: set[FilePath] = set()
-        """Folders of weights that are loaded."""
         self.seconds = {"batch": BATCH_SECONDS, "refinement": BATCH_SECONDS}
         """Expected times [s]: that of the last one, or more if those before it took longer."""
 
     def prepare(self, robot: Robot) -> None:
-        """Load the weights that the settings name. Those of the package are loaded within a call, if it has
-        LOAD_SECONDS left, or else by `warm_up` and `load_wanted`."""
-        if self.settings.weights is not None:
-            self._load(robot)
-
-    def load_wanted(self, robot: Robot) -> None:
-        """See `planning.planner.Planner`."""
-        super().load_wanted(robot)
-        if self.weights(robot) in self.wanted:
-            self._load(robot)
-
-    def _load_rarely_needed(self, robot: Robot) -> None:
-        super()._load_rarely_needed(robot)
-        self._load(robot)
-
-    def weights(self, robot: Robot) -> FilePath | None:
-        """The folder of the weights for a robot; None if there are none."""
-        given = self.settings.weights
-        return weights_for(self.network_name, robot) if given is None else FilePath(given)
-
-    def _load(self, robot: Robot) -> None:
-        weights = self.weights(robot)
-        if weights is not None:
-            self.model(robot)
-            self.loaded.add(weights)
+        """Load the weights for the robot, if there are any."""
+        self.model(robot)
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -131,14 +100,12 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
             return plan_constrained(context, start_goal, settings.search)
         search = AnytimeSearch(context, start_goal, settings.search, AORRTC.name)
-        weights, fallback = self.weights(robot), None
-        if weights is not None:
-            batches = _NetworkBatches(self, context, start_goal, search, weights)
+        model, fallback = self.model(robot), None
+        if model is not None:
+            batches = _NetworkBatches(self, context, start_goal, search, model)
             fallback = batches.offer
         else:
             batches = _Batches(self, context, start_goal, search)
-            note = f"there are no weights for {robot.name}; planned by search and smooth noise"
-            context.notes.append(note)
 
         def improve() -> None:
             if batches.due:
@@ -146,13 +113,17 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             else:
                 search.improve(context.search_until, IMPROVEMENT_STEP)
 
-        return anytime(
+        result = anytime(
             context,
             search,
             lambda: search.improves(settings.search.gain, settings.search.patience),
             improve,
             fallback,
         )
+        if model is not None or result.stage == "straight_line":
+            return result
+        note = f"there are no weights for {robot.name}; planned by search and smooth noise"
+        return replace(result, notes=(*result.notes, note))
 
     def code(
         self, model: "MotionModel", checker: CollisionChecker, rng: np.random.Generator
@@ -237,22 +208,10 @@ class _NetworkBatches(_Batches):
         context: PlanningContext,
         start_goal: StartGoal,
         search: AnytimeSearch,
-        weights: FilePath,
+        model: "MotionModel",
     ) -> None:
         super().__init__(planner, context, start_goal, search)
-        self._weights = weights
-
-    def _can(self) -> bool:
-        """Whether there is time for a batch, and for loading the network unless it is loaded."""
-        self.planner.wanted.add(self._weights)
-        loaded = self._weights in self.planner.loaded or self.context.remaining > LOAD_SECONDS
-        return loaded and super()._can()
-
-    @cached_property
-    def _model(self) -> "MotionModel":
-        model = self.planner.model(self.context.problem.robot)
-        assert model is not None  # _NetworkBatches are made only where there are weights
-        return model
+        self._model = model
 
     @cached_property
     def _code(self) -> Float[ndarray, "code"] | None:
@@ -260,11 +219,9 @@ class _NetworkBatches(_Batches):
 
     def _draw(self) -> None:
         planner, checker, context = self.planner, self.start_goal.checker, self.context
-        model = self._model
-        planner.loaded.add(self._weights)
         start, goals = self.start_goal.rows()
         with self._timed("batch"):
-            sampled = planner.draw(model, checker, self._code, start, goals, context.rng)
+            sampled = planner.draw(self._model, checker, self._code, start, goals, context.rng)
         if not self._take(sampled, "network") and self._time_for("refinement"):
             with self._timed("refinement"):
                 refined = planner.refine(checker, sampled)

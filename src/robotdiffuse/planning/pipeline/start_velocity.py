@@ -23,12 +23,13 @@ BRAKING_FRACTION = 0.9
 def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
     """A motion from the problem's start velocity to rest at its goal.
 
-    Raises InputError for a velocity beyond the scaled velocity limits of the request, and for a jerk limit.
+    Raises InputError for a velocity beyond the scaled velocity limits of the request, and for a finite jerk
+    limit in the request; the robot's own is not kept, and a note says so.
     """
     context, robot = PlanningContext(solver.name, problem, request), problem.robot
     velocity = problem.start_velocity
     assert velocity is not None
-    if request.jerk is not None:
+    if request.jerk is not None and np.isfinite(request.jerk):
         raise InputError("jerk cannot be combined with start_velocity: the motion before it is not known")
     beyond = np.flatnonzero(np.abs(velocity) > request.velocity_scaling * robot.velocity)
     if len(beyond):
@@ -50,7 +51,9 @@ def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequ
     if result.path is None:
         return replace(result, reason=f"from where the arm can stop: {result.reason}")
     waypoints = np.concatenate([problem.start[None], result.path.positions])
-    notes = tuple(note for note in result.notes if note not in problem.notes)
+    notes = tuple(note for note in result.notes if note not in context.notes)
+    if request.jerk is None:
+        notes = (*notes, "the jerk is not limited: the motion before the start velocity is not known")
     found = context.finish(waypoints, result.stage or solver.name, notes=notes)
     if found is not None:
         return found

@@ -10,6 +10,9 @@ of what was seen, and of as much more as lets it pass:
 - occupied: every voxel that no view saw, and nothing after it.
 - optimistic: as seen.
 
+By default, the policy is predicted where the network covers the arm's reach, else padded. A motion under any
+but the first assumption has a note that names those that failed.
+
 Start and goal are taken to be free: the space around them is carved out of the assumed obstacles, not of what
 was seen.
 """
@@ -57,6 +60,7 @@ MIN_TIME_FRACTION = 0.1
 """Part of the time limit that every attempt of the planner gets at least."""
 PICTURE_THRESHOLD = 0.2
 """Pictures show voxels with a probability above this."""
+FREE_UNKNOWN_SPACE = "unknown space taken as free"
 AS_SEEN = "as seen"
 """Name of the assumption without additional obstacles."""
 
@@ -76,23 +80,26 @@ def plan_with_unknown_space(
     The result says which assumption it comes from, its confidence (how likely the motion is free in the true
     scene), and which unknown space it crosses.
     """
-    if problem.unknown == PREDICTED and predicted is None:
-        from robotdiffuse.learning.completion import bundled, predict  # PyTorch, before the clock starts
+    policy, policy_note = policy_for(problem)
+    if policy == PREDICTED and predicted is None:
+        from robotdiffuse.learning.completion import exported_completion, predict
 
-        bundled()
+        exported_completion()  # loaded before the clock starts
     else:
         predict = None
     context = PlanningContext(solver.name, problem, request)
     volume = observe(problem.views, problem.robot, problem.start)
     if predict is not None:
         predicted = predict(volume)
+    prepared = context.elapsed
     attempts = _Attempts(solver, context, unknown_space_of(problem, volume, predicted))
     as_seen, limit = replace(problem, views=()), request.time_limit
-    if problem.unknown != OPTIMISTIC:
+    failed = list[str]()
+    if policy != OPTIMISTIC:
         goals = _goals(context, as_seen)
         if isinstance(goals, PlanResult):
-            return goals
-        only = problem.unknown == OCCUPIED
+            return _with_notes(context, goals)
+        only = policy == OCCUPIED
         for assumption in assumptions_of(problem, volume, predicted):
             left = (1 - AS_SEEN_TIME_FRACTION) * limit - context.elapsed
             if not only and left < MIN_TIME_FRACTION * limit:
@@ -105,10 +112,48 @@ def plan_with_unknown_space(
             result = attempts.best(assumed, assumption.name, until)
             if only and not result.solved:
                 why = "no motion keeps out of all space that no view saw"
-                return replace(result, reason=f"{why}: {result.reason}")
+                return _with_notes(context, replace(result, reason=f"{why}: {result.reason}"))
             if only or result.solved:
-                return result
-    return attempts.best(as_seen, AS_SEEN, limit)
+                return _with_notes(context, result, policy_note, _lesser(failed, assumption.name))
+            failed.append(assumption.name)
+    result = attempts.best(as_seen, AS_SEEN, limit)
+    if policy == OPTIMISTIC or not result.solved:
+        return _with_notes(context, result)
+    if failed:
+        return _with_notes(context, result, policy_note, _lesser(failed, FREE_UNKNOWN_SPACE))
+    late = f"preparing it took {prepared:.2g} s of the time limit of {limit:g} s"
+    return _with_notes(
+        context,
+        result,
+        policy_note,
+        f"no time for the policy {policy}: {late}; planned with {FREE_UNKNOWN_SPACE}",
+    )
+
+
+def policy_for(problem: Problem) -> tuple[str, str]:
+    """The problem's policy for unknown space or the default one, and a note where that is not prediction."""
+    if problem.unknown is not None:
+        return problem.unknown, ""
+    from robotdiffuse.learning.completion.coverage import covers
+    from robotdiffuse.learning.completion.volume import REACH
+
+    if covers(problem.robot):
+        return PREDICTED, ""
+    where = f"predicts up to {REACH:g} m from a Panda's shoulder; {problem.robot.name} reaches farther"
+    return PADDED, f"unknown space: {PADDED}, since the network {where}"
+
+
+def _lesser(failed: list[str], used: str) -> str:
+    """A note on the assumptions that left no motion; "" if none failed."""
+    if not failed:
+        return ""
+    return f"no motion was found in the time given to {', '.join(failed)}: planned with {used}"
+
+
+def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> PlanResult:
+    """The result with the notes of the call, which an attempt does not have, and with more."""
+    every = (*context.notes, *result.notes, *(note for note in notes if note))
+    return replace(result, notes=tuple(dict.fromkeys(every)))
 
 
 def assumptions_of(
@@ -119,13 +164,14 @@ def assumptions_of(
     predicted: the probability that each fine voxel is occupied, for the policy "predicted".
     """
     robot, known = problem.robot, problem.known_scene
-    if problem.unknown == PADDED:
+    policy, _ = policy_for(problem)
+    if policy == PADDED:
         seen = [shape.points for shape in problem.scene.shapes if isinstance(shape, SeenPoints)]
         yield from padded_assumptions(np.concatenate([np.zeros((0, 3)), *seen]))
-    elif problem.unknown == PREDICTED:
+    elif policy == PREDICTED:
         assert predicted is not None
         yield from predicted_assumptions(predicted, robot, known)
-    elif problem.unknown == OCCUPIED:
+    elif policy == OCCUPIED:
         yield occupied_assumption(volume, robot, known)
 
 

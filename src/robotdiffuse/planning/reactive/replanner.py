@@ -11,7 +11,6 @@ The guarantee does not depend on the prediction.
 """
 
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Annotated
@@ -24,27 +23,21 @@ from numpy.typing import ArrayLike
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.collision.moving_obstacles import MovingCollision
-from robotdiffuse.core.bounds import numbers, rigid_transform, within
+from robotdiffuse.core.bounds import numbers
 from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
-from robotdiffuse.core.transforms import inverse, rotation_angle, transform
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.reactive.timed_path import SpeedProfile, TimedPath
+from robotdiffuse.planning.reactive.observations import ObservedObstacle, PredictedObstacles
+from robotdiffuse.planning.reactive.timed_path import MIN_LENGTH, SpeedProfile, TimedPath
 from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
-from robotdiffuse.problems.problem import Problem, check_problem
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
+from robotdiffuse.problems.goals import Goal
+from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.validation.validator import verifier
 
-OBSERVATION_ERROR = 1e-3
-"""Tolerance for an obstacle that seems to move faster than its maximum speed, for inexact observations
-[m]."""
 SEARCH_TIME_LIMIT = 10.0
 """Time limit for the first path [s]."""
 COARSE_RESOLUTION, COARSE_SAMPLE_TIME = 0.05, 0.04
@@ -130,12 +123,31 @@ class Replanner:
         self._robot, self._still = problem.robot, replace(problem, moving=())
         self._validator = verifier(self._still)
         self._rng = np.random.default_rng(seed)
-        self._seen = {one.name: _Observed(one) for one in problem.moving}
+        self._seen = {one.name: ObservedObstacle(one) for one in problem.moving}
         self._now, self._searches = -np.inf, 0
         self._next: TimedPath | None = None
         self._path, self._goals, self._space = self._first_path()
         self._since, self._motion = -np.inf, AT_REST
         """The motion under way: along the path, from this time on."""
+        self._left = False
+        """Whether the arm leaves the path at the end of its motion, for a new goal."""
+
+    def set_goal(self, goal: ArrayLike | Goal) -> None:
+        """Take the arm to another goal, from where its present motion ends.
+
+        The next steps search for the way. Raises InputError for a goal that is not usable in the static
+        scene; the old one stays then.
+        """
+        rest = self._path.at(float(self._motion.s[-1]))
+        problem = replace(self.problem, goal=goal)  # type: ignore[arg-type]
+        request = PlanRequest(SEARCH_TIME_LIMIT, self.seed)
+        start_goal = usable_start_goal(
+            PlanningContext("replanner", replace(problem, start=rest, moving=()), request)
+        )
+        if isinstance(start_goal, PlanResult):
+            raise InputError(f"the replanner cannot take this goal: {start_goal.reason}")
+        self.problem, self._goals = problem, np.array(start_goal.goals)
+        self._next, self._left = None, True
 
     def step(self, observation: Mapping[str, ArrayLike], now: float) -> Command:
         """The motion from one period after `now` [s], given the obstacles as observed at `now`.
@@ -159,14 +171,20 @@ class Replanner:
         self._since = begins
         oldest = min(seen.time for seen in self._seen.values())
         predicted = self._predict()
-        grown = _MovingObstacles(self._robot, [seen.anywhere() for seen in self._seen.values()], oldest)
+        grown = PredictedObstacles(self._robot, [seen.anywhere() for seen in self._seen.values()], oldest)
         clear = self._choose_path(predicted)
         self._change_path()
         renewed = self._next is None and self._extend(predicted, grown, clear)
         motion = self._path.rows(self._motion, self.settings.sample_time)
-        path, at_rest = self._path, self._motion.speeds[0] == 0
-        arrived = at_rest and path.to_goal and path.then is None and self._motion.s[0] >= path.end
-        return Command(begins, motion, renewed, bool(arrived))
+        arrived = bool(self._motion.speeds[0] == 0) and self._at_goal()
+        return Command(begins, motion, renewed, arrived)
+
+    def _at_goal(self) -> bool:
+        """Whether the arm, at rest, is at a goal."""
+        path, s = self._path, float(self._motion.s[0])
+        if self._left:
+            return bool(np.linalg.norm(self._goals - path.at(s), axis=1).min() < MIN_LENGTH)
+        return bool(path.to_goal and path.then is None and s >= path.end)
 
     def _first_path(self) -> tuple[TimedPath, Float[ndarray, "k dof"], Space]:
         """The first path, the goal configurations, and the space in which motions are checked."""
@@ -195,19 +213,19 @@ class Replanner:
             if not np.isfinite(one.time):
                 self._seen[name] = replace(one, time=now)  # not seen yet: where the problem says
 
-    def _predict(self) -> "_MovingObstacles":
+    def _predict(self) -> PredictedObstacles:
         """The predicted obstacles, with the largest safety margin that the arm keeps now."""
         moving = [seen.straight_on(self._now) for seen in self._seen.values()]
         speeds = np.array([seen.obstacle.top_speed for seen in self._seen.values()])
         here = self._path.at(float(self._motion.s[0]))
-        predicted = _MovingObstacles(self._robot, moving, self._now)
+        predicted = PredictedObstacles(self._robot, moving, self._now)
         for share in MARGIN_FRACTIONS:
             wide = predicted.wider(share * self.settings.safety_margin * speeds)
             if wide.comes(here, self._now, self.settings.period) is None:
                 return wide
         return predicted
 
-    def _choose_path(self, predicted: "_MovingObstacles") -> bool:
+    def _choose_path(self, predicted: PredictedObstacles) -> bool:
         """Search for another path if an obstacle is predicted on the present one; returns whether none is
         predicted on the path that the arm is on."""
         settings = self.settings
@@ -215,29 +233,33 @@ class Replanner:
         ahead = self._path if self._next is None else self._next
         clear = self._path_clear(predicted, ahead, self._next is None)
         moving = self._motion.duration > 0
-        done = clear and (ahead.to_goal or moving)
+        leaves = self._left and self._next is None
+        done = clear and (ahead.to_goal or moving) and not leaves
         if done and not settings.from_scratch:
             return clear
         found = self._search(predicted, rest, rest_time)
         if done:
             return clear
         if found is not None and predicted.free(
-            found.rows(found.onwards(0.0, 0.0), COARSE_SAMPLE_TIME), rest_time, settings
+            found.rows(found.onwards(0.0, 0.0), COARSE_SAMPLE_TIME),
+            rest_time,
+            settings.horizon,
+            settings.rest_time,
         ):
             self._next = found
         elif not moving and predicted.comes(rest, rest_time, settings.rest_time) is not None:
             self._next = self._evasion(predicted, rest, rest_time) or self._next
         return clear
 
-    def _path_clear(self, predicted: "_MovingObstacles", path: TimedPath, under_way: bool) -> bool:
+    def _path_clear(self, predicted: PredictedObstacles, path: TimedPath, under_way: bool) -> bool:
         """Whether the arm can go on to the end of a path, by the prediction."""
         s, speed = (float(self._motion.s[0]), float(self._motion.speeds[0])) if under_way else (0.0, 0.0)
         begins = self._since if under_way else self._since + self._motion.duration
         motion = path.rows(path.onwards(s, speed), COARSE_SAMPLE_TIME)
-        return predicted.free(motion, begins, self.settings)
+        return predicted.free(motion, begins, self.settings.horizon, self.settings.rest_time)
 
     def _search(
-        self, predicted: "_MovingObstacles", start: Float[ndarray, "dof"], time: float
+        self, predicted: PredictedObstacles, start: Float[ndarray, "dof"], time: float
     ) -> TimedPath | None:
         """A path from where the arm can rest to a goal, around the obstacles predicted for some time after
         that; or back to the present path, where that is free."""
@@ -245,7 +267,7 @@ class Replanner:
         later = time + PREDICTION_DELAYS[self._searches % len(PREDICTION_DELAYS)]
         checker = CollisionChecker(self._robot, Scene([*self._still.scene.shapes, *predicted.shapes(later)]))
         roots, after = list(self._goals), [np.zeros((0, self._robot.dof))] * len(self._goals)
-        if self._path.to_goal and not settings.from_scratch:
+        if self._path.to_goal and not (settings.from_scratch or self._left):
             old = self._path.remaining(float(self._motion.s[-1]))
             free = motions_free(search_space(checker, COARSE_RESOLUTION), old.astype(np.float32))
             first = len(free) - int(np.argmin(free[::-1])) if not free.all() else 1
@@ -255,7 +277,7 @@ class Replanner:
         if not usable[0] or not usable[1:].any():
             return None
         chosen = np.array([root for root, free in zip(roots, usable[1:], strict=True) if free])
-        clearance = float(predicted.margin.min()) + settings.clearance
+        clearance = min(float(predicted.margin.min()) + settings.clearance, MAX_CLEARANCE)
         request = PlanRequest(SEARCH_TIME_LIMIT, self.seed + self._searches, clearance=clearance)
         context = PlanningContext("replanner", self._still, request)
         search = AnytimeSearch(
@@ -268,7 +290,7 @@ class Replanner:
         return TimedPath.certified(self._robot, self._validator, np.concatenate([path, after[end]]), True)
 
     def _evasion(
-        self, predicted: "_MovingObstacles", rest: Float[ndarray, "dof"], time: float
+        self, predicted: PredictedObstacles, rest: Float[ndarray, "dof"], time: float
     ) -> TimedPath | None:
         """A straight path to where the next obstacle is predicted latest; None if that is here."""
         settings, robot = self.settings, self._robot
@@ -297,15 +319,15 @@ class Replanner:
         if self._motion.speeds[0] > 0:
             return
         if self._next is not None:
-            self._path, self._next, self._motion = self._next, None, AT_REST
-        elif self._path.then is not None and self._motion.s[0] >= self._path.end:
+            self._path, self._next, self._motion, self._left = self._next, None, AT_REST, False
+        elif not self._left and self._path.then is not None and self._motion.s[0] >= self._path.end:
             self._path, self._motion = self._path.then, AT_REST
 
-    def _extend(self, predicted: "_MovingObstacles", grown: "_MovingObstacles", clear: bool) -> bool:
+    def _extend(self, predicted: PredictedObstacles, grown: PredictedObstacles, clear: bool) -> bool:
         """Extend the motion if the extension is certified and useful; returns whether it was extended."""
         settings, path = self.settings, self._path
         s, speed = float(self._motion.s[0]), float(self._motion.speeds[0])
-        if s >= path.end:
+        if s >= path.end or self._left:
             return False
         for periods in DRIVING_PERIODS:
             extended = path.on_then_rest(s, speed, periods * settings.period)
@@ -317,93 +339,3 @@ class Replanner:
                 self._motion = extended
                 return True
         return False
-
-
-@dataclass(frozen=True, eq=False)
-class _Observed:
-    """An obstacle as it was last seen."""
-
-    obstacle: MovingObstacle
-    """As in the problem, or static where it was last seen."""
-    time: float = np.nan
-    velocity: Float[ndarray, "3"] | None = None
-
-    def again(self, value: ArrayLike, now: float) -> "_Observed":
-        """The obstacle after a new observation."""
-        name, T_before = self.obstacle.name, self.obstacle.shape.T_base_shape
-        xyz = numbers(value)
-        if xyz is not None and xyz.shape == (3,) and within(xyz):
-            T = transform(xyz, T_before[:3, :3])
-        else:
-            T = rigid_transform(f"observation[{name!r}]", value)
-        most = self.obstacle.top_speed
-        velocity = self.obstacle.velocity
-        if np.isfinite(self.time):
-            passed = now - self.time
-            moved = np.linalg.norm(T[:3, 3] - T_before[:3, 3])
-            moved += self.obstacle.radius * rotation_angle(T_before[:3, :3].T @ T[:3, :3])
-            if moved > most * passed + OBSERVATION_ERROR:
-                raise InputError(
-                    f"observation[{name!r}] is {moved:.3g} m from where it was {passed:.3g} s ago; its "
-                    f"maximum speed {most:g} m/s allows {most * passed:.3g} m"
-                )
-            velocity = (T[:3, 3] - T_before[:3, 3]) / passed
-        shape = self.obstacle.shape.moved(T @ inverse(T_before))
-        return _Observed(MovingObstacle(shape, max_speed=most), now, velocity)
-
-    def anywhere(self) -> MovingObstacle:
-        """The obstacle moving in any way from when it was last seen."""
-        return MovingObstacle(self.obstacle.shape, max_speed=self.obstacle.top_speed)
-
-    def straight_on(self, now: float) -> MovingObstacle:
-        """The obstacle keeping the velocity last seen, from now on."""
-        velocity = np.zeros(3) if self.velocity is None else self.velocity
-        passed = transform((now - self.time) * velocity)
-        return MovingObstacle(self.obstacle.shape.moved(passed), velocity=velocity)
-
-
-class _MovingObstacles:
-    """Moving obstacles from a time on, grown or predicted, for checks of motions in time."""
-
-    def __init__(self, robot: Robot, moving: list[MovingObstacle], since: float) -> None:
-        self._moving, self._since = moving, since
-        self._collision = MovingCollision(robot, moving, 0.0, 0.0)
-        self.margin = np.zeros(len(moving))
-
-    def wider(self, margin: Float[ndarray, "obstacles"]) -> "_MovingObstacles":
-        """The same obstacles, each inflated by a margin [m]."""
-        other = copy(self)
-        other.margin = self.margin + margin
-        other._collision = self._collision.inflated(margin)
-        return other
-
-    def shapes(self, time: float) -> list[Shape]:
-        """The obstacles at a time [s]."""
-        return [one.at(time - self._since) for one in self._moving]
-
-    def near(self, motion: Trajectory, begins: float, clearance: float) -> float | None:
-        """When an obstacle first comes nearer to the motion than the clearance [s]; None if none does."""
-        times = motion.times + (begins - self._since)
-        first = self._collision.first_unproved_time(times, motion.positions, clearance)
-        return None if first is None else first + self._since
-
-    def comes_to(
-        self, q: Float[ndarray, "n dof"], times: Float[ndarray, "n"], rest_time: float
-    ) -> float | None:
-        """When an obstacle first touches the arm on its way, or while it then rests for `rest_time` [s]; None
-        if none."""
-        times = np.append(times, times[-1] + rest_time) - self._since
-        first = self._collision.first_unproved_time(times, np.concatenate([q, q[-1:]]), 0.0)
-        return None if first is None else first + self._since
-
-    def comes(self, q: Float[ndarray, "dof"], time: float, rest_time: float) -> float | None:
-        """When an obstacle first touches the arm at rest [s]; None if none does."""
-        return self.comes_to(q[None], np.array([time]), rest_time)
-
-    def free(self, motion: Trajectory, begins: float, settings: ReplannerSettings) -> bool:
-        """Whether no obstacle touches the arm up to the horizon, or until it has rested at the end for the
-        rest time."""
-        soon = max(int(np.searchsorted(motion.times, settings.horizon)), 1)
-        times = motion.times[:soon] + begins
-        rest_time = settings.rest_time if soon == len(motion.times) else 0.0
-        return self.comes_to(motion.positions[:soon], times, rest_time + 1e-3) is None

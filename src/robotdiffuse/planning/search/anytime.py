@@ -1,4 +1,8 @@
-"""The anytime loop of the search planners: find a first path, shorten it, and validate paths on the way."""
+"""The anytime loop of the search planners: find a first path, improve it, and validate paths on the way.
+
+With the objective "length" a call returns the shortest path found. With "time", every path found is also
+the start of a local search for a faster motion, and the call returns the motion that takes the least time.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,15 +17,18 @@ from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, Positive, Settings
-from robotdiffuse.core.types import CONVERGED, FIRST, Tree
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.core.types import FIRST, TIME, TIME_LIMIT, Tree
+from robotdiffuse.planning.context import DEFAULT_CLEARANCE, PlanningContext
 from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.search.time_optimization import Candidate, TimeOptimization, still_improves
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.simplification import simplify, tighten
 
 MIN_CLEARANCE = 0.002
 """Clearance that is tried even if none is requested [m]: telling contact from near contact is costly, and
 paths are hardly longer."""
+FALLING_FRACTIONS = (1.0, 0.5, 0.25)
+"""Fractions of a clearance that are tried; after those of one above the default clearance, the default's."""
 ITERATIONS_PER_CLEARANCE = 400
 """Iterations at a clearance before the next lower one is tried."""
 FALLBACK_INTERVAL = 8_000
@@ -38,6 +45,19 @@ TIGHTENING_FACTOR = 1.05
 """Paths longer than this factor of the best length are not tightened: tightening shortens by less."""
 OPTIMALITY_TOLERANCE = 1e-4
 """A path that exceeds the straight line by no more than this part is optimal."""
+NEAR_FACTOR = 1.3
+"""Paths up to this factor of the best length may become the fastest motion."""
+ATTEMPTS_PER_ITERATION = 0.2
+"""Attempts to make a motion faster per iteration of the search; both then take about the same time."""
+ATTEMPTS_AFTER_SEARCH = 200
+"""Attempts between two checks whether to go on, once the search has ended."""
+TIME_GAIN, TIME_PATIENCE = 0.005, 800
+"""With until "converged", attempts end when doubling them reduced the time by less than this part, but not
+before this many."""
+MIN_TIME_GAIN = 0.01
+"""A faster motion is validated before the search ends if its estimated time is less by this part."""
+FINAL_CANDIDATES = 2
+"""Number of valid motions of which the fastest is returned, if there is time to validate as many."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +122,8 @@ class AnytimeSearch:
         """Number of paths that the search found."""
         self.history = list[tuple[ndarray, str]]()
         """Each path that was the shortest when it was found, and its stage."""
+        self.motions: TimeOptimization | None = None
+        """The fastest motions near the paths found, if the objective is time."""
         self._lengths = list[tuple[int, float]]()
         self._untightened = False
         """Whether the best path is not tightened yet: the first one is, once there is time to improve it."""
@@ -109,8 +131,7 @@ class AnytimeSearch:
         self._round: _Round | None = None
         self._grown: rrt_kernel.Trees | None = None
         """The trees that found the shortest path of the search; those that grow until there is one."""
-        wanted = [share * context.clearance for share in (1.0, 0.5, 0.25)]
-        usual = [*(kept for kept in wanted if kept > MIN_CLEARANCE), MIN_CLEARANCE, 0.0]
+        usual = usual_clearances(context.clearance)
         self._clearances, self._tries = [*clearances] or usual, tries
         self._set_level(0)
 
@@ -171,10 +192,7 @@ class AnytimeSearch:
     def improves(self, gain: float, patience: int) -> bool:
         """Whether to search on: the last doubling of the work shortened the path by at least the part `gain`,
         or there were fewer than `patience` iterations."""
-        half = [length for work, length in self._lengths if work <= self.work / 2]
-        if self.work < patience or not half:
-            return True
-        return bool(half[-1] - self.length >= gain * half[-1])
+        return still_improves(self._lengths, self.work, float(self.length), gain, patience)
 
     def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
         """Simplify a path from the start to a goal, free in `space`, and keep it if it is the shortest so
@@ -188,6 +206,8 @@ class AnytimeSearch:
         elif length < TIGHTENING_FACTOR * self.length:
             path = tighten(self.space, path, settings.tightenings, self._state)
             length = path_length(path)
+        if self.motions is not None and length < NEAR_FACTOR * self.length:
+            self.motions.offer(self.space, path, stage)
         return bool(length < self.length) and self._take(path, float(length), stage)
 
     def _take(self, path: Float[ndarray, "n dof"], length: float, stage: str) -> bool:
@@ -262,6 +282,16 @@ class AnytimeSearch:
                 self._grown = now.trees
 
 
+def usual_clearances(wanted: float) -> list[float]:
+    """The clearances that a search tries one after the other [m]: the wanted one and fractions of it, the
+    default one's if that is less, MIN_CLEARANCE and 0."""
+    falling = [share * wanted for share in FALLING_FRACTIONS]
+    if wanted > DEFAULT_CLEARANCE:
+        usual = [share * DEFAULT_CLEARANCE for share in FALLING_FRACTIONS]
+        falling = [*(kept for kept in falling if kept > DEFAULT_CLEARANCE), *usual]
+    return [*(kept for kept in falling if kept > MIN_CLEARANCE), MIN_CLEARANCE, 0.0]
+
+
 @dataclass
 class _Round:
     """The trees of a round, and the iterations left for them."""
@@ -277,26 +307,39 @@ class _Validation:
         self.context, self.search = context, search
         self.best: PlanResult | None = None
         self._path: ndarray | None = None
+        self._shortest: PlanResult | None = None
+        """The last valid path of the search, and its result."""
         self._validated_at = 0
+        self._late = False
+        """Whether a path was validated after the time for searching had run out."""
 
     @property
     def due(self) -> bool:
-        """Whether to validate now: the first path at once, shorter ones every VALIDATION_INTERVAL
+        """Whether to validate now: the first path at once, better ones every VALIDATION_INTERVAL
         iterations."""
         rested = self.search.work >= self._validated_at + VALIDATION_INTERVAL
-        return self.best is None or (rested and self.search.best is not self._path)
+        return self.best is None or (rested and self._improved())
+
+    def _improved(self) -> bool:
+        motions = self.search.motions
+        if motions is None or motions.best is None:
+            return self.search.best is not self._path
+        return motions.best.time < (1 - MIN_TIME_GAIN) * _duration(self.best)
 
     def run(self) -> bool:
         """Validate the best path of the search; if it is refused, the search goes back to the last valid one.
 
         Returns whether there is a valid path to answer with.
         """
-        search = self.search
+        search, motions = self.search, self.search.motions
         assert search.best is not None
         self._validated_at = search.work
-        if search.best is self._path:
+        self._late = self.context.remaining <= 0
+        if motions is not None and motions.best is not None and (self.best is not None or self._late):
+            self._accepts_motion(motions.best)
+        if motions is not None and self.best is not None:
             return True
-        if self._accepts(search.best, search.stage):
+        if search.best is self._path or self._accepts(search.best, search.stage):
             return True
         if self.context.remaining <= 0 and self.best is None:
             # no time to search on: try the path before it
@@ -304,13 +347,61 @@ class _Validation:
         search.refuse(self._path)
         return False
 
+    def run_last(self) -> None:
+        """Make the best result the fastest of the best motions found and of the shortest path's.
+
+        Results before these count only if time ran out, or else the clock would decide which is returned.
+        """
+        search, motions, before = self.search, self.search.motions, self.best
+        if motions is None or before is None or self.context.ended or self._late:
+            return
+        self.best = None
+        accepted = 0
+        for candidate in motions.fastest():
+            accepted += self._accepts_motion(candidate)
+            if accepted == FINAL_CANDIDATES or self.context.remaining <= 0:
+                break
+        if self.context.remaining > 0 and search.best is not None:
+            if search.best is self._path:
+                self._keep(self._shortest)
+            else:
+                self._accepts(search.best, search.stage)
+        if self.best is None or self.context.remaining <= 0:
+            self._keep(before)
+
     def _accepts(self, path: ndarray, stage: str) -> bool:
-        search = self.search
-        waypoints = search.start_goal.complete(path)
-        result = self.context.finish(waypoints, stage, notes=search.notes, keeps=search.keeps_clearance)
+        result = self._finished(self.search.start_goal.complete(path), stage, None)
         if result is not None:
-            self.best, self._path = result, path
+            self._path, self._shortest = path, result
         return result is not None
+
+    def _accepts_motion(self, candidate: Candidate) -> bool:
+        start_goal, most = self.search.start_goal, self.context.timing.corner_deviation
+        path = start_goal.complete(candidate.path)
+        # the exact start or goal may be added beside the ends of the search
+        deviations = np.full(len(path), most)
+        begins = start_goal.start_lead
+        assert begins is not None  # else there would be no path
+        first = 1 if np.array_equal(begins, start_goal.start) else 2
+        deviations[first : first + len(candidate.deviations)] = candidate.deviations
+        return self._finished(path, candidate.stage, deviations) is not None
+
+    def _finished(self, path: ndarray, stage: str, deviations: ndarray | None) -> PlanResult | None:
+        """Validate and time a path, and keep its result."""
+        search = self.search
+        keeps = search.keeps_clearance
+        result = self.context.finish(path, stage, notes=search.notes, keeps=keeps, deviations=deviations)
+        self._keep(result)
+        return result
+
+    def _keep(self, result: PlanResult | None) -> None:
+        """Make a result the best one, unless its motion takes longer and the objective is time."""
+        if result is not None and (self.search.motions is None or _duration(result) < _duration(self.best)):
+            self.best = result
+
+
+def _duration(result: PlanResult | None) -> float:
+    return np.inf if result is None or result.duration is None else result.duration
 
 
 def anytime(
@@ -320,24 +411,50 @@ def anytime(
     improve: Callable[[], None],
     fallback: Callable[[], None] | None = None,
 ) -> PlanResult:
-    """Search for a path, and for shorter ones for as long as the call's `until` says.
+    """Search for a path, and for better ones for as long as the call's `until` says.
 
     improves: whether more time is still likely to shorten the path.
     improve: spends some time on shorter paths.
     fallback: may offer paths where the search finds none at any clearance.
     """
+    request, problem = context.request, context.problem
+    if request.objective == TIME and request.until != FIRST and not problem.constraints:
+        search.motions = TimeOptimization(
+            problem.robot, context.timing, search.start, search.goals, request.seed
+        )
+    motions = search.motions
+
+    def searches() -> bool:
+        return not search.shortest and (request.until == TIME_LIMIT or improves())
+
+    def optimizes() -> bool:
+        if motions is None or not motions.candidates:
+            return False
+        return request.until == TIME_LIMIT or motions.improves(TIME_GAIN, TIME_PATIENCE)
 
     def ended() -> bool:
-        done = context.request.until == FIRST or search.shortest or context.remaining <= 0
-        return done or (context.request.until == CONVERGED and not improves())
+        if request.until == FIRST or context.remaining <= 0 or (motions is not None and motions.optimal):
+            return True
+        return not (searches() or optimizes())
 
     validation = _Validation(context, search)
     while search.first(context.search_until, fallback):
-        if ended() or (context.validates_early and validation.due):
+        done = ended()
+        if done and motions is not None and validation.best is not None:
+            break
+        if done or (context.validates_early and validation.due):
             if validation.run() and ended():
                 break
             if validation.best is None and context.remaining <= 0:
                 break
         else:
-            improve()
+            searching = searches()
+            if searching:
+                improve()
+            if motions is not None:
+                share = ATTEMPTS_PER_ITERATION * search.work
+                wanted = share if searching else motions.attempts + ATTEMPTS_AFTER_SEARCH
+                while motions.attempts < wanted and context.remaining > 0 and motions.candidates:
+                    motions.improve(search.space)
+    validation.run_last()
     return replace(validation.best or context.unsolved(), trees=search.trees)

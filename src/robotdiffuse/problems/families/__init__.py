@@ -19,6 +19,7 @@ FAMILIES = Registry(
         "clutter": Entry(f"{HERE}.clutter:CLUTTER", "between many small objects on a table"),
         "kitchen": Entry(f"{HERE}.kitchen:KITCHEN", "in ovens and cupboards and on a counter"),
     },
+    group="robotdiffuse.families",
 )
 """Append new families at the end: the seeds of held-out problems depend on the position in this table."""
 

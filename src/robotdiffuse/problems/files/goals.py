@@ -1,5 +1,6 @@
 """Reads and writes goals of problem files.
 
+[...], or the name of a pose of the robot
 {joints: [...]}
 {joint_set: [[...], [...]]}
 {pose: {frame: panda_hand, xyz: [...], wxyz: [...]}}
@@ -18,6 +19,8 @@ from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.problems.files.robot_setup import pose_of
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
+from robotdiffuse.robots.named_poses import named_pose
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
 
@@ -25,20 +28,28 @@ GOAL_KINDS = ("joints", "joint_set", "pose", "poses", "any")
 TOLERANCES = ("xyz_tolerance", "rpy_tolerance")
 
 
-def read_goal(field: str, data: object, scene: Scene) -> Goal:
+def read_goal(field: str, data: object, scene: Scene, robot: Robot) -> Goal:
     """The goal of an entry of a problem file. Raises InputError that names the field.
+
+    As in Python, it may also be a configuration, a list of them, the name of a pose of the robot, or a list
+    of goals, any of which may be reached.
 
     Poses are in the frame of the scene, or of the object of the scene that `relative_to` names.
     """
+    if isinstance(data, str):
+        return JointGoal(named_pose(robot, field, data))
+    if isinstance(data, list):
+        data = {_kind_of_list(data): data}
     if not isinstance(data, dict) or len(data) != 1:
-        raise InputError(f"{field} is {shown(data)}; it must be one of {', '.join(GOAL_KINDS)}")
+        kinds = ", ".join(GOAL_KINDS)
+        raise InputError(f"{field} is {shown(data)}; it must be one of {kinds}, or a configuration")
     [(kind, value)] = data.items()
     if kind not in GOAL_KINDS:
         raise unknown_name(f"field of {field}:", kind, GOAL_KINDS)
     if kind == "any":
         if not isinstance(value, list) or not value:
             raise InputError(f"{field}.any is {shown(value)}; it must be a non-empty list of goals")
-        goals = [read_goal(f"{field}.any[{i}]", one, scene) for i, one in enumerate(value)]
+        goals = [read_goal(f"{field}.any[{i}]", one, scene, robot) for i, one in enumerate(value)]
         return AnyGoal(tuple(goals))  # type: ignore[arg-type]
     if kind == "pose":
         return _pose_goal(f"{field}.pose", value, scene)
@@ -47,6 +58,8 @@ def read_goal(field: str, data: object, scene: Scene) -> Goal:
             raise InputError(f"{field}.poses is {shown(value)}; it must map link names to poses")
         each = [_pose_goal(f"{field}.poses.{frame}", one, scene, frame) for frame, one in value.items()]
         return PosesGoal(each)
+    if kind == "joints" and isinstance(value, str):
+        value = named_pose(robot, f"{field}.joints", value)
     array = numbers(value)
     if array is None or array.ndim != (1 if kind == "joints" else 2):
         form = "a list of numbers" if kind == "joints" else "a list of configurations of one length"
@@ -54,11 +67,18 @@ def read_goal(field: str, data: object, scene: Scene) -> Goal:
     return JointGoal(array)
 
 
-def read_waypoints(data: object, scene: Scene) -> tuple[Goal, ...]:
+def _kind_of_list(data: list[Any]) -> str:
+    """Which of GOAL_KINDS a list stands for."""
+    if any(isinstance(one, dict | str) for one in data):
+        return "any"
+    return "joint_set" if data and all(isinstance(one, list) for one in data) else "joints"
+
+
+def read_waypoints(data: object, scene: Scene, robot: Robot) -> tuple[Goal, ...]:
     """The waypoints of a problem file. Raises InputError that names the field."""
     if not isinstance(data, list):
         raise InputError(f"waypoints is {shown(data)}; it must be a list of goals")
-    return tuple(read_goal(f"waypoints[{i}]", one, scene) for i, one in enumerate(data))
+    return tuple(read_goal(f"waypoints[{i}]", one, scene, robot) for i, one in enumerate(data))
 
 
 def goal_entry(goal: Goal) -> dict[str, Any]:

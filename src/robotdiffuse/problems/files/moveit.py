@@ -23,18 +23,21 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
+from robotdiffuse.problems.files.moveit_shapes import cone, plane
 from robotdiffuse.robots.bodies import AttachedBody
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
+from robotdiffuse.scenes.octomap import cover_radius, occupied_voxels
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
 
 PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shape]]] = {
     "box": (3, lambda size, xyz, wxyz, name: Box(xyz, size, wxyz, name)),
     "sphere": (1, lambda size, xyz, wxyz, name: Sphere(xyz, size[0], name)),
     "cylinder": (2, lambda size, xyz, wxyz, name: Cylinder(xyz, size[1], size[0], wxyz, name)),
+    "cone": (2, cone),
 }
-"""For each type, the number of its dimensions and the shape (a cylinder's dimensions are height, radius)."""
+"""For each type, the number of its dimensions and the shape (of cylinders and cones height and radius)."""
 TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
 """Numbers of the types in messages (shape_msgs/SolidPrimitive)."""
 NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
@@ -68,23 +71,19 @@ class MoveItRequest:
     """Notes on parts of the request that are ignored."""
 
 
-def read_moveit_scene(file: str | Path, robot: Robot | None = None, ignore_joints: bool = False) -> Scene:
-    """The collision objects of a planning scene, in the frame of the robot's base.
+def read_moveit_scene(
+    file: str | Path, robot: Robot | None = None, ignore_joints: bool = False
+) -> tuple[Scene, tuple[str, ...]]:
+    """The collision objects of a planning scene, in the frame of the robot's base, and notes on differences
+    between the scene's robot and `robot`.
 
     The pose of the root of the robot's URDF comes from robot_state.multi_dof_joint_state, the pose of its
     base relative to the root from the robot (None: base and root are the same), and frames from
     fixed_frame_transforms and from the links that are fixed to the base. The allowed collision matrix is
     ignored, because the robot has its own. Raises InputError, naming file and object, for a missing or
-    damaged file, unknown frames, shapes that are not supported (cone, plane, octomap), and, unless
+    damaged file, unknown frames, shapes that are not supported (prisms), and, unless
     `ignore_joints`, joints that the robot lacks.
     """
-    return read_noted_moveit_scene(file, robot, ignore_joints)[0]
-
-
-def read_noted_moveit_scene(
-    file: str | Path, robot: Robot | None = None, ignore_joints: bool = False
-) -> tuple[Scene, tuple[str, ...]]:
-    """`read_moveit_scene`, and notes on differences between the scene's robot and `robot`."""
     data = read_yaml(file)
     try:
         notes = () if robot is None else scene_robot_notes(data, robot, ignore_joints)
@@ -225,10 +224,7 @@ def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
 def moveit_scene(data: object, frames: MoveItFrames, folder: Path) -> Scene:
     """`read_moveit_scene` for a parsed file; names of mesh files are relative to `folder`."""
     world = _mapping("world", _mapping("a planning scene", data).get("world"))
-    octomap = _mapping("octomap", _mapping("octomap", world.get("octomap")).get("octomap"))
-    if octomap.get("data"):
-        raise InputError("world.octomap is not supported; give the points as a point cloud")
-    shapes: list[Shape] = []
+    shapes = _octomap(_mapping("world.octomap", world.get("octomap")), frames)
     for i, entry in enumerate(_list("world.collision_objects", world.get("collision_objects"))):
         shown_id = _mapping(f"collision object {i}", entry).get("id", i)
         try:
@@ -238,12 +234,36 @@ def moveit_scene(data: object, frames: MoveItFrames, folder: Path) -> Scene:
     return Scene(shapes)
 
 
+def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
+    """The occupied voxels of an OctomapWithPose as a cloud of spheres around them; none without data."""
+    message = _mapping("world.octomap.octomap", entry.get("octomap"))
+    data = _list("world.octomap.octomap.data", message.get("data"))
+    if not data:
+        return []
+    if not message.get("binary"):
+        raise InputError("world.octomap is not binary; publish it as a binary octomap (octomap_binary)")
+    where = "world.octomap.octomap.data"
+    bytes_ = (vector(where, "data", data, len(data)).astype(np.int64) % 256).astype(np.uint8).tobytes()
+    edge = float(vector("world.octomap.octomap", "resolution", [message.get("resolution")], 1)[0])
+    T = frames.of("world.octomap", entry) @ _pose("world.octomap.origin", entry.get("origin") or NO_POSE)
+    try:
+        cloud = PointCloud(occupied_voxels(bytes_, edge), cover_radius(edge), name="octomap")
+    except InputError as error:
+        raise InputError(f"world.octomap: {error}") from None
+    return [cloud.moved(T)]
+
+
 def _object(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> list[Shape]:
-    if _list("planes", entry.get("planes")):
-        raise InputError("planes are not supported; use a large box")
     T_base_object = frames.of("header", entry) @ _pose("pose", entry.get("pose") or NO_POSE)
     name = str(entry.get("id") or "object")
+    planes = _list("planes", entry.get("planes"))
+    poses = _list("plane_poses", entry.get("plane_poses")) or [NO_POSE] * len(planes)
+    if len(poses) != len(planes):
+        raise InputError(f"has {len(planes)} planes and {len(poses)} plane_poses; it must be one for each")
     shapes: list[Shape] = []
+    for i, (part, pose) in enumerate(zip(planes, poses, strict=True)):
+        coefficients = vector(f"planes[{i}]", "coef", _mapping(f"planes[{i}]", part).get("coef"), 4)
+        shapes.append(plane(coefficients, name).moved(T_base_object @ _pose(f"plane_poses[{i}]", pose)))
     for key, build in (("primitive", _primitive), ("mesh", _mesh)):
         plural = "meshes" if key == "mesh" else "primitives"
         parts = _list(plural, entry.get(plural))

@@ -40,7 +40,6 @@ from robotdiffuse.problems.files.robot_setup import (
     rounded,
 )
 from robotdiffuse.problems.problem import (
-    OPTIMISTIC,
     Goal,
     JointGoal,
     PoseGoal,
@@ -180,7 +179,7 @@ def problem_record(
         record["clearance"] = problem.clearance
     if views:
         record["views"] = written([view_entry(view, folder) for view in views])
-    if problem.unknown != OPTIMISTIC:
+    if problem.unknown is not None:
         record["unknown"] = problem.unknown
     return record
 
@@ -320,6 +319,11 @@ def _problem(
     ignore_joints: bool = False,
 ) -> Problem:
     try:
+        if isinstance(data, dict) and {"status", "planner"} <= data.keys():
+            raise InputError(
+                "it is a result, not a problem; `robotdiffuse view` draws it and `robotdiffuse verify` "
+                "validates it"
+            )
         requested = isinstance(data, dict) and "request" in data
         required = REQUIRED_WITH_REQUEST if requested else REQUIRED_FIELDS
         values = check_fields("problem", data, required, OPTIONAL_FIELDS)
@@ -332,7 +336,7 @@ def _problem(
             )
         options: dict[str, Any] = {}
         if "clearance" in values:
-            options["clearance"] = check_clearance("clearance", values["clearance"])
+            options["clearance"] = check_clearance(values["clearance"])
         frames, model = moveit_frames({}, robot), ""
         if isinstance(values["scene"], str):
             file = folder / values["scene"]
@@ -344,7 +348,7 @@ def _problem(
             scene, scene_notes = read_scene(values["scene"], folder)
             notes += scene_notes
         options["views"], view_notes = read_views(values.get("views", []), folder)
-        options["unknown"] = values.get("unknown", OPTIMISTIC)
+        options["unknown"] = values.get("unknown")
         for name in NOT_WITH_REQUEST:
             if requested and name in values:
                 raise InputError(f"{name} cannot be combined with request")
@@ -355,10 +359,10 @@ def _problem(
             notes += request_robot_notes(request, robot, model, ignore_joints)
             request = replace(request, notes=(*request.notes, *notes, *view_notes))
             return _requested(robot, scene, request, options)  # type: ignore[arg-type]
-        goal = read_goal("goal", values["goal"], scene)
+        goal = read_goal("goal", values["goal"], scene, robot)
         options |= {
             "notes": (*notes, *view_notes),
-            "waypoints": read_waypoints(values.get("waypoints", []), scene),
+            "waypoints": read_waypoints(values.get("waypoints", []), scene, robot),
             "moving": read_moving(values.get("moving", []), folder),
             "start_velocity": values.get("start_velocity"),
             "blend": values.get("blend", ()),

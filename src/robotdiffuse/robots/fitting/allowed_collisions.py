@@ -1,23 +1,13 @@
 """Finds pairs of links that need no collision check against each other, by sampling configurations."""
 
-# Coal's Python module has no type information.
-# pyright: reportAttributeAccessIssue=false
-
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 
-import coal
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from numpy import ndarray
-from scipy.optimize import linprog
 
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
-from robotdiffuse.robots.fitting.convex_parts import planes_of
-from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
+from robotdiffuse.robots.fitting.sampled_links import NEAR_DISTANCE, Links
 from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 from robotdiffuse.robots.robot import Robot
 
@@ -25,24 +15,15 @@ ADJACENT, ALWAYS, NEVER, CHECKED = "adjacent", "always", "never", "checked"
 DEFAULT, POSE, LIMITS = "default", "pose", "limits"
 NAMED, BY_SRDF = "named", "srdf"
 """Reasons given by the user: the pair was named when the robot was added, or an SRDF allows it."""
-BINS = 24
-"""Bins of a joint's range, to test whether the joint alone determines when two links collide."""
-MAX_STOPPED_RANGE = 5.2
-"""A joint with a narrower range has mechanical stops [rad]; limits of wider ranges may be arbitrary."""
 ADJACENT_STRIDE = 10
 """One in this many samples is tested for adjacent links, which are allowed in any case."""
-MIN_LIMITS_COLLIDING, MAX_UNEXPLAINED = 0.2, 0.25
-"""For the reason `limits`: the smallest fraction of colliding configurations, and the largest fraction of the
-variance of colliding that the joint with the stop leaves unexplained."""
+MIN_LIMITS_COLLIDING = 0.2
+"""Smallest fraction of colliding configurations for the reason `limits`."""
 MAX_HELD_JOINTS = 1
 """Largest number of held joints between an arm's link and another link that belongs to the arm, such as the
 bellows of a lift. Links after more held joints belong to a head or another arm."""
 MAX_POSE_OVERLAP = 0.03
 """If links overlap in a named pose by less than this, their meshes count as coarse there [m]."""
-BALL_MARGIN = 1e-9
-"""Margin of bounding and inscribed balls of meshes [m], larger than rounding errors."""
-NEAR_DISTANCE = 0.1
-"""For pairs of links that stay further apart than this, fewer descents are made [m]."""
 
 
 @dataclass(frozen=True)
@@ -210,217 +191,3 @@ def _adjacent(robot: Robot) -> set[frozenset[str]]:
         solid[joint.child] = joint.child if joint.child in robot.meshes else above
         pairs.add(frozenset((above, joint.child)))
     return pairs
-
-
-class Links:
-    """Poses of all links for batches of values of all movable joints, and collision tests of pairs of
-    links."""
-
-    def __init__(self, robot: Robot) -> None:
-        self.robot = robot
-        self.joints = [j for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None]
-        self.lower = np.array([joint.lower for joint in self.joints])
-        self.upper = np.array([joint.upper for joint in self.joints])
-        self._hit: dict[tuple[str, str], tuple[int, int]] = {}
-        self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
-        self._leading: dict[frozenset[str], tuple[str, list[Joint]]] = {}
-        self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
-
-    @cached_property
-    def hulls(self) -> dict[str, list["coal.Convex"]]:
-        meshes = self.robot.meshes.items()
-        return {link: [coal_convex(mesh.vertices, mesh.faces) for mesh in parts] for link, parts in meshes}
-
-    @cached_property
-    def balls(self) -> dict[str, Float[ndarray, "parts 4"]]:
-        """Balls [x y z radius] around each part, by link [m]."""
-        return {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
-
-    @cached_property
-    def inner(self) -> dict[str, Float[ndarray, "parts 4"]]:
-        """Balls [x y z radius] inside each part, by link [m]."""
-        return {link: np.stack([_inner(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
-
-    def random(self, count: int, rng: np.random.Generator) -> Float[ndarray, "n d"]:
-        """Uniform values of all joints within their limits."""
-        return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
-
-    def named(self, pose: dict[str, float]) -> Float[ndarray, "d"]:
-        """Values of all joints in a named pose; joints that it omits keep their locked value, or else
-        zero."""
-        rest = self.robot.locked | pose
-        return np.array([rest.get(j.name, min(max(0.0, j.lower), j.upper)) for j in self.joints])
-
-    def stop_explains(self, joint: Joint, q: Float[ndarray, "n d"], colliding: Bool[ndarray, "n"]) -> bool:
-        """Whether a joint alone determines in which configurations two links collide, up to one of its
-        stops."""
-        if joint not in self.joints or joint.upper - joint.lower > MAX_STOPPED_RANGE:
-            return False
-        share = (q[:, self.joints.index(joint)] - joint.lower) / (joint.upper - joint.lower)
-        place = np.minimum((share * BINS).astype(int), BINS - 1)
-        count = np.maximum(np.bincount(place, minlength=BINS), 1)
-        often = np.bincount(place, colliding, minlength=BINS) / count
-        left = (often * (1 - often) * count).sum() / len(q)
-        whole = colliding.mean() * (1 - colliding.mean())
-        return bool(max(often[0], often[-1]) > 0.99 and left < MAX_UNEXPLAINED * whole)
-
-    def poses(
-        self, q: Float[ndarray, "n d"], wanted: frozenset[str] | None = None
-    ) -> dict[str, Float[ndarray, "n 4 4"]]:
-        """T_base_link by link. With `wanted` links, only their relative poses, in the frame of some common
-        link."""
-        start, joints = (self.robot.base, self.robot.joints) if wanted is None else self._between(wanted)
-        poses = {start: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
-        for joint in joints:
-            poses[joint.child] = poses[joint.parent] @ self._motion(joint, q)
-        return poses
-
-    def _motion(self, joint: Joint, q: Float[ndarray, "n d"]) -> Float[ndarray, "*n 4 4"]:
-        """T_parent_child for a batch of values of all joints."""
-        if joint.kind not in MOVING_KINDS:
-            return joint.T_parent_joint
-        column, multiplier, offset, still, of_cosine, of_sine = self._moves[joint.name]
-        value = multiplier * q[:, column, None, None] + offset
-        if joint.kind == "prismatic":
-            return still + value * of_sine
-        return still + np.cos(value) * of_cosine + np.sin(value) * of_sine
-
-    @cached_property
-    def _moves(self) -> dict[str, tuple[int, float, float, ndarray, ndarray, ndarray]]:
-        """By movable joint: the column of its (or its leader's) value, the factor and offset of that value,
-        and the matrices C, A, B of T_parent_child = C + cos(value) A + sin(value) B, or C + value B if
-        prismatic."""
-        by_name = {joint.name: joint for joint in self.robot.joints}
-        columns = {joint.name: i for i, joint in enumerate(self.joints)}
-        moves = {}
-        for joint in self.robot.joints:
-            if joint.kind not in MOVING_KINDS:
-                continue
-            leader, multiplier, offset = joint, 1.0, 0.0
-            while leader.mimic is not None:
-                offset += multiplier * leader.mimic.offset
-                multiplier *= leader.mimic.multiplier
-                leader = by_name[leader.mimic.joint]
-            still, of_cosine, of_sine = np.eye(4), np.zeros((4, 4)), np.zeros((4, 4))
-            if joint.kind == "prismatic":
-                of_sine[:3, 3] = joint.axis
-            else:
-                still[:3, :3] = np.outer(joint.axis, joint.axis)
-                of_cosine[:3, :3] = np.eye(3) - still[:3, :3]
-                of_sine[:3, :3] = np.cross(np.eye(3), joint.axis)
-            matrices = (joint.T_parent_joint @ matrix for matrix in (still, of_cosine, of_sine))
-            moves[joint.name] = (columns[leader.name], multiplier, offset, *matrices)
-        return moves
-
-    def _between(self, links: frozenset[str]) -> tuple[str, list[Joint]]:
-        """The last common ancestor of links, and the joints from there to them."""
-        if links not in self._leading:
-            by_child = {joint.child: joint for joint in self.robot.joints}
-            chains = []
-            for link in links:
-                chain = [link]
-                while chain[-1] in by_child:
-                    chain.append(by_child[chain[-1]].parent)
-                chains.append(chain[::-1])
-            common = [link for link, *others in zip(*chains, strict=False) if {*others} <= {link}]
-            needed = {link for chain in chains for link in chain[len(common) :]}
-            joints = [joint for joint in self.robot.joints if joint.child in needed]
-            self._leading[links] = common[-1], joints
-        return self._leading[links]
-
-    def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
-        """Signed distances between the covering spheres of two links [m], a lower bound for their meshes."""
-        first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
-        return -deepest_touches(poses[a], poses[b], first, second, NEAR_DISTANCE, -np.inf)[0]
-
-    def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
-        """Whether the meshes of two links collide in configuration i."""
-        inside = ball_distances(poses[a][i], poses[b][i], self.inner[a], self.inner[b])
-        if (inside < 0).any():
-            return True
-        T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
-        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
-        near = list(zip(*np.nonzero(apart <= 0), strict=True))
-        hit = self._hit.get((a, b))
-        for m, n in [hit, *near] if hit in near else near:
-            self.result.clear()
-            if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.request, self.result):
-                self._hit[a, b] = m, n
-                return True
-        return False
-
-    def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Float[ndarray, "n 3"]:
-        """Points where convex parts of two links overlap in configuration i, one for each pair of parts
-        [m]."""
-        T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
-        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
-        found = []
-        for m, n in zip(*np.nonzero(apart <= 0), strict=True):
-            result = coal.CollisionResult()
-            request = coal.CollisionRequest(coal.CONTACT, 1)
-            if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, request, result):
-                found.append(result.getContact(0).pos)
-        return np.reshape(found, (-1, 3))
-
-    def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
-        """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
-        T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
-        least = np.inf
-        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
-        for k in apart.argsort(axis=None):
-            m, n = divmod(int(k), apart.shape[1])
-            if apart[m, n] >= least:
-                break
-            self.distance_result.clear()
-            distance = coal.distance(
-                self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.distance_request, self.distance_result
-            )
-            least = min(least, distance)
-        return float(least)
-
-    def part_distances(
-        self,
-        poses: dict[str, ndarray],
-        a: str,
-        b: str,
-        rows: Int[ndarray, "n"],
-        parts: Int[ndarray, "2 n"],
-        limit: float,
-    ) -> Float[ndarray, "n"]:
-        """Distances between parts of two links [m]: parts[:, k] in configuration rows[k]. Distances above
-        `limit` are replaced by lower bounds that are above it too."""
-        balls = [self.balls[link][parts[k]] for k, link in enumerate((a, b))]
-        middles = [
-            np.einsum("nij,nj->ni", poses[link][rows, :3, :3], ball[:, :3]) + poses[link][rows, :3, 3]
-            for link, ball in zip((a, b), balls, strict=True)
-        ]
-        found = np.linalg.norm(middles[0] - middles[1], axis=1) - balls[0][:, 3] - balls[1][:, 3]
-        near = np.flatnonzero(found <= limit)
-        places = {int(row): (coal_pose(poses[a][row]), coal_pose(poses[b][row])) for row in set(rows[near])}
-        for k in near:
-            T_a, T_b = places[int(rows[k])]
-            self.distance_result.clear()
-            found[k] = coal.distance(
-                self.hulls[a][parts[0, k]],
-                T_a,
-                self.hulls[b][parts[1, k]],
-                T_b,
-                self.distance_request,
-                self.distance_result,
-            )
-        return found
-
-
-def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
-    """Centre and radius of a ball that contains a mesh [m]."""
-    center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    return np.append(center, np.linalg.norm(mesh.vertices - center, axis=1).max() + BALL_MARGIN)
-
-
-@lru_cache(maxsize=1024)
-def _inner(mesh: ConvexMesh) -> Float[ndarray, "4"]:
-    """Centre and radius of a largest ball inside a convex mesh [m]."""
-    normals, offsets = planes_of(mesh)
-    planes = np.column_stack([normals, np.ones(len(normals))])
-    found = linprog([0, 0, 0, -1], planes, offsets, bounds=[(None, None)] * 3 + [(0, None)])
-    return np.append(found.x[:3], found.x[3] - BALL_MARGIN) if found.success else np.array([0, 0, 0, -np.inf])

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.robots.fitting.allowed_collisions import Links
+from robotdiffuse.robots.fitting.sampled_links import Links
 from robotdiffuse.robots.link_pair_tables import TURN, LinkPairTable
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot

@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numba import njit
 from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.bodies import ConvexMesh
+from robotdiffuse.robots.bodies import ConvexMesh, Surface
 
 MIN_THICKNESS = 1e-3
 """Smallest thickness of a hull [m]: spheres and distances need a sheet to have a volume."""
@@ -77,14 +77,6 @@ class PartSettings:
     def finer(self) -> "PartSettings":
         """The settings with voxels of half the size."""
         return replace(self, voxels=8 * self.voxels, finest=self.finest / 2)
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """A triangle mesh in the frame of its link [m]; it may be open."""
-
-    vertices: Float[ndarray, "v 3"]
-    faces: Int[ndarray, "f 3"]
 
 
 def convex_parts(

@@ -70,7 +70,7 @@ def _lattice(size: Float[ndarray, "3"]) -> tuple[int, ...]:
 
 
 def _slices(corners: Float[ndarray, "v 3"], axis: int, cuts: Float[ndarray, "c"]) -> list[ndarray]:
-    """Corners of the slices that cuts at coordinates along an axis make of the hull of `corners`."""
+    """The hull of `corners`, cut at coordinates along an axis: the corners of each slice."""
     slices = []
     for cut in cuts:
         below, above = corners[corners[:, axis] < cut], corners[corners[:, axis] > cut]

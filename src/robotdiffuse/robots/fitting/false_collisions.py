@@ -14,8 +14,8 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
-from robotdiffuse.robots.fitting.allowed_collisions import Links
 from robotdiffuse.robots.fitting.convex_parts import Surface
+from robotdiffuse.robots.fitting.sampled_links import Links
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import deepest_touches
 from robotdiffuse.robots.robot import Robot
 

@@ -17,7 +17,6 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.fitting.allowed_collisions import (
     CHECKED,
-    Links,
     PairReport,
     SamplingSettings,
     allowed_pairs,
@@ -30,7 +29,9 @@ from robotdiffuse.robots.fitting.false_collisions import (
     PairFalseCollisions,
     measure_false_collisions,
 )
+from robotdiffuse.robots.fitting.grazing_links import with_grazing_links
 from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours
+from robotdiffuse.robots.fitting.sampled_links import Links
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
 from robotdiffuse.robots.fitting.sphere_size_grid import FLOOR_TOLERANCE, Bounds, Solid
 from robotdiffuse.robots.robot import Robot
@@ -39,6 +40,8 @@ from robotdiffuse.robots.scaling import reach
 LARGE_REACH = 1.4
 """Reach beyond which the lengths in the settings grow with the reach [m]: a larger arm works in more space,
 and needs no more parts and spheres."""
+GRAZING_ROUNDS = 10
+"""Measurements of false collisions that look for grazing links: few configurations graze."""
 Progress = Callable[[str, int, int], None]
 """Called with the current activity, the index of the step and the number of steps."""
 CONCAVITY_SHRINKAGE = 0.5
@@ -189,12 +192,17 @@ def prepare(
             break
         robot = _refined(robot, links, false_collisions, k, settings, seed)
     _, _, robot, false_collisions = min(tried, key=lambda one: one[:2])  # refinement can add false collisions
-    closer = _with_finer_parts(robot, links, false_collisions, settings, seed)
+    closer = with_finer_parts(robot, links, false_collisions, settings, seed)
     if closer is not None:
         again = measure_false_collisions(closer, surfaces, settings.samples, np.random.default_rng(seed))
         worst = max(false_collisions.by_spheres, settings.max_false_collisions)
         if again.by_parts < false_collisions.by_parts and again.by_spheres <= worst:
             robot, false_collisions = closer, again
+    measured = (
+        measure_false_collisions(robot, surfaces, settings.samples, np.random.default_rng((seed, k)))
+        for k in range(GRAZING_ROUNDS)
+    )
+    robot = with_grazing_links(robot, surfaces, measured)
     progress("done", steps, steps)
     return Prepared(robot, tuple(_report(robot, name) for name in links), pairs, sampled, false_collisions)
 
@@ -255,7 +263,7 @@ def _refined(
     return _with_tables(robot, close | stale, settings)
 
 
-def _with_finer_parts(
+def with_finer_parts(
     robot: Robot,
     links: dict[str, _Link],
     false_collisions: FalseCollisions,

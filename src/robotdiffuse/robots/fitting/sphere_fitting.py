@@ -42,6 +42,8 @@ EXCESS_TOLERANCE = 0.1
 COARSE_CELLS, FINE_CELLS = (5.0, 60_000), (8.0, 150_000)
 """Cell sizes for choosing spheres and for the final fit: cells per radius of the disc that a sphere covers,
 and the largest number of cells."""
+SMALLEST_TRIANGLE = 2e-6
+"""Smaller pieces of the surface that no single sphere contains count as uncovered [m]."""
 ADDED_SPACING = 0.02
 """Smallest distance between spheres that are added in one round [m]."""
 
@@ -118,11 +120,11 @@ def stick_out(solid: Solid, spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n
     return spheres[:, 3] - solid.inscribed_sizes().at(spheres[:, :3])
 
 
-def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], finest: float = 2e-6) -> bool:
+def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> bool:
     """Whether the spheres provably cover the surface of the union of the meshes.
 
     Triangles that no single sphere contains are cut in four, until all are contained, or a corner is found
-    outside all spheres, or triangles are smaller than `finest` [m].
+    outside all spheres, or triangles are smaller than SMALLEST_TRIANGLE.
     """
     triangles, spheres = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), for_kernels(spheres)
     single = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
@@ -137,7 +139,7 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], fine
         if bare.any():
             return False
         triangles = triangles[is_open]
-        if len(triangles) and np.linalg.norm(np.ptp(triangles, axis=1), axis=1).min() < finest:
+        if len(triangles) and np.linalg.norm(np.ptp(triangles, axis=1), axis=1).min() < SMALLEST_TRIANGLE:
             return False
         a, b, c = np.moveaxis(triangles, 1, 0)
         ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2

@@ -309,7 +309,6 @@ class Session:
                 planner = load_planner(options.planner, settings)
                 planner.warm_up(problem)
                 self._planners[options.planner] = planner
-            planner.load_wanted(problem.robot)
             began = time.perf_counter()
             result = planner.plan(problem, options.time_limit)
             whole = time.perf_counter() - began

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
 from robotdiffuse.planning.planner import compiles_first
 from robotdiffuse.validation.validator import Report
 from robotdiffuse.visualization.live.session import State
@@ -67,4 +68,6 @@ def _why_not(state: State) -> str:
 
 def _distance(metres: float | None) -> str:
     metres = metres or 0.0
+    if metres > CLEARANCE_CAP - 1e-4:
+        return f"more than {CLEARANCE_CAP:g} m"
     return f"{100 * metres:.1f} cm" if metres >= 0.01 else f"{1000 * metres:.1f} mm"

@@ -3,26 +3,24 @@
 A*: P. Hart, N. Nilsson and B. Raphael, "A formal basis for the heuristic determination of minimum cost
 paths", IEEE Trans. SSC 1968. D* Lite: S. Koenig and M. Likhachev, "D* Lite", AAAI 2002, optimized version.
 
-The lattice. In each planned joint, nodes lie whole steps of `spacing` from the start. Edges change one joint
-by a step (or up to `joints_per_move` joints); their cost is joint-space length [rad]. The corners of the cell
-around a goal are connected to it by exact last edges. Nodes and edges are created and checked when a search
-reaches them. The result is the path along the lattice, without shortcuts.
+In each planned joint, nodes lie whole steps of `spacing` from the start. Edges change one joint by a step (or
+up to `joints_per_move` joints); their cost is joint-space length [rad]. The corners of the cell around a goal
+are connected to it by exact last edges. The result is the path along the lattice, without shortcuts.
 
-Limits, with seven joints. A node has 14 neighbours, or 2,186 if all joints may move at once, and a spacing of
-0.3 rad makes 10^9 nodes. The heuristic ignores obstacles: before the search leaves one, it fills the whole
-pocket in front of it, whose size grows with the seventh power of its width. With inflation 1 it also expands
-every node whose straight-line estimate is below the cost, and all orders of the same steps are ties. So
-optimal search is fast only where the path is nearly straight; inflation trades length for speed. Passages
-narrower than a step are not found: no path on the lattice does not mean no path. A path of single-joint steps
-is a staircase, up to sqrt(dof) times as long as the straight line that it follows.
+Limits, with seven joints: a node has 14 neighbours, or 2,186 if all joints may move at once, and a spacing of
+0.3 rad makes 10^9 nodes. The heuristic ignores obstacles: before a search leaves a pocket, it fills it, and
+that takes a time that grows with the seventh power of the pocket's width. Inflation trades length for speed.
+Passages narrower than a step are not found: no path on the lattice does not mean no path. A path of
+single-joint steps is up to sqrt(dof) times as long as the straight line that it follows.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations, product
-from math import ceil, comb, sqrt
-from typing import Annotated, NamedTuple, TypeVar
+from math import comb, sqrt
+from typing import Annotated, Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -34,9 +32,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.core.types import Status
-from robotdiffuse.planning.baselines.lattice import graph as lattice_graph
 from robotdiffuse.planning.baselines.lattice import kernel, table
-from robotdiffuse.planning.baselines.lattice.graph import UNITS, Lattice
+from robotdiffuse.planning.baselines.lattice.kernel import UNITS, Lattice
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal
@@ -101,58 +98,39 @@ class Outcome(Enum):
     """`max_nodes` nodes are in use."""
 
 
-class _Graph(NamedTuple):
-    lattice: Lattice
-    lowest: Float[ndarray, "dof"]
-    highest: Float[ndarray, "dof"]
-    """The joint limits."""
-    start_key: int
-
-    def configurations(self, keys: Int[ndarray, "n"]) -> Float[ndarray, "n dof"]:
-        """The nodes' joint positions."""
-        at = keys[:, None] // self.lattice.strides % self.lattice.counts
-        return np.clip(self.lattice.origin + self.lattice.spacing * at, self.lowest, self.highest)
-
-
-def _make_graph(
+def make_lattice(
     robot: Robot, start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], settings: LatticeSettings
-) -> _Graph:
-    spacing, lower, upper = settings.spacing, robot.lower.astype(float), robot.upper.astype(float)
-    start = start.astype(np.float64)
-    below = np.maximum(np.floor((start - lower) / spacing - LIMIT_MARGIN), 0).astype(np.int64)
-    above = np.maximum(np.floor((upper - start) / spacing - LIMIT_MARGIN), 0).astype(np.int64)
-    counts = below + above + 1
+) -> tuple[Lattice, int]:
+    """The lattice through the start, and the start's key. Raises InputError for one that is too large."""
+    spacing, name = settings.spacing, settings.settings_name
+    below = _steps(start.astype(float) - robot.lower.astype(float), spacing)
+    counts = below + _steps(robot.upper.astype(float) - start.astype(float), spacing) + 1
     if (total := np.prod(counts.astype(float))) >= MAX_NODE_KEYS:
         raise InputError(
-            f"{settings.settings_name}.spacing is {spacing:g}; on {robot.name} that makes {total:.0e} nodes, "
-            f"which must be below {MAX_NODE_KEYS:.0e}: a spacing of "
+            f"{name}.spacing is {spacing:g}; on {robot.name} that makes {total:.0e} nodes, which must be "
+            f"below {MAX_NODE_KEYS:.0e}: a spacing of "
             f"{spacing * (total / MAX_NODE_KEYS) ** (1 / robot.dof) * 1.1:.2g} does it"
         )
-    edges = [comb(robot.dof, k) * 2**k for k in range(1, robot.dof + 1)]
-    if sum(edges[: settings.joints_per_move]) > MAX_MOVES:
-        most = int(np.searchsorted(np.cumsum(edges), MAX_MOVES, side="right"))
+    edges = np.cumsum([comb(robot.dof, k) * 2**k for k in range(1, robot.dof + 1)])
+    if (count := edges[min(settings.joints_per_move, robot.dof) - 1]) > MAX_MOVES:
         raise InputError(
-            f"{settings.settings_name}.joints_per_move is {settings.joints_per_move}; on {robot.name} that "
-            f"makes {sum(edges[: settings.joints_per_move])} edges of a node; it must be at most {most}"
+            f"{name}.joints_per_move is {settings.joints_per_move}; on {robot.name} that makes {count} edges "
+            f"of a node; it must be at most {np.searchsorted(edges, MAX_MOVES, side='right')}"
         )
     strides = np.concatenate([[1], np.cumprod(counts[:-1])]).astype(np.int64)
-    origin = start - spacing * below
+    origin = start.astype(float) - spacing * below
     half = lattice_moves(robot.dof, settings.joints_per_move)
     moves = np.concatenate([half, -half])
-    goals_at = (goals.astype(np.float64) - origin) / spacing
-    lattice = Lattice(
-        origin,
-        float(spacing),
-        counts,
-        strides,
-        moves,
-        np.ceil(UNITS * np.sqrt(np.abs(moves).sum(axis=1))).astype(np.int64),
-        1 / sqrt(min(settings.joints_per_move, robot.dof)),
-        np.ascontiguousarray(goals, np.float32),
-        goals_at,
-        np.floor(goals_at).astype(np.int64),
-    )
-    return _Graph(lattice, lower, upper, int(below @ strides))
+    costs = np.ceil(UNITS * np.sqrt(np.abs(moves).sum(axis=1))).astype(np.int64)
+    slope = 1 / sqrt(min(settings.joints_per_move, robot.dof))
+    goals_at = (goals.astype(float) - origin) / spacing
+    goals = np.ascontiguousarray(goals, np.float32)
+    lattice = Lattice(origin, float(spacing), counts, strides, moves, costs, slope, goals, goals_at)
+    return lattice, int(below @ strides)
+
+
+def _steps(distance: Float[ndarray, "dof"], spacing: float) -> Int[ndarray, "dof"]:
+    return np.maximum(np.floor(distance / spacing - LIMIT_MARGIN), 0).astype(np.int64)
 
 
 def lattice_moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
@@ -170,143 +148,139 @@ def lattice_moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
     return np.array(moves, np.int64)
 
 
-class _Search:
-    """Base of both searches: the graph, the table of nodes, and the path along it."""
+class _Search(ABC, Generic[LatticePlannerSettings]):
+    """Base of both searches: the lattice, the table of nodes, and the path along it."""
+
+    remembers_edges: bool
 
     def __init__(
         self,
         checker: CollisionChecker,
         start: Float[ndarray, "dof"],
         goals: Float[ndarray, "k dof"],
-        settings: LatticeSettings,
-        padding: float,
-        incremental: bool,
+        settings: LatticePlannerSettings,
+        padding: float = 0.0,
     ) -> None:
-        self.checker, self.settings, self.padding = checker, settings, padding
-        self.goals = goals
-        self._graph = _make_graph(checker.robot, start, goals, settings)
-        self._expansions = max(CLOCK_INTERVAL // len(self._graph.lattice.moves), 1)
-        self._table = table.make_table(self._graph.lattice, settings.max_nodes, incremental)
-        self._space = search_space(checker, settings.resolution, padding)
+        """`padding` is the distance to obstacles that paths keep [m]."""
+        self.settings, self.padding, self.goals = settings, padding, goals
+        self._lattice, key = make_lattice(checker.robot, start, goals, settings)
+        moves, dof = self._lattice.moves.shape
+        self._expansions = max(CLOCK_INTERVAL // moves, 1)
+        self._table = table.make_table(settings.max_nodes, self.remembers_edges * moves // 2)
+        self._last = np.zeros((len(goals), self.remembers_edges * 2**dof), np.uint8)
+        self._start = self._table.values[table.START] = table.find_or_add(self._table, key)
+        self._use(checker)
+        self._begin()
+
+    def _use(self, checker: CollisionChecker) -> None:
+        self.checker = checker
+        space = search_space(checker, self.settings.resolution, self.padding)
+        self._search = kernel.make_search(space, self._lattice, self._table, self._last)
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
+        """Search until there is a path, there is none, memory is full, or `stop` returns True."""
+        while True:
+            outcome = Outcome(self._expand())
+            if outcome is not Outcome.GOING or stop():
+                return outcome
+
+    def path(self) -> Float[ndarray, "n dof"] | None:
+        """The start, the nodes at which the path found so far turns, and the goal; None if there is none."""
+        if self._units() >= table.INFINITE:
+            return None
+        keys = self._path_keys()
+        turns = np.ones(len(keys), np.bool_)
+        turns[1:-1] = (np.diff(self._coordinates(keys), 2, axis=0) != 0).any(axis=1)
+        goal = self.goals[self._table.values[table.GOAL]].astype(np.float64)
+        return np.concatenate([self._configurations(keys[turns]), goal[None]])
+
+    @property
+    def cost(self) -> float:
+        """Length of the path found so far [rad]; infinite if there is none."""
+        units = self._units()
+        return float("inf") if units >= table.INFINITE else units * self.settings.spacing / UNITS
 
     @property
     def expansions(self) -> int:
         """Number of expansions so far; a node may be expanded several times."""
-        return int(self._table.count[table.EXPANSIONS])
+        return int(self._table.values[table.EXPANSIONS])
 
     @property
     def nodes(self) -> int:
         """Nodes in memory."""
-        return int(self._table.count[table.NODES]) - 1
+        return int(self._table.values[table.NODES]) - 1
 
-    def _radians(self, units: int) -> float:
-        return float("inf") if units >= table.INFINITE else units * self.settings.spacing / UNITS
+    def _coordinates(self, keys: Int[ndarray, "n"]) -> Int[ndarray, "n dof"]:
+        return keys[:, None] // self._lattice.strides % self._lattice.counts
 
-    def _waypoints(self, keys: Int[ndarray, "n"]) -> Float[ndarray, "m dof"]:
-        """The start, the nodes at which the path turns, and the goal."""
-        lattice = self._graph.lattice
-        at = keys[:, None] // lattice.strides % lattice.counts
-        turns = np.ones(len(keys), np.bool_)
-        turns[1:-1] = (np.diff(at, 2, axis=0) != 0).any(axis=1)
-        goal = self.goals[self._table.count[table.GOAL]].astype(np.float64)
-        return np.concatenate([self._graph.configurations(keys[turns]), goal[None]])
+    def _configurations(self, keys: Int[ndarray, "n"]) -> Float[ndarray, "n dof"]:
+        robot, lattice = self.checker.robot, self._lattice
+        q = lattice.origin + lattice.spacing * self._coordinates(keys)
+        return np.clip(q, robot.lower.astype(float), robot.upper.astype(float))
 
+    @abstractmethod
+    def _begin(self) -> None:
+        """Fill the queue."""
 
-class AStarSearch(_Search):
-    """A* from the start. `start` and at least one of the goals should be free of collision."""
+    @abstractmethod
+    def _expand(self) -> int:
+        """Some expansions; returns the value of an Outcome."""
 
-    def __init__(
-        self,
-        checker: CollisionChecker,
-        start: Float[ndarray, "dof"],
-        goals: Float[ndarray, "k dof"],
-        settings: AStarSettings,
-        padding: float = 0.0,
-    ) -> None:
-        """`padding` is the distance to obstacles that paths keep [m]."""
-        super().__init__(checker, start, goals, settings, padding, incremental=False)
-        self._inflation = float(settings.inflation)
-        kernel.begin_a_star(self._graph.lattice, self._table, self._graph.start_key, self._inflation)
+    @abstractmethod
+    def _units(self) -> int:
+        """Cost of the path found so far [units]."""
 
-    def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
-        """Search until there is a path, there is none, memory is full, or `stop` returns True."""
-        while True:
-            code = kernel.a_star(
-                self._space, self._graph.lattice, self._table, self._inflation, self._expansions
-            )
-            if code != kernel.GOING or stop():
-                return Outcome(code)
-
-    @property
-    def cost(self) -> float:
-        """Length of the best path so far [rad]; infinite if there is none."""
-        return self._radians(int(self._table.g[table.AT_GOAL]))
-
-    def path(self) -> Float[ndarray, "n dof"] | None:
-        """Waypoints from the start to a goal; None if there is none yet."""
-        node = int(self._table.parent[table.AT_GOAL])
-        if self._table.g[table.AT_GOAL] >= table.INFINITE:
-            return None
-        keys = []
-        while node >= 0:
-            keys.append(self._table.keys[node])
-            node = int(self._table.parent[node])
-        return self._waypoints(np.array(keys[::-1]))
+    @abstractmethod
+    def _path_keys(self) -> Int[ndarray, "n"]:
+        """The keys of the path's nodes."""
 
 
-class DStarLiteSearch(_Search):
-    """D* Lite from the goals, which can be repaired when obstacles or the arm have moved."""
+class AStarSearch(_Search[AStarSettings]):
+    """Weighted A* from the start, which must be free, to the nearest goal."""
 
-    def __init__(
-        self,
-        checker: CollisionChecker,
-        start: Float[ndarray, "dof"],
-        goals: Float[ndarray, "k dof"],
-        settings: DStarLiteSettings,
-        padding: float = 0.0,
-    ) -> None:
-        """`padding` is the distance to obstacles that paths keep [m]. Needs memory for 2^dof edges to each
-        goal."""
-        super().__init__(checker, start, goals, settings, padding, incremental=True)
-        self._last = np.zeros((len(goals), 2 ** len(start)), np.uint8)
-        moves = np.abs(self._graph.lattice.moves[: len(self._graph.lattice.moves) // 2])
-        self._reaches = (0.5 * settings.spacing * moves @ largest_motion_radii(checker.robot)).astype(
-            np.float32
-        )
+    remembers_edges = False
+
+    def _begin(self) -> None:
+        self._table.g[self._start], self._table.state[self._start] = 0, table.FREE
+        table.put(self._table, self._start, 0, 0)
+
+    def _expand(self) -> int:
+        return kernel.a_star(self._search, float(self.settings.inflation), self._expansions)
+
+    def _units(self) -> int:
+        return int(self._table.g[table.AT_GOAL])
+
+    def _path_keys(self) -> Int[ndarray, "n"]:
+        nodes = [self._table.rhs[table.AT_GOAL]]
+        while nodes[-1] != self._start:
+            nodes.append(self._table.rhs[nodes[-1]])
+        return self._table.keys[nodes[::-1]]
+
+
+class DStarLiteSearch(_Search[DStarLiteSettings]):
+    """D* Lite from the goals, which can be repaired when obstacles or the arm have moved. Needs memory for
+    2^dof edges to each goal."""
+
+    remembers_edges = True
+
+    def _begin(self) -> None:
+        moves = np.abs(self._lattice.moves[: len(self._lattice.moves) // 2])
+        reaches = 0.5 * self.settings.spacing * moves @ largest_motion_radii(self.checker.robot)
+        self._reaches = reaches.astype(np.float32)
         """How far any point of the arm moves by half of each move [m]."""
-        self._offset = 0
-        self._start = int(table.find_or_add(self._table, self._graph.start_key))
-        self._has_room = self._update(np.full(len(self._table.keys), np.inf, np.float32))
+        self._has_room = self._repair(np.full(len(self._table.keys), np.inf, np.float32))
 
-    def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
-        """Search until there is a path, there is none, memory is full, or `stop` returns True."""
-        if self._table.state[self._start] == table.BLOCKED:
-            return Outcome.EXHAUSTED
-        if not self._has_room:
-            return Outcome.FULL
-        while True:
-            code = kernel.d_star_lite(
-                self._space,
-                self._graph.lattice,
-                self._table,
-                self._last,
-                self._start,
-                self._offset,
-                self._expansions,
-            )
-            if code != kernel.GOING or stop():
-                return Outcome(code)
+    def _repair(self, near: Float[ndarray, "capacity"]) -> bool:
+        return kernel.update(self._search, near, self._reaches)
 
-    @property
-    def cost(self) -> float:
-        """Length of the path that `run` found [rad]; infinite if there is none."""
-        return self._radians(int(self._table.rhs[self._start]))
+    def _expand(self) -> int:
+        return kernel.d_star_lite(self._search, self._expansions) if self._has_room else kernel.FULL
 
-    def path(self) -> Float[ndarray, "n dof"] | None:
-        """Waypoints from the start to a goal, after `run` returned FOUND; None if there is no path."""
-        if self._table.rhs[self._start] >= table.INFINITE:
-            return None
-        return self._waypoints(kernel.path_from(self._graph.lattice, self._table, self._last, self._start))
+    def _units(self) -> int:
+        return int(self._table.rhs[self._start])
+
+    def _path_keys(self) -> Int[ndarray, "n"]:
+        return kernel.path_keys(self._search)
 
     def update(self, checker: CollisionChecker, start: Float[ndarray, "dof"] | None = None) -> None:
         """Take over a changed scene, and a new start at another node of the lattice; `run` then repairs the
@@ -324,9 +298,8 @@ class DStarLiteSearch(_Search):
         if start is not None:
             self._move_start(start)
         near = self._distances_to_changes(checker)
-        self.checker = checker
-        self._space = search_space(checker, self.settings.resolution, self.padding)
-        self._has_room = self._update(near)
+        self._use(checker)
+        self._has_room = self._repair(near)
 
     def _distances_to_changes(self, checker: CollisionChecker) -> Float[ndarray, "capacity"]:
         """A lower bound of the distance of the arm at each node from shapes that were added, removed or moved
@@ -339,36 +312,27 @@ class DStarLiteSearch(_Search):
         if checker.padding != self.checker.padding:
             near[known] = -np.inf
         elif moved:
-            margin = float(self._space.padding) + ROUNDING
-            changes = CollisionChecker(checker.robot, Scene(moved))
-            q = self._graph.configurations(self._table.keys[known])
-            clearances = changes.link_clearances(q, limit=float(self._reaches.max()) + 2 * margin)
+            margin = float(self._search.space.padding) + ROUNDING
+            q, limit = self._configurations(self._table.keys[known]), float(self._reaches.max()) + 2 * margin
+            clearances = CollisionChecker(checker.robot, Scene(moved)).link_clearances(q, limit=limit)
             near[known] = clearances.min(axis=1, initial=np.inf) - margin
         return near
 
     def _move_start(self, start: Float[ndarray, "dof"]) -> None:
-        lattice = self._graph.lattice
+        lattice = self._lattice
         at = (np.asarray(start, np.float64) - lattice.origin) / lattice.spacing
         whole = np.round(at).astype(np.int64)
         if np.abs(at - whole).max() > 1e-3 or (whole < 0).any() or (whole >= lattice.counts).any():
             raise InputError(f"start is {np.round(start, 4)}; it must be a node of the lattice")
-        before = self._table.keys[self._start] // lattice.strides % lattice.counts
-        node = int(table.find_or_add(self._table, int(whole @ lattice.strides)))
+        node = table.find_or_add(self._table, int(whole @ lattice.strides))
         if node < 0:
             raise InputError(
                 f"start is {np.round(start, 4)}; the search has not reached it, and memory is full"
             )
-        steps = np.abs(whole - before)
-        way = max(float(np.linalg.norm(steps)), float(steps.sum()) * lattice.slope)
-        # rounded up: queued keys must stay lower bounds
-        self._offset += ceil(UNITS * way + lattice_graph.ROUNDING) if way else 0
-        self._start = node
-
-    def _update(self, near: Float[ndarray, "capacity"]) -> bool:
-        lattice, offset = self._graph.lattice, self._offset
-        return kernel.update(
-            self._space, lattice, self._table, self._last, self._start, offset, near, self._reaches
-        )
+        if node != self._start:
+            # rounded up: queued keys must stay lower bounds
+            self._table.values[table.OFFSET] += kernel.heuristic(lattice, whole, self._search.start_at, 0) + 2
+        self._start = self._table.values[table.START] = node
 
 
 class _LatticePlanner(Planner[LatticePlannerSettings]):

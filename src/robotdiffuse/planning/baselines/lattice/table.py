@@ -4,7 +4,6 @@ with the place of each node in it."""
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
 
@@ -12,12 +11,10 @@ INFINITE = 1 << 60
 """Cost of nodes that are not reached."""
 UNKNOWN, FREE, BLOCKED, CLOSED = 0, 1, 2, 3
 """States of nodes and edges; CLOSED is a free node that A* has expanded."""
-NODES, QUEUED, EXPANSIONS, GOAL = 0, 1, 2, 3
-"""Places in `Table.count`."""
+NODES, QUEUED, EXPANSIONS, GOAL, START, OFFSET = range(6)
+"""Places in `Table.values`."""
 AT_GOAL = 0
 """The node that stands for the goals."""
-NO_ROOM = -2
-"""Returned in place of a node when memory is full."""
 _FACTOR_1, _FACTOR_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 
@@ -31,9 +28,7 @@ class Table(NamedTuple):
     g: np.ndarray
     """[capacity] A*: cost from the start; D* Lite: to the goal, by the last expansion [units]."""
     rhs: np.ndarray
-    """[capacity] D* Lite: cost to the goal, by the neighbours' g [units]."""
-    parent: np.ndarray
-    """[capacity] A*: the node before."""
+    """[capacity] D* Lite: cost to the goal, by the neighbours' g [units]; A*: the node before."""
     state: np.ndarray
     """[capacity]"""
     edges: np.ndarray
@@ -45,32 +40,23 @@ class Table(NamedTuple):
     first: np.ndarray
     second: np.ndarray
     """[capacity] the keys by which the queue is sorted."""
-    count: np.ndarray
-    """[4] counts at the places NODES, QUEUED, EXPANSIONS, GOAL."""
+    values: np.ndarray
+    """[6] numbers of nodes, queued nodes and expansions; the path's goal; the start and k_m of D* Lite."""
 
 
-@njit(cache=True)
-def make_table(lattice, max_nodes, incremental):
-    """An empty table for `max_nodes` nodes; the system allocates its memory as it is used."""
-    capacity, slots = max_nodes + 1, 1
-    while slots < 2 * capacity:
-        slots *= 2
-    cached = capacity if incremental else 1
+def make_table(max_nodes: int, edges: int) -> Table:
+    """An empty table for `max_nodes` nodes, each with room for `edges` edges; the system allocates its memory
+    as it is used."""
+    capacity = max_nodes + 1
     table = Table(
-        np.zeros(slots, np.int32),
-        np.empty(capacity, np.int64),
-        np.empty(capacity, np.int64),
-        np.empty(cached, np.int64),
-        np.empty(capacity, np.int32),
-        np.zeros(capacity, np.uint8),
-        np.zeros((cached, len(lattice.moves) // 2), np.uint8),
-        np.empty(capacity, np.int32),
-        np.zeros(capacity, np.int32),
-        np.empty(capacity, np.int64),
-        np.empty(capacity, np.int64),
-        np.zeros(4, np.int64),
+        np.zeros(1 << (2 * capacity - 1).bit_length(), np.int32),
+        *(np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity, np.int64)),
+        *(np.zeros(capacity, np.uint8), np.zeros((capacity, edges), np.uint8)),
+        *(np.empty(capacity, np.int32), np.zeros(capacity, np.int32)),
+        *(np.empty(capacity, np.int64), np.empty(capacity, np.int64)),
+        np.zeros(6, np.int64),
     )
-    table.count[NODES] = 1
+    table.values[NODES] = 1
     table.keys[AT_GOAL], table.g[AT_GOAL] = -1, INFINITE
     return table
 
@@ -101,14 +87,12 @@ def find_or_add(table, key):
     i = _slot(table, key)
     if table.slots[i] != 0:
         return np.int64(table.slots[i]) - 1
-    node = table.count[NODES]
+    node = table.values[NODES]
     if node == len(table.keys):
         return np.int64(-1)
-    table.count[NODES] += 1
+    table.values[NODES] += 1
     table.slots[i] = node + 1
-    table.keys[node], table.g[node] = key, INFINITE
-    if len(table.rhs) > 1:
-        table.rhs[node] = INFINITE
+    table.keys[node], table.g[node], table.rhs[node] = key, INFINITE, INFINITE
     return node
 
 
@@ -120,14 +104,13 @@ def _before(table, a, b):
 
 
 @allocation_free()
-def _settle(table, i):
-    """Move the node at place i of the heap up or down to where its keys belong."""
-    heap, place, node = table.heap, table.place, np.int64(table.heap[i])
+def _settle(table, i, node):
+    """Fill the gap at place i of the heap with a node, moved up or down to where its keys belong."""
+    heap, place, queued = table.heap, table.place, table.values[QUEUED]
     while i > 0 and _before(table, node, heap[(i - 1) // 2]):
         heap[i] = heap[(i - 1) // 2]
         place[heap[i]] = i + 1
         i = (i - 1) // 2
-    queued = table.count[QUEUED]
     while 2 * i + 1 < queued:
         child = 2 * i + 1
         if child + 1 < queued and _before(table, heap[child + 1], heap[child]):
@@ -137,8 +120,7 @@ def _settle(table, i):
         heap[i] = heap[child]
         place[heap[i]] = i + 1
         i = child
-    heap[i] = node
-    place[node] = i + 1
+    heap[i], place[node] = node, i + 1
 
 
 @allocation_free()
@@ -146,10 +128,9 @@ def put(table, node, first, second):
     """Queue a node, or change its keys if it is queued."""
     table.first[node], table.second[node] = first, second
     if table.place[node] == 0:
-        table.heap[table.count[QUEUED]] = node
-        table.place[node] = table.count[QUEUED] + 1
-        table.count[QUEUED] += 1
-    _settle(table, np.int64(table.place[node]) - 1)
+        table.values[QUEUED] += 1
+        table.place[node] = table.values[QUEUED]
+    _settle(table, np.int64(table.place[node]) - 1, node)
 
 
 @allocation_free()
@@ -159,9 +140,7 @@ def take(table, node):
     if i < 0:
         return
     table.place[node] = 0
-    table.count[QUEUED] -= 1
-    last = np.int64(table.heap[table.count[QUEUED]])
+    table.values[QUEUED] -= 1
+    last = np.int64(table.heap[table.values[QUEUED]])
     if last != node:
-        table.heap[i] = last
-        table.place[last] = i + 1
-        _settle(table, i)
+        _settle(table, i, last)

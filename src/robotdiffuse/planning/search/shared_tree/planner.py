@@ -94,7 +94,7 @@ class SharedTreeSearch:
         self.start, self.goals = start.astype(np.float32), goals.astype(np.float32)
         self._ends = np.concatenate([self.start[None], self.goals])
         self._clearances = checker.link_clearances(self._ends).min(axis=1, initial=1.0)
-        self._tree = tree.make_tree(self.start, self.goals, settings.capacity + len(goals))
+        self.tree = tree.make_tree(self.start, self.goals, settings.capacity + len(goals))
         self.costs: list[float] = []
         """The best cost after each round [rad], infinite while there is no path."""
         self._distances = self._safety_distances()
@@ -104,33 +104,33 @@ class SharedTreeSearch:
     @property
     def cost(self) -> float:
         """The length of the best path to any goal [rad]; infinite if there is none."""
-        return float(tree.best_cost(self._tree))
+        return float(tree.best_cost(self.tree))
 
     @property
     def goal_costs(self) -> Float[ndarray, "k"]:
         """The length of the best path to each goal [rad]; infinite where there is none."""
-        return np.array([tree.goal_cost(self._tree, g) for g in range(len(self.goals))])
+        return np.array([tree.goal_cost(self.tree, g) for g in range(len(self.goals))])
 
     @property
     def best_goal(self) -> int:
         """The goal that the best path leads to; -1 if there is no path."""
-        return int(tree.best_goal(self._tree))
+        return int(tree.best_goal(self.tree))
 
     @property
     def nodes(self) -> int:
-        return int(self._tree.size[0])
+        return int(self.tree.size[0])
 
     def path(self, goal: int | None = None) -> Float[ndarray, "n dof"] | None:
         """Waypoints of the best path, or of the best one to a goal; None if there is none."""
         g = self.best_goal if goal is None else goal
-        return None if g < 0 or self._tree.goal_node[g] < 0 else tree.path_to(self._tree, g)
+        return None if g < 0 or self.tree.goal_node[g] < 0 else tree.path_to(self.tree, g)
 
     @property
     def finished(self) -> bool:
         """Whether it is enough by the settings: no path can be shorter, or it hardly improves any more."""
         settings, costs = self.settings, self.costs
         if self.cost < np.inf:
-            if not any(tree.goal_is_open(self._tree, g, self.cost) for g in range(len(self.goals))):
+            if not any(tree.goal_is_open(self.tree, g, self.cost) for g in range(len(self.goals))):
                 return True
             if settings.improvement > 0 and len(costs) > settings.patience:
                 before = costs[-1 - settings.patience]
@@ -149,7 +149,7 @@ class SharedTreeSearch:
     def round(self) -> None:
         """Run a round: one path by RRT-Connect, RRT* iterations, and shortcuts of the best path."""
         settings = self.settings
-        g = kernel.draw_goal(self._tree, self.state)
+        g = kernel.draw_goal(self.tree, self.state)
         if g >= 0:
             self._connect(np.arange(len(self.goals)) if self.best_goal < 0 else np.array([g]))
             self._grow()
@@ -182,7 +182,7 @@ class SharedTreeSearch:
         for g, goal in enumerate(self.goals):
             line = np.stack([self.start, goal])
             if motions_free(self._space, line)[0]:
-                tree.graft(self._tree, line, g)
+                tree.graft(self.tree, line, g)
 
     def _connect(self, targets: ndarray) -> None:
         settings = self.settings
@@ -193,26 +193,26 @@ class SharedTreeSearch:
         if len(path):
             self._graft(path, int(targets[np.abs(self.goals[targets] - path[-1]).max(axis=1).argmin()]))
         elif len(targets) == 1:
-            self._tree.failures[targets] += 1
+            self.tree.failures[targets] += 1
 
     def _grow(self) -> None:
         settings, left = self.settings, self.settings.growth
         longest, bias = np.float32(settings.range), np.float32(settings.goal_bias)
         while True:
-            left -= kernel.grow(self._space, self._tree, longest, bias, left, self.state)
+            left -= kernel.grow(self._space, self.tree, longest, bias, left, self.state)
             if left == 0 or not self._make_room(len(self.goals) + 1):
                 return
 
     def _graft(self, path: Float[ndarray, "n dof"], g: int) -> None:
         shorter = shortcut(self._space, path, self.settings.shortcuts, self.state)
         self._make_room(len(shorter))
-        tree.graft(self._tree, shorter, g)
+        tree.graft(self.tree, shorter, g)
 
     def _make_room(self, nodes: int) -> bool:
         """Double the tree's capacity if less than this is left; returns whether that was done."""
-        if self.nodes + nodes < len(self._tree.nodes):
+        if self.nodes + nodes < len(self.tree.nodes):
             return False
-        self._tree = tree.grown(self._tree, 2 * (len(self._tree.nodes) + nodes))
+        self.tree = tree.grown(self.tree, 2 * (len(self.tree.nodes) + nodes))
         return True
 
 

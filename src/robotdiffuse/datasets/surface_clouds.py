@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float32, Int8
 from torch import Generator, Tensor
 
+from robotdiffuse.datasets.surface_clouds_kernel import fill_clouds
 from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
-from robotdiffuse.scenes.surface_clouds_kernel import fill_clouds
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
 CPU_BATCH_POINTS = 1 << 15

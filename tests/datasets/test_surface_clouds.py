@@ -6,12 +6,12 @@ import torch
 from numpy import ndarray
 
 from robotdiffuse.core.transforms import rotation_from_quaternion
+from robotdiffuse.datasets import surface_clouds as module
+from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.training.batches import random_scenes
-from robotdiffuse.scenes import surface_clouds as module
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.scenes.surface_clouds import surface_clouds
 from robotdiffuse.scenes.surface_points import PANDA_REGION, sample_surface
 
 

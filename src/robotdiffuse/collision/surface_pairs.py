@@ -1,0 +1,111 @@
+"""Distances between the surfaces of two grazing links, whose convex parts can overlap where the links do not.
+
+Convex parts fill hollows of a mesh. Where the parts of two links overlap only a little, the triangles that
+the URDF gives decide: they must not touch, and no piece of one link may lie inside the other. The distance of
+the surfaces then bounds motion as that of the parts does: a piece cannot get inside without touching.
+"""
+
+# Coal's Python module has no type information.
+# pyright: reportAttributeAccessIssue=false
+
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from robotdiffuse.collision.convex_geometry import Check, checks_of, surfaces_decide
+from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
+from robotdiffuse.robots.robot import Robot, once_per_robot
+
+MAX_OVERLAP = 0.005
+"""Overlap of convex parts beyond which links collide, whatever their surfaces [m]."""
+RAYS = np.array([[0.6137, 0.5291, 0.5861], [-0.7313, 0.3917, -0.5583], [0.1723, -0.8839, 0.4348]])
+"""Directions of the rays that tell whether a point is inside; along no common edge or face."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """The surface of a link, in the frame that the link is fixed to."""
+
+    frame: int
+    tree: "coal.BVHModelOBBRSS"
+    triangles: Float[ndarray, "f 3 3"]
+    component: Int[ndarray, "f"]
+    """Connected component of each triangle."""
+    points: Float[ndarray, "components 3"]
+    """One point of each component."""
+
+    def inside(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+        """Whether each point may be inside a component: one of several rays crosses it an odd number of
+        times. Points in front of an open component can count as inside."""
+        low, high = self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
+        found = ((points >= low) & (points <= high)).all(axis=1)
+        for i in np.flatnonzero(found):
+            found[i] = any((np.bincount(self._crossed(points[i], ray)) % 2).any() for ray in RAYS)
+        return found
+
+    def _crossed(self, point: Float[ndarray, "3"], ray: Float[ndarray, "3"]) -> Int[ndarray, "k"]:
+        """Component of every triangle that a ray from a point crosses."""
+        a, b, c = np.moveaxis(self.triangles - point, 1, 0)
+        sides = [np.cross(one, other) @ ray for one, other in ((a, b), (b, c), (c, a))]
+        through = np.all([side >= 0 for side in sides], axis=0) | np.all([side < 0 for side in sides], axis=0)
+        normal = np.cross(b - a, c - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = np.einsum("fd,fd->f", normal, a) / (normal @ ray)
+        return self.component[through & (along > 0)]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePair:
+    """The surfaces of two links."""
+
+    first: _Body
+    second: _Body
+
+    def distance(self, frames: Float[ndarray, "frames 4 4"], cutoff: float = np.inf) -> float | None:
+        """Distance of the surfaces [m]; any value of at least `cutoff` beyond it. None if they touch, or a
+        piece of one is inside the other."""
+        a, b = self.first, self.second
+        T_a, T_b = frames[a.frame], frames[b.frame]
+        places = a.tree, coal_pose(T_a), b.tree, coal_pose(T_b)
+        if coal.collide(*places, coal.CollisionRequest(), coal.CollisionResult()):
+            return None
+        for body, T_body, other, T_other in ((a, T_a, b, T_b), (b, T_b, a, T_a)):
+            in_base = other.points @ T_other[:3, :3].T + T_other[:3, 3]
+            if body.inside((in_base - T_body[:3, 3]) @ T_body[:3, :3]).any():
+                return None
+        result = coal.DistanceResult()
+        if np.isfinite(cutoff):
+            result.min_distance = cutoff
+        return float(coal.distance(*places, coal.DistanceRequest(), result))
+
+
+@once_per_robot
+def surface_pairs(robot: Robot) -> dict[Check, SurfacePair]:
+    """The surfaces of each checked pair of grazing links."""
+    bodies: dict[str, _Body] = {}
+    found = {}
+    for check in checks_of(robot):
+        if check.other is None or not surfaces_decide(robot, check):
+            continue
+        for link in (check.link, check.other):
+            if link not in bodies:
+                bodies[link] = _body(robot, link)
+        found[check] = SurfacePair(bodies[check.link], bodies[check.other])
+    return found
+
+
+def _body(robot: Robot, link: str) -> _Body:
+    from scipy.sparse import coo_array  # few robots need it
+    from scipy.sparse.csgraph import connected_components
+
+    T, surface = robot.T_frame_link(link), robot.surfaces[link]
+    vertices, faces = surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces
+    ends = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    edges = coo_array((np.ones(len(ends[0]), bool), ends), (len(vertices),) * 2)
+    _, of_vertices = connected_components(edges, directed=False)
+    _, first, component = np.unique(of_vertices[faces[:, 0]], return_index=True, return_inverse=True)
+    points = vertices[faces[first, 0]]
+    return _Body(robot.link_frame(link), coal_surface(vertices, faces), vertices[faces], component, points)

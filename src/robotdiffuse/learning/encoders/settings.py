@@ -1,0 +1,145 @@
+"""Settings of the encoders; without PyTorch, so that planning can read them."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
+from robotdiffuse.core.settings import Count, Natural, NotNegative, Settings, Sizes
+from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
+
+
+@dataclass(frozen=True)
+class EncoderSettings(Settings, name="encoder"):
+    """Settings that every encoder has."""
+
+    any_size: ClassVar[bool] = True
+    """Whether clouds of any size work well; otherwise they should have about `cloud` points."""
+    ordered: ClassVar[bool] = False
+    """Whether clouds must have exactly `cloud` points, sorted as by `in_order`."""
+    code: Count = 96
+    """Size of z (paper: 60, for two obstacles)."""
+    cloud: Count = 512
+    """Points of an input cloud."""
+    region: VisibleRegion = PANDA_REGION
+    """Points outside are ignored, for the arm does not reach them. Within a large reach whole surfaces
+    count."""
+
+    @classmethod
+    def paper_size(cls) -> "EncoderSettings":
+        """The sizes given by the authors of this encoder, with z of this paper's size."""
+        return cls(code=60)
+
+    def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
+        """Points within the region in the form that the exported encoder takes [m]."""
+        if self.ordered:
+            return in_order(points, self.cloud)
+        # zeros count for nothing; the exported network needs a point, and exactly `cloud` unless any_size
+        needed = 1 if self.any_size else self.cloud
+        return np.pad(points, ((0, max(needed - len(points), 0)), (0, 0)))
+
+
+ORDER_STEPS = 2**20 - 1
+"""Coordinates are sorted in so many steps from zero to the largest one of a cloud."""
+
+
+def in_order(points: Float32[ndarray, "n 3"], count: int) -> Float32[ndarray, "{count} 3"]:
+    """`count` of the points, sorted by x, then y, then z: thinned evenly, or repeated if there are fewer.
+
+    Coordinates are rounded to a millionth of the largest one. Zeros without any point. See also
+    `CompressionAutoencoder.arrange`, for batches of tensors.
+    """
+    if not len(points):
+        return np.zeros((count, 3), np.float32)
+    scale = np.float32(ORDER_STEPS) / np.float32(max(np.abs(points).max(), 1e-12))
+    steps = np.rint(points * scale)
+    ordered = steps[np.lexsort(steps.T[::-1])] / scale
+    return ordered[(2 * np.arange(count) + 1) * len(points) // (2 * count)].astype(np.float32)
+
+
+@dataclass(frozen=True)
+class PointAutoencoderSettings(EncoderSettings):
+    points: Sizes = (64, 128, 256)
+    """Layers of the perceptron on each point."""
+    octaves: Natural = 4
+    """Wavelengths (4 m, 2 m, ...) of the sines and cosines of its coordinates that each point is given."""
+    hidden: Count = 384
+    """Width of the layer between the pooled features and z, and of the decoder's."""
+    decoded: Count = 192
+    """Points that the decoder reconstructs."""
+    distance_weight: NotNegative = 4.0
+    """In training: weight of the error of the distance field relative to the Chamfer distance, both in
+    metres."""
+
+
+@dataclass(frozen=True)
+class CompressionAutoencoderSettings(EncoderSettings):
+    """The paper's sizes."""
+
+    any_size = False
+    ordered = True
+    code: Count = 60
+    """Size of z."""
+    cloud: Count = 1400
+    """Points of an input cloud; the input has three numbers for each."""
+    hidden: Sizes = (786, 512, 256)
+    """Layers of the encoder between the cloud and z; the decoder has the same in reverse order."""
+
+
+@dataclass(frozen=True)
+class PointNetSettings(EncoderSettings):
+    """Sizes for training on a CPU; the original's are in brackets."""
+
+    cloud: Count = 256
+    """Points of an input cloud (1024)."""
+    input_transform: bool = True
+    """Whether the coordinates are multiplied by a matrix that a small network predicts from the cloud."""
+    feature_transform: bool = True
+    """Whether the features of the first layers are transformed in the same way."""
+    first: Sizes = (32, 32)
+    """Layers on each point before the feature transform (64, 64)."""
+    second: Sizes = (32, 64, 192)
+    """Layers on each point after it (64, 128, 1024)."""
+    transform: Sizes = (16, 32, 64)
+    """Layers on each point within a transform's network (64, 128, 1024)."""
+    transform_head: tuple[Count, ...] = (32,)
+    """Layers of a transform's network after the maximum (512, 256)."""
+    head: tuple[Count, ...] = (192,)
+    """Layers between the maximum and z (512, 256)."""
+
+    @classmethod
+    def paper_size(cls) -> "PointNetSettings":
+        return cls(
+            code=60,
+            cloud=1024,
+            first=(64, 64),
+            second=(64, 128, 1024),
+            transform=(64, 128, 1024),
+            transform_head=(512, 256),
+            head=(512, 256),
+        )
+
+
+@dataclass(frozen=True)
+class DGCNNSettings(EncoderSettings):
+    """Sizes for training on a CPU; the original's are in brackets."""
+
+    any_size = False  # distances to neighbours depend on the density of the cloud
+    cloud: Count = 128
+    """Points of an input cloud (1024)."""
+    neighbours: Count = 8
+    """Nearest points that each point is joined with (20)."""
+    edges: Sizes = (32, 32, 64)
+    """Widths of the layers of edge convolution (64, 64, 128, 256)."""
+    embedding: Count = 192
+    """Features of a point, computed from all these layers, that are pooled (1024)."""
+    head: tuple[Count, ...] = (192,)
+    """Layers between the pooled features and z (512, 256)."""
+
+    @classmethod
+    def paper_size(cls) -> "DGCNNSettings":
+        return cls(
+            code=60, cloud=1024, neighbours=20, edges=(64, 64, 128, 256), embedding=1024, head=(512, 256)
+        )

@@ -1,0 +1,95 @@
+"""Writes networks as ONNX, the form in which planning runs them."""
+
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from robotdiffuse.learning import need_packages
+
+if TYPE_CHECKING:
+    from onnx import GraphProto
+
+EXPORT_PACKAGES = ("onnx", "onnxscript")
+"""What PyTorch's exporter needs."""
+LEAST_STORED_IN_HALF = 1024
+"""Weights with at least so many numbers are stored in fp16 if that changes none of them."""
+
+
+def exported(
+    module: nn.Module, inputs: Mapping[str, Tensor], dynamic: Mapping[str, Mapping[int, str]]
+) -> bytes:
+    """A module, called with the inputs by position, as the bytes of an ONNX file. The module is frozen.
+
+    inputs: examples by the names that the inputs get in the file.
+    dynamic: names of the axes whose sizes may differ from the examples, by input and axis.
+
+    Raises InputError if the packages for it are not installed.
+    """
+    need_packages("saving a network", *EXPORT_PACKAGES)
+    import onnx
+
+    dims = {name: torch.export.Dim(name) for axes in dynamic.values() for name in axes.values()}
+    shapes = tuple({axis: dims[name] for axis, name in dynamic.get(key, {}).items()} for key in inputs)
+    with _quietly(), torch.no_grad():
+        program = torch.onnx.export(
+            module.requires_grad_(False).eval(),
+            tuple(inputs.values()),
+            input_names=list(inputs),
+            output_names=["output"],
+            dynamic_shapes=shapes,
+            dynamo=True,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    for given in model.graph.input:
+        sizes = given.type.tensor_type.shape.dim
+        fixed = [axis for axis in dynamic.get(given.name, {}) if not sizes[axis].dim_param]
+        assert not fixed, f"axes {fixed} of {given.name} have become fixed: use shape[axis], not len or int"
+    _store_in_half(model.graph)
+    for node in model.graph.node:
+        del node.metadata_props[:]  # stack traces with paths of this machine
+        node.doc_string = ""
+    del model.metadata_props[:], model.graph.metadata_props[:]
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def _store_in_half(graph: "GraphProto") -> None:
+    """Store large weights in fp16 where that is exact, as for weights read from a checkpoint: half the size.
+
+    ONNX Runtime converts them back as it loads, so that it computes in fp32.
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    for tensor in graph.initializer:
+        values = numpy_helper.to_array(tensor)
+        if values.dtype != np.float32 or values.size < LEAST_STORED_IN_HALF:
+            continue
+        with np.errstate(over="ignore"):
+            half = values.astype(np.float16)
+        if np.array_equal(half.astype(np.float32), values):
+            name = tensor.name
+            tensor.CopyFrom(numpy_helper.from_array(half, f"{name}.half"))
+            cast = helper.make_node("Cast", [f"{name}.half"], [name], to=TensorProto.FLOAT)
+            graph.node.insert(0, cast)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Without the exporter's warnings about packages that it does not need, and its own deprecations."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

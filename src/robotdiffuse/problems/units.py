@@ -1,0 +1,92 @@
+"""Notes on problems whose numbers look like millimetres."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision.kernel_arrays import reach_bound
+from robotdiffuse.perception.depth_view import AssumedPoints, DepthView, SeenPoints
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
+
+MAX_EXTENT = 10.0
+"""Meshes, clouds and views that are larger get a note; so do other shapes of which every edge is longer: a
+floor may be large, but it is flat [m]."""
+VIEW_STRIDE = 4
+"""One pixel of so many, along rows and columns, is looked at."""
+MIN_POINTS_IN_ARM = 10
+"""Fewer points than this within the arm are noise."""
+ADVICE = "lengths are in metres: divide millimetres by 1000"
+
+
+def unit_notes(problem: Problem) -> tuple[str, ...]:
+    """Notes on obstacles that are all out of reach or too large: they may be given in millimetres."""
+    reach = reach_bound(problem.robot)
+    shapes = [shape for shape in problem.scene.shapes if not isinstance(shape, SeenPoints | AssumedPoints)]
+    seen = len(shapes) < len(problem.scene.shapes)
+    notes = [_size_note(shape) for shape in shapes]
+    notes += [_view_note(i, view, reach) for i, view in enumerate(problem.views)]
+    found = tuple(note for note in notes if note)
+    away = [_distance(shape.bounds) for shape in shapes if not _is_empty(shape)]
+    if not found and away and min(away) > reach and not (seen or problem.views or problem.moving):
+        what = f"all {len(away)} obstacles are" if len(away) > 1 else f"the obstacle {shapes[0].name} is"
+        where = f"beyond the arm's reach of {reach:.1f} m, at least {min(away):.1f} m from its base"
+        found = (f"check the units: {what} {where}; {ADVICE}",)
+    return found
+
+
+def arm_in_cloud_note(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str:
+    """A note on the cloud that has most points within the arm at a configuration; "" if none has many."""
+    clouds = [shape for shape in scene.shapes if type(shape) is PointCloud]
+    spheres = placed_spheres(robot, q)
+    counts = [_points_within(cloud.points, spheres) for cloud in clouds]
+    if max(counts, default=0) < MIN_POINTS_IN_ARM:
+        return ""
+    most = int(np.argmax(counts))
+    return (
+        f"check the cloud: {counts[most]} of {len(clouds[most].points)} points of {clouds[most].name} are "
+        "within the arm. Remove the arm's own points, or give the cloud as a view; else check its frame (the "
+        f"robot's base) and its units: {ADVICE}"
+    )
+
+
+def _size_note(shape: Shape) -> str:
+    extents = np.ptp(shape.bounds, axis=0)
+    scanned = isinstance(shape, Mesh | PointCloud)
+    if (extents.max() if scanned else extents.min()) <= MAX_EXTENT:
+        return ""
+    return f"check the units: {shape.name} is {extents.max():.4g} m long; {ADVICE}"
+
+
+def _view_note(i: int, view: DepthView, reach: float) -> str:
+    depths = view.depth[::VIEW_STRIDE, ::VIEW_STRIDE]
+    depths = depths[np.isfinite(depths) & (depths > 0)]
+    if not len(depths):
+        return ""
+    nearest, middle = float(depths.min()), float(np.median(depths))
+    if middle <= MAX_EXTENT and nearest <= reach + float(np.linalg.norm(view.T_base_camera[:3, 3])):
+        return ""
+    depths_are = f"depths of views[{i}] begin at {nearest:.4g} m, and half of them exceed {middle:.4g} m"
+    return f"check the units: the {depths_are}; {ADVICE}"
+
+
+def _is_empty(shape: Shape) -> bool:
+    return isinstance(shape, PointCloud) and len(shape.points) == 0
+
+
+def _distance(bounds: Float[ndarray, "2 3"]) -> float:
+    """Distance of an axis-aligned box from the origin [m]."""
+    return float(np.linalg.norm(np.maximum(np.maximum(bounds[0], -bounds[1]), 0.0)))
+
+
+def _points_within(points: Float[ndarray, "n 3"], spheres: Float[ndarray, "m 4"]) -> int:
+    """Number of points within any sphere."""
+    low, high = ((spheres[:, :3] + sign * spheres[:, 3:]) for sign in (-1, 1))
+    points = points[((points >= low.min(axis=0)) & (points <= high.max(axis=0))).all(axis=1)]
+    within = np.zeros(len(points), np.bool_)
+    for sphere in spheres:
+        within |= ((points - sphere[:3]) ** 2).sum(axis=1) < sphere[3] ** 2
+    return int(within.sum())

@@ -1,0 +1,72 @@
+"""The commands `schema` and `completion`."""
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+from helpers.code_blocks import PAGES, code_blocks
+from helpers.commands import PROBLEM, run
+from robotdiffuse.problems.files.schema import problem_schema
+
+ROOT = Path(__file__).parents[2]
+BLOCKS = [
+    yaml.safe_load(block.code) for page in PAGES for block in code_blocks(page) if block.language == "yaml"
+]
+PROBLEMS = [block for block in BLOCKS if isinstance(block, dict) and {"robot", "scene"} <= block.keys()]
+
+
+def test_the_schema_accepts_the_problems_of_the_documentation() -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    validator = jsonschema.Draft202012Validator(problem_schema())
+    files = [yaml.safe_load(file.read_text()) for file in (ROOT / "examples").glob("*.yaml")]
+    assert len(PROBLEMS) > 5 and len(files) > 2
+    for problem in [*PROBLEMS, *files]:
+        assert [error.message for error in validator.iter_errors(problem)] == []
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"gaol": []},
+        {"scene": [{"ball": {}}]},
+        {"scene": [{"box": {"center": [0, 0, 0]}}]},
+        {"unknown": "free"},
+        {"clearance": 5},
+        {"goal": {"pose": {"xyz": [0, 0, 0]}}},
+    ],
+)
+def test_the_schema_refuses_what_files_may_not_hold(changes: dict[str, object]) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    assert not jsonschema.Draft202012Validator(problem_schema()).is_valid(PROBLEM | changes)
+
+
+def test_the_schema_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("schema") == 0
+    assert json.loads(capsys.readouterr().out) == problem_schema()
+
+
+def completed(script: str, *words: str) -> list[str]:
+    """What bash proposes for the last of these words."""
+    line = " ".join(f'"{word}"' for word in words)
+    asks = f"COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; _robotdiffuse"
+    asks += "; printf '%s\\n' \"${COMPREPLY[@]}\""
+    ended = subprocess.run(["bash", "-c", f"{script}\n{asks}"], capture_output=True, text=True, check=True)
+    return ended.stdout.split()
+
+
+def test_bash_completes_commands_and_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run("completion", "bash") == 0
+    script = capsys.readouterr().out
+    assert completed(script, "robotdiffuse", "pl") == ["plan", "planners"]
+    assert completed(script, "robotdiffuse", "plan", "--cl") == ["--clearance"]
+    assert completed(script, "robotdiffuse", "data", "inf") == ["info"]
+    assert "--page" in completed(script, "robotdiffuse", "data", "info", "folder", "--")
+    (tmp_path / "problem.yaml").write_text("")
+    assert completed(script, "robotdiffuse", "plan", "prob") == ["problem.yaml"]
+    assert run("completion", "zsh") == 0 and "bashcompinit" in capsys.readouterr().out

@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+
+from helpers.box_arm import box_arm
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Trajectory
+from robotdiffuse.validation.rates import RateTolerances, rate_violations
+
+
+def cubic(steps: int = 7) -> Trajectory:
+    """A minimum-acceleration motion, whose positions are one cubic: rows at uneven times."""
+    t = np.linspace(0.0, 1.0, steps) ** 1.3 * 2.0
+    u = (t / 2.0)[:, None]
+    far = np.array([[1.0, -0.5, 0.2]])
+    rows = (u**2 * (3 - 2 * u) * far, 3 * u * (1 - u) * far, (1.5 - 3 * u) * far)
+    return Trajectory(("a", "b", "c"), t, *rows)
+
+
+def smooth(legs: int = 1, rate: float = 40.0) -> Trajectory:
+    """Minimum-jerk motions of 1 s each, with a wait of 0.5 s between them."""
+    u = np.linspace(0.0, 1.0, int(rate) + 1)[:, None]
+    far = np.array([[0.9, -0.5, 0.2]])
+    q = (10 * u**3 - 15 * u**4 + 6 * u**5) * far
+    v, a = 30 * u**2 * (1 - u) ** 2 * far, 60 * u * (1 - u) * (1 - 2 * u) * far
+    shift = [(1.5 * k + u[:, 0], q + k * far) for k in range(legs)]
+    times, positions = np.concatenate([s[0] for s in shift]), np.concatenate([s[1] for s in shift])
+    return Trajectory(("a", "b", "c"), times, positions, np.tile(v, (legs, 1)), np.tile(a, (legs, 1)))
+
+
+def test_a_cubic_is_exact_at_any_time():
+    rough, fine = cubic(), cubic(101)
+    state = rough.at(fine.times)
+    for got, right in zip(state, (fine.positions, fine.velocities, fine.accelerations), strict=False):
+        assert np.allclose(got, right, atol=1e-12)
+    assert np.allclose(state.jerks, -1.5 * np.array([1.0, -0.5, 0.2]))
+    one = rough.at(0.7)
+    assert one.jerks.shape == one.positions.shape == (3,)
+    assert np.allclose(one.positions, rough.at(np.array([0.7])).positions[0])
+
+
+def test_rows_are_their_own():
+    motion = smooth(2)
+    state = motion.at(motion.times)
+    for got, right in zip(state, (motion.positions, motion.velocities, motion.accelerations), strict=False):
+        assert np.allclose(got, right, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("time", [-0.1, 2.1, np.nan, np.array([0.5, 3.0])])
+def test_times_outside_are_refused(time):
+    with pytest.raises(InputError, match=r"it must be in \[0, 2\]"):
+        cubic().at(time)
+
+
+def test_the_largest_jerk_is_that_between_rows_unless_the_ends_jump():
+    # 60 at both ends of a minimum-jerk motion, whose accelerations are 0 there
+    assert np.allclose(smooth(rate=400.0).peak_jerks, 60 * np.array([0.9, 0.5, 0.2]), rtol=0.01)
+    assert np.isinf(cubic().peak_jerks).all()
+
+
+@pytest.mark.parametrize("rate", [125, 250, 500, 1000, 3.3, 0.1])
+def test_resampled_times(rate):
+    motion = cubic()
+    rows = motion.resample(rate)
+    assert np.allclose(rows.times[:-1] * rate, np.arange(len(rows.times) - 1))
+    assert rows.duration == motion.duration and (np.diff(rows.times) > 1e-9).all()
+    assert (rows.positions[-1] == motion.positions[-1]).all() and (rows.velocities[-1] == 0).all()
+
+
+@pytest.mark.parametrize("rate", [125, 250, 500, 1000])
+def test_resampled_rates_still_keep_limits(rate):
+    tolerances = RateTolerances(slack=0.01, agreement=0.25, jump=1.5, resolution=1e-6)
+    for motion in (smooth(), smooth(2)):
+        assert rate_violations(box_arm(), motion, tolerances) == []
+        assert rate_violations(box_arm(), motion.resample(rate), tolerances) == []
+
+
+@pytest.mark.parametrize("rate", [0, -5, np.inf, np.nan])
+def test_rates_that_are_not_positive_are_refused(rate):
+    with pytest.raises(InputError, match="rate is"):
+        cubic().resample(rate)
+
+
+def test_a_wait_is_one_stop():
+    assert len(smooth().stops) == 0
+    assert np.allclose(smooth(3).stops, [1.25, 2.75])
+
+
+def test_saved_at_a_rate(tmp_path):
+    cubic().save(tmp_path / "motion.csv", rate=100)
+    assert np.allclose(np.diff(np.loadtxt(tmp_path / "motion.csv", delimiter=",", skiprows=1)[:, 0]), 0.01)

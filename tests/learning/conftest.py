@@ -1,0 +1,11 @@
+"""What tests of networks share."""
+
+import pytest
+
+from robotdiffuse.learning.motion_network import MotionNetwork
+
+
+@pytest.fixture
+def no_export(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights are saved without the ONNX files, which take seconds: for tests that read them by PyTorch."""
+    monkeypatch.setattr(MotionNetwork, "exports", lambda self: {})

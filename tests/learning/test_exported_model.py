@@ -1,0 +1,131 @@
+"""Networks as ONNX Runtime runs them, against PyTorch."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.box_arm import box_arm
+from helpers.small_model import small_model
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.checkpoint import load_completion, load_network, save_network
+from robotdiffuse.learning.completion import exported_completion
+from robotdiffuse.learning.completion.samples import BITS
+from robotdiffuse.learning.encoders.compression_autoencoder import CompressionAutoencoder
+from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings, in_order
+from robotdiffuse.learning.exported_model import exported_model
+from robotdiffuse.learning.motion_network import MotionNetwork
+from robotdiffuse.learning.weights_registry import BUNDLED
+from robotdiffuse.perception.observed_volume import SHAPE
+from robotdiffuse.robots import load_robot
+
+PANDA = load_robot("panda")
+RELATIVE_TOLERANCE = 1e-5
+"""Of the largest number: fp32 rounds to 6e-8, and a network has some hundred roundings in a row."""
+MAX_FILE_SIZE = 16e6
+
+
+def assert_same(exported: np.ndarray, ours: np.ndarray) -> None:
+    assert exported.shape == ours.shape and exported.dtype == np.float32
+    assert np.abs(exported - ours).max() < RELATIVE_TOLERANCE * np.abs(ours).max()
+
+
+@pytest.mark.parametrize("name", ["model", "trajectory_prior"])
+@pytest.mark.parametrize("batch", [1, 16])
+def test_bundled_denoisers(name: str, batch: int) -> None:
+    exported, network = exported_model(name, None, PANDA), load_network(name, None, PANDA)
+    assert isinstance(network, MotionNetwork) and exported.settings == network.settings
+    for ours, its in zip(network.statistics, exported.statistics, strict=True):
+        np.testing.assert_array_equal(ours, its)
+    rng = np.random.default_rng(batch)
+    features = rng.normal(size=(batch, exported.waypoints, exported.feature_count)).astype(np.float32)
+    condition = rng.normal(size=(batch, exported.condition_count)).astype(np.float32)
+    given = features, rng.random(batch).astype(np.float32), condition
+    assert_same(exported.denoised(*given), network.denoised(*given))
+    if exported.settings.null_condition:
+        dropped = rng.random(batch) < 0.5
+        assert_same(exported.denoised(*given, dropped), network.denoised(*given, dropped))
+
+
+@pytest.mark.parametrize("points", [0, 1, 320, 5000])
+def test_bundled_encoder(points: int) -> None:
+    cloud = np.random.default_rng(points).uniform(-0.7, 0.7, (points, 3))
+    exported, network = exported_model("model", None, PANDA), load_network("model", None, PANDA)
+    assert_same(exported.encode(cloud), network.encode(cloud))
+
+
+def test_bundled_completion_network() -> None:
+    rng = np.random.default_rng(0)
+    seen = rng.integers(0, sum(BITS) + 1, SHAPE).astype(np.uint8)
+    behind = rng.integers(0, 256, SHAPE).astype(np.uint8)
+    with torch.inference_mode():
+        ours = load_completion().probabilities(torch.from_numpy(seen)[None], torch.from_numpy(behind)[None])
+    assert_same(exported_completion()(seen, behind), ours[0].numpy())
+
+
+def test_every_bundled_file_is_small_and_has_no_path_in_it() -> None:
+    files = [file for file in BUNDLED.rglob("*") if file.is_file()]
+    assert {file.suffix for file in files} == {".json", ".onnx", ".safetensors"}
+    for file in files:
+        data = file.read_bytes()
+        assert len(data) < MAX_FILE_SIZE and b".py" not in data, file
+
+
+def test_a_cloud_in_order_is_that_of_the_compression_autoencoder() -> None:
+    settings = CompressionAutoencoderSettings(cloud=40)
+    encoder = CompressionAutoencoder(settings)
+    for points in (0, 1, 7, 40, 90):
+        cloud = np.random.default_rng(points).uniform([-0.5, -0.5, 0.1], 0.8, (points, 3)).astype(np.float32)
+        ours = encoder.arrange(torch.from_numpy(cloud)[None])[0].numpy()
+        np.testing.assert_allclose(in_order(cloud, 40), ours, atol=1e-6)
+
+
+def test_units_of_joints_agree_for_arrays_and_tensors() -> None:
+    network = small_model()
+    q = np.random.default_rng(0).uniform(-2, 2, (5, 3)).astype(np.float32)
+    unit = network.normalizer.to_unit(q)
+    np.testing.assert_allclose(network.to_unit(torch.from_numpy(q)).numpy(), unit, atol=1e-6)
+    np.testing.assert_allclose(network.from_unit(torch.from_numpy(unit)).numpy(), q, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("weights")
+    save_network("model", small_model(), place, {})
+    return place
+
+
+def _described(folder: Path, change: dict) -> None:
+    file = folder / "model.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+
+
+@pytest.mark.parametrize(
+    ("case", "message"),
+    [
+        ("truncated", r"model\.onnx is damaged"),
+        ("missing", r"cannot read .*model\.encoder\.onnx"),
+        ("none", "without the ONNX files that planning runs; write them: robotdiffuse train export"),
+        ("other size", r"model\.json does not fit its ONNX files"),
+        ("no statistics", r"cannot read .*model\.safetensors"),
+    ],
+)
+def test_damaged_files_give_one_line(folder: Path, tmp_path: Path, case: str, message: str) -> None:
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    about = json.loads((tmp_path / "model.json").read_text())
+    if case == "truncated":
+        (tmp_path / "model.onnx").write_bytes((tmp_path / "model.onnx").read_bytes()[:-10])
+    elif case == "missing":
+        (tmp_path / "model.encoder.onnx").unlink()
+    elif case == "none":
+        _described(tmp_path, {"onnx_sha256": {}})
+    elif case == "other size":
+        _described(tmp_path, {"settings": about["settings"] | {"waypoints": 20}})
+    else:
+        (tmp_path / "model.safetensors").unlink()
+    with pytest.raises(InputError, match=message) as caught:
+        exported_model("model", tmp_path, box_arm())
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,111 @@
+"""OctoMap's binary files, written here from the description of their format, and height maps."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.files import problem_from_record, problem_record
+from robotdiffuse.scenes.octomap import TREE_DEPTH, occupied_voxels, read_octomap
+
+HALF = 2 ** (TREE_DEPTH - 1)
+Key = tuple[int, int, int]
+
+
+def tree(keys: set[Key], level: int = TREE_DEPTH, low: Key = (-HALF, -HALF, -HALF)) -> bytes:
+    """The bytes of a tree whose voxels with these lower corners, in voxels, are occupied."""
+    bits, below, edge = 0, b"", 2 ** (level - 1)
+    for child in range(8):
+        corner = tuple(low[a] + edge * (child >> a & 1) for a in range(3))
+        inside = {key for key in keys if all(0 <= key[a] - corner[a] < edge for a in range(3))}
+        if len(inside) == edge**3:
+            bits |= 2 << 2 * child
+        elif inside:
+            bits |= 3 << 2 * child
+            below += tree(inside, level - 1, corner)  # type: ignore[arg-type]
+    return bits.to_bytes(2, "little") + below
+
+
+def written(file: Path, keys: set[Key], edge: float = 0.05) -> Path:
+    header = f"# Octomap OcTree binary file\n# (a comment)\nid OcTree\nsize {len(keys)}\nres {edge}\ndata\n"
+    file.write_bytes(header.encode() + tree(keys))
+    return file
+
+
+def test_occupied_voxels_are_read(tmp_path: Path) -> None:
+    keys = {(3, -4, 7), (-1, 0, 2), (100, 100, -100)}
+    points, edge = read_octomap(written(tmp_path / "map.bt", keys))
+    expected = (np.array(sorted(keys)) + 0.5) * 0.05
+    np.testing.assert_allclose(points[np.lexsort(points.T[::-1])], expected, atol=1e-12)
+    assert edge == 0.05
+
+
+def test_large_leaves_are_their_surface() -> None:
+    cube = {(x, y, z) for x in range(4) for y in range(4) for z in range(4)}
+    points = occupied_voxels(tree(cube), 1.0)
+    assert len(points) == 4**3 - 2**3
+    np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], [[0.5] * 3, [3.5] * 3])
+
+
+def test_an_octomap_is_a_cloud_of_a_problem_file(tmp_path: Path) -> None:
+    file = written(tmp_path / "map.bt", {(12, 6, 12)})
+    scene = [{"point_cloud": {"file": str(file)}}]
+    problem = problem_from_record({"robot": "panda", "scene": scene, "start": "ready", "goal": "ready"})
+    [cloud] = problem.scene.shapes
+    assert isinstance(cloud, rd.PointCloud) and cloud.point_radius == pytest.approx(0.05 * 3**0.5 / 2)
+    assert problem_record(problem)["scene"][0]["point_cloud"]["file"] == str(file)  # type: ignore[index]
+    assert rd.PointCloud.from_file(file, scale=2.0).point_radius == pytest.approx(0.05 * 3**0.5)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"# something else\ndata\n", "no binary OctoMap file"),
+        (
+            b"# Octomap OcTree binary file\nid ColorOcTree\nres 0.1\ndata\n",
+            "'ColorOcTree'; it must be an OcTree",
+        ),
+        (b"# Octomap OcTree binary file\nid OcTree\nres 0\ndata\n\x01\x00", "resolution is 0.0"),
+        (b"# Octomap OcTree binary file\nid OcTree\nres 0.1\ndata\n\x03\x00", "the tree ends too soon"),
+        (b"# Octomap OcTree binary file\nid OcTree\nres 0.1\ndata\n\x02\x00", "more than 5,000,000"),
+    ],
+)
+def test_damaged_octomaps(content: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / "map.bt").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_octomap(tmp_path / "map.bt")
+
+
+def test_a_height_map_cannot_be_held() -> None:
+    with pytest.raises(rd.InputError, match="'height_map' is a height_map; it must be one of sphere"):
+        rd.HeightMap(np.zeros((2, 2)), 0.1).solid()
+
+
+def test_a_height_map_is_an_obstacle_with_holes(tmp_path: Path) -> None:
+    heights = np.zeros((21, 21))
+    heights[10, 16:] = 0.3
+    heights[0, 0] = np.nan
+    np.save(tmp_path / "terrain.npy", heights)
+    entry = {"height_map": {"file": str(tmp_path / "terrain.npy"), "cell": 0.1, "xyz": [-1, -1, -0.1]}}
+    record = {"robot": "panda", "scene": [entry], "start": "ready", "goal": "ready"}
+    problem = problem_from_record(record)
+    [terrain] = problem.scene.shapes
+    assert isinstance(terrain, rd.HeightMap) and len(terrain.mesh.faces) == 2 * (20 * 20 - 1)
+    np.testing.assert_allclose(terrain.bounds, [[-1, -1, -0.1], [1, 1, 0.2]])
+    assert problem_record(problem)["scene"][0]["height_map"]["cell"] == 0.1  # type: ignore[index]
+    free = CollisionChecker(problem.robot, problem.scene).link_clearances(problem.start[None])
+    raised = rd.Scene([rd.HeightMap(heights, 0.1, [-1, -1, 0.4])])
+    assert free.min() > 0 > CollisionChecker(problem.robot, raised).link_clearances(problem.start[None]).min()
+
+
+def test_wrong_height_maps() -> None:
+    for heights, message in (
+        ([0.0, 1.0], r"height_map\.heights is an array of 2; it must be rows x columns"),
+        ([[0.0, 1e9], [0, 0]], "not within"),
+        ([[np.nan, 1], [0, 0]], "no cell of four heights"),
+    ):
+        with pytest.raises(InputError, match=message):
+            rd.HeightMap(heights, 0.1)

@@ -1,0 +1,76 @@
+"""Planning without PyTorch: every planner but MPNet and MPiNets, views, certificates."""
+
+import subprocess
+import sys
+
+BLOCKED = """
+import sys
+sys.modules["torch"] = None  # importing it raises ImportError
+import numpy as np
+import robotdiffuse as rd
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+
+robot = rd.load_robot("panda")
+start, goal = (np.array([turn, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]) for turn in (0.9, -0.9))
+scene = rd.Scene([rd.Sphere([0.5, 0.0, 0.4], 0.15)])
+problem = rd.Problem(robot, scene, start, rd.JointGoal(goal[None]))
+"""
+
+
+def run(code: str) -> list[str]:
+    done = subprocess.run([sys.executable, "-c", BLOCKED + code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split("\n")
+
+
+def test_plans_and_certifies() -> None:
+    code = """
+for name in ("robotdiffuse", "diffusion", "mpd", "edmp"):
+    result = rd.load_planner(name).plan(problem, time_limit=60.0)
+    print(name, result.solved, rd.verify(problem, result.path).valid)
+    assert result.solved, result.reason
+print("certified", rd.certify(problem, result.trajectory) is not None)
+"""
+    said = run(code)
+    assert said[:4] == [f"{name} True True" for name in ("robotdiffuse", "diffusion", "mpd", "edmp")]
+
+
+def test_plans_in_a_scene_that_a_camera_saw_with_predicted_unknown_space() -> None:
+    code = """
+T = looking_at(np.array([-1.2, 0.4, 1.0]), np.array([0.4, 0.0, 0.3]))
+view = ray_cast(scene, T, (120.0, 120.0, 79.5, 59.5), (160, 120), robot, start)
+seen = rd.Problem(robot, rd.Scene(), start, rd.JointGoal(goal[None]), views=[view], unknown="predicted")
+result = rd.plan(seen, time_limit=60.0)
+print(result.solved, result.assumption != "", 0 < result.confidence <= 1)
+"""
+    assert run(code)[0] == "True True True"
+
+
+def test_the_network_shortens_in_the_first_call() -> None:
+    """Its batches are drawn within one call, in a process that loaded nothing before."""
+    code = """
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
+drawn, draw = [], RobotDiffuse.draw
+RobotDiffuse.draw = lambda *given: drawn.append(1) or draw(*given)
+RobotDiffuse(RobotDiffuseSettings(network_share=0.9)).plan(
+    problem, time_limit=3.0, until="time_limit", objective="length"
+)
+print(bool(drawn))
+"""
+    assert run(code)[0] == "True"
+
+
+def test_what_needs_pytorch_says_how_to_install_it() -> None:
+    code = """
+from robotdiffuse.cli import main
+for name in ("mpnet", "mpinets"):
+    try:
+        rd.load_planner(name).plan(problem)
+    except rd.InputError as error:
+        print(error)
+print(main(["train", "encoder", "--out", "nowhere"]))
+"""
+    said = run(code)
+    for name, line in zip(("mpnet", "mpinets"), said, strict=False):
+        assert line == f'the planner {name} needs torch, not installed: pip install "robotdiffuse[train]"'
+    assert said[2] == "2"
