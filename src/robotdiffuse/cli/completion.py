@@ -6,21 +6,22 @@ from collections.abc import Iterator
 
 BASH, ZSH = SHELLS = ("bash", "zsh")
 SCRIPT = """_robotdiffuse() {{
-  local word="${{COMP_WORDS[COMP_CWORD]}}" path="" words="" i
+  local word="${{COMP_WORDS[COMP_CWORD]}}" command="" words="" options="" i
   for ((i = 1; i < COMP_CWORD; i++)); do
-    case "$path ${{COMP_WORDS[i]}}" in
-      {paths}) path="$path ${{COMP_WORDS[i]}}" ;;
+    case "$command ${{COMP_WORDS[i]}}" in
+      {paths}) command="$command ${{COMP_WORDS[i]}}" ;;
     esac
   done
-  case "$path" in
+  case "$command" in
 {cases}
   esac
+  if [[ $word == -* ]]; then words="$options"; fi
   COMPREPLY=($(compgen -W "$words" -- "$word"))
-  if [[ $word != -* ]]; then COMPREPLY+=($(compgen -f -- "$word")); fi
 }}
-complete -o filenames -F _robotdiffuse robotdiffuse
+complete -o default -F _robotdiffuse robotdiffuse
 """
-"""A function of bash; zsh runs it by bashcompinit."""
+"""A function of bash; zsh runs it by bashcompinit, where `path` is not a plain variable.
+Where no word fits, the shell completes names of files."""
 
 
 def add_schema(commands: argparse._SubParsersAction) -> None:
@@ -51,11 +52,14 @@ def run_schema(arguments: argparse.Namespace) -> int:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    words = {"": [*arguments.parsers, "--help", "--version"]}
+    found = {"": (list(arguments.parsers), ["--help", "--version"])}
     for name, parser in arguments.parsers.items():
-        words |= _words(parser, f" {name}")
-    paths = "|".join(f'"{path}"' for path in words if path)
-    cases = "\n".join(f"""    "{path}") words="{" ".join(found)}" ;;""" for path, found in words.items())
+        found |= _words(parser, f" {name}")
+    paths = "|".join(f'"{path}"' for path in found if path)
+    cases = "\n".join(
+        f"""    "{path}") words="{" ".join(words)}" options="{" ".join(options)}" ;;"""
+        for path, (words, options) in found.items()
+    )
     script = SCRIPT.format(paths=paths, cases=cases)
     print(
         script if arguments.shell == BASH else f"autoload -U +X bashcompinit && bashcompinit\n{script}",
@@ -64,16 +68,17 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _words(parser: argparse.ArgumentParser, path: str) -> Iterator[tuple[str, list[str]]]:
-    """Each command by its path, such as " data info", with what may follow: commands, choices and options."""
-    found: list[str] = []
-    below: list[tuple[str, argparse.ArgumentParser]] = []
+def _words(parser: argparse.ArgumentParser, path: str) -> Iterator[tuple[str, tuple[list[str], list[str]]]]:
+    """Each command by its path, such as " data info", with its subcommands or choices, and its options."""
+    words: list[str] = []
+    options: list[str] = []
+    below: dict[str, argparse.ArgumentParser] = {}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
-            below += action.choices.items()
+            below |= action.choices
         elif not action.option_strings:
-            found += map(str, action.choices or ())
-        found += [option for option in action.option_strings if option.startswith("--")]
-    yield path, [*(name for name, _ in below), *found]
-    for name, child in below:
+            words += map(str, action.choices or ())
+        options += [option for option in action.option_strings if option.startswith("--")]
+    yield path, ([*below, *words], options)
+    for name, child in below.items():
         yield from _words(child, f"{path} {name}")
