@@ -46,6 +46,7 @@ def made(robot: str, out: Path | None = None) -> Path:
     return kept
 
 
+@pytest.mark.slow
 def test_an_arm_of_five_joints_plans_with_its_trained_network(tmp_path: Path) -> None:
     robot = load_robot("so101")
     assert weights_for("model", robot) is None
@@ -66,6 +67,7 @@ def test_data_are_in_the_size_of_the_arm() -> None:
     assert large.search.safety_distance == 0.05 and small.search.safety_distance == pytest.approx(0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", ["data", "training"])
 def test_it_continues_where_it_was_interrupted(
     phase: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

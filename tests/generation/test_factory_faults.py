@@ -57,6 +57,7 @@ def test_killed_at_a_random_moment_it_ends_in_the_same_data(
     assert group_ends(run.pid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 1])
 def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
     """As a terminal does it, to all processes: while the workers start, and while they work."""
@@ -73,6 +74,7 @@ def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
     assert not [name for name in contents(tmp_path) if name.startswith(".")]
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     undisturbed: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -98,6 +100,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     assert contents(tmp_path) == undisturbed
 
 
+@pytest.mark.slow
 def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(
     undisturbed: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -49,6 +49,7 @@ def cluster(head: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     return head
 
 
+@pytest.mark.slow
 def test_a_node_killed_midway_changes_nothing(
     cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,6 +109,7 @@ def test_a_cluster_that_nobody_listens_at_is_refused_at_once(
             generate(SETTINGS, tmp_path, cluster="ray")
 
 
+@pytest.mark.slow
 def test_bench_on_a_cluster_is_as_on_this_machine(cluster: Any, tmp_path: Path) -> None:
     def quiet(*_: object) -> None: ...
 

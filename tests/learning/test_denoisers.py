@@ -249,6 +249,7 @@ def sample(model: MotionModel, scale: float = 1.0) -> np.ndarray:
     return model.sample(start, goal, code, clearances, rng, settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "null_condition"), list(zip(DENOISERS, cycle([True, False]))))
 def test_files(tmp_path, name, null_condition):
     """Also those that planning reads."""

@@ -339,6 +339,7 @@ def planner(data, encoder, **changes) -> PlannerTraining:
     return replace(planned, **changes)
 
 
+@pytest.mark.slow
 @every_encoder
 def test_joint_training_changes_the_encoder(name, data, tmp_path):
     """The planner's file holds the trained encoder."""

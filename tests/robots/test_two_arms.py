@@ -147,6 +147,7 @@ def _crossing(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
             return start, goal
 
 
+@pytest.mark.slow
 def test_a_pose_of_one_hand_leaves_the_other_arm_where_it_starts() -> None:
     robot, rng = two_arms(), np.random.default_rng(5)
     checker = CollisionChecker(robot, rd.Scene())

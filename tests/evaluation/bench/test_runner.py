@@ -177,6 +177,7 @@ def test_restarts_are_asked_for_where_time_is_left(tmp_path: Path) -> None:
     assert left(10.0, again) == ["rop/0", "rop/1"]
 
 
+@pytest.mark.slow
 def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> None:
     asked = replace(settings(tmp_path, "rrt_connect", "rop_nontrivial", count=2), time_limit=0.3)
     assert run_bench(asked, quiet, quiet) == 2

@@ -1,5 +1,6 @@
 """Training of an auto-encoder."""
 
+import pytest
 import torch
 
 from helpers.training_log import read_log
@@ -11,6 +12,7 @@ from robotdiffuse.learning.training.encoder import train_encoder
 SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
 
 
+@pytest.mark.slow
 def test_encoder_learns(tmp_path):
     settings = EncoderTraining(
         minutes=None, samples=1600, batch=16, points=64, warmup_steps=10, encoder=SMALL_ENCODER

@@ -225,6 +225,7 @@ def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
     assert train(tmp_path / "parts") == whole, "a finished run is left as it is"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [

@@ -109,6 +109,7 @@ def stay(q: ndarray, _left: int) -> ndarray:
     return q
 
 
+@pytest.mark.slow
 def test_the_loss_falls() -> None:
     torch.manual_seed(0)
     network, data, rng = MotionNetwork(RANGES, SMALL), data_of(32), np.random.default_rng(0)
@@ -137,6 +138,7 @@ def test_share_of_trivial_motions() -> None:
         assert set(np.unique(replace(data, trivial=trivial).draw(4000, 0.2, rng))) == set(range(30))
 
 
+@pytest.mark.slow
 def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> None:
     """100 steps without a guide; 300 samples of several joints give the variance to a few percent."""
     starts, goals = (np.repeat(end[None], 300, 0) for end in (LEFT, RIGHT))
@@ -351,6 +353,7 @@ def test_missing_weights(kind: type[MPD | EDMP], tmp_path) -> None:
         kind(settings).plan(PROBLEM, time_limit=1.0)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_weights_survive_a_file(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = MotionNetwork(RANGES, SMALL)
@@ -366,6 +369,7 @@ def test_weights_survive_a_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(exported.denoised(*arrays), loaded.denoised(*arrays), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_training_stopped_and_continued_ends_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -304,6 +304,7 @@ def test_updates_refuse_another_robot_and_places_off_the_lattice():
         search.update(checker, start + np.float32(0.1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [AStarSettings(), DStarLiteSettings()])
 def test_two_arms_do_not_outrun_the_time_limit(settings: AStarSettings | DStarLiteSettings) -> None:
     """Regression: with 14 joints 200 expansions checked 78,400 edges between two readings of the clock, which

@@ -73,6 +73,7 @@ def shares(robot: Robot) -> tuple[float, int]:
     return float(1 - free[exact].mean()), int((free & ~exact).sum())
 
 
+@pytest.mark.slow
 def test_a_pair_that_is_always_close_refuses_little() -> None:
     prepared = made()
     robot = prepared.robot
@@ -116,6 +117,7 @@ def test_joints_between_links_are_those_of_the_chain_and_all_planned() -> None:
     assert robot.with_locked({"bend": 0.0}).joints_between(*PAIR) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [PAIR, ("wrist", "flange")])
 def test_tables_say_no_more_than_the_parts(pair: tuple[str, str]) -> None:
     robot = made().robot
