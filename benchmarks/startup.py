@@ -91,7 +91,7 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
 
 def work(file: str, seed: int, names: list[str]) -> None:
     """Call the parts in this order and save what they return."""
-    from robotdiffuse.collision.kernels.compiled import compile_seconds
+    from robotdiffuse.core.loading import compile_seconds
 
     known = parts(seed)
     arrays = {name: np.asarray(known[name]()) for name in names}

@@ -1,8 +1,7 @@
-"""Shared by compiled code: a decorator for functions that do not allocate, random numbers, and compile
-time."""
+"""Shared by compiled code: a decorator for functions that do not allocate, random numbers, and the account
+of loading time."""
 
 import sys
-import time
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
@@ -12,6 +11,8 @@ from numba import njit
 from numba.core import event, types
 from numba.extending import overload
 from numpy import ndarray
+
+from robotdiffuse.core import loading
 
 
 def _without_scipy(module: str) -> None:
@@ -29,30 +30,24 @@ def _without_scipy(module: str) -> None:
 _without_scipy("numba.np.arraymath")  # SciPy would take a ninth of the time of a plan by search
 
 
-class _CompileTimer(event.Listener):
-    """Adds up the time of outermost compilations; only one thread compiles at a time."""
-
-    def __init__(self) -> None:
-        self.seconds, self._depth, self._began = 0.0, 0, 0.0
+class _Listener(event.Listener):
+    """Counts the work of Numba's compiler as loading: reading code from the cache, compiling and writing it."""
 
     def on_start(self, event: event.Event) -> None:
-        if self._depth == 0:
-            self._began = time.perf_counter()
-        self._depth += 1
+        if event.kind == LOCK:
+            loading.begin()
+        else:
+            loading.compiles(event.data["dispatcher"].__name__)
 
     def on_end(self, event: event.Event) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            self.seconds += time.perf_counter() - self._began
+        if event.kind == LOCK:
+            loading.end()
 
 
-_timer = _CompileTimer()
-event.register("numba:compile", _timer)
-
-
-def compile_seconds() -> float:
-    """Time that this process has spent compiling so far [s], without loading compiled code from disk."""
-    return _timer.seconds
+LOCK, COMPILE = "numba:compiler_lock", "numba:compile"
+"""Events of Numba: it holds its lock while it reads from the cache too, and compiles within that."""
+for kind in (LOCK, COMPILE):
+    event.register(kind, _Listener())
 
 
 def allocation_free(
