@@ -173,7 +173,9 @@ class PlanningContext:
 
     def _too_short(self, error: OutOfTimeError) -> str:
         limit = f"the time limit of {self.request.time_limit:g} s is too short {error.what}"
-        before = f"the search began after {self.prepared:.2f} s" if self.prepared else "before the search began"
+        before = (
+            f"the search began after {self.prepared:.2f} s" if self.prepared else "before the search began"
+        )
         found = f", its first path came after {self._progress[0][0]:.2f} s" if self._progress else ""
         return f"{limit}: there was no time for {error} after {self.elapsed:.2f} s; {before}{found}"
 

@@ -1,66 +1,11 @@
-"""Shared by compiled code: a decorator for functions that do not allocate, random numbers, and the account
-of loading time."""
-
-import sys
-from collections.abc import Callable
-from importlib import import_module
-from typing import Any
+"""Shared by compiled code: the parent frame of a joint, and random numbers."""
 
 import numpy as np
-from numba import njit
-from numba.core import event, types
+from numba.core import types
 from numba.extending import overload
 from numpy import ndarray
 
-from robotdiffuse.core import loading
-
-
-def _without_scipy(module: str) -> None:
-    """Import a module of Numba without SciPy, which it imports only to choose an algorithm for
-    `np.convolve`."""
-    blas = "scipy.linalg.cython_blas"
-    if blas not in sys.modules:
-        sys.modules[blas] = None  # pyright: ignore[reportArgumentType]  (makes the import fail)
-        try:
-            import_module(module)
-        finally:
-            del sys.modules[blas]
-
-
-_without_scipy("numba.np.arraymath")  # SciPy would take a ninth of the time of a plan by search
-
-
-class _Listener(event.Listener):
-    """Counts the work of Numba's compiler as loading: reading code from the cache, compiling and writing it."""
-
-    def on_start(self, event: event.Event) -> None:
-        if event.kind == LOCK:
-            loading.begin()
-        else:
-            loading.compiles(event.data["dispatcher"].__name__)
-
-    def on_end(self, event: event.Event) -> None:
-        if event.kind == LOCK:
-            loading.end()
-
-
-LOCK, COMPILE = "numba:compiler_lock", "numba:compile"
-"""Events of Numba: it holds its lock while it reads from the cache too, and compiles within that."""
-for kind in (LOCK, COMPILE):
-    event.register(kind, _Listener())
-
-
-def allocation_free(
-    fastmath: bool = False, inline: str = "never", forceinline: bool = False
-) -> Callable[[Callable], Any]:
-    """A decorator that compiles a function without Numba's reference counting.
-
-    Counting references to the arrays in every call would take two thirds of the collision kernel's time. Such
-    a function must not allocate memory, nor assign an array to a slice.
-    """
-    options: dict[str, Any] = {"fastmath": fastmath, "inline": inline, "forceinline": forceinline}
-    options |= {"cache": True, "_nrt": False}
-    return njit(**options)
+from robotdiffuse.core.kernels import allocation_free
 
 
 def parent_of(parents, j):
