@@ -3,7 +3,6 @@
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 from numba import njit
 from numba.core.compiler_lock import global_compiler_lock
@@ -13,7 +12,7 @@ from helpers.clock import Clock, stop_clock
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.loading import compile_seconds, compiled, loading, loading_seconds
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.robots.robot import once_per_robot
+from robotdiffuse.robots.robot import Robot, once_per_robot
 
 FIRST_CALLS = """
 import sys, time
@@ -60,8 +59,9 @@ assert late[0] > 0, "nothing was loaded"
 
 def test_loading_takes_no_time_of_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = stop_clock(monkeypatch)
-    q = np.zeros(7)
-    context = PlanningContext("test", rd.Problem(rd.load_robot("panda"), rd.Scene(), q, q))
+    robot = rd.load_robot("panda")
+    middle = (robot.lower + robot.upper) / 2
+    context = PlanningContext("test", rd.Problem(robot, rd.Scene(), middle, middle))
     before = context.elapsed
     clock.now += 1.0
     with loading(), loading():
@@ -75,7 +75,7 @@ def test_loading_takes_no_time_of_the_call(monkeypatch: pytest.MonkeyPatch) -> N
 
 def _built(clock: Clock):
     @once_per_robot
-    def build(robot: rd.Robot) -> None:
+    def build(robot: Robot) -> None:
         clock.now += 5.0
 
     return build

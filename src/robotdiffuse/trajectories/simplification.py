@@ -89,7 +89,7 @@ def tighten(space, path, tries, state):
     return points[:n].copy()
 
 
-@inner_kernel()
+@inner_kernel(inline="always")
 def _make_scratch(space, path):
     """Scratch memory of the motion checks, and two configurations."""
     dof = path.shape[1]
@@ -97,7 +97,7 @@ def _make_scratch(space, path):
     return work, block, np.empty(dof, np.float32), np.empty(dof, np.float32)
 
 
-@inner_kernel()
+@inner_kernel(inline="always")
 def _free(space, path, block, work):
     for i in range(len(path) - 1):  # noqa: SIM110
         if not motion_free(space, path[i], path[i + 1], block, work):
@@ -123,7 +123,7 @@ def _skipped(space, path, block, work):
         i = following
 
 
-@inner_kernel()
+@inner_kernel(inline="always")
 def _smoothed(space, path, trial, block, work):
     """The path after repeated subdivision: segment middles become waypoints, corners move towards them."""
     points, dof = path, path.shape[1]
@@ -226,7 +226,7 @@ def _pull_in(space, points, n, trial, block, work, state):
         pull *= np.float32(0.4)
 
 
-@inner_kernel()
+@inner_kernel(inline="always")
 def _move(space, points, i, anywhere, trial, block, work, state):
     """Moves waypoint i towards the chord of its neighbours, and at random with `anywhere`, if that is free
     and shorter."""

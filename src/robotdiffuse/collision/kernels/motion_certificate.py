@@ -219,7 +219,7 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
             e[j] = max(e[j], abs(d - t * dq[j]))
 
 
-@inner_kernel()
+@inner_kernel(inline="always")
 def _remainder(radii, second, e, most):
     """The bound on |r| at the top of this file [m]."""
     total, before = 0.0, 0.0
@@ -327,7 +327,7 @@ def bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, c
     return asked
 
 
-@inner_kernel()
+@inner_kernel(inline="always")
 def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     """Bounds of one check of a piece from separating planes.
 

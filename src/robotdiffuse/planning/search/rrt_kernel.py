@@ -190,7 +190,7 @@ def _squared(trees, tree, part, q):
     return total
 
 
-@inner_kernel()
+@inner_kernel(inline="always")
 def _cheaper(space, trees, tree, roots, near, cost, new, block, work, state):
     """A parent that reaches `new` at a lower cost, and that cost: draws cheaper ones until an edge
     collides."""

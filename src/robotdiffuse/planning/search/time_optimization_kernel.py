@@ -56,7 +56,7 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, tries, st
     return path, deviations, time
 
 
-@inner_kernel()
+@inner_kernel(inline="always")
 def _candidate(space, path, deviations, step, again, state):
     """A change of the path or of its corners, and the first and the last segment that it touches; no
     waypoints if one of these is too short. Waypoint `again`, unless it is 0, moves on by `step`."""
@@ -95,7 +95,7 @@ def _candidate(space, path, deviations, step, again, state):
     return new, wider, i - 1, i
 
 
-@inner_kernel()
+@inner_kernel(inline="always")
 def _is_free(space, line, first, last, a, b, block, work):
     """Whether segments `first` to `last` of the polyline are free, and the rounded corners at their ends and
     next to them."""
