@@ -96,6 +96,8 @@ def test_compile_time_is_all_of_the_block_that_compiles(monkeypatch: pytest.Monk
     assert loading_seconds() - loaded == pytest.approx(12.0)
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_first_calls_load_outside_their_time() -> None:
     """`rd.plan` in a fresh process timed out while it loaded: each load here takes far longer than the
     limit."""
