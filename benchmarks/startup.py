@@ -1,7 +1,10 @@
 """Compiled code from a cold cache, from a warm one, and loaded in another order: whether results are the same
-bits.
+bits; and what a first plan costs.
 
     python benchmarks/startup.py [--seed 0] [--only clearances,gradients]
+    python benchmarks/startup.py --first-plan
+
+The second command prints benchmarks/results/first_plan.txt.
 
 Prints benchmarks/results/cold_cache.txt. Each part runs in a process of its own: first with an empty cache,
 which compiles; then twice with the cache that this left, in the same order and in reverse. Every number that
@@ -91,11 +94,46 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
 
 def work(file: str, seed: int, names: list[str]) -> None:
     """Call the parts in this order and save what they return."""
-    from robotdiffuse.collision.kernels.compiled import compile_seconds
+    from robotdiffuse.core.loading import compile_seconds
 
     known = parts(seed)
     arrays = {name: np.asarray(known[name]()) for name in names}
     np.savez(file, **arrays, seconds=np.array(compile_seconds()))  # type: ignore[arg-type]
+
+
+FIRST_PLAN = """
+from importlib.resources import files
+import robotdiffuse as rd
+from robotdiffuse.core.loading import compile_seconds, compiled, loading_seconds
+problem = rd.load_problem(files("robotdiffuse") / "examples" / "shelf.yaml")
+assert rd.plan(problem, time_limit=10.0, until="first").solved
+assert rd.plan(problem, time_limit=10.0).solved
+print(len(compiled), compile_seconds(), loading_seconds())
+"""
+"""Two plans by the default planner in one process."""
+
+
+def first_plan() -> None:
+    """Print the CPU time of a process that plans: with an empty cache, and with the cache that it left."""
+    from common import print_table
+
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for run in RUNS[:2]:
+            before = os.times()
+            done = subprocess.run(
+                [sys.executable, "-c", FIRST_PLAN],
+                env=os.environ | {"NUMBA_CACHE_DIR": folder, "OMP_NUM_THREADS": "1"},
+                check=True,
+                capture_output=True,
+                text=True,
+            )
+            after = os.times()
+            spent = sum(after[2:4]) - sum(before[2:4])
+            count, compiling, loading = done.stdout.split()
+            rows.append([run, f"{spent:.1f}", count, f"{float(compiling):.1f}", f"{float(loading):.1f}"])
+    columns = ["cache", "CPU [s]", "functions compiled", "compiling, wall [s]", "loading in all, wall [s]"]
+    print_table("A process that plans the shelf", columns, rows)
 
 
 def main() -> None:
@@ -105,6 +143,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="The same bits from a cold and from a warm cache.")
     parser.add_argument("--seed", type=int, default=0, help="(0)")
     parser.add_argument("--only", default=",".join(known), help="some of the parts (all)")
+    parser.add_argument("--first-plan", action="store_true", help="only the cost of a first plan")
     parser.add_argument("--work", help=argparse.SUPPRESS)
     arguments = parse(parser, only="pairs of links")
     names = parts_of(arguments.only, known)
@@ -112,6 +151,9 @@ def main() -> None:
         work(arguments.work, arguments.seed, names)
         return
     print(header("numpy", "numba", "llvmlite"), "\n")
+    if arguments.first_plan:
+        first_plan()
+        return
     kept: dict[str, dict[str, ndarray]] = {}
     with tempfile.TemporaryDirectory() as folder:
         for i, run in enumerate(RUNS):

@@ -1,6 +1,5 @@
 """Two arms as one robot: planned joints, goals for one hand, plans, proofs, tools."""
 
-import time
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -8,22 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numba import njit
 
 import robotdiffuse as rd
 from helpers.example_robots import example_robot
 from helpers.made_arms import chain, row, written
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.constraints import constraint_bounds
-from robotdiffuse.cli import main, plan
-from robotdiffuse.cli.console import Spinner
-from robotdiffuse.cli.plan import load_and_plan
+from robotdiffuse.cli import main
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import reach_bound
-from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.inertias import Payload, inertia_of
@@ -235,24 +229,6 @@ def test_added_planned_and_verified_from_the_command_line(
     out = tmp_path / "result.json"
     assert main(["plan", str(problem), "--planner", "rrt_connect", "--out", str(out)]) == 0
     assert main(["verify", str(out)]) == 0
-
-
-def test_the_first_robot_of_several_arms_compiles_which_is_said_and_takes_no_time_of_the_call(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Kernels for branching robots are compiled at the first plan, on machines of any age; a note says so."""
-    robot, shown = two_arms(), []
-    monkeypatch.setattr(plan, "Spinner", lambda text: (shown.append(text), Spinner(text))[1])
-    q = np.zeros(robot.dof)
-    problem = rd.Problem(robot=robot, scene=rd.Scene(), start=q, goal=q)
-    load_and_plan(problem, "rrt_connect", time_limit=20.0)
-    assert "the first robot of several arms compiles first" in shown[0]
-    began, call = time.perf_counter(), PlanningContext("test", problem, PlanRequest(time_limit=20.0))
-    before = call.elapsed
-    njit(lambda parents: parent_of(parents, 3))(robot.kernel_parents)
-    waited = time.perf_counter() - began
-    assert call.elapsed - before < 0.5 * waited
-    assert any("compiled for" in note for note in call.unsolved().notes)
 
 
 def test_both_arms_reach_as_far_as_one() -> None:

@@ -1,7 +1,9 @@
 """Terminal output of commands: result tables, and a spinner for long waits."""
 
-from threading import Timer
+from threading import Event, Thread
 from typing import TYPE_CHECKING
+
+from robotdiffuse.core.loading import compiled
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
 
 SPINNER_DELAY = 2.0
 """Time until the spinner appears [s]."""
+STATUS_INTERVAL, LOG_INTERVAL = 0.2, 5.0
+"""Time between two updates of the spinner, and between two lines where there is no terminal [s]."""
 CAP_TOLERANCE = 1e-4
 """A clearance this close to the largest one that is measured is printed as larger [m]."""
 ASSUMPTION_TEXTS = {"as seen": "what was seen", "unknown is occupied": "all that was not seen free"}
@@ -21,36 +25,53 @@ ASSUMPTION_TEXTS = {"as seen": "what was seen", "unknown is occupied": "all that
 
 
 class Spinner:
-    """A context manager that shows a spinner with a text on standard error while the block runs.
+    """A context manager that shows a text on standard error while the block runs, and what is compiled.
 
-    It appears after SPINNER_DELAY, so that short commands need not import rich.
+    It appears after SPINNER_DELAY, so that short commands need not import rich. Where standard error is not a
+    terminal, it prints a line while code is compiled, every LOG_INTERVAL.
     """
 
     def __init__(self, text: str) -> None:
         self.text = text
         self._status: Status | None = None
-        self._timer = Timer(SPINNER_DELAY, self._show)
-        self._timer.daemon = True
+        self._ended = Event()
+        self._thread = Thread(target=self._show, daemon=True)
+        self._compiled = len(compiled)
 
     def __enter__(self) -> "Spinner":
-        self._timer.start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._timer.cancel()
-        self._timer.join()
         self.stop()
+        self._thread.join()
 
     def stop(self) -> None:
         """Remove the spinner, if it has appeared."""
+        self._ended.set()
         if self._status is not None:
             self._status.stop()
 
     def _show(self) -> None:
+        if self._ended.wait(SPINNER_DELAY):
+            return
         from rich.console import Console
 
-        self._status = Console(stderr=True).status(self.text)
-        self._status.start()
+        console = Console(stderr=True, highlight=False)
+        if console.is_terminal:
+            self._status = console.status(self._line())
+            self._status.start()
+        while not self._ended.wait(STATUS_INTERVAL if self._status else LOG_INTERVAL):
+            if self._status is not None:
+                self._status.update(self._line())
+            elif len(compiled) > self._compiled:
+                console.print(self._line(), soft_wrap=True)
+
+    def _line(self) -> str:
+        count = len(compiled) - self._compiled
+        if count == 0:
+            return self.text
+        return f"{self.text}: compiling, once on this machine; {count} functions so far ({compiled[-1]})"
 
 
 def clearances(motion: "PlanResult | Report | Certificate", asked: float | None = None) -> str:

@@ -239,17 +239,11 @@ def load_and_plan(
     weights: str | None = None,
     **request: Any,
 ) -> "PlanResult":
-    """Load a planner and its compiled code, then plan; `request` holds arguments of `Planner.plan`.
-
-    Loading comes first because it would use up the time limit, above all on a new machine, which compiles.
-    """
+    """Load a planner and plan, with a spinner that names what is compiled; `request` holds arguments of
+    `Planner.plan`."""
     from robotdiffuse.core.processes import exit_on_interrupt
     from robotdiffuse.planning import load_planner
-    from robotdiffuse.planning.planner import compiles_first
 
-    spinner = Spinner(f"loading compiled code ({compiles_first(problem.robot)})")
+    spinner = Spinner(f"planning with {planner}")
     with exit_on_interrupt(spinner.stop), spinner:
-        loaded = load_planner(planner, settings, weights)
-        loaded.warm_up(problem)
-    with Spinner(f"planning with {planner}"):
-        return loaded.plan(problem, **request)
+        return load_planner(planner, settings, weights).plan(problem, **request)

@@ -5,14 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
-from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import BOX_SLACK, EMPTY_BOX, RobotArrays, SceneArrays, compile_scene
 from robotdiffuse.collision.kernels.clearance_gradients import clearances_and_gradients_into
-from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_clearance import clearances_into, make_clearance_workspace
 from robotdiffuse.collision.kernels.simd import W
+from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box
@@ -65,7 +64,7 @@ class _Rows(NamedTuple):
     solid_boxes: ndarray
 
 
-@njit(cache=True)
+@inner_kernel()
 def _make_rows(obstacles):
     """Memory for so many obstacles and a floor."""
     return _Rows(
@@ -76,7 +75,7 @@ def _make_rows(obstacles):
     )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _join(spheres, boxes, solids, around):
     """Writes what `kernel_arrays._solids` computes from spheres and boxes; returns the number of rows of
     `around`, each of 16 bounding boxes."""
@@ -101,7 +100,7 @@ def _join(spheres, boxes, solids, around):
     return rows
 
 
-@njit(cache=True)
+@inner_kernel()
 def _scene(empty, floors, floor, kinds, params, rows):
     """The SceneArrays of a packed scene, in the memory `rows`; its floor, one of `floors`, is the first
     box."""
@@ -128,7 +127,7 @@ def _scene(empty, floors, floor, kinds, params, rows):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _packed_link_clearances(robot, empty, floors, floor, kinds, params, q, limit):
     first = np.searchsorted(robot.frame, 1)
     out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
@@ -140,7 +139,7 @@ def _packed_link_clearances(robot, empty, floors, floor, kinds, params, q, limit
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _packed_gradients(robot, empty, floors, floor, kinds, params, q, limit, margin):
     first = np.searchsorted(robot.frame, 1)
     out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)

@@ -4,13 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
-from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
 from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace, pair_clearances_into
+from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -33,7 +32,7 @@ class Steps(NamedTuple):
     length: np.float32
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def descend(robot, scene, q, lower, upper, steps, rounds):
     """Moves trajectories q [batch, waypoints, dof] by some rounds, in place; the first and the last waypoint
     stay. Returns the costs of the margins [batch] that the last round found.
@@ -78,7 +77,7 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
     return costs
 
 
-@njit(cache=True)
+@inner_kernel()
 def _push_away(cost, gradient, push, pushed):
     """The Gauss-Newton step -g 2c / (g.g) of the collision costs, at most `push` [rad], into pushed[dof].
 
@@ -98,7 +97,7 @@ def _push_away(cost, gradient, push, pushed):
     return _ONE
 
 
-@njit(cache=True)
+@inner_kernel()
 def _push_inside(q, lower, upper, margin, push, pushed):
     """Adds the Newton step of the limits' cost, at most `push` [rad] per joint, to pushed[dof]. Returns the
     cost.

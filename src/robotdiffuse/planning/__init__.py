@@ -190,7 +190,7 @@ def plan(
     """Plan a motion. The result holds a verified motion, or a status and a reason why there is none.
 
     problem: a `rd.Problem`; `rd.load_problem` reads one from a file.
-    time_limit: wall time for the call, without loading weights and compiling kernels [s].
+    time_limit: wall time for the call, without what is loaded once (code, weights, a robot's arrays) [s].
     seed: seed of all random numbers, at least 0. The same seed gives the same path, unless time runs out.
     until: "first" returns the first verified motion, "converged" searches on until more time hardly shortens
         the path, "time_limit" until time runs out.

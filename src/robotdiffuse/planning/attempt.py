@@ -27,6 +27,9 @@ def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResul
     with context.deadline():
         try:
             start_goal = usable_start_goal(context)
-            return start_goal if isinstance(start_goal, PlanResult) else solver.solve(context, start_goal)
+            if isinstance(start_goal, PlanResult):
+                return start_goal
+            context.prepared = context.elapsed
+            return solver.solve(context, start_goal)
         except OutOfTimeError as error:
             return context.out_of_time(error)

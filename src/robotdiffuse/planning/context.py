@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.core.deadline import OutOfTimeError, check_left, deadline
+from robotdiffuse.core.loading import loading_seconds
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural, OneOf, Settings
 from robotdiffuse.core.types import CONVERGED, OBJECTIVES, TIME, UNTIL, Path, Status, Trajectory
@@ -86,7 +86,7 @@ class PlanningContext:
 
     def __init__(self, planner_name: str, problem: Problem, request: PlanRequest = PlanRequest()) -> None:
         """Starts the clock. Raises InputError if `problem` is not a Problem."""
-        self.started, self._compiled = time.perf_counter(), compile_seconds()
+        self.started = time.perf_counter() - loading_seconds()
         check_problem(problem)
         self.planner_name, self.problem, self.request = planner_name, problem, request
         self.clearance = requested_clearance(problem, request.clearance)
@@ -98,6 +98,8 @@ class PlanningContext:
         self.validator = verifier(problem)
         self.notes = [*unit_notes(problem), *problem.notes]
         """Notes of the result, on what was changed or ignored; planners may add to them."""
+        self.prepared = 0.0
+        """When the search began [s since the call]."""
         self._progress: list[tuple[float, float]] = []
         self._refused = ""
         self._ended: tuple[Status, str] | None = None
@@ -115,21 +117,9 @@ class PlanningContext:
 
     @property
     def elapsed(self) -> float:
-        """Wall time since the call began, without the time for compiling kernels, once on a machine [s]."""
+        """Wall time since the call began, without that for loading; see `core/loading.py` [s]."""
         check_left()
-        return time.perf_counter() - self.started - self._compiling
-
-    @property
-    def _compiling(self) -> float:
-        return compile_seconds() - self._compiled
-
-    @property
-    def _all_notes(self) -> tuple[str, ...]:
-        """The notes, and how long compiling took, which does not count as planning time."""
-        if self._compiling == 0:
-            return tuple(self.notes)
-        spent = f"compiled for {self._compiling:.1f} s, once on this machine, which does not count as time"
-        return (*self.notes, spent)
+        return time.perf_counter() - loading_seconds() - self.started
 
     @property
     def search_until(self) -> float:
@@ -156,7 +146,7 @@ class PlanningContext:
             robot=self.problem.robot.name,
             planning_time=self.elapsed,
             seed=self.request.seed,
-            notes=self._all_notes,
+            notes=tuple(self.notes),
             refused=self._refused,
         )
 
@@ -183,7 +173,11 @@ class PlanningContext:
 
     def _too_short(self, error: OutOfTimeError) -> str:
         limit = f"the time limit of {self.request.time_limit:g} s is too short {error.what}"
-        return f"{limit}: there was no time for {error}"
+        before = (
+            f"the search began after {self.prepared:.2f} s" if self.prepared else "before the search began"
+        )
+        found = f", its first path came after {self._progress[0][0]:.2f} s" if self._progress else ""
+        return f"{limit}: there was no time for {error} after {self.elapsed:.2f} s; {before}{found}"
 
     @property
     def ended(self) -> bool:
@@ -273,7 +267,7 @@ class PlanningContext:
             min_clearance=min(scene, itself),
             scene_clearance=scene,
             self_clearance=itself,
-            notes=(*self._all_notes, *notes),
+            notes=(*self.notes, *notes),
             progress=(*longer, (found[0] if found else planning_time, whole)),
             refused=self._refused,
         )

@@ -7,6 +7,7 @@ from typing import ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.loading import compile_note
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import CONVERGED, FIRST, TIME
@@ -56,7 +57,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         The same seed gives the same path, as long as time does not run out. A result with status SOLVED holds
         a path and a trajectory that passed `verify`; any other status comes with a reason.
 
-        time_limit: wall time for the call, without loading weights and compiling kernels [s].
+        time_limit: wall time for the call, without what is loaded once (code, weights, a robot's arrays) [s].
         seed: seed of all random numbers, at least 0.
         until: "first" returns the first verified motion, "converged" searches on until more time hardly
             improves it, "time_limit" until time runs out; planners that cannot improve a path return
@@ -91,9 +92,13 @@ class Planner(ABC, Generic[PlannerSettings]):
         request = PlanRequest(
             time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk, objective
         )
+        result, note = self._plan(problem, request), compile_note()
+        return replace(result, problem=problem, notes=(*result.notes, note) if note else result.notes)
+
+    def _plan(self, problem: Problem, request: PlanRequest) -> PlanResult:
         self._check_support(problem, request)
         self.prepare(problem.robot)
-        return replace(pipeline_for(problem)(self, problem, request), problem=problem)
+        return pipeline_for(problem)(self, problem, request)
 
     def _check_support(self, problem: Problem, request: PlanRequest) -> None:
         """Raises InputError for a request that the planner does not support."""
@@ -104,13 +109,13 @@ class Planner(ABC, Generic[PlannerSettings]):
                 raise InputError(f"planner {self.name} does not support {what}; these do: {able}")
 
     def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
-        """Compile or load the kernels now, so that the first call does not spend its time limit on it.
+        """Load or compile the code of later calls now, for programs that cannot wait in a first call.
 
-        On a new machine this takes about a minute. `until` is that of the calls to come.
+        A first call loads by itself what it needs, and does not count it as its time, but takes longer.
+        `until` is that of the calls to come.
 
         Returns the results of the calls that it makes: without obstacles, with balls on the straight line,
-        and a very short one with one small obstacle of each kind in the problem's scene. The problem's own
-        scene is compiled within the time of its own call.
+        and a very short one with one small obstacle of each kind in the problem's scene.
         """
         from robotdiffuse.collision.exact_meshes import warm_up as load_coal
 
@@ -124,7 +129,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]
         calls = [*((easier, EASY_TIME_LIMIT) for easier in easy), (kinds, SHORT_TIME_LIMIT)]
         load_coal(robot)
-        return [self.plan(task, seconds, until=until) for task, seconds in calls]
+        return [self._plan(task, PlanRequest(seconds, until=until)) for task, seconds in calls]
 
     def prepare(self, robot: Robot) -> None:
         """Do what does not count as planning time: learned planners load their weights for the robot, and
@@ -144,13 +149,6 @@ def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[
         yield settings, attempt
         settings = replace(settings, resolution=finer_resolution(settings.resolution))  # type: ignore
         attempt += 1
-
-
-def compiles_first(robot: Robot) -> str:
-    """A message for people who wait for a first call. Kernels for robots with several arms are compiled
-    separately."""
-    who = "a new machine" if robot.kernel_parents is None else "the first robot of several arms"
-    return f"{who} compiles first, for about a minute"
 
 
 def one_of_each(scene: Scene) -> Scene:

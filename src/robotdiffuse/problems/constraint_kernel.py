@@ -21,8 +21,8 @@ second derivative is at most (sum_j |dq_j|)². TURN grows no faster than the fra
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step, forward, pose_error
 
 DISTANCE, CONE, TURN = 0, 1, 2
@@ -100,7 +100,7 @@ class Work(NamedTuple):
     trial: np.ndarray
 
 
-@njit(cache=True)
+@kernel()
 def make_work(rows):
     m, dof = rows.lever_bounds.shape
     most = 3 * m
@@ -124,7 +124,7 @@ def make_work(rows):
     )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _pose(rows, m, q, work):
     """Writes the pose of the frame of row m to work.T, and the joint axes and origins of its chain."""
     for k in range(rows.chain_length[m]):
@@ -141,7 +141,7 @@ def _pose(rows, m, q, work):
     )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _in_box(rows, m, T, r):
     """Coordinate r of the frame's origin in the frame of the box."""
     place, out = rows.reference_pose[m], 0.0
@@ -150,7 +150,7 @@ def _in_box(rows, m, T, r):
     return out
 
 
-@njit(cache=True)
+@inner_kernel()
 def _cone(rows, m, T, normal):
     """The angle of a CONE; writes to normal[3] the rotation axis that reduces it, of length sin(angle)."""
     a, b = rows.a[m], rows.b[m]
@@ -162,7 +162,7 @@ def _cone(rows, m, T, normal):
     return np.arctan2(sine, x * b[0] + y * b[1] + z * b[2])
 
 
-@njit(cache=True)
+@inner_kernel()
 def _turn(rows, m, T, target, error):
     """The angle of a TURN; writes to error[3:6] the rotation vector to the interpolated orientation."""
     place, fraction = rows.reference_pose[m], 0.0
@@ -185,7 +185,7 @@ def _turn(rows, m, T, target, error):
     return np.sqrt(pose_error(T, target, 6, 1.0, error))
 
 
-@njit(cache=True)
+@inner_kernel()
 def _value(rows, m, work):
     """The value of row m at the pose in work.T."""
     if rows.row_kind[m] == CONE:
@@ -200,7 +200,7 @@ def _value(rows, m, work):
     return np.sqrt(outside) + min(deepest, 0.0)
 
 
-@njit(cache=True)
+@kernel()
 def evaluate(rows, q, end, work):
     """Writes the values at a configuration to work.values[end], and the distances from the joint axes to the
     frame's origin to work.levers[end]."""
@@ -216,7 +216,7 @@ def evaluate(rows, q, end, work):
                 work.levers[end, m, k] = np.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
 
 
-@njit(cache=True)
+@kernel()
 def values(rows, q):
     """Values of the rows [n, m] at configurations [n, dof]."""
     work = make_work(rows)
@@ -227,7 +227,7 @@ def values(rows, q):
     return out
 
 
-@njit(cache=True)
+@kernel()
 def speeds(rows, m, q, rates):
     """Speed of the origin of the frame of row m [n] at configurations [n, dof] with joint rates [n, dof]."""
     work = make_work(rows)
@@ -241,7 +241,7 @@ def speeds(rows, m, q, rates):
     return out
 
 
-@njit(cache=True)
+@inner_kernel()
 def _add_velocity(rows, m, k, rate, work, total):
     """Adds to `total` the velocity of the frame's origin of row m that joint k of its chain causes."""
     a, b, c = work.axes[k, 0], work.axes[k, 1], work.axes[k, 2]
@@ -256,7 +256,7 @@ def _add_velocity(rows, m, k, rate, work, total):
     total[2] += rate * z
 
 
-@njit(cache=True)
+@inner_kernel()
 def _unproved(rows, limits, a, b, fraction, first, second, work):
     """The first row that is not proved along a piece of the motion from a to b; -1 if all are proved.
 
@@ -298,7 +298,7 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
     return -1
 
 
-@njit(cache=True)
+@inner_kernel()
 def proved(rows, limits, a, b, min_fraction, work):
     """The fraction of the straight motion from a to b up to which the limits are proved, and the row that is
     not proved there; 1.0 and -1 if all are proved. Pieces are split down to the fraction `min_fraction`."""
@@ -319,7 +319,7 @@ def proved(rows, limits, a, b, min_fraction, work):
     return 1.0, -1
 
 
-@njit(cache=True)
+@kernel()
 def first_unproved(rows, limits, q, min_fraction):
     """Where the limits are first not proved along the motion through q[n, dof]: the segment, the fraction of
     it, and the row. The row is -1 if all are proved."""
@@ -335,7 +335,7 @@ def first_unproved(rows, limits, q, min_fraction):
     return len(q) - 1, 0.0, -1
 
 
-@njit(cache=True)
+@inner_kernel()
 def _residuals(rows, limits, q, work):
     """The number of residuals of the rows that exceed their limits.
 
@@ -386,7 +386,7 @@ def _residuals(rows, limits, q, work):
     return count
 
 
-@njit(cache=True)
+@inner_kernel()
 def step(rows, limits, q, most, work):
     """Moves q by one damped Newton step towards the limits, within the joint limits.
 
@@ -417,7 +417,7 @@ def step(rows, limits, q, most, work):
     return count
 
 
-@njit(cache=True)
+@kernel()
 def project(rows, limits, q, work):
     """Projects q in place onto the limits by damped Newton steps, within the joint limits.
 

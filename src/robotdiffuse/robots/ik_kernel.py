@@ -7,8 +7,9 @@ Continuous joints are unbounded while solving, and wrapped to [-pi, pi] in solut
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy import ndarray
+
+from robotdiffuse.core.kernels import inner_kernel, kernel
 
 REVOLUTE, PRISMATIC, CONTINUOUS = 0, 1, 2
 TURN = 2 * np.pi
@@ -23,7 +24,7 @@ REQUIRED_PROGRESS = 0.5
 """A seed whose error has not dropped to this fraction since the last check is given up."""
 
 
-@njit(cache=True)
+@inner_kernel()
 def forward(q, offsets, tool, kinds, frame, T, axes, origins):
     """Write the axes and origins of the first `frame` joints, and the pose of the tool into T [3, 4].
 
@@ -56,7 +57,7 @@ def forward(q, offsets, tool, kinds, frame, T, axes, origins):
         T[i, 3] = a * tool[0, 3] + b * tool[1, 3] + c * tool[2, 3] + d
 
 
-@njit(cache=True)
+@inner_kernel()
 def pose_error(T, target, rows, rotation_weight, error):
     """Write the error of pose T into `error` [6] and return its squared norm.
 
@@ -95,7 +96,7 @@ def pose_error(T, target, rows, rotation_weight, error):
     return total
 
 
-@njit(cache=True)
+@inner_kernel()
 def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
     """Write the geometric Jacobian of the tool, rotations weighted, into J [6, dof]."""
     for j in range(frame):
@@ -111,7 +112,7 @@ def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
                 J[3, j], J[4, j], J[5, j] = rotation_weight * ax, rotation_weight * ay, rotation_weight * az
 
 
-@njit(cache=True)
+@inner_kernel()
 def damped_step(J, error, damping, rows, frame, held, A, y, step):
     """Write step = J^T (J J^T + damping I)^-1 error for the joints that are not held; solved by Cholesky."""
     for i in range(rows):
@@ -145,7 +146,7 @@ def damped_step(J, error, damping, rows, frame, held, A, y, step):
         step[j] = total
 
 
-@njit(cache=True)
+@inner_kernel()
 def _is_new(q, others, count, kinds, min_distance):
     """Whether q is further than min_distance from the first `count` others: max norm, continuous joints
     wrapped."""
@@ -191,7 +192,7 @@ class IKParameters(NamedTuple):
     min_distance: float
 
 
-@njit(cache=True)
+@kernel()
 def solve_seeds(seeds, known, wanted, chain, target, parameters):
     """Solve seed after seed until `wanted` configurations are found that differ from `known` and each other.
 

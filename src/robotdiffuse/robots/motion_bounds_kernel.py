@@ -4,10 +4,11 @@ Sums have a fixed order and no fused operations, so the results equal those of N
 """
 
 import numpy as np
-from numba import njit
+
+from robotdiffuse.core.kernels import kernel
 
 
-@njit(cache=True)
+@kernel()
 def sliding_maximum(support, first, width):
     """Largest value [n, rows, columns] among `width` longitudes, beginning `first` after each longitude."""
     n, rows, columns = support.shape
@@ -25,11 +26,12 @@ def sliding_maximum(support, first, width):
                     next_wide[k] = max(wide[k], wide[k + shift - columns])
                 wide, next_wide = next_wide, wide
                 done += shift
-            out[i, row] = wide
+            for k in range(columns):  # assigning the array would compile Numba's messages on shapes
+                out[i, row, k] = wide[k]
     return out
 
 
-@njit(cache=True)
+@kernel()
 def interpolated(values, corners, weights, residual, reach):
     """Bounds [n, directions] in rotated directions: values interpolated from four grid corners each, with
     weights [4, directions], plus the residual times the distance `reach` [n] of the farthest point."""

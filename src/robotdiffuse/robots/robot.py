@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, Value, read_only
 from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, rotation_z_to, transform
 from robotdiffuse.robots.bodies import TOOL, AttachedBody, BodyContent, ConvexMesh, RigidShape, Surface
 from robotdiffuse.robots.inertias import Inertia
@@ -508,13 +509,15 @@ def _with_body(robot: Robot, content: BodyContent) -> Robot:
 
 
 def once_per_robot(build: Callable[[Robot], T]) -> Callable[[Robot], T]:
-    """Decorator: cache a function of a robot on the robot itself, for the robot's lifetime."""
+    """Decorator: cache a function of a robot on the robot itself, for the robot's lifetime. The first call
+    counts as loading."""
     name = f"{build.__module__}.{build.__qualname__}"
 
     @wraps(build)
     def known(robot: Robot) -> T:
         if name not in robot.__dict__:
-            robot.__dict__[name] = build(robot)
+            with loading():
+                robot.__dict__[name] = build(robot)
         return robot.__dict__[name]
 
     return known

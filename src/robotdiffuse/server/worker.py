@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import orjson
 
-from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.core.deadline import check_left, left_by
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import parse_json
+from robotdiffuse.core.loading import compile_seconds
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import UNTIL
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner

@@ -6,11 +6,11 @@ Microseconds via Vectorized Sampling-Based Planning", ICRA 2024, and in OMPL's p
 """
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free, random
+from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
+from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 MAX_SUBDIVISIONS = 5
@@ -27,7 +27,7 @@ MAX_RANDOM_MOVE, RANDOM_MOVE_LOG_RANGE = np.float32(0.3), np.float32(5.0)
 longest to the shortest."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def simplify(space, path, rounds):
     """A path [n, dof] with the same start and goal that is free and no longer.
 
@@ -51,7 +51,7 @@ def simplify(space, path, rounds):
     return points
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def shortcut(space, path, tries, state):
     """A path [n, dof] with the same start and goal that is free and no longer.
 
@@ -65,7 +65,7 @@ def shortcut(space, path, tries, state):
     return _shortcuts(space, points, tries, a, b, block, work, state)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def tighten(space, path, tries, state):
     """A path [n, dof] with the same start and goal that is free and no longer, near a given free one.
 
@@ -89,7 +89,7 @@ def tighten(space, path, tries, state):
     return points[:n].copy()
 
 
-@njit(cache=True)
+@inner_kernel(inline="always")
 def _make_scratch(space, path):
     """Scratch memory of the motion checks, and two configurations."""
     dof = path.shape[1]
@@ -97,7 +97,7 @@ def _make_scratch(space, path):
     return work, block, np.empty(dof, np.float32), np.empty(dof, np.float32)
 
 
-@njit(cache=True)
+@inner_kernel(inline="always")
 def _free(space, path, block, work):
     for i in range(len(path) - 1):  # noqa: SIM110
         if not motion_free(space, path[i], path[i + 1], block, work):
@@ -105,7 +105,7 @@ def _free(space, path, block, work):
     return True
 
 
-@njit(cache=True)
+@inner_kernel()
 def _skipped(space, path, block, work):
     """The path without the waypoints that straight lines can skip; the farthest reachable one comes next."""
     out = np.empty(path.shape, np.float32)
@@ -123,7 +123,7 @@ def _skipped(space, path, block, work):
         i = following
 
 
-@njit(cache=True)
+@inner_kernel(inline="always")
 def _smoothed(space, path, trial, block, work):
     """The path after repeated subdivision: segment middles become waypoints, corners move towards them."""
     points, dof = path, path.shape[1]
@@ -153,7 +153,7 @@ def _smoothed(space, path, trial, block, work):
     return points
 
 
-@njit(cache=True)
+@inner_kernel()
 def _shortcuts(space, path, tries, a, b, block, work, state):
     capacity, dof = len(path) + tries + 2, path.shape[1]
     points, n = np.empty((capacity, dof), np.float32), len(path)
@@ -207,7 +207,7 @@ def _place_at(points, n, length, out):
     return 0
 
 
-@njit(cache=True)
+@inner_kernel()
 def _pull_in(space, points, n, trial, block, work, state):
     """Moves a random inner waypoint towards the chord of its neighbours, by less after each failed check."""
     i = 1 + int(random(state) * np.float32(n - 2))
@@ -226,7 +226,7 @@ def _pull_in(space, points, n, trial, block, work, state):
         pull *= np.float32(0.4)
 
 
-@njit(cache=True)
+@inner_kernel(inline="always")
 def _move(space, points, i, anywhere, trial, block, work, state):
     """Moves waypoint i towards the chord of its neighbours, and at random with `anywhere`, if that is free
     and shorter."""

@@ -9,7 +9,8 @@ of an interval.
 """
 
 import numpy as np
-from numba import njit
+
+from robotdiffuse.core.kernels import inner_kernel, kernel
 
 SAMPLES_PER_INTERVAL = 16
 """Parts of a grid interval at whose ends `slowdown` checks limits; with 4, a reversal was 1.8 % too fast."""
@@ -31,7 +32,7 @@ MIN_SPEED_RATIO = 0.01
 changes sign, the limits would otherwise allow a speed that only a stop can follow."""
 
 
-@njit(cache=True)
+@inner_kernel()
 def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
     """Writes the path (order 0) or its first or second derivative at s to out[dof]; see `BlendedPolyline`."""
     segments = len(directions)
@@ -76,7 +77,7 @@ def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
             out[j] = 0.0
 
 
-@njit(cache=True)
+@kernel()
 def evaluate(line, s, order):
     """`evaluate_at` for every value of s, [m, dof]; `line` is (waypoints, knots, directions, half_widths)."""
     waypoints, knots, directions, half_widths = line
@@ -86,7 +87,7 @@ def evaluate(line, s, order):
     return out
 
 
-@njit(cache=True)
+@kernel()
 def rounded_line(waypoints, deviations):
     """The polyline through waypoints [n, dof] with the widest blends that leave it by at most the deviations
     [n - 2] and do not overlap, as the arguments of `evaluate`."""
@@ -113,7 +114,7 @@ def rounded_line(waypoints, deviations):
     return waypoints, knots, directions, widths
 
 
-@njit(cache=True)
+@kernel()
 def timing_grid(knots, half_widths, corner_intervals, line_intervals):
     """Values of s: equal parts of every rounded corner, and parts of the straight lines by their lengths.
 
@@ -139,7 +140,7 @@ def timing_grid(knots, half_widths, corner_intervals, line_intervals):
     return grid[: count + 1].copy()
 
 
-@njit(cache=True)
+@kernel()
 def least_time(line, velocity, acceleration, corner_intervals, line_intervals):
     """Duration of the fastest motion along a line from rest to rest, without limits of jerk [s]."""
     grid = timing_grid(line[1], line[3], corner_intervals, line_intervals)
@@ -153,7 +154,7 @@ def least_time(line, velocity, acceleration, corner_intervals, line_intervals):
     return duration * slowdown(line, grid, speeds, velocity, acceleration)
 
 
-@njit(cache=True)
+@kernel()
 def estimated_time(line, velocity, acceleration):
     """About the least duration of a motion along a line from rest to rest, without limits of jerk [s]: on
     random lines 0.7 % more, with a standard deviation of 0.5 %.
@@ -193,7 +194,7 @@ def estimated_time(line, velocity, acceleration):
     return duration
 
 
-@njit(cache=True)
+@inner_kernel()
 def _greatest_pull(first, second, i, x, sign, acceleration):
     """The greatest |s̈| of a sign with which accelerations are within their limits at grid point i."""
     most = np.inf
@@ -204,7 +205,7 @@ def _greatest_pull(first, second, i, x, sign, acceleration):
     return most
 
 
-@njit(cache=True)
+@inner_kernel()
 def _bounds_of_next(first, second, i, width, x, most, weakest, strongest):
     """Bounds of the next x after x in interval i, as linear functions of x; `most` is the greatest next x.
 
@@ -234,7 +235,7 @@ def _bounds_of_next(first, second, i, width, x, most, weakest, strongest):
     return low, low_slope, high, high_slope, greatest
 
 
-@njit(cache=True)
+@kernel()
 def controllable(first, second, grid, velocity, weakest, strongest):
     """The greatest ṡ² at each grid point from which the end can be reached at rest without a stop before it.
 
@@ -265,7 +266,7 @@ def controllable(first, second, grid, velocity, weakest, strongest):
     return x
 
 
-@njit(cache=True)
+@kernel()
 def fastest_speeds(first, second, grid, velocity, weakest, strongest, start_speed=0.0):
     """ṡ at each grid point: `start_speed` at the first, 0 at the last, positive between; arguments as of
     `controllable`. All NaN if the end cannot be reached from the start speed."""
@@ -286,7 +287,7 @@ def fastest_speeds(first, second, grid, velocity, weakest, strongest, start_spee
     return speeds
 
 
-@njit(cache=True)
+@kernel()
 def slowdown(line, grid, speeds, velocity, acceleration):
     """The factor, at least 1, by which the motion must be slowed to keep the limits between grid points
     too."""
@@ -313,7 +314,7 @@ def slowdown(line, grid, speeds, velocity, acceleration):
     return worst
 
 
-@njit(cache=True)
+@kernel()
 def sample_rows(line, grid, speeds, sample_time):
     """Times [n], positions, velocities and accelerations [n, dof] of the motion with these speeds.
 

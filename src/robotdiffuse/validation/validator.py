@@ -9,13 +9,13 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import describe_contact
 from robotdiffuse.collision.motions import Contact, ContinuousCollision
 from robotdiffuse.core.bounds import MAX_COORDINATE, for_kernels, within
 from robotdiffuse.core.errors import InputError, check_type, joined, shown
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
@@ -386,7 +386,7 @@ class Verifier:
         return MovingCollision(self.robot, self.problem.moving, settings.contact, settings.tightness)
 
 
-@njit(cache=True)
+@kernel()
 def _spaced_rows(q, step):
     """Indices of rows of q[n, dof] such that each is at least `step` from the one before, beginning with row
     0."""

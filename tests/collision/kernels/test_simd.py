@@ -5,7 +5,6 @@ import pytest
 from numba.core.errors import TypingError
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.simd import (
     W,
     absolute,
@@ -26,9 +25,10 @@ from robotdiffuse.collision.kernels.simd import (
     sqrt,
     store,
 )
+from robotdiffuse.core.kernels import allocation_free
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def _calculate(a, b, s, out):
     x, y = load(a, 0, 0), load(b, 1, 1)
     store(out, 0, 0, x + y * s)
@@ -42,7 +42,7 @@ def _calculate(a, b, s, out):
     return x < y, reduce_min(x), reduce_max(x), lane(x, 3)
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def _look_up(table, index, bit, out):
     found = gather(table, load(index, 0, 0))
     store(out, 0, 0, found)

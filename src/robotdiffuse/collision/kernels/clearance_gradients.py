@@ -1,7 +1,6 @@
 """Compiled clearances of links, with the gradient of the arm's violation of a margin to obstacles."""
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.lane_clearance import (
@@ -9,9 +8,10 @@ from robotdiffuse.collision.kernels.lane_clearance import (
     count_obstacles,
     make_clearance_workspace,
 )
+from robotdiffuse.core.kernels import inner_kernel, kernel
 
 
-@njit(cache=True)
+@inner_kernel()
 def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearances, gradients):
     """Writes clearances[n, groups] of the moving groups and gradients[n, dof] for the rows of q[n, dof].
 
@@ -32,7 +32,7 @@ def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearanc
                 gradients[i] /= np.sqrt(np.float32(2.0) * cost)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def clearances_and_gradients(robot, scene, q, limit, margin):
     """Clearances [n, moving groups] to the scene, at most `limit`, and gradients [n, dof]; see
     `clearances_and_gradients_into`."""

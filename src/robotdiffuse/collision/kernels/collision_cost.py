@@ -9,12 +9,12 @@ the joints before the link.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
+from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.distance import frames_of, placed, solid_distance
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
 from robotdiffuse.collision.kernels.simd import W, absolute, first_lane, lane, load, maximum, minimum, sqrt
+from robotdiffuse.core.kernels import allocation_free, inner_kernel
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _TINY = np.float32(1e-9)
@@ -141,7 +141,7 @@ class CostWorkspace(NamedTuple):
     """[2, 6] forces and moments on one link and on another."""
 
 
-@njit(cache=True)
+@inner_kernel()
 def make_cost_workspace(dof):
     """Scratch memory for one thread."""
     return CostWorkspace(

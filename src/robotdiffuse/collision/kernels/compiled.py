@@ -1,71 +1,11 @@
-"""Shared by compiled code: a decorator for functions that do not allocate, random numbers, and compile
-time."""
-
-import sys
-import time
-from collections.abc import Callable
-from importlib import import_module
-from typing import Any
+"""Shared by compiled code: the parent frame of a joint, and random numbers."""
 
 import numpy as np
-from numba import njit
-from numba.core import event, types
+from numba.core import types
 from numba.extending import overload
 from numpy import ndarray
 
-
-def _without_scipy(module: str) -> None:
-    """Import a module of Numba without SciPy, which it imports only to choose an algorithm for
-    `np.convolve`."""
-    blas = "scipy.linalg.cython_blas"
-    if blas not in sys.modules:
-        sys.modules[blas] = None  # pyright: ignore[reportArgumentType]  (makes the import fail)
-        try:
-            import_module(module)
-        finally:
-            del sys.modules[blas]
-
-
-_without_scipy("numba.np.arraymath")  # SciPy would take a ninth of the time of a plan by search
-
-
-class _CompileTimer(event.Listener):
-    """Adds up the time of outermost compilations; only one thread compiles at a time."""
-
-    def __init__(self) -> None:
-        self.seconds, self._depth, self._began = 0.0, 0, 0.0
-
-    def on_start(self, event: event.Event) -> None:
-        if self._depth == 0:
-            self._began = time.perf_counter()
-        self._depth += 1
-
-    def on_end(self, event: event.Event) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            self.seconds += time.perf_counter() - self._began
-
-
-_timer = _CompileTimer()
-event.register("numba:compile", _timer)
-
-
-def compile_seconds() -> float:
-    """Time that this process has spent compiling so far [s], without loading compiled code from disk."""
-    return _timer.seconds
-
-
-def allocation_free(
-    fastmath: bool = False, inline: str = "never", forceinline: bool = False
-) -> Callable[[Callable], Any]:
-    """A decorator that compiles a function without Numba's reference counting.
-
-    Counting references to the arrays in every call would take two thirds of the collision kernel's time. Such
-    a function must not allocate memory, nor assign an array to a slice.
-    """
-    options: dict[str, Any] = {"fastmath": fastmath, "inline": inline, "forceinline": forceinline}
-    options |= {"cache": True, "_nrt": False}
-    return njit(**options)
+from robotdiffuse.core.kernels import allocation_free
 
 
 def parent_of(parents, j):

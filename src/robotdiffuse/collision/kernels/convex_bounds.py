@@ -10,10 +10,10 @@ All computations are in float64.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
+from robotdiffuse.core.kernels import inner_kernel, kernel
 
 MAX_GJK_STEPS = 32
 """Iterations of GJK at most; usually it takes three to eight."""
@@ -73,7 +73,7 @@ class Posture(NamedTuple):
     """[3, 3] a normal, and the support points of the two bodies along it."""
 
 
-@njit(cache=True)
+@kernel()
 def make_posture(hulls, solids, dof):
     """Scratch memory for one thread."""
     frames = np.zeros((dof + 1, 3, 4))
@@ -86,7 +86,7 @@ def make_posture(hulls, solids, dof):
     )
 
 
-@njit(cache=True)
+@kernel()
 def pose(offsets, parents, slides, q, dq, posture):
     """Writes the frames at q and their twists along dq to `posture`.
 
@@ -104,7 +104,7 @@ def pose(offsets, parents, slides, q, dq, posture):
             twist[3 + r] = before[3 + r] + (axis if slides[j] else moment)
 
 
-@njit(cache=True)
+@inner_kernel()
 def part_speed(hulls, p, base, posture):
     """Upper bound on how far any point of a part moves from the middle to an end, seen from frame `base` [m],
     without the remainder."""
@@ -118,7 +118,7 @@ def part_speed(hulls, p, base, posture):
     return np.sqrt(u * u + v * v + w * w) + ball[3] * np.sqrt(a * a + b * b + c * c)
 
 
-@njit(cache=True)
+@inner_kernel()
 def ball_to_solid(hulls, p, solids, o, posture):
     """Lower bound of the distance of a part to an obstacle in the middle, from the part's ball [m]."""
     T, ball = posture.frames[hulls.frame[p]], hulls.balls[p]
@@ -127,7 +127,7 @@ def ball_to_solid(hulls, p, solids, o, posture):
     return gap - solids.rounding[o] - ball[3]
 
 
-@njit(cache=True)
+@inner_kernel()
 def ball_to_ball(hulls, p, q, posture):
     """Lower bound of the distance of two parts in the middle, from their balls [m]."""
     S, T, total = posture.frames[hulls.frame[p]], posture.frames[hulls.frame[q]], 0.0
@@ -137,7 +137,7 @@ def ball_to_ball(hulls, p, q, posture):
     return np.sqrt(total) - a[3] - b[3]
 
 
-@njit(cache=True, fastmath=True)
+@inner_kernel(fastmath=True)
 def _least(vertices, first, last, x, y, z, offset, u, v, w, speed):
     """Minimum of a - |b| over vertices, where a and b are linear functions of the vertex; plus `offset`."""
     least = np.inf
@@ -148,7 +148,7 @@ def _least(vertices, first, last, x, y, z, offset, u, v, w, speed):
     return least + offset
 
 
-@njit(cache=True)
+@inner_kernel()
 def _furthest(vertices, first, last, x, y, z):
     """Index of the vertex that is furthest in a direction."""
     best, at = -np.inf, first
@@ -159,7 +159,7 @@ def _furthest(vertices, first, last, x, y, z):
     return at
 
 
-@njit(cache=True)
+@inner_kernel()
 def _support_of_part(hulls, p, posture, sign, row):
     """Writes the vertex of a part that is furthest along sign * points[0] to points[row]."""
     T, points = posture.frames[hulls.frame[p]], posture.points
@@ -176,7 +176,7 @@ def _support_of_part(hulls, p, posture, sign, row):
         points[row, r] = placed(T, hulls.vertices[:, i], r)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _support_of_solid(solids, o, posture):
     """Writes the point of an obstacle, without its rounding, that is furthest along points[0] to
     points[2]."""
@@ -193,7 +193,7 @@ def _support_of_solid(solids, o, posture):
         points[2, r] = R[0, r] * a + R[1, r] * b + R[2, r] * c + solids.middle[o, r]
 
 
-@njit(cache=True)
+@inner_kernel()
 def _least_along(hulls, p, base, sign, posture):
     """Minimum height of a part along sign * points[0] at the two ends of the motion, without the remainder,
     with velocities seen from frame `base`."""
@@ -216,7 +216,7 @@ def _least_along(hulls, p, base, sign, posture):
     return at_start - hulls.rounding[p], at_stop - hulls.rounding[p]
 
 
-@njit(cache=True)
+@inner_kernel()
 def separation(hulls, p, solids, other, base, posture):
     """Widths of the gap between two bodies along the unit normal points[0] [m].
 
@@ -262,12 +262,12 @@ def separation(hulls, p, solids, other, base, posture):
     return middle - reach - 1e-9, along - reach - 1e-9
 
 
-@njit(cache=True)
+@inner_kernel()
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True)
+@inner_kernel()
 def _holds_origin(e, new):
     """Whether the tetrahedron of `new` and `new` + e[0], e[1], e[2] contains the origin."""
     inside = 1.0
@@ -284,7 +284,7 @@ def _holds_origin(e, new):
     return inside > 0
 
 
-@njit(cache=True)
+@inner_kernel()
 def _nearest(simplex, count, edges, nearest):
     """Writes the point of a simplex nearest to the origin to `nearest`; it is known to depend on the last
     vertex.
@@ -329,7 +329,7 @@ def _nearest(simplex, count, edges, nearest):
     return at
 
 
-@njit(cache=True)
+@inner_kernel()
 def find_plane(hulls, p, solids, other, posture):
     """Replaces the normal points[0], an initial guess, by that of the plane with the widest gap between two
     bodies in the middle of the motion. False if they touch, or nearly."""
@@ -364,7 +364,7 @@ def find_plane(hulls, p, solids, other, posture):
     return best > rounding
 
 
-@njit(cache=True)
+@kernel()
 def best_plane(hulls, p, solids, other, base, enough, plane, posture):
     """Gaps between two bodies by a separating plane, and whether GJK computed it.
 

@@ -6,8 +6,9 @@ in guidance and refinement.
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
+from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.point_grid import near_point
+from robotdiffuse.core.kernels import allocation_free
 
 CLEARANCE_CAP = np.float32(1.0)
 """Clearances beyond this [m] are reported as this."""

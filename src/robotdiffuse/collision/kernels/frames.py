@@ -2,10 +2,11 @@
 boxes."""
 
 import numpy as np
-from numba import njit
+
+from robotdiffuse.core.kernels import inner_kernel
 
 
-@njit(cache=True)
+@inner_kernel()
 def step(parent, offset, slides, q, child):
     """Writes the frame behind a joint at q [rad or m]: T_base_child from T_base_parent and T_parent_joint[4,
     4]."""
@@ -19,13 +20,13 @@ def step(parent, offset, slides, q, child):
         child[r, 3] = t + parent[r, 3] + z * slide
 
 
-@njit(cache=True)
+@inner_kernel()
 def placed(T, p, r):
     """Coordinate r in the base frame of the point p of frame T."""
     return T[r, 0] * p[0] + T[r, 1] * p[1] + T[r, 2] * p[2] + T[r, 3]
 
 
-@njit(cache=True)
+@inner_kernel()
 def point_to_box(x, y, z, rotation, middle, half, disc):
     """Lower bound of the signed distance [m] from a point to a box with rotation R_box_base[3, 3], whose
     first two half edges are increased by the radius of a disc; negative inside."""

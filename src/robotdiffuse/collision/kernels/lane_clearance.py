@@ -4,13 +4,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
-from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_collision import W, lanes_that_may_touch, place, place_frames
 from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, points_distance, points_lower_bound
 from robotdiffuse.collision.kernels.simd import load, reduce_min
+from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 _ZERO = np.float32(0.0)
 
@@ -160,7 +159,7 @@ class ClearanceWorkspace(NamedTuple):
     """[groups] whether the group's positions have been computed for this block."""
 
 
-@njit(cache=True)
+@inner_kernel()
 def make_clearance_workspace(robot, obstacles):
     """Scratch memory for one thread and at most so many obstacles; all point clouds and meshes count as
     one."""
@@ -237,7 +236,7 @@ def group_clearance(robot, scene, g, limit, work, best):
             _lower_to(work.least, robot.spheres[s, 3], best)
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def block_clearances(robot, scene, first, q, limit, work, best, out):
     """Writes signed distances to the scene, at most `limit`, of the groups from `first` on to out[groups,
     16].
@@ -300,7 +299,7 @@ def block_pair_clearances(robot, q, limit, work, out):
             out[p, i] = limit if apart else work.least[0, i]
 
 
-@njit(cache=True)
+@inner_kernel()
 def pair_clearances_into(robot, q, limit, work, out):
     """Writes clearances of the checked pairs for the rows of q[n, dof] to out[n, pairs]."""
     n, dof = q.shape
@@ -316,7 +315,7 @@ def pair_clearances_into(robot, q, limit, work, out):
                 out[start + i, p] = found[p, i]
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def pair_clearances(robot, q, limit):
     """Distances [n, pairs] between the checked pairs of links at q[n, dof], at most `limit`."""
     out = np.empty((len(q), len(robot.pairs)), np.float32)
@@ -324,7 +323,7 @@ def pair_clearances(robot, q, limit):
     return out
 
 
-@njit(cache=True)
+@inner_kernel()
 def clearances_into(robot, scene, q, limit, work, out):
     """Writes clearances of the moving groups for the rows of q[n, dof] to out[n, groups]."""
     n, dof = q.shape
@@ -342,7 +341,7 @@ def clearances_into(robot, scene, q, limit, work, out):
                 out[start + i, g] = found[g, i]
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def link_clearances(robot, scene, q, limit):
     """Signed distances [n, moving groups] to the scene at q[n, dof], at most `limit`."""
     moving = len(robot.frame) - np.searchsorted(robot.frame, 1)
@@ -352,7 +351,7 @@ def link_clearances(robot, scene, q, limit):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def cost_gradients(robot, scene, q, margin, self_margin):
     """Collision costs [n] of the rows of q[n, dof] and their gradients [n, dof]; see `cost_gradient_at`."""
     n, dof = q.shape

@@ -10,9 +10,8 @@ and whether the link itself does, for one configuration after the other, with a 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
+from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.point_grid import far_from_points, near_points, touch_points
 from robotdiffuse.collision.kernels.simd import (
     W,
@@ -31,6 +30,7 @@ from robotdiffuse.collision.kernels.simd import (
     sqrt,
     store,
 )
+from robotdiffuse.core.kernels import allocation_free, kernel
 
 _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
@@ -137,7 +137,7 @@ class Workspace(NamedTuple):
     """[1, 3 * W] positions of a row of spheres."""
 
 
-@njit(cache=True)
+@kernel()
 def make_workspace(robot, scene):
     """Scratch memory for one thread."""
     frames = lanes_array(len(robot.offsets) + 1, 12)
@@ -345,7 +345,7 @@ def _hits_itself(robot, q, hits, stop_at_first, work):
     return hits
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def block_hits(robot, scene, q, padding, stop_at_first, work):
     """Mask of the configurations of q[dof, 16] that collide: bit i belongs to column i.
 
@@ -359,7 +359,7 @@ def block_hits(robot, scene, q, padding, stop_at_first, work):
     return _hits_itself(robot, q, hits, stop_at_first, work)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def free_many(robot, scene, q, padding):
     """Whether each row of q[n, dof] is free of collision."""
     n, dof = q.shape

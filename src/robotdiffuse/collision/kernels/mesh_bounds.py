@@ -1,13 +1,13 @@
 """Compiled lower bounds of distances between meshes, from balls around them and boxes around obstacles."""
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
+from robotdiffuse.core.kernels import kernel
 
 
-@njit(cache=True)
+@kernel()
 def forward(offsets, parents, slides, q):
     """T_base_frame [n, dof + 1, 4, 4] at q[n, dof] in float64, from offsets[dof, 4, 4], parents[dof] (None
     for a chain) and slides[dof], which marks prismatic joints."""
@@ -22,7 +22,7 @@ def forward(offsets, parents, slides, q):
     return frames
 
 
-@njit(cache=True)
+@kernel()
 def scene_bounds(frames, frame, centers, radii, boxes):
     """Lower bounds [n, pieces * obstacles] of the distances of a link's pieces to obstacles [m].
 
@@ -42,7 +42,7 @@ def scene_bounds(frames, frame, centers, radii, boxes):
     return out
 
 
-@njit(cache=True)
+@kernel()
 def pair_bounds(frames, frame, centers, radii, other_frame, other_centers, other_radii):
     """Lower bounds [n, pieces * others] of the distances between the pieces of two links, given by balls
     [m]."""

@@ -19,7 +19,6 @@ links add up.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels import convex_bounds as meshes
 from robotdiffuse.collision.kernels.lane_collision import W
@@ -29,6 +28,7 @@ from robotdiffuse.collision.kernels.swept_spheres import (
     pair_along,
     place_motions,
 )
+from robotdiffuse.core.kernels import inner_kernel, kernel
 
 CLEARANCE_CAP = 1.0
 """Larger clearances are not computed [m]."""
@@ -120,7 +120,7 @@ class Round(NamedTuple):
     else negative."""
 
 
-@njit(cache=True)
+@kernel()
 def travel_along(q, motion_radii):
     """`Motion.travel` [n] of the waypoints q[n, dof]: each step counts the link that moves most."""
     travel = np.zeros(len(q))
@@ -135,7 +135,7 @@ def travel_along(q, motion_radii):
     return travel
 
 
-@njit(cache=True)
+@kernel()
 def segment_at(travel, at):
     """The last waypoint that is not beyond a place, and the share of the segment from there to the next."""
     low = min(max(np.searchsorted(travel, at, side="right") - 1, 0), max(len(travel) - 2, 0))
@@ -144,7 +144,7 @@ def segment_at(travel, at):
     return low, min((at - travel[low]) / (travel[low + 1] - travel[low]), 1.0)
 
 
-@njit(cache=True)
+@inner_kernel()
 def configuration(motion, at, out):
     """Writes the configuration at a place to out[dof]."""
     low, share = segment_at(motion.travel, at)
@@ -153,7 +153,7 @@ def configuration(motion, at, out):
         out[j] = motion.q[low, j] + share * (motion.q[high, j] - motion.q[low, j])
 
 
-@njit(cache=True)
+@inner_kernel()
 def _cut(ends, start, stop, travel):
     """Appends the ends of the equal parts, about `travel` long, of a stretch."""
     count = max(int(np.ceil((stop - start) / travel)), 1)
@@ -162,7 +162,7 @@ def _cut(ends, start, stop, travel):
     ends.append(stop)
 
 
-@njit(cache=True)
+@kernel()
 def first_pieces(motion, checks, travel):
     """The initial pieces: one of length zero at the start, then pieces with a motion bound of about `travel`
     [m] that change their direction little."""
@@ -191,7 +191,7 @@ def first_pieces(motion, checks, travel):
     return Pieces(start, stop, np.ones((len(ends), len(checks.kind)), np.bool_))
 
 
-@njit(cache=True)
+@inner_kernel()
 def _spread(motion, start, stop, q, dq, e, most, scratch):
     """Writes q, dq, e and D (`most`), as defined at the top of this file, for a piece."""
     dof = len(q)
@@ -219,7 +219,7 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
             e[j] = max(e[j], abs(d - t * dq[j]))
 
 
-@njit(cache=True)
+@inner_kernel(inline="always")
 def _remainder(radii, second, e, most):
     """The bound on |r| at the top of this file [m]."""
     total, before = 0.0, 0.0
@@ -232,7 +232,7 @@ def _remainder(radii, second, e, most):
     return total
 
 
-@njit(cache=True)
+@kernel()
 def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
     """Bounds of the pieces from the spheres; lowers best[2], the smallest measured clearances by kind."""
     n, count = pieces.undecided.shape
@@ -281,14 +281,14 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
     return Round(pieces, clearance, lower, rest, np.full((n, count), -1.0))
 
 
-@njit(cache=True)
+@inner_kernel()
 def _is_open(found, checks, best, tightness, row, c):
     """Whether a check of a piece is not settled by its lower bound."""
     least = tightness * best[checks.kind[c]]
     return found.pieces.undecided[row, c] and found.lower[row, c] < least
 
 
-@njit(cache=True)
+@kernel()
 def bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, contact, posture):
     """Better bounds from the convex meshes where those of the spheres are too coarse; lowers best[2].
 
@@ -327,7 +327,7 @@ def bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, c
     return asked
 
 
-@njit(cache=True)
+@inner_kernel(inline="always")
 def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     """Bounds of one check of a piece from separating planes.
 
@@ -364,12 +364,12 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     return clearance, lower, best, coarse, touching
 
 
-@njit(cache=True)
+@kernel()
 def settle(checks, found, best, certified, tightness):
     """Settles the checks whose bounds suffice and splits the other pieces; lowers certified[2]."""
     pieces = found.pieces
     n, count = found.clearance.shape
-    parts, total = np.zeros(n, np.int64), 0
+    parts, total = np.zeros(n, np.int64), np.int64(0)
     for row in range(n):
         for c in range(count):
             if not pieces.undecided[row, c]:
@@ -390,7 +390,7 @@ def settle(checks, found, best, certified, tightness):
     return split(pieces, parts, total)
 
 
-@njit(cache=True)
+@inner_kernel()
 def split(pieces, parts, total):
     """Every piece in parts[n] equal parts, `total` altogether; 0 drops a piece."""
     start, stop = np.empty(total), np.empty(total)
@@ -406,7 +406,7 @@ def split(pieces, parts, total):
     return Pieces(start, stop, undecided)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightness, contact):
     """Repeats bounding, settling and splitting until a check needs Coal, or nothing is left.
 
@@ -430,7 +430,7 @@ def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightnes
         pieces = settle(checks, found, best, certified, tightness)
 
 
-@njit(cache=True)
+@kernel()
 def configurations(motion, places):
     """Configurations [m, dof] at places."""
     out = np.empty((len(places), motion.q.shape[1]))

@@ -3,11 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_collision import block_hits, make_workspace
 from robotdiffuse.collision.kernels.simd import W, lane_numbers, store
+from robotdiffuse.core.kernels import allocation_free, kernel
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 RELAXATION_SLOPE = np.float32(0.1)
@@ -46,7 +45,7 @@ def distance(a, b):
     return np.sqrt(total)
 
 
-@njit(cache=True)
+@kernel()
 def path_length(path):
     """Sum of the lengths of the segments [rad]."""
     total = np.float32(0.0)
@@ -55,7 +54,7 @@ def path_length(path):
     return total
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def motion_free(space, a, b, block, work):
     """Whether the straight motion from a to b is free of collision; b is checked, a is not.
 
@@ -119,7 +118,7 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def motions_free(space, path):
     """Whether each straight motion between rows of path[n, dof] is free of collision; row 0 is not
     checked."""

@@ -9,10 +9,10 @@ spheres. Where these touch, the pair is left to the exact meshes.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, step
+from robotdiffuse.core.kernels import inner_kernel, kernel
 
 CLEARANCE_CAP = 1.0
 """Clearances beyond this [m] are reported as this."""
@@ -77,7 +77,7 @@ class Tasks(NamedTuple):
     """[n, links, obstacles] whether the pair is open."""
 
 
-@njit(cache=True)
+@inner_kernel()
 def pose_at(tracks, o, time, rotation, xyz):
     """Writes the pose of obstacle o at a time: R_base_obstacle [3, 3] and its origin [3]."""
     low, high = tracks.first[o], tracks.first[o + 1] - 1
@@ -120,7 +120,7 @@ def pose_at(tracks, o, time, rotation, xyz):
     )
 
 
-@njit(cache=True)
+@kernel()
 def speed_between(tracks, o, start, stop):
     """Upper bound on the speed of any point of obstacle o between two times [m/s], without its growth."""
     most = 0.0
@@ -130,7 +130,7 @@ def speed_between(tracks, o, start, stop):
     return most
 
 
-@njit(cache=True)
+@inner_kernel()
 def _obstacle_distance(tracks, o, rotation, xyz, x, y, z):
     """Signed distance of a point to obstacle o without its growth [m]; inside, a lower bound."""
     x, y, z = x - xyz[0], y - xyz[1], z - xyz[2]
@@ -148,7 +148,7 @@ def _obstacle_distance(tracks, o, rotation, xyz, x, y, z):
     return np.sqrt(outside) + min(max(deepest, w), 0.0) - tracks.rounding[o]
 
 
-@njit(cache=True)
+@inner_kernel()
 def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
     """Clearance of the spheres of a link to obstacle o [m]; if it exceeds `enough`, a lower bound that does
     too."""
@@ -173,14 +173,14 @@ def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
     return least
 
 
-@njit(cache=True)
+@inner_kernel()
 def _pose_arm(links, q, frames):
     """Writes the frames at q."""
     for j in range(len(q)):
         step(frames[parent_of(links.parents, j)], links.offsets[j], links.slides[j], q[j], frames[j + 1])
 
 
-@njit(cache=True)
+@inner_kernel()
 def _row_at(times, time):
     """The last row that is not later than a time, and the share of the time from there to the next."""
     low = min(max(np.searchsorted(times, time, side="right") - 1, 0), max(len(times) - 2, 0))
@@ -189,14 +189,14 @@ def _row_at(times, time):
     return low, min(max((time - times[low]) / (times[low + 1] - times[low]), 0.0), 1.0)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _interpolated(rows, low, share, j):
     """Column j of rows, interpolated between row `low` and the next."""
     high = min(low + 1, len(rows) - 1)
     return rows[low, j] + share * (rows[high, j] - rows[low, j])
 
 
-@njit(cache=True)
+@kernel()
 def cumulative_motion(q):
     """[n, dof] total motion of each joint, forwards and backwards, from the first row to each row."""
     ways = np.zeros_like(q)
@@ -206,7 +206,7 @@ def cumulative_motion(q):
     return ways
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     """Settles the tasks, in order, as far as the spheres can.
 
@@ -285,7 +285,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     return certified, left
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def free_at_times(links, tracks, q, times, least):
     """Whether the covering spheres keep `least` [m] from all obstacles, [n, k], at each of q[n, dof] and each
     of the increasing times[k]."""

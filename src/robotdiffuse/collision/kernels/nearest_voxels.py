@@ -2,9 +2,8 @@
 voxel."""
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.core.kernels import allocation_free, kernel
 
 _NO_POINTS = np.int32(1 << 30)
 """Squared distance in lines without any points [voxels²]."""
@@ -13,7 +12,7 @@ _ROUNDED = 1e-6
 integer."""
 
 
-@njit(fastmath=True, cache=True)
+@kernel(fastmath=True)
 def nearest_voxels(run):
     """For each voxel the squared distance to the nearest voxel with points [voxels²], and that voxel's value
     in `run`.

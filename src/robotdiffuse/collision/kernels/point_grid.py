@@ -8,9 +8,7 @@ which are fields of SceneArrays.
 """
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.nearest_voxels import nearest_voxels
 from robotdiffuse.collision.kernels.simd import (
     W,
@@ -23,6 +21,7 @@ from robotdiffuse.collision.kernels.simd import (
     minimum,
     sqrt,
 )
+from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 POINT_RANGE = np.float32(0.3)
 """Points are kept up to this far beyond the robot's reach, and clearances to points are at most this [m]."""
@@ -34,7 +33,7 @@ _SLACK = np.float32(1e-5)
 """More than the rounding error of a distance within the grid [m]."""
 
 
-@njit(fastmath=True, cache=True)
+@kernel(fastmath=True)
 def make_grid(points, starts, run, low, voxel, shape, band, known):
     """For every voxel centre the distance to the nearest point, and the index of that point.
 
@@ -77,7 +76,7 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
     return distances, nearest
 
 
-@njit(fastmath=True, cache=True)
+@inner_kernel(fastmath=True)
 def _balls(points, starts):
     """A ball [x, y, z, radius] around the points of each voxel that has any."""
     balls = np.zeros((len(starts) - 1, 4), np.float32)
@@ -92,7 +91,7 @@ def _balls(points, starts):
     return balls
 
 
-@njit(fastmath=True, cache=True)
+@inner_kernel(fastmath=True)
 def _blur(points, low, voxel):
     """Largest distance of a point from the centre of its voxel [m]."""
     most = _ZERO
@@ -106,7 +105,7 @@ def _blur(points, low, voxel):
     return voxel * np.sqrt(most) + _SLACK
 
 
-@njit(fastmath=True, cache=True)
+@inner_kernel(fastmath=True)
 def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
     """Makes distances below the band exact, and larger ones at least the band."""
     nx, ny, nz = shape

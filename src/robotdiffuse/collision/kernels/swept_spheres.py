@@ -11,9 +11,8 @@ lanes, as in `lane_clearance.py`.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
+from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.lane_clearance import (
     ClearanceWorkspace,
     count_obstacles,
@@ -22,6 +21,7 @@ from robotdiffuse.collision.kernels.lane_clearance import (
 )
 from robotdiffuse.collision.kernels.lane_collision import W, place, place_frames
 from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, points_distance
+from robotdiffuse.core.kernels import allocation_free, kernel
 
 _ZERO, _TINY = np.float32(0.0), np.float32(1e-9)
 
@@ -46,7 +46,7 @@ class SweptSpheres(NamedTuple):
     """[1, W] lower bounds along the motions, without the remainder."""
 
 
-@njit(cache=True)
+@kernel()
 def make_swept_spheres(robot, scene):
     """Scratch memory for one thread."""
     return SweptSpheres(

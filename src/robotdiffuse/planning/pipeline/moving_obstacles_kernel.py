@@ -2,10 +2,10 @@
 
 import numpy as np
 from jaxtyping import Bool, Int
-from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.core.deadline import check_timing
+from robotdiffuse.core.kernels import kernel
 
 UNREACHED, WAITED = -2, -1
 CELLS_PER_CLOCK_CHECK = 10_000_000
@@ -41,7 +41,7 @@ def earliest(
     return [], False
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _reached(came, clear, cell, source, target, first, cells, begin, count):
     """Go through `count` ticks from `begin`, and write to came[ticks, places] by which motion a place is
     reached at a tick, or WAITED. Returns the tick at which the last place is first reached; -1 if it is none
@@ -69,7 +69,7 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
     return -1
 
 
-@njit(cache=True)
+@kernel()
 def _way_to(end, came, source, first):
     """The numbers of the motions that reach the last place at tick `end`, in order; -1 for each tick of
     waiting."""

@@ -11,6 +11,7 @@ The guarantee does not depend on the prediction.
 """
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Annotated
@@ -131,6 +132,14 @@ class Replanner:
         """The motion under way: along the path, from this time on."""
         self._left = False
         """Whether the arm leaves the path at the end of its motion, for a new goal."""
+        self._rehearse()
+
+    def _rehearse(self) -> None:
+        """Make two steps on a copy, so that the compiled code is loaded before the first step is due."""
+        rehearsal = copy(self)
+        rehearsal._seen, rehearsal._rng = dict(self._seen), np.random.default_rng(self.seed)
+        for k in range(2):
+            rehearsal.step({}, k * self.settings.period)
 
     def set_goal(self, goal: ArrayLike | Goal) -> None:
         """Take the arm to another goal, from where its present motion ends.

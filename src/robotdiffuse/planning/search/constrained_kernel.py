@@ -9,11 +9,11 @@ halves are treated alike.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import motion_free
+from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.problems.constraint_kernel import evaluate, make_work, project, proved
 
 MAX_DEPTH = 9
@@ -75,7 +75,7 @@ class Memory(NamedTuple):
     trial: np.ndarray
 
 
-@njit(cache=True)
+@kernel()
 def make_trees(start, goals, capacity):
     """Trees with the start and the goals as their roots."""
     nodes = np.empty((2, capacity, len(start)))
@@ -84,7 +84,7 @@ def make_trees(start, goals, capacity):
     return Trees(nodes, np.full((2, capacity), -1, np.int32), np.array([1, len(goals)], np.int32))
 
 
-@njit(cache=True)
+@inner_kernel()
 def _memory(limits):
     dof = len(limits.rows.lower)
     return Memory(
@@ -99,7 +99,7 @@ def _memory(limits):
     )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _distance(a, b):
     total = 0.0
     for j in range(len(a)):
@@ -107,7 +107,7 @@ def _distance(a, b):
     return np.sqrt(total)
 
 
-@njit(cache=True)
+@kernel()
 def length(path):
     """Sum of the lengths of the segments [rad]."""
     total = 0.0
@@ -116,7 +116,7 @@ def length(path):
     return total
 
 
-@njit(cache=True)
+@inner_kernel()
 def _straight(limits, a, b, memory):
     """Whether the straight piece between two configurations is proved to keep the constraints, with values
     little above those at its ends."""
@@ -129,12 +129,12 @@ def _straight(limits, a, b, memory):
     return proved(rows, memory.growing, a, b, MIN_PROOF_PIECE, work)[1] < 0
 
 
-@njit(cache=True)
+@inner_kernel()
 def _usable(limits, a, b, memory):
     return _straight(limits, a, b, memory) and motion_free(limits.space, a, b, memory.block, memory.space)
 
 
-@njit(cache=True)
+@inner_kernel()
 def between(limits, a, b, most, memory):
     """Find a motion from a to b, which keep the constraints, as straight pieces; write their ends to
     memory.out.
@@ -171,7 +171,7 @@ def between(limits, a, b, most, memory):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def line(limits, a, b):
     """The waypoints [n, dof] of `between`, with a; n = 0 if there is none."""
     memory = _memory(limits)
@@ -183,7 +183,7 @@ def line(limits, a, b):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def search(limits, trees, longest, iterations, state):
     """Grow the trees for a number of iterations, or until they meet; `longest` bounds their steps [rad].
 
@@ -215,7 +215,7 @@ def search(limits, trees, longest, iterations, state):
     return np.empty((0, dof))
 
 
-@njit(cache=True)
+@inner_kernel()
 def _extended(limits, trees, tree, q, longest, memory):
     """Step from the nearest node towards q; returns the last node added, -1 for none."""
     best, near = np.inf, 0
@@ -228,7 +228,7 @@ def _extended(limits, trees, tree, q, longest, memory):
     return _stepped(limits, trees, tree, near, q, longest, memory)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _stepped(limits, trees, tree, near, q, longest, memory):
     """Step from a node towards q; returns the last node added, -1 for none."""
     origin = trees.nodes[tree, near]
@@ -255,7 +255,7 @@ def _stepped(limits, trees, tree, near, q, longest, memory):
     return parent if count else -1
 
 
-@njit(cache=True)
+@inner_kernel()
 def _joined(nodes, parents, tree, here, there):
     a, b = (here, there) if tree == 0 else (there, here)
     count, node = 0, a
@@ -273,7 +273,7 @@ def _joined(nodes, parents, tree, here, there):
     return path
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def simplify(limits, path, rounds, tries, state):
     """A path with the same ends that is no longer: try shortcuts between random places, `tries` of them; then
     in each of `rounds` rounds smooth the corners and leave out waypoints that a straight piece can skip."""
@@ -300,7 +300,7 @@ def simplify(limits, path, rounds, tries, state):
     return _skipped(limits, points, memory)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _finer(path):
     """The path with its pieces split until they are no longer than MAX_INITIAL_PIECE."""
     total = 1
@@ -316,7 +316,7 @@ def _finer(path):
     return out
 
 
-@njit(cache=True)
+@inner_kernel()
 def _skipped(limits, path, memory):
     """The path without waypoints that straight pieces can skip, in growing steps."""
     out, n, i = np.empty(path.shape), 0, 0
@@ -331,7 +331,7 @@ def _skipped(limits, path, memory):
         i = following
 
 
-@njit(cache=True)
+@inner_kernel()
 def _smoothed(limits, path, memory):
     """The path with the middles of its pieces as waypoints, and its corners moved towards them."""
     finer, dof = np.empty((2 * len(path) - 1, path.shape[1])), path.shape[1]

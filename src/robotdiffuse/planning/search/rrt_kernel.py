@@ -10,12 +10,12 @@ Srinivasa and T. D. Barfoot, "Informed RRT*", IROS 2014.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free, random
+from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.lane_collision import make_workspace
 from robotdiffuse.collision.kernels.motions import distance, motion_free
 from robotdiffuse.collision.kernels.simd import W, lane, load
+from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _TAU = np.float32(6.283185307179586)
@@ -39,7 +39,7 @@ class Trees(NamedTuple):
     """[2]"""
 
 
-@njit(cache=True)
+@kernel()
 def make_trees(start, goals, capacity):
     """Trees with the start and the goals as their roots."""
     dof, lanes = len(start), (capacity + W - 1) // W * W
@@ -56,7 +56,7 @@ def make_trees(start, goals, capacity):
     return trees
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def search(space, trees, goals, bound, longest, iterations, state):
     """Grow the trees for a number of iterations, or until they hold a path shorter than `bound` [rad].
 
@@ -115,7 +115,7 @@ def search(space, trees, goals, bound, longest, iterations, state):
     return np.empty((0, dof), np.float32)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def connect(space, trees, longest, iterations, state):
     """RRT-Connect: `search` without a bound."""
     nowhere = np.empty((0, trees.nodes.shape[2]), np.float32)
@@ -190,7 +190,7 @@ def _squared(trees, tree, part, q):
     return total
 
 
-@njit(cache=True)
+@inner_kernel(inline="always")
 def _cheaper(space, trees, tree, roots, near, cost, new, block, work, state):
     """A parent that reaches `new` at a lower cost, and that cost: draws cheaper ones until an edge
     collides."""
@@ -213,7 +213,7 @@ def _sample_box(space, q, state):
         q[j] = space.lower[j] + random(state) * (space.upper[j] - space.lower[j])
 
 
-@njit(cache=True)
+@kernel()
 def goal_shares(start, goals, bound):
     """Cumulative shares of the samples for each goal, by the volumes of their hyperspheroids."""
     shares, total = np.empty(len(goals), np.float32), _ZERO
@@ -226,7 +226,7 @@ def goal_shares(start, goals, bound):
     return shares / max(total, np.float32(1e-30))
 
 
-@njit(cache=True)
+@kernel()
 def sample_within(space, start, goals, shares, bound, q, state):
     """Sample q uniformly in the prolate hyperspheroid of paths from the start to a goal shorter than `bound`,
     clamped to the limits; the goal is drawn by `shares`."""
@@ -261,7 +261,7 @@ def _normal(state):
     return radius * np.cos(_TAU * random(state))
 
 
-@njit(cache=True)
+@inner_kernel()
 def _join(nodes, parents, tree, here, near):
     a, b = (here, near) if tree == 0 else (near, here)
     count = 0

@@ -4,12 +4,12 @@ The time of a candidate is that of the fastest motion along its rounded polyline
 """
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.lane_collision import make_workspace
 from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.collision.kernels.simd import W
+from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.trajectories.timing_kernel import estimated_time, evaluate_at, rounded_line
 
 REMOVE_SHARE, ADD_SHARE, WIDEN_SHARE = 0.02, 0.05, 0.12
@@ -30,7 +30,7 @@ MAX_CHORD, MAX_CHORDS = 0.05, 16
 """A rounded corner is checked along chords of this length [rad], of which there are at most MAX_CHORDS."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def reduce_time(space, path, deviations, time, velocity, acceleration, tries, state):
     """A faster rounded polyline: its waypoints [m, dof], its deviations [m - 2] and its estimated time [s].
 
@@ -40,7 +40,7 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, tries, st
     dof = path.shape[1]
     work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
     a, b = np.empty(dof, np.float32), np.empty(dof, np.float32)
-    step, moved = np.zeros(dof), 0
+    step, moved = np.zeros(dof), np.int64(0)  # a literal 0 would be compiled separately
     for _ in range(tries):
         new, wider, first, last = _candidate(space, path, deviations, step, moved, state)
         moved = 0
@@ -56,7 +56,7 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, tries, st
     return path, deviations, time
 
 
-@njit(cache=True)
+@inner_kernel(inline="always")
 def _candidate(space, path, deviations, step, again, state):
     """A change of the path or of its corners, and the first and the last segment that it touches; no
     waypoints if one of these is too short. Waypoint `again`, unless it is 0, moves on by `step`."""
@@ -95,7 +95,7 @@ def _candidate(space, path, deviations, step, again, state):
     return new, wider, i - 1, i
 
 
-@njit(cache=True)
+@inner_kernel(inline="always")
 def _is_free(space, line, first, last, a, b, block, work):
     """Whether segments `first` to `last` of the polyline are free, and the rounded corners at their ends and
     next to them."""
@@ -110,7 +110,7 @@ def _is_free(space, line, first, last, a, b, block, work):
     return True
 
 
-@njit(cache=True)
+@inner_kernel()
 def _corner_is_free(space, line, corner, a, b, block, work):
     waypoints, knots, directions, widths = line
     width = widths[corner]
@@ -124,7 +124,7 @@ def _corner_is_free(space, line, corner, a, b, block, work):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def free_deviations(space, path, deviation):
     """For each corner of a free polyline [n, dof], the largest of `deviation` and its halves for which the
     rounded corner is free [n - 2], and at least MIN_DEVIATION."""

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
-from robotdiffuse.planning.planner import compiles_first
 from robotdiffuse.validation.validator import Report
 from robotdiffuse.visualization.live.session import State
 
@@ -31,7 +30,7 @@ def validity(state: State) -> Validity:
         if why_not:
             return Validity(NO_MOTION, "no plan", (why_not,))
         if state.planning:
-            return Validity(PENDING, "planning", (compiles_first(state.problem.robot),))
+            return Validity(PENDING, "planning", ("a new machine compiles first, for about a minute",))
         return Validity(PENDING, "not planned yet")
     if validation is None:
         return Validity(PENDING, "validating")

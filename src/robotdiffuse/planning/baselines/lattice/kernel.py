@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_collision import W, block_hits, make_workspace
 from robotdiffuse.collision.kernels.motions import Space, motion_free
+from robotdiffuse.core.kernels import allocation_free
 from robotdiffuse.planning.baselines.lattice.table import (
     AT_GOAL,
     BLOCKED,
@@ -198,7 +198,7 @@ def _last_edge(lattice, goal, at):
     return corner, np.int64(np.ceil(UNITS * np.sqrt(square)))
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def heuristic(lattice, at, targets, cell):
     """A consistent lower bound of the cost from a node to the nearest of the targets' coordinates.
 

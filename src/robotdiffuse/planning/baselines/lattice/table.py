@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.core.kernels import allocation_free
 
 INFINITE = 1 << 60
 """Cost of nodes that are not reached."""
@@ -81,7 +81,7 @@ def find(table, key):
     return np.int64(table.slots[_slot(table, key)]) - 1
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def find_or_add(table, key):
     """The node of a key, added if it is new; -1 if memory is full."""
     i = _slot(table, key)
@@ -123,7 +123,7 @@ def _settle(table, i, node):
     heap[i], place[node] = node, i + 1
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def put(table, node, first, second):
     """Queue a node, or change its keys if it is queued."""
     table.first[node], table.second[node] = first, second

@@ -8,9 +8,8 @@ D. Mount, "Algorithms for fast vector quantization", DCC 1993).
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.core.kernels import allocation_free, kernel
 
 BUCKET = 16
 """Largest number of points of a leaf."""
@@ -47,7 +46,7 @@ class Neighbours(NamedTuple):
     offsets: np.ndarray
 
 
-@njit(cache=True)
+@kernel()
 def make_kd_tree(capacity):
     """An empty tree for up to `capacity` points."""
     # a split leaves at least half a bucket on either side
@@ -62,7 +61,7 @@ def make_kd_tree(capacity):
     )
 
 
-@njit(cache=True)
+@kernel()
 def make_neighbours(most, dof):
     """Memory for queries of up to `most` points."""
     return Neighbours(
@@ -74,7 +73,7 @@ def make_neighbours(most, dof):
     )
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def insert(tree, points, index):
     """Add the point points[index]. It is left out if its leaf is full of copies of it."""
     cell = 0
@@ -132,7 +131,7 @@ def _split(tree, points, cell):
     return True
 
 
-@allocation_free(fastmath=True)
+@allocation_free(fastmath=True, inner=False)
 def query(tree, points, q, k, out):
     """Find the k points nearest to q; returns their number (fewer than k only in a smaller tree)."""
     dof = len(q)

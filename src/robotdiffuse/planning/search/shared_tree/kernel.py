@@ -6,11 +6,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free, random
+from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import distance, motion_free
+from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 from robotdiffuse.planning.search.shared_tree import kd_tree
 from robotdiffuse.planning.search.shared_tree.tree import (
     GAIN,
@@ -33,7 +33,7 @@ MAX_DRAWS = 32
 """Draws from a hyperspheroid before a sample outside the joint limits is clamped to them."""
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def draw_goal(tree, state):
     """Draw a goal by its promise; -1 if no path can be shortened.
 
@@ -67,7 +67,7 @@ def _gaussian(state):
     return np.sqrt(np.float32(-2.0) * np.log(u)) * np.cos(np.float32(2.0 * np.pi) * random(state))
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def sample_hyperspheroid(a, b, length, lower, upper, state, out):
     """Sample uniformly among the points through which a path from a to b can be shorter than `length`.
 
@@ -145,7 +145,7 @@ class Scratch(NamedTuple):
     near: kd_tree.Neighbours
 
 
-@njit(cache=True)
+@inner_kernel()
 def make_scratch(space, dof):
     return Scratch(
         make_workspace(space.robot, space.scene),
@@ -219,7 +219,7 @@ def _try_goals(space, tree, node, drawn, longest, scratch):
             rewire(tree, tree.goal_node[g], node, cost)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def grow(space, tree, longest, goal_bias, iterations, state):
     """RRT* iterations; returns how many were done: fewer when the tree is full or no path can be shortened.
 

@@ -3,10 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.motions import distance, path_length
+from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.planning.search.shared_tree import kd_tree
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
@@ -41,7 +40,7 @@ class Tree(NamedTuple):
     """[k] failed searches for this goal alone."""
 
 
-@njit(cache=True)
+@kernel()
 def make_tree(start, goals, capacity):
     """A tree with only the start."""
     k, dof = goals.shape
@@ -67,7 +66,7 @@ def make_tree(start, goals, capacity):
     return tree
 
 
-@njit(cache=True)
+@kernel()
 def grown(tree, capacity):
     """A copy of the tree with a larger capacity."""
     wider = make_tree(tree.nodes[0], tree.goals, capacity)
@@ -80,14 +79,14 @@ def grown(tree, capacity):
     return wider
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def goal_cost(tree, g):
     """The length of the best path known to a goal [rad], infinite if there is none."""
     node = tree.goal_node[g]
     return tree.cost[node] if node >= 0 else _INFINITY
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def best_goal(tree):
     """The goal with the shortest path; -1 if none is reached."""
     best, where = _INFINITY, -1
@@ -98,13 +97,13 @@ def best_goal(tree):
     return where
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def best_cost(tree):
     g = best_goal(tree)
     return goal_cost(tree, g) if g >= 0 else _INFINITY
 
 
-@allocation_free()
+@allocation_free(inner=False)
 def goal_is_open(tree, g, best):
     """Whether a path to the goal might still be shorter than the best one to any goal."""
     return tree.bound[g] < best * (_ONE - GAIN) and tree.bound[g] < goal_cost(tree, g) * (_ONE - GAIN)
@@ -154,7 +153,7 @@ def rewire(tree, node, parent, cost):
         at = tree.sibling[at]
 
 
-@njit(cache=True)
+@kernel()
 def path_to(tree, g):
     """Waypoints [n, dof] of the best path to a goal; n = 0 if it is not reached."""
     count, node = 0, tree.goal_node[g]
@@ -169,7 +168,7 @@ def path_to(tree, g):
     return path
 
 
-@njit(cache=True)
+@kernel()
 def graft(tree, path, g):
     """Add a free path from the start to a goal as a branch if it is the shortest known; returns whether it
     was."""

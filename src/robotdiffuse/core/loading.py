@@ -1,0 +1,74 @@
+"""Time that loading takes: compiling code, reading it from the cache, importing, and building what a robot
+needs once. No call of a planner counts it as its time."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class _Clock(threading.local):
+    """The time that one thread has spent on loading [s]."""
+
+    loading = compiling = began = 0.0
+    depth = 0
+    """Number of blocks of `loading` around the thread's present step."""
+    compiles = False
+    """Whether code was compiled in the outermost of these blocks."""
+    noted = 0.0
+    """What `compile_note` has reported of `compiling`."""
+
+
+_clock = _Clock()
+compiled: list[str] = []
+"""Names of the functions that this process has compiled, or has begun to; for progress."""
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Within the block, the time of this thread is loading time."""
+    begin()
+    try:
+        yield
+    finally:
+        end()
+
+
+def begin() -> None:
+    """Begin a block of `loading`."""
+    if _clock.depth == 0:
+        _clock.began, _clock.compiles = time.perf_counter(), False
+    _clock.depth += 1
+
+
+def end() -> None:
+    """End a block of `loading`."""
+    _clock.depth -= 1
+    if _clock.depth == 0:
+        took = time.perf_counter() - _clock.began
+        _clock.loading += took
+        _clock.compiling += took if _clock.compiles else 0.0
+
+
+def compiles(name: str) -> None:
+    """Note that this thread compiles a function: the whole block of `loading` around it is compile time."""
+    _clock.compiles = True
+    compiled.append(name)
+
+
+def loading_seconds() -> float:
+    """Time that this thread has spent on loading so far [s], up to now within a block of `loading`."""
+    return _clock.loading + (time.perf_counter() - _clock.began if _clock.depth else 0.0)
+
+
+def compile_seconds() -> float:
+    """The part of it in which code was compiled [s]: type inference, LLVM and writing to the cache."""
+    return _clock.compiling
+
+
+def compile_note() -> str:
+    """A note on the compile time of this thread; empty if none has passed since the last note."""
+    if _clock.compiling == _clock.noted:
+        return ""
+    _clock.noted = _clock.compiling
+    return f"compiled for {_clock.compiling:.1f} s, once on this machine, which does not count as time"
