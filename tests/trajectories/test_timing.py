@@ -289,7 +289,7 @@ def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
         assert np.array_equal(t.positions[0], q[0]) and np.array_equal(t.positions[-1], q[-1])
         assert np.allclose(t.velocities[0], velocity, rtol=1e-12) and not t.accelerations[0].any()
         assert not t.velocities[-1].any() and not t.accelerations[-1].any()
-        assert not t.stops
+        assert len(t.stops) == 0
         states = t.at(np.arange(0.0, t.duration, 1e-4))
         assert (np.abs(states.velocities) <= scale * robot.velocity * (1 + 2e-6)).all()
         assert (np.abs(states.accelerations) <= scale * robot.acceleration * (1 + 2e-6)).all()

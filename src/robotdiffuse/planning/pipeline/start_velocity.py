@@ -44,7 +44,10 @@ def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequ
         return replace(result, reason=f"from where the arm can stop: {result.reason}")
     waypoints = np.concatenate([problem.start[None], result.path.positions])
     notes = tuple(note for note in result.notes if note not in context.notes)
-    found = context.finish(waypoints, result.stage or solver.name, notes=notes)
+    deviations = np.full(len(waypoints), context.timing.corner_deviation)
+    if result.corner_deviations is not None:
+        deviations[2:] = result.corner_deviations[1:]
+    found = context.finish(waypoints, result.stage or solver.name, notes=notes, deviations=deviations)
     if found is not None:
         return found
     if context.ended:
