@@ -46,6 +46,9 @@ LIMIT_TOLERANCE = 1e-6
 """Share by which a motion with a start speed may exceed the limits."""
 START_SHARES = tuple(ACCELERATION_FACTOR**k for k in range(16))
 """Shares of the acceleration limits that are tried for a motion with a start speed."""
+MAX_SHARES = 12
+"""Times that the limits of a motion with a start speed are lowered, until they hold between grid points
+too."""
 BRAKING_FRACTION = 0.9
 """Part of these that `stopping_distance` counts on; the rest lets corners be rounded."""
 MIN_STOPPING_DISTANCE = 0.01
@@ -297,19 +300,21 @@ def _fastest_speeds(
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Float[ndarray, "m"]:
     """ṡ at each value of s in the grid, such that limits hold between grid points too."""
-    share = 1.0
-    while True:
+    share, at_start = 1.0, start_speed * np.abs(line(grid[:1], 1)[0])
+    for _ in range(MAX_SHARES):
         check_timing("the fastest speeds")
-        limits = share * velocity, share**2 * acceleration
+        # at the start the velocity is given: less than it cannot be asked for
+        limits = np.minimum(velocity, np.maximum(share * velocity, at_start)), share**2 * acceleration
         speeds = fastest_speeds(*_derivatives_and_limits(line, grid, *limits, extra), start_speed)
         if start_speed and np.isnan(speeds).any():
-            raise TooFastError(f"the motion cannot stop along the path from {start_speed:.3g} rad/s")
+            break
         slower = slowdown(line.arrays, grid, speeds, velocity, acceleration)
         if start_speed == 0:
             return speeds / slower
         if slower <= 1 + LIMIT_TOLERANCE:
             return speeds
-        share /= slower  # the start speed is given, so that the motion cannot just be slowed down
+        share /= slower * (1 + LIMIT_TOLERANCE)
+    raise TooFastError(f"the motion cannot stop along the path from {start_speed:.3g} rad/s")
 
 
 def _derivatives_and_limits(
