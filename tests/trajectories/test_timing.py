@@ -267,6 +267,35 @@ def test_a_limit_of_jerk_is_kept_with_the_others(
         assert distance_to_polyline(t.positions, q).max() < 1e-8
 
 
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    jerk=st.floats(3.0, 1e4) | st.just(np.inf),
+    scale=st.floats(0.1, 1.0),
+    ratio=st.floats(0.01, 0.99),
+)
+def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
+    seed: int, jerk: float, scale: float, ratio: float
+) -> None:
+    """Velocities, accelerations and jerks every 0.1 ms, on the way straight on and then around a corner."""
+    robot, rng = arm(), np.random.default_rng(seed)
+    settings = TimingSettings(jerk=jerk, velocity_scale=scale, acceleration_scale=scale)
+    direction = rng.normal(size=7)
+    direction /= np.linalg.norm(direction)
+    velocity = ratio * scale * float((robot.velocity / np.abs(direction)).min()) * direction
+    stop = speed_limits.stopping_distance(robot, settings, velocity) * direction
+    start_speed = float(np.linalg.norm(velocity))
+    for q in (np.stack([0 * stop, stop]), np.stack([0 * stop, stop, stop + 0.5 * rng.normal(size=7)])):
+        t = time_parameterize(robot, path(robot, q), always, always, settings, start_speed=start_speed)
+        assert np.array_equal(t.positions[0], q[0]) and np.array_equal(t.positions[-1], q[-1])
+        assert np.allclose(t.velocities[0], velocity, rtol=1e-12) and not t.accelerations[0].any()
+        assert not t.velocities[-1].any() and not t.accelerations[-1].any()
+        assert len(t.stops) == 0
+        states = t.at(np.arange(0.0, t.duration, 1e-4))
+        assert (np.abs(states.velocities) <= scale * robot.velocity * (1 + 2e-6)).all()
+        assert (np.abs(states.accelerations) <= scale * robot.acceleration * (1 + 2e-6)).all()
+        assert (np.abs(states.jerks) <= jerk * (1 + 1e-6)).all()
+
+
 def test_a_limit_of_jerk_costs_what_it_must() -> None:
     """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs a row at most."""
     robot = arm((20.0,), (80.0,))

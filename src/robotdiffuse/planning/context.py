@@ -264,6 +264,7 @@ class PlanningContext:
             stage=stage,
             path=path,
             trajectory=trajectory,
+            corner_deviations=deviations,
             min_clearance=min(scene, itself),
             scene_clearance=scene,
             self_clearance=itself,

@@ -15,7 +15,7 @@ from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import timing_kernel
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline
-from robotdiffuse.trajectories.timing_kernel import fastest_speeds, sample_rows, slowdown
+from robotdiffuse.trajectories.timing_kernel import fastest_speeds, sample_positions, slowdown
 
 MAX_ROWS = 200_000
 """Rows of a motion between two stops at most, before a jerk limit makes it longer; longer motions have larger
@@ -44,6 +44,16 @@ MIN_TORQUE_SHARE = 2e-3
 """Share of a torque limit that is left to motion where gravity takes all of it."""
 LIMIT_TOLERANCE = 1e-6
 """Share by which a motion with a start speed may exceed the limits."""
+START_SHARES = tuple(ACCELERATION_FACTOR**k for k in range(16))
+"""Shares of the acceleration limits that are tried for a motion with a start speed."""
+MAX_SHARES = 12
+"""Times that the limits of a motion with a start speed are lowered, until they hold between grid points
+too."""
+BRAKING_FRACTION = 0.9
+"""Part of these that `stopping_distance` counts on; the rest lets corners be rounded."""
+MIN_STOPPING_DISTANCE = 0.01
+"""Shortest straight line on which a motion stops from a start velocity [rad]: a corner at its end can be
+rounded."""
 
 
 class TooFastError(RuntimeError):
@@ -116,16 +126,13 @@ def time_line(
 ) -> Rows:
     """The fastest motion along a line that begins with ṡ = `start_speed` and ends at rest.
 
-    A motion from rest has constant jerk between its rows, within the limits; its accelerations are 0 at both
-    ends. With a start speed, accelerations may jump, since the motion before is not known. Raises
+    The jerk is constant between rows and within the limits, and accelerations are 0 at both ends. Raises
     OutOfTimeError if the deadline leaves no time for it, and TooFastError if it cannot stop from its start
     speed.
     """
-    grid, (velocity, acceleration) = timing_grid(line, settings), scaled_limits(robot, settings)
     if start_speed > 0:
-        speeds = _fastest_speeds(line, grid, velocity, acceleration, start_speed, extra)
-        speeds = _slow_to_extra_limits(line, grid, speeds, extra)
-        return sample_rows(line.arrays, grid, speeds, _row_spacing(_duration(grid, speeds), settings))
+        return _moving_start(robot, line, settings, start_speed)
+    grid, (velocity, acceleration) = timing_grid(line, settings), scaled_limits(robot, settings)
     jerk, best, share = jerk_limits(robot, settings), None, 1.0
     while True:
         limits = velocity, share * acceleration
@@ -135,10 +142,15 @@ def time_line(
         if 2 * (limits[1] / jerk).max() > duration:  # then lower accelerations make a shorter motion
             share *= ACCELERATION_FACTOR
             continue
-        controls = sample_rows(line.arrays, grid, speeds, _row_spacing(duration, settings))[1]
-        step = duration / (len(controls) - 1)
-        window = _window(controls, step, limits[1], jerk)
-        rows = _spline_rows(controls, step, window)
+        count = _row_count(duration, settings)
+        step = duration / count
+        controls = sample_positions(line.arrays, grid, speeds, step * np.arange(count + 1))
+        controls[-1] = line.waypoints[-1]
+        for window in _windows(step, limits[1], jerk):
+            rows = _spline_rows(controls, step, window)
+            rows[1][0] = line.waypoints[0]
+            if _keeps_jerk(rows, step, jerk):
+                break
         if best is not None and rows[0][-1] >= best[0][-1]:
             break
         best, share = rows, ACCELERATION_FACTOR * share
@@ -158,17 +170,69 @@ def jerk_limits(robot: Robot, settings: TimingSettings = DEFAULT) -> Float[ndarr
     return np.where(robot.jerk > 0, robot.jerk, DEFAULT_JERK_RATIO * robot.acceleration)
 
 
-def _spline_rows(controls: Float[ndarray, "m dof"], step: float, window: int) -> Rows:
+def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings, start_speed: float) -> Rows:
+    """See `time_line`. The motion keeps its start speed for a while before it is averaged, so that the mean
+    begins at the start with that velocity and without acceleration."""
+    velocity, acceleration = scaled_limits(robot, settings)
+    jerk, step, best = jerk_limits(robot, settings), settings.sample_time, None
+    direction, first = line.directions[0], line.knots[1]
+    for share in START_SHARES:
+        found, windows = None, _windows(step, share * acceleration, jerk)
+        for window in windows:
+            lead = 0.5 * (window + 1) * step * start_speed
+            if lead >= first:
+                break
+            widths = line.half_widths.copy()
+            widths[:1] = np.minimum(widths[:1], first - lead)
+            ahead = np.concatenate([line.waypoints[:1] + lead * direction, line.waypoints[1:]])
+            rest = BlendedPolyline(ahead, widths)
+            grid = timing_grid(rest, settings)
+            try:
+                speeds = _fastest_speeds(rest, grid, velocity, share * acceleration, start_speed)
+            except TooFastError:
+                break
+            count = int(np.ceil(_duration(grid, speeds) / step))
+            check_timing(f"the {count} rows of a motion", SECONDS_PER_ROW * count)
+            controls = sample_positions(rest.arrays, grid, speeds, step * np.arange(count + 1))
+            rows = _spline_rows(controls, step, window, start_speed * direction)
+            if window == windows[-1] or _keeps_jerk(rows, step, jerk):
+                rows[1][0] = line.waypoints[0]
+                found = rows
+                break
+        if best is not None and (found is None or found[0][-1] >= best[0][-1]):
+            break
+        best = found
+    if best is None:
+        raise TooFastError(f"the motion cannot stop along the path from {start_speed:.3g} rad/s")
+    return best
+
+
+def stopping_distance(robot: Robot, settings: TimingSettings, velocity: Float[ndarray, "dof"]) -> float:
+    """Length of a straight line on which a motion with a start velocity can stop [rad, joint-space L2]."""
+    acceleration, speed = scaled_limits(robot, settings)[1], float(np.linalg.norm(velocity))
+    moving = velocity != 0
+    most = float((acceleration[moving] * speed / np.abs(velocity[moving])).min())
+    window = 2 * float((acceleration / jerk_limits(robot, settings)).max())
+    delays = [0.5 * share * window + 2 * settings.sample_time for share in START_SHARES]
+    braking = [speed**2 / (2 * BRAKING_FRACTION * share * most) for share in START_SHARES]
+    least = min(speed * delay + length for delay, length in zip(delays, braking, strict=True))
+    return max(least, MIN_STOPPING_DISTANCE)
+
+
+def _spline_rows(
+    controls: Float[ndarray, "m dof"], step: float, window: int, velocity: Float[ndarray, "dof"] | float = 0.0
+) -> Rows:
     """The uniform cubic B-spline whose control points are moving averages of the configurations of a motion
-    from rest to rest, `step` [s] apart, over `window` of them.
+    that ends at rest, `step` [s] apart, over `window` of them. Before these the arm moved with `velocity`.
 
     Velocities and accelerations are weighted means of the motion's, and so within the same limits at every
     time; jerks are constant between rows. The spline leaves the motion's path by no more than about a sixth
     of the acceleration times `step` squared, and stays on straight lines.
     """
+    before = np.arange(-window - 2, 0)[:, None] * step * np.broadcast_to(velocity, controls.shape[1])
     moved = np.concatenate(
         [
-            np.zeros((window + 2, controls.shape[1])),
+            before,
             controls - controls[0],
             np.repeat(controls[-1:] - controls[0], window + 1, axis=0),
         ]
@@ -178,35 +242,31 @@ def _spline_rows(controls: Float[ndarray, "m dof"], step: float, window: int) ->
     before, at, after = points[:-2], points[1:-1], points[2:]
     q = controls[0] + (before + 4 * at + after) / 6
     v, a = (after - before) / (2 * step), (after - 2 * at + before) / step**2
-    q[0], q[-1] = controls[0], controls[-1]
-    v[[0, -1]], a[[0, -1]] = 0.0, 0.0
+    q[-1] = controls[-1]
+    v[0], v[-1], a[[0, -1]] = velocity, 0.0, 0.0
     return step * np.arange(len(q)), q, v, a
 
 
-def _window(
-    controls: Float[ndarray, "m dof"],
-    step: float,
-    acceleration: Float[ndarray, "dof"],
-    jerk: Float[ndarray, "dof"],
-) -> int:
-    """The number of configurations over which `_spline_rows` must average to keep the jerk limits."""
+def _windows(step: float, acceleration: Float[ndarray, "dof"], jerk: Float[ndarray, "dof"]) -> list[int]:
+    """Numbers of configurations over which `_spline_rows` may average to keep the jerk limits, in the order
+    tried; the last keeps them in any case."""
     enough = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
-    tried = sorted({1, *(int(np.ceil(fraction * enough)) for fraction in WINDOW_FRACTIONS)} - {enough})
-    for window in tried:
-        accelerations = _spline_rows(controls, step, window)[3]
-        if (np.abs(np.diff(accelerations, axis=0)) <= step * jerk).all():
-            return window
-    return enough
+    return sorted({1, *(int(np.ceil(fraction * enough)) for fraction in WINDOW_FRACTIONS), enough})
 
 
-def _row_spacing(duration: float, settings: TimingSettings) -> float:
-    """Time between the rows of a motion, which divides its duration [s].
+def _keeps_jerk(rows: Rows, step: float, jerk: Float[ndarray, "dof"]) -> bool:
+    """Whether the jerks between rows are within their limits."""
+    return bool((np.abs(np.diff(rows[3], axis=0)) <= step * jerk).all())
+
+
+def _row_count(duration: float, settings: TimingSettings) -> int:
+    """The number of equal parts into which the rows of a motion divide its duration.
 
     Raises OutOfTimeError if the deadline leaves no time for that many rows.
     """
     count = min(max(int(np.ceil(duration / settings.sample_time)), MIN_STEPS), MAX_ROWS)
     check_timing(f"the {count} rows of a motion of {duration:.3g} s", SECONDS_PER_ROW * count)
-    return duration / count
+    return count
 
 
 def _duration(grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"]) -> float:
@@ -217,7 +277,7 @@ def _duration(grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"]) -> float:
 def can_begin(robot: Robot, line: BlendedPolyline, settings: TimingSettings, start_speed: float) -> bool:
     """Whether a motion along the line with this start speed keeps the limits and can stop at the end."""
     try:
-        _fastest_speeds(line, timing_grid(line, settings), *scaled_limits(robot, settings), start_speed)
+        time_line(robot, line, settings, start_speed)
     except TooFastError:
         return False
     return True
@@ -240,19 +300,21 @@ def _fastest_speeds(
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Float[ndarray, "m"]:
     """ṡ at each value of s in the grid, such that limits hold between grid points too."""
-    share = 1.0
-    while True:
+    share, at_start = 1.0, start_speed * np.abs(line(grid[:1], 1)[0])
+    for _ in range(MAX_SHARES):
         check_timing("the fastest speeds")
-        limits = share * velocity, share**2 * acceleration
+        # at the start the velocity is given: less than it cannot be asked for
+        limits = np.minimum(velocity, np.maximum(share * velocity, at_start)), share**2 * acceleration
         speeds = fastest_speeds(*_derivatives_and_limits(line, grid, *limits, extra), start_speed)
         if start_speed and np.isnan(speeds).any():
-            raise TooFastError(f"the motion cannot stop along the path from {start_speed:.3g} rad/s")
+            break
         slower = slowdown(line.arrays, grid, speeds, velocity, acceleration)
         if start_speed == 0:
             return speeds / slower
         if slower <= 1 + LIMIT_TOLERANCE:
             return speeds
-        share /= slower  # the start speed is given, so that the motion cannot just be slowed down
+        share /= slower * (1 + LIMIT_TOLERANCE)
+    raise TooFastError(f"the motion cannot stop along the path from {start_speed:.3g} rad/s")
 
 
 def _derivatives_and_limits(

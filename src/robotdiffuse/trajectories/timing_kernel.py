@@ -315,41 +315,27 @@ def slowdown(line, grid, speeds, velocity, acceleration):
 
 
 @kernel()
-def sample_rows(line, grid, speeds, sample_time):
-    """Times [n], positions, velocities and accelerations [n, dof] of the motion with these speeds.
+def sample_positions(line, grid, speeds, times):
+    """Positions [n, dof] at increasing times of the motion with these speeds, which rests after its end.
 
-    Times are multiples of the sample time, followed by the duration, at least a tenth of the sample time
-    later.
+    grid, speeds: values of s [m] and ṡ at each, between which s̈ is constant; times [n]: from 0 on [s].
     """
     waypoints, knots, directions, half_widths = line
     ends = np.zeros(len(grid))
     for i in range(len(grid) - 1):
-        ends[i + 1] = ends[i] + 2 * (grid[i + 1] - grid[i]) / (speeds[i] + speeds[i + 1])
-    count = max(1, int(np.ceil(ends[-1] / sample_time - 0.1)))
-    dof = waypoints.shape[1]
-    times, q = np.empty(count + 1), np.empty((count + 1, dof))
-    velocities, accelerations = np.zeros((count + 1, dof)), np.zeros((count + 1, dof))
-    first, second = np.empty(dof), np.empty(dof)
-    i = 0
-    for k in range(count + 1):
-        times[k] = k * sample_time if k < count else ends[-1]
-        while i < len(grid) - 2 and ends[i + 1] <= times[k]:
+        both = speeds[i] + speeds[i + 1]
+        ends[i + 1] = ends[i] + (2 * (grid[i + 1] - grid[i]) / both if both > 0 else 0.0)
+    q, i = np.empty((len(times), waypoints.shape[1])), 0
+    for k in range(len(times)):
+        time = min(times[k], ends[-1])
+        while i < len(grid) - 2 and ends[i + 1] <= time:
             i += 1
-        pull = (speeds[i + 1] - speeds[i]) / (ends[i + 1] - ends[i])
-        ago = times[k] - ends[i]
-        s = min(grid[i] + (speeds[i] + 0.5 * pull * ago) * ago, knots[-1])
-        speed = speeds[i] + pull * ago
+        lasts, ago = ends[i + 1] - ends[i], time - ends[i]
+        pull = (speeds[i + 1] - speeds[i]) / lasts if lasts > 0 else 0.0
+        s = min(grid[i] + (speeds[i] + 0.5 * pull * ago) * ago, grid[i + 1])
+        if times[k] >= ends[-1]:
+            s = grid[-1]
         evaluate_at(waypoints, knots, directions, half_widths, s, 0, q[k])
-        evaluate_at(waypoints, knots, directions, half_widths, s, 1, first)
-        evaluate_at(waypoints, knots, directions, half_widths, s, 2, second)
-        for j in range(dof):
-            velocities[k, j] = first[j] * speed
-            accelerations[k, j] = first[j] * pull + second[j] * speed * speed
-    if grid[0] == 0:
-        q[0] = waypoints[0]
-    if grid[-1] == knots[-1]:
-        q[count] = waypoints[-1]
-    velocities[count] = 0.0
-    if speeds[0] == 0:
-        velocities[0] = 0.0
-    return times, q, velocities, accelerations
+        if s == knots[-1]:
+            q[k] = waypoints[-1]
+    return q

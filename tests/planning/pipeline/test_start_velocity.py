@@ -8,6 +8,7 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
+from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")
@@ -24,10 +25,26 @@ def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
     assert np.allclose(found.trajectory.velocities[0], velocity, atol=1e-9)
     assert (np.abs(found.trajectory.velocities) <= PANDA.velocity * (1 + 1e-6)).all()
     assert (np.abs(found.trajectory.accelerations) <= PANDA.acceleration * (1 + 1e-3)).all()
+    assert not found.stops and not found.notes
+    states = found.trajectory.at(np.arange(0.0, found.trajectory.duration, 1e-4))
+    assert (np.abs(states.jerks) <= jerk_limits(PANDA)).all()
+    assert not found.trajectory.accelerations[0].any()
     assert verify_trajectory(task, found.trajectory).valid
     at_rest = verify_trajectory(replace(task, start_velocity=None), found.trajectory).violation
     assert at_rest is not None
     assert at_rest.kind in ("rest", "acceleration")
+
+
+@pytest.mark.parametrize("jerk", [20.0, 200.0, np.inf])
+def test_a_jerk_limit_holds_from_the_start_velocity_on(jerk: float) -> None:
+    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[0.6, 0.1, 0.2, -0.3, 0, 0, 0.5])
+    found = rd.load_planner("rrt_connect").plan(task, 5.0, jerk=jerk)
+    assert found.trajectory is not None, found.reason
+    assert np.allclose(found.trajectory.velocities[0], task.start_velocity, atol=1e-9)
+    assert (np.abs(found.trajectory.at(0.0).jerks) <= jerk).all()
+    steps = np.diff(found.trajectory.times)[:, None]
+    assert (np.abs(np.diff(found.trajectory.accelerations, axis=0) / steps) <= jerk * (1 + 1e-9)).all()
+    assert not found.stops
 
 
 @pytest.mark.parametrize(
@@ -56,8 +73,13 @@ def test_start_velocity_beyond_what_scaling_leaves() -> None:
     task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=np.eye(7)[0] * 2.0)
     with pytest.raises(InputError, match=r"velocity_scaling leaves it 1\.08"):
         rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
-    with pytest.raises(InputError, match="jerk cannot be combined with start_velocity"):
-        rd.load_planner("rrt_connect").plan(task, jerk=100.0)
+
+
+def test_a_start_velocity_too_high_to_stop_from_with_little_jerk() -> None:
+    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=np.eye(7)[0] * 2.0)
+    found = rd.load_planner("rrt_connect").plan(task, jerk=0.1)
+    assert found.status is Status.INVALID_START
+    assert "panda_joint1 cannot stop" in found.reason
 
 
 def test_start_velocities_of_nearly_nothing_are_rest() -> None:

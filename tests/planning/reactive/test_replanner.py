@@ -8,6 +8,7 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.collision.moving_obstacles import MovingCollision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")
@@ -36,6 +37,7 @@ def test_every_command_is_a_certified_stop(count: int, seed: int) -> None:
     places, velocities = balls(count, seed)
     replanner = loop(places)
     names = [one.name for one in replanner.problem.moving]
+    jerk = jerk_limits(PANDA)
     before, renewed, arrived = None, 0, False
     for k in range(600):
         now = k * PERIOD
@@ -44,14 +46,17 @@ def test_every_command_is_a_certified_stop(count: int, seed: int) -> None:
         motion = command.motion
         assert command.begins == pytest.approx(now + PERIOD)
         assert np.abs(motion.velocities[-1]).max() == 0
-        assert (np.abs(motion.velocities) <= PANDA.velocity).all()
-        assert (np.abs(motion.accelerations) <= PANDA.acceleration).all()
-        if before is not None:  # it goes on where the last one is then
-            at = command.begins - before.begins
-            rows = before.motion
-            for what in ("positions", "velocities"):
-                then = [np.interp(at, rows.times, column) for column in getattr(rows, what).T]
-                assert np.allclose(getattr(motion, what)[0], then, atol=2e-3 if what == "positions" else 0.05)
+        states = motion.at(np.arange(0.0, motion.duration, 1e-4))
+        for limit, rates in (
+            (PANDA.velocity, states.velocities),
+            (PANDA.acceleration, states.accelerations),
+            (jerk, states.jerks),
+        ):
+            assert (np.abs(rates) <= limit).all()
+        if before is not None:  # it goes on as the last one is then
+            then = before.motion.at(min(command.begins - before.begins, before.motion.duration))
+            for what in ("positions", "velocities", "accelerations"):
+                assert np.allclose(getattr(motion, what)[0], getattr(then, what), atol=1e-9)
         if command.renewed:
             renewed += 1
             anywhere = [rd.MovingObstacle(rd.Sphere(place, 0.1), max_speed=SPEED) for place in seen]

@@ -1,4 +1,4 @@
-"""Motions from a problem's start velocity: the arm is moving when the motion begins.
+"""Motions from a problem's start velocity: the arm is moving when the motion begins, without acceleration.
 
 The arm first goes straight on, as far as it needs to stop. The planner plans from there. The path is then
 timed from the start velocity on, and its corner at the stopping place is rounded where that is free, so that
@@ -15,22 +15,17 @@ from robotdiffuse.core.types import Status
 from robotdiffuse.planning.attempt import Solver, attempt
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.problems.problem import Problem
-
-BRAKING_FRACTION = 0.9
-"""Part of the acceleration limits used for stopping; the rest lets corners be rounded."""
+from robotdiffuse.trajectories.speed_limits import stopping_distance
 
 
 def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
     """A motion from the problem's start velocity to rest at its goal.
 
-    Raises InputError for a velocity beyond the scaled velocity limits of the request, and for a finite jerk
-    limit in the request; the robot's own is not kept, and a note says so.
+    Raises InputError for a velocity beyond the scaled velocity limits of the request.
     """
     context, robot = PlanningContext(solver.name, problem, request), problem.robot
     velocity = problem.start_velocity
     assert velocity is not None
-    if request.jerk is not None and np.isfinite(request.jerk):
-        raise InputError("jerk cannot be combined with start_velocity: the motion before it is not known")
     beyond = np.flatnonzero(np.abs(velocity) > request.velocity_scaling * robot.velocity)
     if len(beyond):
         j = int(beyond[0])
@@ -38,11 +33,8 @@ def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequ
             f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; velocity_scaling leaves it "
             f"{request.velocity_scaling * robot.velocity[j]:g}"
         )
-    speed = float(np.linalg.norm(velocity))
-    direction, moving = velocity / speed, velocity != 0
-    most = float((robot.acceleration[moving] / np.abs(direction[moving])).min())
-    deceleration = BRAKING_FRACTION * request.acceleration_scaling * most
-    stop = problem.start + speed**2 / (2 * deceleration) * direction
+    direction = velocity / np.linalg.norm(velocity)
+    stop = problem.start + stopping_distance(robot, context.timing, velocity) * direction
     beyond = np.flatnonzero(((stop < robot.lower) | (stop > robot.upper)) & ~np.array(robot.continuous))
     if len(beyond):
         name = robot.joint_names[int(beyond[0])]
@@ -52,9 +44,10 @@ def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequ
         return replace(result, reason=f"from where the arm can stop: {result.reason}")
     waypoints = np.concatenate([problem.start[None], result.path.positions])
     notes = tuple(note for note in result.notes if note not in context.notes)
-    if request.jerk is None:
-        notes = (*notes, "the jerk is not limited: the motion before the start velocity is not known")
-    found = context.finish(waypoints, result.stage or solver.name, notes=notes)
+    deviations = np.full(len(waypoints), context.timing.corner_deviation)
+    if result.corner_deviations is not None:
+        deviations[2:] = result.corner_deviations[1:]
+    found = context.finish(waypoints, result.stage or solver.name, notes=notes, deviations=deviations)
     if found is not None:
         return found
     if context.ended:

@@ -103,6 +103,9 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
     whole.timing = replace(whole.timing, line_intervals=len(segments) * whole.timing.line_intervals)
     corners = np.cumsum([len(s.path.positions) - 1 for s in segments[:-1] if s.path is not None])
     deviations = np.full(len(path.positions), whole.timing.corner_deviation)
+    for row, segment in zip([0, *corners], segments, strict=True):
+        if segment.corner_deviations is not None:
+            deviations[row : row + len(segment.corner_deviations)] = segment.corner_deviations
     for row, goal, radius in zip(corners, part.waypoints, blend, strict=True):
         deviations[row] = _deviation(part, path, int(row), goal, radius)
     clearances = [s.min_clearance for s in segments if s.min_clearance is not None]

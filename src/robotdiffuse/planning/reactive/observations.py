@@ -105,10 +105,16 @@ class PredictedObstacles:
         """When an obstacle first touches the arm at rest [s]; None if none does."""
         return self.comes_to(q[None], np.array([time]), rest_time)
 
-    def free(self, motion: Trajectory, begins: float, horizon: float, rest_time: float) -> bool:
-        """Whether no obstacle touches the arm for `horizon` [s], or until it has rested at the end for
-        `rest_time` [s]."""
-        soon = max(int(np.searchsorted(motion.times, horizon)), 1)
-        times = motion.times[:soon] + begins
-        rest_time = rest_time if soon == len(motion.times) else 0.0
-        return self.comes_to(motion.positions[:soon], times, rest_time + 1e-3) is None
+    def free(
+        self,
+        times: Float[ndarray, "n"],
+        q: Float[ndarray, "n dof"],
+        begins: float,
+        horizon: float,
+        rest_time: float,
+    ) -> bool:
+        """Whether no obstacle touches the arm on its way for `horizon` [s], or until it has rested at the end
+        for `rest_time` [s]."""
+        soon = max(int(np.searchsorted(times, horizon)), 1)
+        rest_time = rest_time if soon == len(times) else 0.0
+        return self.comes_to(q[:soon], times[:soon] + begins, rest_time + 1e-3) is None

@@ -6,6 +6,9 @@ of the arm comes near any place that an obstacle can reach from where it was las
 If no new motion can be certified, the arm continues the last one, which was. An obstacle may still run into
 an arm at rest, as obstacles can corner any arm; the loop evades where it predicts that.
 
+**Limits.** Velocity, acceleration and jerk are within the robot's limits at every time, stops included
+(`planning/reactive/jerk_filter.py`). Joints that state no jerk limit have none here.
+
 **Prediction.** Which way to go is chosen by where the obstacles will be if they keep the velocity last seen.
 The guarantee does not depend on the prediction.
 """
@@ -30,6 +33,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
+from robotdiffuse.planning.reactive.jerk_filter import JerkFilter
 from robotdiffuse.planning.reactive.observations import ObservedObstacle, PredictedObstacles
 from robotdiffuse.planning.reactive.timed_path import MIN_LENGTH, SpeedProfile, TimedPath
 from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
@@ -37,6 +41,7 @@ from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.goals import Goal
 from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.trajectories.speed_limits import Jerk
 from robotdiffuse.validation.validator import verifier
 
 SEARCH_TIME_LIMIT = 10.0
@@ -75,8 +80,13 @@ class ReplannerSettings(Settings, name="replanner"):
     """Random directions that are tried for an evasion, when the arm rests where an obstacle is predicted."""
     evasion_radius: Positive = 0.8
     """Length of evasions [rad, joint-space L2]."""
-    sample_time: Annotated[float, Bound(least=1e-3, most=0.1)] = 0.01
-    """Time between the rows of the motion that a step returns [s]."""
+    sample_time: Annotated[float, Bound(least=1e-3, most=0.1)] = 0.005
+    """Time between the rows of the motion that a step returns [s]. Filtering for the jerk limits delays
+    motions by at least four of these."""
+    jerk: Jerk | None = None
+    """Jerk limit of every joint [rad/s³] or [m/s³]; None: the limits that the robot states, and none for
+    joints without one: unlike in plans, the default of 10 / s times the acceleration limit does not hold,
+    with which stops take 1.7 times as long."""
     from_scratch: bool = False
     """Whether each step searches for a whole new path, even if the old one is free: the control of the
     benchmark."""
@@ -127,9 +137,12 @@ class Replanner:
         self._seen = {one.name: ObservedObstacle(one) for one in problem.moving}
         self._now, self._searches = -np.inf, 0
         self._next: TimedPath | None = None
+        stated = np.where(problem.robot.jerk > 0, problem.robot.jerk, np.inf)
+        jerk = stated if settings.jerk is None else np.full(problem.robot.dof, settings.jerk)
+        self._filter = JerkFilter(problem.robot, jerk, settings.sample_time, problem.start)
         self._path, self._goals, self._space = self._first_path()
         self._since, self._motion = -np.inf, AT_REST
-        """The motion under way: along the path, from this time on."""
+        """The motion under way: along the path, from this time on, before it is filtered."""
         self._left = False
         """Whether the arm leaves the path at the end of its motion, for a new goal."""
         self._rehearse()
@@ -175,6 +188,7 @@ class Replanner:
             raise InputError(f"now is {now:g} s after {self._now:g} s; time must go on from step to step")
         self._observe(observation, float(now))
         begins = self._now + self.settings.period
+        self._filter.advance(self._path, self._motion, self._since, begins)
         if np.isfinite(self._since):
             self._motion = self._motion.rest(begins - self._since)
         self._since = begins
@@ -184,9 +198,19 @@ class Replanner:
         clear = self._choose_path(predicted)
         self._change_path()
         renewed = self._next is None and self._extend(predicted, grown, clear)
-        motion = self._path.rows(self._motion, self.settings.sample_time)
-        arrived = bool(self._motion.speeds[0] == 0) and self._at_goal()
+        motion = self._filter.follow(self._path, self._motion)
+        arrived = self._rests and self._at_goal()
         return Command(begins, motion, renewed, arrived)
+
+    @property
+    def _rests(self) -> bool:
+        """Whether the arm is at rest."""
+        return bool(self._motion.speeds[0] == 0) and self._filter.at_rest
+
+    @property
+    def _rest_time(self) -> float:
+        """When the arm comes to rest [s]."""
+        return self._since + (0.0 if self._rests else self._motion.duration + self._filter.lag)
 
     def _at_goal(self) -> bool:
         """Whether the arm, at rest, is at a goal."""
@@ -203,7 +227,7 @@ class Replanner:
             raise InputError(f"the replanner cannot begin: {start_goal.reason}")
         search = AnytimeSearch(context, start_goal, SearchSettings(), "replanner", bounded=False)
         while search.first(context.search_until) and search.best is not None:
-            path = TimedPath.certified(self._robot, self._validator, start_goal.complete(search.best), True)
+            path = self._certified(start_goal.complete(search.best), True)
             if path is not None:
                 return path, np.array(start_goal.goals), search_space(start_goal.checker, COARSE_RESOLUTION)
             search.refuse(None)
@@ -238,10 +262,10 @@ class Replanner:
         """Search for another path if an obstacle is predicted on the present one; returns whether none is
         predicted on the path that the arm is on."""
         settings = self.settings
-        rest_time, rest = self._since + self._motion.duration, self._path.at(float(self._motion.s[-1]))
+        rest_time, rest = self._rest_time, self._path.at(float(self._motion.s[-1]))
         ahead = self._path if self._next is None else self._next
         clear = self._path_clear(predicted, ahead, self._next is None)
-        moving = self._motion.duration > 0
+        moving = not self._rests or self._motion.duration > 0
         leaves = self._left and self._next is None
         done = clear and (ahead.to_goal or moving) and not leaves
         if done and not settings.from_scratch:
@@ -250,7 +274,7 @@ class Replanner:
         if done:
             return clear
         if found is not None and predicted.free(
-            found.rows(found.onwards(0.0, 0.0), COARSE_SAMPLE_TIME),
+            *found.coarse(found.onwards(0.0, 0.0), COARSE_SAMPLE_TIME),
             rest_time,
             settings.horizon,
             settings.rest_time,
@@ -263,9 +287,9 @@ class Replanner:
     def _path_clear(self, predicted: PredictedObstacles, path: TimedPath, under_way: bool) -> bool:
         """Whether the arm can go on to the end of a path, by the prediction."""
         s, speed = (float(self._motion.s[0]), float(self._motion.speeds[0])) if under_way else (0.0, 0.0)
-        begins = self._since if under_way else self._since + self._motion.duration
-        motion = path.rows(path.onwards(s, speed), COARSE_SAMPLE_TIME)
-        return predicted.free(motion, begins, self.settings.horizon, self.settings.rest_time)
+        begins = self._since if under_way else self._rest_time
+        motion = path.coarse(path.onwards(s, speed), COARSE_SAMPLE_TIME)
+        return predicted.free(*motion, begins, self.settings.horizon, self.settings.rest_time)
 
     def _search(
         self, predicted: PredictedObstacles, start: Float[ndarray, "dof"], time: float
@@ -296,7 +320,7 @@ class Replanner:
             return None
         path = search.start_goal.complete(search.best)
         end = int(np.abs(np.array(roots) - path[-1]).max(axis=1).argmin())
-        return TimedPath.certified(self._robot, self._validator, np.concatenate([path, after[end]]), True)
+        return self._certified(np.concatenate([path, after[end]]), True)
 
     def _evasion(
         self, predicted: PredictedObstacles, rest: Float[ndarray, "dof"], time: float
@@ -321,11 +345,16 @@ class Replanner:
                 break
         if best is None:
             return None
-        return TimedPath.certified(robot, self._validator, np.stack([rest, best]), False)
+        return self._certified(np.stack([rest, best]), False)
+
+    def _certified(self, waypoints: Float[ndarray, "n dof"], to_goal: bool) -> TimedPath | None:
+        """See `TimedPath.certified`."""
+        limits = self._filter.acceleration, self._filter.displacement
+        return TimedPath.certified(self._robot, self._validator, waypoints, to_goal, *limits)
 
     def _change_path(self) -> None:
         """At rest, change to the next path, or to what follows the present one."""
-        if self._motion.speeds[0] > 0:
+        if not self._rests:
             return
         if self._next is not None:
             self._path, self._next, self._motion, self._left = self._next, None, AT_REST, False
@@ -340,7 +369,7 @@ class Replanner:
             return False
         for periods in DRIVING_PERIODS:
             extended = path.on_then_rest(s, speed, periods * settings.period)
-            motion = path.rows(extended, settings.sample_time)
+            motion = self._filter.follow(path, extended)
             rests = self._since + motion.duration
             left_alone = clear or predicted.comes(motion.positions[-1], rests, settings.rest_time) is None
             certified = grown.near(motion, self._since, settings.clearance) is None

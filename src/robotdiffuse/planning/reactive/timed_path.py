@@ -1,6 +1,6 @@
 """Paths that are certified in the static scene, and speed profiles along them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
@@ -15,11 +15,14 @@ from robotdiffuse.trajectories import braking_kernel
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import TimingSettings, symmetric_bounds, timing_grid
 from robotdiffuse.trajectories.timing import rounded_corners
-from robotdiffuse.trajectories.timing_kernel import controllable, sample_rows
-from robotdiffuse.validation.validator import Verifier
+from robotdiffuse.trajectories.timing_kernel import controllable, sample_positions
+from robotdiffuse.validation.tolerances import DEFAULT
+from robotdiffuse.validation.validator import Verifier, verifier
 
 VELOCITY_FRACTION, ACCELERATION_FRACTION = 0.99, 0.96
 """Parts of the limits that are used at the grid points; the rest covers what lies between them."""
+CORNER_SAMPLES = 65
+"""Configurations of a rounded corner that are checked with a distance."""
 MIN_LENGTH = 1e-4
 """Paths are longer than this [rad]."""
 LINE_INTERVAL = 0.03
@@ -56,6 +59,8 @@ class TimedPath:
     """A polyline with rounded corners that passed the validator; the arm need not stop along it."""
 
     robot: Robot
+    acceleration: Float[ndarray, "dof"]
+    """Acceleration limits of motions along it."""
     line: BlendedPolyline
     to_goal: bool
     """Whether it, or the path that follows, ends at the goal."""
@@ -64,9 +69,18 @@ class TimedPath:
 
     @staticmethod
     def certified(
-        robot: Robot, validator: Verifier, waypoints: Float[ndarray, "n dof"], to_goal: bool
+        robot: Robot,
+        validator: Verifier,
+        waypoints: Float[ndarray, "n dof"],
+        to_goal: bool,
+        acceleration: Float[ndarray, "dof"],
+        displacement: float,
     ) -> "TimedPath | None":
-        """The path through waypoints; None if the validator refuses it, or all waypoints are the same."""
+        """The path through waypoints; None if the validator refuses it, or all waypoints are the same.
+
+        Rounded corners are free even where the arm is up to `displacement` [m] off the path; at one that
+        cannot be, the arm stops.
+        """
         path = Path(robot.joint_names, waypoints)
         if path.length < MIN_LENGTH or not validator.collision_free(path):
             return None
@@ -74,13 +88,21 @@ class TimedPath:
         def free(motion: Trajectory) -> bool:
             return validator.collision_free(Path(motion.joint_names, motion.positions))
 
-        rows, deviations = rounded_corners(robot, path, free, validator.collision_free)
+        def free_around(q: Float[ndarray, "n dof"]) -> bool:
+            return distant.collision_free(Path(robot.joint_names, q))
+
+        distant = verifier(validator.problem, replace(DEFAULT, contact=max(displacement, DEFAULT.contact)))
+        rows, deviations = rounded_corners(robot, path, free, validator.collision_free, keeps=free_around)
+        line = BlendedPolyline(rows, half_widths(rows, deviations))
+        for i in np.flatnonzero(deviations):
+            width = line.half_widths[i]
+            if not free_around(line(line.knots[i + 1] + width * np.linspace(-1, 1, CORNER_SAMPLES), 0)):
+                deviations[i] = 0.0
         stops = [0, *(np.flatnonzero(deviations == 0) + 1).tolist(), len(rows) - 1]
         timed = None
         for first, last in reversed(list(pairwise(stops))):
-            part = rows[first : last + 1]
-            line = BlendedPolyline(part, half_widths(part, deviations[first : last - 1]))
-            timed = TimedPath(robot, line, to_goal, timed)
+            part = BlendedPolyline(rows[first : last + 1], line.half_widths[first : last - 1])
+            timed = TimedPath(robot, acceleration, part, to_goal, timed)
         return timed
 
     @cached_property
@@ -98,18 +120,14 @@ class TimedPath:
                 two,
                 grid,
                 VELOCITY_FRACTION * self.robot.velocity,
-                *symmetric_bounds(self._acceleration, len(grid)),
+                *symmetric_bounds(self.acceleration, len(grid)),
             ),
         )
-
-    @property
-    def _acceleration(self) -> Float[ndarray, "dof"]:
-        return ACCELERATION_FRACTION * self.robot.acceleration
 
     def on_then_rest(self, s: float, speed: float, time: float) -> SpeedProfile:
         """The motion that drives as fast as possible towards the end for a time [s], then brakes to rest."""
         return SpeedProfile(
-            *braking_kernel.advance_then_brake(*self._grid, s, speed, time, self._acceleration)
+            *braking_kernel.advance_then_brake(*self._grid, s, speed, time, self.acceleration)
         )
 
     def onwards(self, s: float, speed: float) -> SpeedProfile:
@@ -131,11 +149,14 @@ class TimedPath:
         after = self.then.remaining(0.0)[1:] if self.then is not None else ahead[:0]
         return np.concatenate([self.at(s)[None], ahead, after])
 
-    def rows(self, speeds: SpeedProfile, sample_time: float) -> Trajectory:
-        """The trajectory of a motion; two rows at rest if it has no duration."""
-        if speeds.duration <= 0:
-            q = np.repeat(self.at(float(speeds.s[0]))[None], 2, axis=0)
-            return Trajectory(self.robot.joint_names, np.array([0.0, sample_time]), q, 0 * q, 0 * q)
-        moving = np.append(True, (speeds.speeds[1:] + speeds.speeds[:-1]) > 0)
-        rows = sample_rows(self.line.arrays, speeds.s[moving], speeds.speeds[moving], sample_time)
-        return Trajectory(self.robot.joint_names, *rows)
+    def positions(self, motion: SpeedProfile, times: Float[ndarray, "n"]) -> Float[ndarray, "n dof"]:
+        """Configurations at times after the beginning of a motion, which rests after its end [s]."""
+        s, speeds = np.append(motion.s, motion.s[-1]), np.append(motion.speeds, 0.0)
+        return sample_positions(self.line.arrays, s, speeds, times)
+
+    def coarse(
+        self, motion: SpeedProfile, step: float
+    ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:
+        """Times, `step` [s] apart, and configurations of a motion until it rests."""
+        times = step * np.arange(int(np.ceil(motion.duration / step)) + 2)
+        return times, self.positions(motion, times)
