@@ -8,7 +8,7 @@ import pytest
 from helpers.example_robots import planar_arm
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.evaluation import ablation
+from robotdiffuse.evaluation.paper import table2
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.denoisers import DENOISERS

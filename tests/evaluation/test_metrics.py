@@ -14,7 +14,7 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.evaluation.comscore import (
+from robotdiffuse.evaluation.paper.comscore import (
     PAPER_TABLE_1,
     Indicators,
     comscores,

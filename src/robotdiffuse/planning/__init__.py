@@ -93,6 +93,12 @@ PLANNERS = Registry(
             LEARNED,
             "EDMP: such a prior, guided by an ensemble of costs",
         ),
+        "straight_line": _entry(
+            "baselines.straight_line:StraightLine",
+            "StraightLineSettings",
+            SEARCH,
+            "no planner: the straight line in joint space, the control of every other row",
+        ),
         "a_star": _entry(
             "baselines.lattice.planner:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"
         ),

@@ -1,0 +1,41 @@
+"""The pages of `robotdiffuse reproduce`, as Markdown."""
+
+from collections.abc import Sequence
+from pathlib import Path as FilePath
+
+from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.evaluation.bench.report import about, crashes
+from robotdiffuse.evaluation.bench.run_folder import Bench
+from robotdiffuse.evaluation.paper import table1
+from robotdiffuse.evaluation.tables import Table, markdown, plain
+
+
+def write_table1(settings: table1.Table1Settings, bench: Bench) -> FilePath:
+    """Write table1.md into the folder; returns the file."""
+    weights = "" if settings.paper_weights is None else " --paper-weights FOLDER"
+    command = (
+        f"robotdiffuse reproduce table1 --out FOLDER --problems {settings.problems} "
+        f"--time-limit {settings.time_limit:g}{weights}"
+    )
+    lines = [*table1.notes(settings), *about(bench), *crashes(bench)]
+    return write_page(settings.out / "table1.md", "Table 1", command, lines, table1.tables(settings, bench))
+
+
+def write_page(
+    file: FilePath,
+    title: str,
+    command: str,
+    notes: Sequence[str],
+    tables: Sequence[Table],
+    pictures: Sequence[tuple[str, str]] = (),
+) -> FilePath:
+    """Write a page: tables, then pictures (captions and files beside the page), then notes."""
+    lines = [f"# {title} of the paper, beside ours", "", "```sh", command, "```"]
+    for table in tables:
+        lines += ["", f"## {plain(table.title)}", "", *markdown(table)]
+    for caption, picture in pictures:
+        lines += ["", f"## {plain(caption.partition(':')[0])}", "", plain(caption.partition(": ")[2])]
+        lines += ["", f"![{plain(caption)}]({picture})"]
+    lines += ["", "## Notes", "", *(f"- {plain(note)}" for note in notes)]
+    write_atomically(file, "\n".join(lines) + "\n", make_folder=True)
+    return file
