@@ -17,8 +17,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench.curves import Curve, curves
 from robotdiffuse.evaluation.bench.outcomes import Calls, Key, Outcome, calls_on, deciding_record, outcome
 from robotdiffuse.evaluation.bench.run_folder import Bench, plain_name
-from robotdiffuse.evaluation.paper.comscore import Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric
+from robotdiffuse.evaluation.paper.comscore import Indicators, comscores
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import RESTARTED, Record
 from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
-import numpy as np
-
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench.figures import Mean
 from robotdiffuse.evaluation.bench.run_folder import Bench, read_bench
@@ -223,16 +221,16 @@ def _table(title: str, rows: Sequence[Row], records: dict[str, list[Record]], be
 def notes(settings: Table1Settings) -> list[str]:
     """How to read the tables."""
     found = [
-        f"Every call has {settings.time_limit:g} s, 600 s in the paper. RRT* searches until then, unless it has the straight "
-        "line.",
+        f"Every call has {settings.time_limit:g} s, in the paper up to 600. RRT* searches until then, unless "
+        "it has the straight line.",
         "success: the motion passes the validator and ends within 1 cm and 15° of the pose, with the 95 % "
         "interval by Wilson. collision: share of problems on which the validator refused the planner's last "
-        "path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion as it ships try again until time runs "
-        "out; the rows of a single sample have one motion a problem, as in the paper.",
+        "path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion as it ships try again until time "
+        "runs out; the rows of a single sample have one motion a problem, as in the paper.",
         "Means are over the problems that a row solves, with 95 % intervals: rows that solve only easy "
         "problems seem short. length of links 1 to 7: path lengths of the origins of the links that joints "
-        "move, which the paper calls path length (its arm has no hand; it names no unit). log jerk: logarithm of the "
-        "dimensionless jerk; turning: sum of the angles between segments.",
+        "move, which the paper calls path length (its arm has no hand; it names no unit). log jerk: "
+        "logarithm of the dimensionless jerk; turning: sum of the angles between segments.",
         "trivial: the straight line to any goal configuration is free. ComScore: as in the paper, among its "
         "five rows; each further row takes the place of the paper's method.",
         "robotdiffuse and aorrtc minimize the duration, their default. time: mean until the planner returns; "

@@ -38,7 +38,7 @@ from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"
 CONTROL = "no network"
-"""The straight line and random bumps in place of a network's samples."""
+"""Smooth noise about the straight line in place of a network's samples."""
 CONTROL_WAYPOINTS = 48
 """As many as those of the rows' networks."""
 STOP_TIMEOUT = 20.0

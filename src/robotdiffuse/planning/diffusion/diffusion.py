@@ -5,7 +5,8 @@ collision guidance; every sample goes to the validator as it is, and the shortes
 Where none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line,
 no search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance
 solve. With the settings samples=1, guidance_steps=0, repeat=false and weights of config `paper`, which have
-no clearances as inputs, it does only what the paper says. The hybrid planner (`planning.diffusion.hybrid`) surrounds it with a search.
+no clearances as inputs, it does only what the paper says. The hybrid planner (`planning.diffusion.hybrid`)
+surrounds it with a search.
 
 Path constraints are one more cost of guidance, and each waypoint of a sample is projected onto them before
 validation, which proves them between the waypoints too. The network was trained without constraints.
