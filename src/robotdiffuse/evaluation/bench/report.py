@@ -34,10 +34,10 @@ NOTES = (
     "and validation follows.",
     "collision: share of problems on which the validator refused the planner's last path because it "
     "collides.",
-    "link length: the paper's, the path lengths of the links that joints move together, mean over the problems that the "
-    "planner itself solved; planners that solve only easy problems seem short. If a call continued and "
-    "returned a shorter path, its length by the limit is that of the returned path, scaled by the "
-    "lengths in joint space.",
+    "link length: the paper's, the path lengths of the links that joints move together, mean over the "
+    "problems that the planner itself solved; planners that solve only easy problems seem short. If a call "
+    "continued and returned a shorter path, its length by the limit is that of the returned path, scaled by "
+    "the lengths in joint space.",
     "ratio: median of the length in joint space over that of the reference, on problems that both solve, "
     "with its 95 % interval (bootstrap over problems), at equal time: for planners that use up the limit. "
     "restarted: a planner that ends earlier is called again with other seeds until its calls have used up "

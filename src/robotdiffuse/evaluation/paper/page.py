@@ -2,12 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
 
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.evaluation.bench.report import about, crashes
 from robotdiffuse.evaluation.bench.run_folder import Bench
 from robotdiffuse.evaluation.paper import table1
 from robotdiffuse.evaluation.tables import Table, markdown, plain
+
+if TYPE_CHECKING:
+    from robotdiffuse.evaluation.paper.table2 import AblationSettings, RowResult
 
 
 def write_table1(settings: table1.Table1Settings, bench: Bench) -> FilePath:
@@ -19,6 +23,19 @@ def write_table1(settings: table1.Table1Settings, bench: Bench) -> FilePath:
     )
     lines = [*table1.notes(settings), *about(bench), *crashes(bench)]
     return write_page(settings.out / "table1.md", "Table 1", command, lines, table1.tables(settings, bench))
+
+
+def write_table2(settings: "AblationSettings", results: "list[RowResult]") -> FilePath:
+    """Write table2.md into the folder; returns the file."""
+    from robotdiffuse.evaluation.paper import table2  # imports PyTorch
+
+    command = (
+        f"robotdiffuse reproduce table2 --data DATA --out FOLDER --samples {settings.samples} "
+        f"--encoder-samples {settings.encoder_samples} --problems {settings.problems} "
+        f"--seeds {settings.seeds}"
+    )
+    tables = [table2.table(settings, results), table2.straight_line_table(settings.problems)]
+    return write_page(FilePath(settings.out) / "table2.md", "Table 2", command, [], tables)
 
 
 def write_page(
@@ -36,6 +53,7 @@ def write_page(
     for caption, picture in pictures:
         lines += ["", f"## {plain(caption.partition(':')[0])}", "", plain(caption.partition(": ")[2])]
         lines += ["", f"![{plain(caption)}]({picture})"]
-    lines += ["", "## Notes", "", *(f"- {plain(note)}" for note in notes)]
+    if notes:
+        lines += ["", "## Notes", "", *(f"- {plain(note)}" for note in notes)]
     write_atomically(file, "\n".join(lines) + "\n", make_folder=True)
     return file
