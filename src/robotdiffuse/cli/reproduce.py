@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 FIGURE_PROBLEMS = 60
 """Most problems of the plot of success against denoising steps."""
-FIGURE_AZIMUTH = 0.9
+FIGURE_AZIMUTH = -0.9
 """Of the camera of figure 1, the same for all noise levels [rad]."""
 
 

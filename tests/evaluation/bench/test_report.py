@@ -396,29 +396,6 @@ def test_latex_is_escaped_and_every_row_has_all_columns(small: Path) -> None:
         assert {len(re.findall(r"(?<!\\)&", line)) for line in lines} == {len(columns) - 1}
 
 
-def test_the_paper_stands_beside_ours(small: Path) -> None:
-    with record_path(small, "diffusion").open("w") as stream:
-        for i in range(4):
-            record = solved("diffusion", f"rop/{i}", 1.0, [(0.3, 2.5)], trivial=i == 3)
-            stream.write(json.dumps(record.row()) + "\n")
-    bench = read_bench(small)
-    whole, _ = figures.sections(bench)
-    table = report.paper_table(whole, whole.main)
-    assert table is not None
-    headings = [column.heading for column in table.columns]
-    of = {row[0]: dict(zip(headings, row, strict=True)) for row in table.texts}
-    assert of["ompl_rrt_star: RRT*"]["paper: success"] == "73.3"
-    assert of["ompl_rrt_star: RRT*"]["paper: returns"] == "600"
-    assert of["diffusion: RobotDiffuse (paper's method)"]["paper: ComScore"] == "0.765"
-    assert of["robotdiffuse: hybrid"]["paper: ComScore"] == "–"
-    assert list(of)[-1] == "robotdiffuse: hybrid"
-    alike = {name: cells["ComScore"] for name, cells in of.items()}
-    assert alike["diffusion: RobotDiffuse (paper's method)"] < alike["robotdiffuse: hybrid"]
-    text = report.markdown(bench, [whole])
-    widths = [line.count("|") - line.count("\\|") for line in text.splitlines() if line.startswith("| robot")]
-    assert max(widths) == 13
-
-
 @pytest.mark.slow
 def test_the_command_writes_everything(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -46,13 +46,19 @@ def write_page(
     tables: Sequence[Table],
     pictures: Sequence[tuple[str, str]] = (),
 ) -> FilePath:
-    """Write a page: tables, then pictures (captions and files beside the page), then notes."""
+    """Write a page: tables, then pictures, then notes.
+
+    pictures: captions and files beside the page; the part of a caption before a colon is its heading.
+    """
     lines = [f"# {title} of the paper, beside ours", "", "```sh", command, "```"]
     for table in tables:
         lines += ["", f"## {plain(table.title)}", "", *markdown(table)]
+    heading = ""
     for caption, picture in pictures:
-        lines += ["", f"## {plain(caption.partition(':')[0])}", "", plain(caption.partition(": ")[2])]
+        of, _, what = caption.partition(": ")
+        lines += ["", *([f"## {plain(of)}", ""] if of != heading else []), f"{plain(what)}:"]
         lines += ["", f"![{plain(caption)}]({picture})"]
+        heading = of
     if notes:
         lines += ["", "## Notes", "", *(f"- {plain(note)}" for note in notes)]
     write_atomically(file, "\n".join(lines) + "\n", make_folder=True)

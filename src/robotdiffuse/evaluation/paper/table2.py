@@ -280,8 +280,8 @@ NOTES = (
 )
 LINE_NOTES = (
     "The straight line in joint space, under the authors' own draw of problems, with inverse kinematics of "
-    "the position alone: share of problems on which it is free. The paper's rows are of all problems, trivial "
-    "too, so a row near these shares has shown no planner.",
+    "the position alone: share of problems on which it is free. The paper's rows are of all problems, "
+    "trivial ones too, so a row near these shares has shown no planner.",
 )
 
 
