@@ -16,6 +16,7 @@ cloud and
   Guidance, where there is some, knows the obstacles in any case. The controls are guidance of smooth noise,
   which is what the model starts from: with as many gradient steps, and with as many as fit in the network's
   CPU time.
+- controls: of `alone`, the guided network and the controls; prints benchmarks/results/network_equal_time.txt.
 - planner: the whole planner; PyBullet checks its motions on meshes.
 - code: the whole planner, which does without the code, beside itself with the code.
 - guidance: single samples and best of 16 against sampling steps, gradient steps and classifier-free scale.
@@ -65,7 +66,7 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.simulation.validator import PyBulletOracle
 
 PANDA = load_robot("panda")
-PARTS = ("alone", "planner", "code", "guidance")
+PARTS = ("alone", "controls", "planner", "code", "guidance")
 PLANNER_LIMIT = 5.0
 """Time limit of the whole planner [s]."""
 EQUAL_TIME = 0.5
@@ -169,6 +170,14 @@ def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]
             found[f"{name}, condition hidden"] = from_network(
                 RobotDiffuse(replace(of.settings, guidance_scale=0.0))
             )
+    return found
+
+
+def controls(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
+    """The network with guidance, and smooth noise with as many gradient steps and with as much CPU time."""
+    model = planner.model(PANDA)
+    assert model is not None
+    found = {"guided": from_network(planner)}
     waypoints = model.settings.waypoints
     found["control: smooth noise, as many gradient steps"] = without_network(planner.settings, waypoints)
     steps = equal_time_steps(planner, waypoints, cases[:TIMED])
@@ -259,10 +268,13 @@ def print_worth_of_inputs(found: dict[str, list[Record]]) -> None:
     print_table(f"{len(own)} problems: single samples, points", ["network", "less", "mean (95 %)"], rows)
 
 
-def report_alone(family: str, cases: list[Case], weights: str | None) -> dict[str, list[Record]]:
-    """Print how the network does alone; its records."""
+def report_alone(
+    family: str, cases: list[Case], weights: str | None, inputs: bool
+) -> dict[str, list[Record]]:
+    """Print how the network does alone, and with `inputs` also without each of them; its records."""
     planner = RobotDiffuse(replace(NETWORK_ALONE, weights=weights))
-    methods = {name: sampled(draw) for name, draw in network_methods(planner, cases).items()}
+    draws = (network_methods(planner, cases) if inputs else {}) | controls(planner, cases)
+    methods = {name: sampled(draw) for name, draw in draws.items()}
     found = run_all(cases, methods, seeds=(1,), title=family)
     show(summary("Network alone, 16 samples", found, (SINGLE, BEST, LENGTH, CPU)), width=WIDTH)
     return found
@@ -390,8 +402,9 @@ def main() -> None:
     alone = dict[str, list[Record]]()
     for family, cases in every.items():
         print(f"\n== {family}, {len(cases)} problems\n", flush=True)
-        if "alone" in parts:
-            for name, records in report_alone(family, cases, arguments.weights).items():
+        if {"alone", "controls"} & set(parts):
+            inputs = "alone" in parts
+            for name, records in report_alone(family, cases, arguments.weights, inputs).items():
                 alone.setdefault(name, []).extend(records)
         if "planner" in parts:
             report_planner(family, cases, arguments.weights)

@@ -44,7 +44,7 @@ PLANNERS = Registry(
             "diffusion.diffusion:Diffusion",
             "DiffusionSettings",
             LEARNED,
-            "the paper's method alone: encoder, sampling, guidance; no search, no simplification",
+            "the diffusion model alone: sampling under guidance; no search, no simplification",
             PATH_CONSTRAINTS,
         ),
         "aorrtc": _entry(

@@ -352,9 +352,7 @@ def test_runs_that_noted_nothing_with_their_calls_are_told_by_what_they_called(t
 
 
 def test_planners_are_called_what_they_are() -> None:
-    assert report.named("diffusion:guidance_steps=0:samples=4") == (
-        "diffusion: RobotDiffuse (paper's method), guidance_steps=0, samples=4"
-    )
+    assert report.named("diffusion:guidance_steps=0:samples=4") == ("diffusion, guidance_steps=0, samples=4")
     assert report.named("rrt_connect:step=0.5+restarts") == "rrt_connect, step=0.5, restarted"
     assert report.named("mpnet@mine") == "mpnet@mine"
 

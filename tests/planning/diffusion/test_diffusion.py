@@ -1,4 +1,4 @@
-"""The paper's method alone: unchanged samples of the network, the shortest valid one, batch after batch."""
+"""The diffusion model alone: unchanged samples of the network, the shortest valid one, batch after batch."""
 
 from dataclasses import replace
 
@@ -89,6 +89,17 @@ def test_batches_repeat_until_one_has_a_valid_sample(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(Diffusion, "draw", draw)
     result = Diffusion().plan(PROBLEM, time_limit=60.0)
     assert result.solved and len(batches) == 3 and "of 48 samples" in result.reason
+
+
+def test_one_batch_is_drawn_without_repeats() -> None:
+    """Around a ball too large for any sample, however much time is left."""
+    wall = Scene([Sphere([0.5, 0.0, 0.4], 0.3, name="ball")])
+    planner = Diffusion(DiffusionSettings(samples=1, guidance_steps=0, repeat=False))
+    results = [planner.plan(replace(PROBLEM, scene=wall), 60.0, seed=seed) for seed in range(3)]
+    for result in results:
+        valid = int(result.solved)
+        assert f"{valid} of 1 samples of the network are valid" in result.reason
+    assert any(result.refused == "scene_collision" for result in results)
 
 
 def test_more_batches_after_the_first_path_make_it_no_longer() -> None:

@@ -36,7 +36,7 @@ class Preset:
 
 PRESETS: dict[str, Preset] = {
     "equal_time": Preset(
-        "path lengths at one second: search, the hybrid, the paper's method, learned baselines",
+        "path lengths at one second: search, the hybrid, diffusion, learned baselines",
         (*NONTRIVIAL_ROP, "shelf_nontrivial"),
         (
             Stage(
@@ -51,7 +51,7 @@ PRESETS: dict[str, Preset] = {
         ),
     ),
     "learning": Preset(
-        "what the network adds: the paper's method and the hybrid beside search, with 0.1 and 0.3 s",
+        "what the network adds: diffusion and the hybrid beside search, with 0.1 and 0.3 s",
         (*NONTRIVIAL_ROP, "shelf_nontrivial"),
         tuple(
             Stage(

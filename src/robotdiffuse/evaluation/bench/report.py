@@ -16,9 +16,8 @@ from robotdiffuse.evaluation.tables import latex as latex_table
 from robotdiffuse.evaluation.tables import markdown as markdown_table
 
 HYBRID = "robotdiffuse"
-"""The planner around the paper's method, which is no row of the paper's tables."""
-PAPER_METHOD = "diffusion"
-TITLES = {HYBRID: "hybrid", PAPER_METHOD: "RobotDiffuse (paper's method)"}
+"""The planner of search and network."""
+TITLES = {HYBRID: "hybrid"}
 """Additions to names of planners."""
 UNEQUAL = " †"
 UNEQUAL_NOTE = (

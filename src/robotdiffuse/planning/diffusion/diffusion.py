@@ -1,4 +1,4 @@
-"""The paper's method alone: encoder, sampling, guidance.
+"""The diffusion model alone: encoder, sampling, guidance, without search.
 
 The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
 collision guidance; every sample goes to the validator as it is, and the shortest valid one is the answer.
@@ -158,7 +158,7 @@ def _projected(
 
 
 class Diffusion(ModelSampler[DiffusionSettings]):
-    """The paper's method as a planner; see the head of this file."""
+    """The diffusion model and its guidance as a planner; see the head of this file."""
 
     name = "diffusion"
     settings_class = DiffusionSettings
