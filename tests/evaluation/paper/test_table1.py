@@ -1,4 +1,4 @@
-"""Table 1: its ComScores by hand, its rows, and a page from a small run that a second call does not repeat."""
+"""Table 1: its ComScores by hand, its rows, and a page from a run that a second call does not repeat."""
 
 from pathlib import Path
 

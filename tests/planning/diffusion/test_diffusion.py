@@ -91,15 +91,18 @@ def test_batches_repeat_until_one_has_a_valid_sample(monkeypatch: pytest.MonkeyP
     assert result.solved and len(batches) == 3 and "of 48 samples" in result.reason
 
 
-def test_one_batch_is_drawn_without_repeats() -> None:
-    """Around a ball too large for any sample, however much time is left."""
-    wall = Scene([Sphere([0.5, 0.0, 0.4], 0.3, name="ball")])
+def test_one_batch_is_drawn_without_repeats(monkeypatch: pytest.MonkeyPatch) -> None:
+    batches = []
+
+    def draw(self, *arguments, own=Diffusion.draw, **more):
+        batches.append(own(self, *arguments, **more))
+        batches[-1][:, 24] = LEFT + 1.5  # away and back: not valid
+        return batches[-1]
+
+    monkeypatch.setattr(Diffusion, "draw", draw)
     planner = Diffusion(DiffusionSettings(samples=1, guidance_steps=0, repeat=False))
-    results = [planner.plan(replace(PROBLEM, scene=wall), 60.0, seed=seed) for seed in range(3)]
-    for result in results:
-        valid = int(result.solved)
-        assert f"{valid} of 1 samples of the network are valid" in result.reason
-    assert any(result.refused == "scene_collision" for result in results)
+    result = planner.plan(PROBLEM, time_limit=60.0)
+    assert not result.solved and len(batches) == 1 and "0 of 1 samples" in result.reason
 
 
 def test_more_batches_after_the_first_path_make_it_no_longer() -> None:
