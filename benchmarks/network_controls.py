@@ -52,6 +52,8 @@ PANDA = load_robot("panda")
 PARTS = ("hybrid", "diversity", "rotation")
 EQUAL_TIME = 0.3
 """Time limit of the hybrids [s]."""
+PLANNER_LIMIT = 20.0
+"""Of planners that end by themselves, for diversity [s]."""
 SEEDS = (1, 2)
 MOTIONS, WAYPOINTS = 16, 48
 TURNS = (15, 90, 180)
@@ -178,7 +180,7 @@ def report_diversity(every: dict[str, list[Case]]) -> None:
     methods = {"diffusion": of_network(network), "aorrtc": of_search(search)}
     rows = []
     for family, cases in every.items():
-        found = run_all(cases, methods, limit=1.0, title=f"{family}, diversity")
+        found = run_all(cases, methods, limit=PLANNER_LIMIT, title=f"{family}, diversity")
         # of problems on which both have several motions
         both = [i for i in range(len(cases)) if all("apart" in of[i].measures for of in found.values())]
         for name, records in found.items():
