@@ -21,7 +21,11 @@ def write_table1(settings: table1.Table1Settings, bench: Bench) -> FilePath:
         f"robotdiffuse reproduce table1 --out FOLDER --problems {settings.problems} "
         f"--time-limit {settings.time_limit:g}{weights}"
     )
-    lines = [*table1.notes(settings), *about(bench), *crashes(bench)]
+    loads = [r.load for records in bench.records.values() for r in records if r.load is not None]
+    load = (
+        f"Load average of the machine after the calls: {min(loads):.1f} to {max(loads):.1f}." if loads else ""
+    )
+    lines = [*table1.notes(settings), *about(bench), *filter(None, [load]), *crashes(bench)]
     return write_page(settings.out / "table1.md", "Table 1", command, lines, table1.tables(settings, bench))
 
 

@@ -62,6 +62,11 @@ def problem_file(out: FilePath, problem_set: str) -> FilePath:
     return out / "problems" / f"{problem_set}.jsonl"
 
 
+def case_name(problem_set: str, number: int) -> str:
+    """The name of a problem in its set."""
+    return f"{problem_set}/{number}"
+
+
 def write_problems(out: FilePath, count: int, report: Report) -> None:
     """Draw the first `count` problems of both sets into the folder of a bench, unless it has them."""
     files = {name: CaseFile(problem_file(out, name)) for name in GOALS}
@@ -71,7 +76,7 @@ def write_problems(out: FilePath, count: int, report: Report) -> None:
             for name, problem in draw_problem(number).items():
                 free = [x for x in free_lines(problem, goal_configurations(problem)) if x is not None]
                 line = min(free, default=None)
-                cases[name].append(Case(f"{name}/{number}", "rop", problem, bool(free), line, name))
+                cases[name].append(Case(case_name(name, number), "rop", problem, bool(free), line, name))
         for name, file in files.items():
             file.fill(cases[name])
         report(f"problems: {count} of {', '.join(GOALS)}")

@@ -11,7 +11,7 @@ from robotdiffuse.evaluation.bench.run_folder import Bench, read_bench
 from robotdiffuse.evaluation.bench.runner import BenchSettings, Done, Report, run_bench
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.paper.comscore import PAPER_TABLE_1, Indicators, comscores
-from robotdiffuse.evaluation.paper.problems import GOALS, POSE, problem_file, write_problems
+from robotdiffuse.evaluation.paper.problems import GOALS, POSE, case_name, problem_file, write_problems
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.statistics import wilson_interval
 from robotdiffuse.evaluation.tables import Column, Figure, Table
@@ -117,12 +117,9 @@ def tables(settings: Table1Settings, bench: Bench) -> list[Table]:
     labels = dict(zip((row.name for row in settings.rows), settings.bench.specs, strict=True))
     found = []
     for problem_set, goal in GOALS.items():
+        names = {case_name(problem_set, i) for i in range(settings.problems)}  # the folder may have more
         of = {
-            name: [
-                r
-                for r in bench.records[label]
-                if r.problem_set == problem_set and r.time_limit == settings.time_limit
-            ]
+            name: [r for r in bench.records[label] if r.name in names and r.time_limit == settings.time_limit]
             for name, label in labels.items()
         }
         solvable = {r.name for records in of.values() for r in records if r.solved}
