@@ -46,6 +46,7 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.shapes import Box, Cylinder, Sphere
 from robotdiffuse.scenes.surface_points import sample_surface
 
 PANDA = load_robot("panda")
@@ -128,8 +129,8 @@ def sides(problem: Problem, path: Float[ndarray, "waypoints dof"]) -> tuple[int,
     axes = np.stack([left, np.cross(along, left)])
     found = []
     for shape in problem.scene.shapes:
-        if shape.name != "floor":
-            center = np.asarray(shape.center)
+        if shape.name != "floor" and isinstance(shape, Sphere | Box | Cylinder):
+            center = shape.center
             away = axes @ (tip[np.linalg.norm(tip - center, axis=1).argmin()] - center)
             axis = int(np.abs(away).argmax())
             found.append(2 * axis + int(away[axis] < 0))

@@ -190,7 +190,8 @@ def _run(
             for guided in (False, True)
         ]
         by_seed = tuple(float(of.single.mean()) for of in each[row.guided])
-        results.append(RowResult(name, *map(Evaluation.mean, each), by_seed))
+        alone, guided = map(Evaluation.mean, each)
+        results.append(RowResult(name, alone, guided, by_seed))
     return [*results, RowResult(CONTROL, found[None, False], found[None, True])]
 
 
