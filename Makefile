@@ -1,7 +1,6 @@
 # make demo      plan a bundled problem; creates the core environment in .venv when there is none
 # make weights   makes training data and trains the weights anew, in runs/panda; the same command resumes
 # make baselines trains the learned baselines on the same data, in runs/panda
-# make table1    every planner on the same problems, in runs/table1; MBM=FOLDER adds MotionBenchMaker's
 # make install   the development environment with all extras in .venv
 # make test      the quick tests: at most five minutes on two idle cores
 # make test-all  all tests, those marked slow, browser, sim and cluster too
@@ -14,7 +13,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: install demo test test-all lint docs gallery bench weights baselines table1 chromium clean
+.PHONY: install demo test test-all lint docs gallery bench weights baselines chromium clean
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
@@ -78,13 +77,6 @@ baselines: .venv/dev.stamp
 	$(BIN)/robotdiffuse train baseline mpinets --out runs/panda/mpinets --data runs/panda/data --samples 900000
 	$(BIN)/robotdiffuse train baseline trajectory_prior --out runs/panda/prior --data runs/panda/data \
 		--samples 1800000
-
-MBM ?=
-
-table1: .venv/dev.stamp
-	$(BIN)/robotdiffuse bench run --preset table1 --out runs/table1 $(if $(MBM),--problems $(MBM))
-	$(BIN)/robotdiffuse bench confirm runs/table1
-	$(BIN)/robotdiffuse bench report runs/table1
 
 clean:
 	rm -rf .venv build dist site .pytest_cache .ruff_cache .hypothesis demo.png demo.html

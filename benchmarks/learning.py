@@ -13,8 +13,10 @@ the validator.
 cloud and
   the clearances of the links along the noisy motion. Rows take each away: the code of another scene of the
   family; the whole condition, which is code, start and goal; clearances as if there were no obstacles.
-  Guidance, where there is some, knows the obstacles in any case. The control is guidance of the straight line
-  and random bumps.
+  Guidance, where there is some, knows the obstacles in any case. The controls are guidance of smooth noise,
+  which is what the model starts from: with as many gradient steps, and with as many as fit in the network's
+  CPU time.
+- controls: of `alone`, the guided network and the controls; prints benchmarks/results/network_equal_time.txt.
 - planner: the whole planner; PyBullet checks its motions on meshes.
 - code: the whole planner, which does without the code, beside itself with the code.
 - guidance: single samples and best of 16 against sampling steps, gradient steps and classifier-free scale.
@@ -64,7 +66,7 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.simulation.validator import PyBulletOracle
 
 PANDA = load_robot("panda")
-PARTS = ("alone", "planner", "code", "guidance")
+PARTS = ("alone", "controls", "planner", "code", "guidance")
 PLANNER_LIMIT = 5.0
 """Time limit of the whole planner [s]."""
 EQUAL_TIME = 0.5
@@ -79,6 +81,9 @@ SCALES = (0.0, 1.0, 1.5, 2.0, 4.0)
 """Of classifier-free guidance: 1 is the network itself, 0 hides its condition and leaves the clearances."""
 SCALED_STEPS = (1, 2, 5, 10)
 """Sampling steps that the scales are tried with."""
+TIMED, TIMED_ROUNDS = 10, 4
+"""Problems and rounds that the equal number of gradient steps is measured on."""
+TIMED_STEPS = (10, 60)
 COLORS = ("#8a94a3", "#7fb3e0", "#3f7fc4", "#14487f", "#d1495b")
 
 
@@ -165,8 +170,34 @@ def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]
             found[f"{name}, condition hidden"] = from_network(
                 RobotDiffuse(replace(of.settings, guidance_scale=0.0))
             )
-    control = without_network(planner.settings, model.settings.waypoints)
-    return found | {"control: guidance of line and bumps": control}
+    return found
+
+
+def controls(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
+    """The network with guidance, and smooth noise with as many gradient steps and with as much CPU time."""
+    model = planner.model(PANDA)
+    assert model is not None
+    found = {"guided": from_network(planner)}
+    waypoints = model.settings.waypoints
+    found["control: smooth noise, as many gradient steps"] = without_network(planner.settings, waypoints)
+    steps = equal_time_steps(planner, waypoints, cases[:TIMED])
+    name = f"control: smooth noise, equal CPU time ({steps} gradient steps)"
+    return found | {name: without_network(planner.settings, waypoints, steps)}
+
+
+def equal_time_steps(planner: RobotDiffuse, waypoints: int, cases: list[Case]) -> int:
+    """Gradient steps on smooth noise that take as much CPU time as a batch of the network under guidance."""
+    few, many = TIMED_STEPS
+    draws = [from_network(planner), *(without_network(planner.settings, waypoints, n) for n in (few, many))]
+    seconds = np.zeros((TIMED_ROUNDS, len(cases), len(draws)))
+    for turn in seconds:  # the first is left out: it loads and compiles
+        for i, case in enumerate(cases):
+            for j, draw in enumerate(draws):
+                with Clock() as clock:
+                    draw(Run(case, i, "", 1), CollisionChecker(PANDA, case.problem.scene))
+                turn[i, j] = clock.cpu
+    network, short, long = np.median(seconds[1:], axis=0).mean(axis=0)
+    return max(round(few + (network - short) * (many - few) / (long - short)), 1)
 
 
 def confirmed(planner: RobotDiffuse) -> Method:
@@ -237,10 +268,13 @@ def print_worth_of_inputs(found: dict[str, list[Record]]) -> None:
     print_table(f"{len(own)} problems: single samples, points", ["network", "less", "mean (95 %)"], rows)
 
 
-def report_alone(family: str, cases: list[Case], weights: str | None) -> dict[str, list[Record]]:
-    """Print how the network does alone; its records."""
+def report_alone(
+    family: str, cases: list[Case], weights: str | None, inputs: bool
+) -> dict[str, list[Record]]:
+    """Print how the network does alone, and with `inputs` also without each of them; its records."""
     planner = RobotDiffuse(replace(NETWORK_ALONE, weights=weights))
-    methods = {name: sampled(draw) for name, draw in network_methods(planner, cases).items()}
+    draws = (network_methods(planner, cases) if inputs else {}) | controls(planner, cases)
+    methods = {name: sampled(draw) for name, draw in draws.items()}
     found = run_all(cases, methods, seeds=(1,), title=family)
     show(summary("Network alone, 16 samples", found, (SINGLE, BEST, LENGTH, CPU)), width=WIDTH)
     return found
@@ -368,8 +402,9 @@ def main() -> None:
     alone = dict[str, list[Record]]()
     for family, cases in every.items():
         print(f"\n== {family}, {len(cases)} problems\n", flush=True)
-        if "alone" in parts:
-            for name, records in report_alone(family, cases, arguments.weights).items():
+        if {"alone", "controls"} & set(parts):
+            inputs = "alone" in parts
+            for name, records in report_alone(family, cases, arguments.weights, inputs).items():
                 alone.setdefault(name, []).extend(records)
         if "planner" in parts:
             report_planner(family, cases, arguments.weights)

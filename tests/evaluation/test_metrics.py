@@ -14,18 +14,18 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.evaluation.comscore import (
-    PAPER_TABLE_1,
-    Indicators,
-    comscores,
-    normalized,
-)
 from robotdiffuse.evaluation.metrics import (
     Measure,
     bending,
     log_dimensionless_jerk,
     spectral_arc_length,
     turning,
+)
+from robotdiffuse.evaluation.paper.comscore import (
+    PAPER_TABLE_1,
+    Indicators,
+    comscores,
+    normalized,
 )
 from robotdiffuse.evaluation.statistics import bootstrap_interval, compare, wilson_interval
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
@@ -57,11 +57,12 @@ def path_of(trajectory: Trajectory) -> Path:
 
 
 def test_lengths_of_an_arm_that_turns_about_its_base() -> None:
-    """Two waypoints: the arcs between them count, not the chord. The origins of l2 and of the tip move."""
+    """Two waypoints: the arcs between them count, not the chord. The origin of l2 moves; the tip is
+    fixed to l2 and does not count as a link."""
     motion = minimum_jerk(2.0, np.zeros(2), np.array([1.5, 0.0]))
     found = Measure(ARM)(path_of(motion), motion)
     assert found["joint_length"] == pytest.approx(1.5)
-    assert found["link_length"] == pytest.approx(1.5 * (0.5 + 0.9), rel=3e-5)
+    assert found["link_length"] == pytest.approx(1.5 * 0.5, rel=3e-5)
     assert found["tip_length"] == pytest.approx(1.5 * 0.9, rel=3e-5)
     assert found["turning"] == 0
     assert found["duration"] == 2.0
@@ -74,7 +75,7 @@ def test_lengths_of_an_arm_that_turns_at_its_elbow_and_back() -> None:
     there_and_back = Path(motion.joint_names, np.array([[0, 0], [0, 0.7], [0, 0]]))
     found = Measure(ARM)(there_and_back, motion)
     assert found["joint_length"] == pytest.approx(1.4)
-    assert found["link_length"] == pytest.approx(1.4 * 0.4, rel=3e-5)
+    assert found["link_length"] == pytest.approx(0, abs=1e-12)  # l2 turns about its own origin
     assert found["tip_length"] == pytest.approx(1.4 * 0.4, rel=3e-5)
     assert found["turning"] == pytest.approx(np.pi)
 
@@ -189,7 +190,7 @@ def test_a_joint_that_does_not_move_the_tip() -> None:
     assert found["tip_length"] == pytest.approx(0, abs=1e-9)
     assert found["sparc_tip"] == 0
     assert found["sparc_joint"] < -1.3
-    assert found["link_length"] > 0  # the fingers turn
+    assert found["link_length"] == pytest.approx(0, abs=1e-9)  # link 7 too; hand and fingers do not count
 
 
 def test_clearance_to_the_scene_and_to_itself_apart() -> None:

@@ -1,4 +1,4 @@
-"""The data factory and the bench on Ray: nodes come and go, the data stay the same."""
+"""The data factory, the bench and plan_many on Ray: nodes come and go, the data stay the same."""
 
 import os
 import socket
@@ -12,9 +12,12 @@ import pytest
 
 from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation.bench import workers
 from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
 from robotdiffuse.evaluation.records import read_records
 from robotdiffuse.generation import GenerationSettings, factory, generate
+from robotdiffuse.planning import load_planner, plan_many
+from robotdiffuse.problems.held_out import held_out_problem
 
 # read when ray is imported: no telemetry, and no pages of logs when a node is lost
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
@@ -120,3 +123,41 @@ def test_bench_on_a_cluster_is_as_on_this_machine(cluster: Any, tmp_path: Path) 
     assert run_bench(replace(asked, cluster=None, out=tmp_path / "here"), quiet, quiet) == 2
     here = read_records(tmp_path / "here")["rrt_connect"]
     assert [record.positions for record in sorted(there, key=lambda r: r.name)] == [r.positions for r in here]
+
+
+def test_a_node_killed_during_a_bench_loses_no_call_and_doubles_none(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "RUNS_PER_TASK", 1)
+    node = cluster.add_node(num_cpus=1, object_store_memory=STORE)
+    cluster.wait_for_nodes()
+    killed: list[int] = []
+
+    def done(_: str, calls: int, __: int) -> None:
+        if calls and not killed:
+            killed.append(calls)
+            cluster.remove_node(node, allow_graceful=False)
+
+    asked = BenchSettings(("straight_line",), ("rop",), tmp_path, time_limit=5.0, count=6, cluster="ray")
+    assert run_bench(asked, lambda _: None, done) == 6
+    assert killed and killed[0] < 6
+    names = [record.name for record in read_records(tmp_path)["straight_line"]]
+    assert sorted(names) == [f"rop/{i}" for i in range(6)]
+
+
+def test_many_problems_with_a_node_killed_are_as_on_this_machine(
+    cluster: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan_many, "PROBLEMS_PER_TASK", 1)
+    node = cluster.add_node(num_cpus=1, object_store_memory=STORE)
+    cluster.wait_for_nodes()
+    problems = [held_out_problem("rop", i) for i in range(6)]
+    found = plan_many.plan_many(problems, "straight_line", cluster="ray", time_limit=5.0)
+    results = [next(found)]
+    cluster.remove_node(node, allow_graceful=False)
+    results += found
+    planner = load_planner("straight_line")
+    for problem, result in zip(problems, results, strict=True):
+        assert result.problem is problem
+        alone = planner.plan(problem, 5.0)
+        assert (result.status, result.path_length) == (alone.status, alone.path_length)

@@ -10,8 +10,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.visualization import PictureSettings, write_picture
-from robotdiffuse.visualization.picture import render
+from robotdiffuse.visualization import PictureSettings, write_comparison, write_picture
+from robotdiffuse.visualization.picture import COMPARED, render
 
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
 
@@ -46,7 +46,30 @@ def test_picture_is_the_same_twice(arm, scene, motion):
     np.testing.assert_array_equal(first, second)
 
 
-@pytest.mark.parametrize("settings", [{"width": 0}, {"height": 3}, {"ghosts": -1}])
+@pytest.mark.parametrize("settings", [{"width": 0}, {"height": 3}, {"ghosts": -1}, {"shell": -0.1}])
 def test_bad_settings(settings):
     with pytest.raises(InputError):
         PictureSettings(**settings)
+
+
+def test_several_motions_have_traces_of_their_own_colours(arm, motion, tmp_path):
+    back = Path(arm.joint_names, motion.positions[::-1].copy() * 0.7)
+    few = replace(SMALL, ghosts=0)
+    pixels, _ = render(arm, Scene(), motion, few, others=[back])
+    for color in COMPARED[:2]:
+        wanted = np.array(color) / np.linalg.norm(color)
+        unit = pixels / np.maximum(np.linalg.norm(pixels, axis=2, keepdims=True), 1.0)
+        assert (unit @ wanted > 0.985).sum() > 5
+    write_comparison(arm, Scene(), {"a": motion, "b": back}, tmp_path / "two.png", settings=few)
+    with Image.open(tmp_path / "two.png") as image:
+        assert image.size == (320, 200)
+    many = {str(i): motion for i in range(len(COMPARED) + 1)}
+    with pytest.raises(InputError, match="5 motions; a picture shows 1 to 4"):
+        write_comparison(arm, Scene(), many, tmp_path / "many.png")
+
+
+def test_the_shell_surrounds_the_arm(arm, motion):
+    bare, camera = render(arm, Scene(), motion, replace(SMALL, ghosts=0))
+    shell, _ = render(arm, Scene(), motion, replace(SMALL, ghosts=0, shell=0.1), camera)
+    changed = (np.abs(bare.astype(int) - shell).max(axis=2) > 3).sum()
+    assert changed > 100

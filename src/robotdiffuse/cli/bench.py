@@ -1,12 +1,14 @@
-"""The commands `robotdiffuse bench run`, `report`, `confirm` and `ablation`."""
+"""The commands `robotdiffuse bench run`, `report` and `confirm`."""
 
 import argparse
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import add_import_option, count, positive
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.learning import need_packages
+from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.problems.families import FAMILIES
 
 if TYPE_CHECKING:
@@ -14,7 +16,7 @@ if TYPE_CHECKING:
 
     from robotdiffuse.evaluation.bench.figures import Section
     from robotdiffuse.evaluation.bench.run_folder import Bench
-    from robotdiffuse.evaluation.bench.runner import BenchSettings
+    from robotdiffuse.evaluation.bench.runner import BenchSettings, Done, Report
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -45,8 +47,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     run.add_argument(
         "--preset",
         metavar="NAME",
-        help="a comparison of docs/results.md with its planners, limits and seeds: table1, equal_time, "
-        "learning, anytime or restarts",
+        help="a comparison of docs/results.md with its planners, limits and seeds: equal_time, learning, "
+        "durations, anytime or restarts",
     )
     run.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems and results")
     run.add_argument("--time-limit", type=positive, metavar="S", help="time limit of a call [s] (default: 1)")
@@ -65,7 +67,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     run.add_argument(
         "--workers", type=count, metavar="N", help="planners that run at once (default: half of the cores)"
     )
-    run.add_argument("--cluster", metavar="NAME", help="ray: use the Ray cluster at RAY_ADDRESS")
+    run.add_argument("--cluster", choices=CLUSTERS, help="use the Ray cluster at RAY_ADDRESS")
     add_import_option(run)
     run.set_defaults(run=run_run)
     report = actions.add_parser(
@@ -95,71 +97,37 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--count", type=count, metavar="N", help="check only the first N problems of each set (default: all)"
     )
     confirm.set_defaults(run=run_confirm)
-    ablation = actions.add_parser(
-        "ablation",
-        help="train and compare the rows of the paper's Table 2",
-        description="Train every row of the paper's Table 2 on the same number of samples, and test it on "
-        "the same held-out problems. Ctrl-C stops; run the same command again to continue.",
-    )
-    ablation.add_argument("--data", required=True, metavar="FOLDER", help="data set of `data generate`")
-    ablation.add_argument("--out", required=True, metavar="FOLDER", help="folder for the trained networks")
-    ablation.add_argument(
-        "--samples", type=count, metavar="N", help="training samples per row (default: 300000)"
-    )
-    ablation.add_argument(
-        "--encoder-samples",
-        type=count,
-        metavar="N",
-        help="point clouds to train the frozen encoder on (default: 300000)",
-    )
-    ablation.add_argument("--problems", type=count, metavar="N", help="held-out problems (default: 500)")
-    ablation.add_argument("--family", metavar="NAME", help="family of these problems (default: rop)")
-    ablation.add_argument("--rows", metavar="NAME,...", help="rows to train (default: all ten)")
-    ablation.add_argument(
-        "--workers",
-        type=count,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="processes (default: all cores)",
-    )
-    ablation.set_defaults(run=run_ablation)
 
 
 def run_run(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.evaluation.bench.runner import run_bench
+
+    made = 0
+    for settings in _bench_settings(arguments):
+        with calls_shown(settings) as (report, done):
+            made += run_bench(settings, report, done)
+    print(f"{made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}")
+    return 0
+
+
+@contextmanager
+def calls_shown(settings: "BenchSettings") -> "Iterator[tuple[Report, Done]]":
+    """The functions for `run_bench` that print messages and show a progress bar for each planner."""
     import sys
 
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TaskID,
-        TextColumn,
-        TimeElapsedColumn,
-    )
-
-    from robotdiffuse.evaluation.bench.runner import run_bench
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    made = 0
-    for settings in _bench_settings(arguments):
-        with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-            bars = {name: bar.add_task(name, total=None, start=False) for name in settings.specs}
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        bars = {name: bar.add_task(name, total=None, start=False) for name in settings.specs}
 
-            def done(
-                planner: str,
-                calls: int,
-                all_calls: int,
-                bar: Progress = bar,
-                bars: dict[str, TaskID] = bars,
-            ) -> None:
-                bar.start_task(bars[planner])
-                bar.update(bars[planner], completed=calls, total=all_calls)
+        def done(planner: str, calls: int, all_calls: int) -> None:
+            bar.start_task(bars[planner])
+            bar.update(bars[planner], completed=calls, total=all_calls)
 
-            made += run_bench(settings, lambda text: print(text, file=sys.stderr, flush=True), done)
-    print(f"{made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}")
-    return 0
+        yield lambda text: print(text, file=sys.stderr, flush=True), done
 
 
 def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
@@ -174,11 +142,11 @@ def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
     out, workers = Path(arguments.out), arguments.workers or max(1, (os.cpu_count() or 1) // 2)
     problems = () if arguments.problems is None else tuple(arguments.problems.split(","))
     if arguments.preset is not None:
-        fixed = ("planners", "time_limit", "seeds", "equal_time", "cluster")
+        fixed = ("planners", "time_limit", "seeds", "equal_time")
         given = [f"--{name.replace('_', '-')}" for name in fixed if getattr(arguments, name)]
         if given:
             raise InputError(f"--preset cannot be combined with {', '.join(given)}: the preset fixes these")
-        return preset_settings(arguments.preset, out, problems, arguments.count, workers)
+        return preset_settings(arguments.preset, out, problems, arguments.count, workers, arguments.cluster)
     if arguments.planners is None or arguments.problems is None:
         raise InputError("name --planners and --problems, or a --preset")
     return [
@@ -291,21 +259,3 @@ def run_confirm(arguments: argparse.Namespace) -> int:
             f"{contact.other}, {-1000 * contact.distance:.1f} mm deep"
         )
     return 1 if refuted else 0
-
-
-def run_ablation(arguments: argparse.Namespace) -> int:
-    import sys
-
-    need_packages("the ablation", "torch")
-    from robotdiffuse.evaluation import ablation
-    from robotdiffuse.evaluation.tables import show
-
-    names = ("data", "out", "samples", "encoder_samples", "problems", "family")
-    given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
-    settings = ablation.AblationSettings(**given)
-    rows = list(ablation.ROWS) if arguments.rows is None else arguments.rows.split(",")
-    results = ablation.run_ablation(
-        settings, rows, arguments.workers, lambda text: print(text, file=sys.stderr, flush=True)
-    )
-    show(ablation.table(settings, results), width=None if sys.stdout.isatty() else 170)
-    return 0

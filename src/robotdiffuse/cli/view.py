@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.drawing import ENDINGS, draw, show
+from robotdiffuse.cli.arguments import not_negative
+from robotdiffuse.cli.drawing import ENDINGS, draw, draw_several, show
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,16 +16,29 @@ if TYPE_CHECKING:
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "view",
-        help="draw a result as a replay (.html) or a picture (.png)",
-        description="Draw the motion of a result file. Without --out, write a replay and open it in the "
-        "browser.",
+        help="draw results as a replay (.html) or a picture (.png)",
+        description="Draw the motions of result files, of several in one picture. Without --out, write a "
+        "replay and open it in the browser.",
     )
-    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
+    parser.add_argument(
+        "results",
+        nargs="+",
+        metavar="RESULT",
+        help="result file (.json) of `robotdiffuse plan --out`; several must be of one problem",
+    )
     parser.add_argument(
         "--out",
         action="append",
         metavar="FILE",
         help="replay (.html) or picture (.png); repeatable (default: the name of RESULT with .html)",
+    )
+    parser.add_argument(
+        "--shell",
+        type=not_negative,
+        default=0.0,
+        metavar="M",
+        help="with several results: thickness of the safety shell that pictures show about the arm [m] "
+        "(default: 0, none)",
     )
     parser.set_defaults(run=run)
 
@@ -49,12 +63,23 @@ def read_solved(file: str) -> "tuple[PlanResult, Problem]":
 
 def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.problems.files import problem_record
 
-    files = arguments.out or [f"{Path(arguments.result).stem}.html"]
+    names = [Path(file).stem for file in arguments.results]
+    files = arguments.out or [f"{names[0]}.html"]
     outputs = [check_output(file, ENDINGS) for file in files]
-    result, problem = read_solved(arguments.result)
+    (result, problem), *others = map(read_solved, arguments.results)
+    if len(set(names)) < len(names):
+        raise InputError(f"results are {', '.join(arguments.results)}; two have the same name")
+    for name, (_, other) in zip(names[1:], others, strict=True):
+        if problem_record(other)["scene"] != problem_record(problem)["scene"] or other.robot != problem.robot:
+            raise InputError(f"{name} is of another robot or scene than {names[0]}; results must share both")
+    several = dict(zip(names, (result, *(one for one, _ in others)), strict=True))
     for file in outputs:
-        draw(problem, result, file)
+        if others:
+            draw_several(problem, several, file, arguments.shell)
+        else:
+            draw(problem, result, file)
         print(f"wrote {file}")
     if not arguments.out:
         show(outputs[0])

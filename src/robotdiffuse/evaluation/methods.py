@@ -25,7 +25,8 @@ from robotdiffuse.evaluation.records import ENDED_EARLY, RAISED, RESTARTABLE, SO
 from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planning.diffusion.diffusion import ModelSampler, encode
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuseSettings, unlearned_starts
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuseSettings
+from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.held_out import goal_of
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -226,17 +227,20 @@ def clearances_without_obstacles(model: "MotionModel") -> "ClearanceFn":
     return clearances
 
 
-def without_network(settings: RobotDiffuseSettings, waypoints: int) -> Draw:
-    """The control without a network: the straight line and random bumps, after as many gradient steps as
-    guidance takes on a network's samples."""
+def without_network(settings: RobotDiffuseSettings, waypoints: int, steps: int | None = None) -> Draw:
+    """The control without a network: smooth noise about the straight line, the noise that the model starts
+    from, after gradient steps of guidance.
+
+    steps: None: as many as guidance takes on a network's samples.
+    """
     sampling_steps = settings.sampling_steps
     assert sampling_steps is not None  # networks are sampled in a given number of steps
-    steps = settings.guidance_steps * ceil(settings.guided_share * sampling_steps)
+    if steps is None:
+        steps = settings.guidance_steps * ceil(settings.guided_share * sampling_steps)
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:
-        problem = run.problem
-        ends = problem.start, goal_of(problem)
-        q = unlearned_starts(*ends, settings.samples, waypoints, problem.robot, run.rng())
+        start, goals = run.problem.start, goal_of(run.problem)[None]
+        q = smooth_noise(start, goals, settings.samples, waypoints, run.problem.robot, run.rng())
         return CollisionGuidance(checker, settings.guidance)(q, steps)[0] if steps else q
 
     return draw

@@ -40,15 +40,17 @@ class Kinematics:
     """Path lengths of the links of one robot."""
 
     def __init__(self, robot: Robot) -> None:
-        moving = [link for link in robot.link_names if robot.link_frame(link) > 0]
         self.robot = robot
-        self._frames = [robot.link_frame(link) for link in moving]
-        self._origins = np.stack([robot.T_frame_link(link)[:, 3] for link in moving])
 
     def link_length(self, q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
-        """The paper's path length: the sum over all moving links of the path lengths of their origins [m]."""
+        """The paper's path length: the sum over the links that joints move, such as links 1 to 7 of the
+        Panda, of the path lengths of their origins [m].
+
+        Links that are fixed to these, such as hand and fingers, are left out: they would count the last link
+        several times. The paper's arm has no hand.
+        """
         T = forward_frames(self.robot, np.asarray(q, np.float64).reshape(-1, q.shape[-1]))
-        at = np.einsum("nlij,lj->nli", T[:, self._frames, :3], self._origins)
+        at = T[:, 1:, :3, 3]
         at = at.reshape(*q.shape[:2], *at.shape[1:])
         return np.linalg.norm(np.diff(at, axis=1), axis=-1).sum(axis=(1, 2))
 

@@ -44,7 +44,7 @@ PLANNERS = Registry(
             "diffusion.diffusion:Diffusion",
             "DiffusionSettings",
             LEARNED,
-            "the paper's method alone: encoder, sampling, guidance; no search, no simplification",
+            "the diffusion model alone: sampling under guidance; no search, no simplification",
             PATH_CONSTRAINTS,
         ),
         "aorrtc": _entry(
@@ -92,6 +92,12 @@ PLANNERS = Registry(
             "EDMPSettings",
             LEARNED,
             "EDMP: such a prior, guided by an ensemble of costs",
+        ),
+        "straight_line": _entry(
+            "baselines.straight_line:StraightLine",
+            "StraightLineSettings",
+            SEARCH,
+            "no planner: the straight line in joint space, the control of every other row",
         ),
         "a_star": _entry(
             "baselines.lattice.planner:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"

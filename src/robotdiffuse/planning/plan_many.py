@@ -1,16 +1,18 @@
-"""Planning for many problems at once, over processes of this machine."""
+"""Planning for many problems at once, over processes of this machine or a Ray cluster."""
 
 import os
 import queue
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import fields, replace
 from numbers import Integral
 from typing import Any, NamedTuple
 
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.processes import NotStartedError, SingleWorker, check_not_importing
+from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Status
@@ -22,6 +24,8 @@ from robotdiffuse.robots.robot import Robot
 
 PlannerArguments = tuple[str, Settings | None, str | None]
 """Of `load_planner`: name, settings, weights."""
+PROBLEMS_PER_TASK = 20
+"""Problems that a node of a cluster plans with one loaded planner."""
 
 
 def plan_many(
@@ -30,21 +34,25 @@ def plan_many(
     settings: Settings | None = None,
     weights: str | None = None,
     workers: int | None = None,
+    cluster: str | None = None,
     **request: Any,
 ) -> Iterator[PlanResult]:
     """Yield the results of problems in their order, each as soon as those before it are there.
 
     planner, settings, weights: as of `load_planner`.
     workers: number of processes; None: one for each core.
+    cluster: "ray": the Ray cluster that RAY_ADDRESS names, or one started here, in place of processes;
+        problems of a lost node are planned again on another.
     request: arguments of `Planner.plan`, the same for all problems: time_limit, seed, until, ...
 
     A problem that raises an error, or kills its process, has a result with status ERROR; the others continue.
+    On a cluster, a problem that kills its process ends the call.
     Processes import the main script: without the line `if __name__ == "__main__":` above what it does, all
     results have status ERROR. Each process compiles or loads its kernels before its first problem, outside
     the time limit.
 
     Raises InputError at once for an unknown planner, settings or weights that do not fit it, unknown
-    arguments or arguments out of bounds, and a number of workers below 1.
+    arguments or arguments out of bounds, a number of workers below 1, and an unknown cluster.
     """
     check_not_importing()
     if isinstance(problems, str) or not isinstance(problems, Iterable):
@@ -59,6 +67,12 @@ def plan_many(
     if unknown:
         raise InputError(f"unknown argument {shown(min(unknown))}; known: {', '.join(sorted(known))}")
     load_planner(planner, settings, weights)
+    if cluster is not None:
+        if cluster not in CLUSTERS:
+            raise unknown_name("cluster", cluster, CLUSTERS)
+        if workers is not None:
+            raise InputError(f"workers is {workers} and cluster is {cluster}; a cluster uses all its cores")
+        return _planned_on_cluster(problems, (planner, settings, weights), cluster, PlanRequest(**request))
     count = min(workers or os.cpu_count() or 1, len(problems))
     return _planned(problems, (planner, settings, weights), count, PlanRequest(**request))
 
@@ -105,6 +119,40 @@ def _planned(
         for worker in pool:
             worker.close()
         threads.shutdown(cancel_futures=True)
+
+
+def _planned_on_cluster(
+    problems: list[Problem], loaded: PlannerArguments, cluster: str, request: PlanRequest
+) -> Iterator[PlanResult]:
+    bare = {robot: replace(robot) for robot in {problem.robot for problem in problems}}
+    sent = [replace(problem, robot=bare[problem.robot]) for problem in problems]
+    calls = [
+        (loaded, request, sent[i : i + PROBLEMS_PER_TASK]) for i in range(0, len(sent), PROBLEMS_PER_TASK)
+    ]
+    early: dict[int, list[PlanResult]] = {}
+    following, given = 0, iter(problems)
+    with closing(CLUSTERS[cluster](_plan_on_node, calls)) as made:
+        for number, results in made:
+            early[number] = results
+            while following in early:
+                for result in early.pop(following):
+                    yield replace(result, problem=next(given))
+                following += 1
+
+
+def _plan_on_node(
+    loaded: PlannerArguments, request: PlanRequest, problems: list[Problem]
+) -> list[PlanResult]:
+    planner, warm, found = load_planner(*loaded), set[Robot](), []
+    for problem in problems:
+        try:
+            if problem.robot not in warm:
+                planner.warm_up(problem)
+                warm.add(problem.robot)
+            found.append(replace(planner.plan(problem, **vars(request)), problem=None))
+        except Exception as error:
+            found.append(_error(loaded[0], problem, f"{type(error).__name__}: {error}", request))
+    return found
 
 
 def _error(planner: str, problem: Problem, reason: str, request: PlanRequest) -> PlanResult:

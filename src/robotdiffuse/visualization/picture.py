@@ -1,6 +1,7 @@
 """Draws a motion as a PNG picture, in software, without GPU, window or browser."""
 
 import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 
@@ -39,6 +40,9 @@ GROUND_RADIUS = 3.2
 """Radius of the visible ground [m]."""
 CAPTION_COLOR = (0xF2, 0xF4, 0xF6)
 """Colour to which the picture fades behind the caption."""
+COMPARED = ((0xE3, 0xA8, 0x12), (0xCF, 0x33, 0x3B), (0x2F, 0x6F, 0xD0), (0x8B, 0x55, 0xB8))
+"""sRGB colours of the traces of several motions in one picture."""
+SHELL_COLOR, SHELL_ALPHA = (0x35, 0xB8, 0x5C), 0.2
 MARGINS = (0.05, 0.11)
 """Fractions of the height left free above the arm, and below it for the caption."""
 
@@ -55,12 +59,15 @@ class PictureSettings:
     """Number of see-through arms from the start towards the goal."""
     azimuth: float | None = None
     """Of the camera, from the x axis of the base [rad]; None: from where most of the motion can be seen."""
+    shell: float = 0.0
+    """Thickness of the see-through safety shell about the arm [m]; 0: none."""
 
     def __post_init__(self) -> None:
         if self.width < 16 or self.height < 16:
             raise InputError(f"picture of {self.width} x {self.height} pixels; each side must be at least 16")
-        if self.ghosts < 0:
-            raise InputError(f"ghosts is {self.ghosts}; it must be 0 or more")
+        for name in ("ghosts", "shell"):
+            if getattr(self, name) < 0:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be 0 or more")
 
 
 def write_picture(
@@ -88,16 +95,45 @@ def write_picture(
     write_atomically(path, buffer.getvalue())
 
 
+def write_comparison(
+    robot: Robot,
+    scene: Scene,
+    motions: Mapping[str, Path | Trajectory],
+    file: str | FilePath,
+    *,
+    title: str | None = None,
+    settings: PictureSettings | None = None,
+) -> None:
+    """Write a picture of several motions by name, of one arm in one scene, as .png.
+
+    The arm is that of the first motion; each motion has a trace of its own colour. Raises InputError as
+    `write_picture` does, and for more motions than there are colours.
+    """
+    path = check_output(file, (".png",))
+    if not 0 < len(motions) <= len(COMPARED):
+        raise InputError(f"{len(motions)} motions; a picture shows 1 to {len(COMPARED)}")
+    first, *others = motions.values()
+    pixels, _ = render(robot, scene, first, settings or PictureSettings(), others=others)
+    image = Image.fromarray(_faded_below(pixels))
+    figures = [", ".join(v for k, v in style.facts(m, None) if v != "untimed") for m in motions.values()]
+    _caption(image, title or robot.name, list(zip(motions, figures, strict=True)), COMPARED)
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", optimize=False)
+    write_atomically(path, buffer.getvalue())
+
+
 def render(
     robot: Robot,
     scene: Scene,
     motion: Path | Trajectory,
     settings: PictureSettings,
     camera: Camera | None = None,
+    others: Sequence[Path | Trajectory] = (),
 ) -> tuple[np.ndarray, Camera]:
     """The picture without its caption, uint8 [height, width, 3], and the camera that took it.
 
     camera: where to look from; without one, from where most of the motion can be seen.
+    others: further motions, of which the trace is drawn; all traces then have the colours COMPARED.
     """
     surfaces = style.robot_surfaces(robot)
     q = style.dense(motion.positions, 240)
@@ -113,14 +149,35 @@ def render(
         size = settings.width, settings.height
         camera = best_view(goal, faint, trace, obstacles, *size, MARGINS, settings.azimuth)
     big = Camera(camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height)
-    image = _paint(big, join([goal, obstacles, _tube(trace)]), ghosts)
+    tool = style.tool_point(robot, surfaces)
+    traces = [trace, *(style.trace(robot, tool, style.dense(other.positions, 240)) for other in others)]
+    colors = [(color, color) for color in COMPARED] if others else [(START, GOAL)]
+    tubes = [_tube(points, *of) for points, of in zip(traces, colors, strict=False)]
+    shell = _shell(robot, poses[-1], settings.shell) if settings.shell else None
+    image = _paint(big, join([goal, obstacles, *tubes]), ghosts, shell)
     s = SUPERSAMPLING
     image = image.reshape(settings.height, s, settings.width, s, 3).mean(axis=(1, 3))
     return _to_srgb(image), camera
 
 
-def _paint(camera: Camera, solid: Surface, ghosts: list[tuple[Surface, float]]) -> Float[ndarray, "h w 3"]:
-    """Linear colours of the solid surfaces with the ghosts over them, the far ones first."""
+def _shell(robot: Robot, T_base_frame: Float[ndarray, "frames 4 4"], thickness: float) -> Surface:
+    """The covering spheres of the arm, enlarged by the thickness of the shell [m]."""
+    import trimesh
+
+    ball, parts = trimesh.creation.icosphere(subdivisions=3), []
+    white = np.ones((len(ball.vertices), 3))
+    for link, spheres in robot.spheres.items():
+        T = T_base_frame[robot.link_frame(link)] @ robot.T_frame_link(link)
+        for x, y, z, radius in spheres:
+            vertices = (T @ [x, y, z, 1.0])[:3] + (radius + thickness) * ball.vertices
+            parts.append(Surface(vertices, np.array(ball.vertices), white, np.asarray(ball.faces, np.int64)))
+    return join(parts)
+
+
+def _paint(
+    camera: Camera, solid: Surface, ghosts: list[tuple[Surface, float]], shell: Surface | None
+) -> Float[ndarray, "h w 3"]:
+    """Linear colours of the solid surfaces with the ghosts over them, the far ones first, and the shell."""
     shape = (camera.height, camera.width)
     image = np.zeros((*shape, 3), np.float32)
     near, ident = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
@@ -139,12 +196,15 @@ def _paint(camera: Camera, solid: Surface, ghosts: list[tuple[Surface, float]]) 
     lattice = light_lattice(LIGHT_SPACING, *seen, view, ground[0], sky, key)
     shade(image, lattice, LIGHT_SPACING, *seen, colors, view, ground, background, sky, key, light)
     ghosts = sorted(ghosts, key=lambda g: -float(np.linalg.norm(g[0].vertices.mean(0) - camera.eye)))
-    for ghost, s in ghosts:
+    clear = [
+        (ghost, _linear(START) * (1 - s) + _linear(GOAL) * s, 0.50 if s == 0 else 0.26) for ghost, s in ghosts
+    ]
+    if shell is not None:
+        clear.append((shell, _linear(SHELL_COLOR), SHELL_ALPHA))
+    for ghost, tint, alpha in clear:
         own, shown = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
         screen = camera.project(ghost.vertices)
         draw(own, shown, screen, ghost.faces)
-        tint = _linear(START) * (1 - s) + _linear(GOAL) * s
-        alpha = 0.50 if s == 0 else 0.26
         blend_ghost(
             image, near, own, shown, screen, ghost.faces, ghost.normals, _linear_array(ghost.colors),
             view, toward, tint, alpha,
@@ -208,8 +268,12 @@ def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tup
     return maps, axes, scale, center, size, 2.0 / scale
 
 
-def _tube(points: Float[ndarray, "n 3"]) -> Surface:
-    """A round tube along a polyline, coloured from START to GOAL, with spheres at both ends."""
+Color = tuple[int, int, int]
+
+
+def _tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
+    """A round tube along a polyline, coloured from the first to the last colour, with spheres at both
+    ends."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=2)
@@ -220,7 +284,7 @@ def _tube(points: Float[ndarray, "n 3"]) -> Surface:
             np.tile(np.array(color) / 255.0, (len(ball.vertices), 1)),
             np.asarray(ball.faces, np.int64),
         )
-        for point, color in ((points[0], START), (points[-1], GOAL))
+        for point, color in ((points[0], first), (points[-1], last))
     ]
     n = len(points)
     if n < 2:
@@ -239,7 +303,7 @@ def _tube(points: Float[ndarray, "n 3"]) -> Surface:
         np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * np.cross(along, across)[:, None]
     )
     t = np.linspace(0, 1, n)[:, None, None]
-    colors = np.broadcast_to(((1 - t) * START + t * GOAL) / 255.0, normals.shape)
+    colors = np.broadcast_to(((1 - t) * first + t * last) / 255.0, normals.shape)
     i, j = np.arange(n - 1)[:, None] * TUBE_SIDES, np.arange(TUBE_SIDES)
     following = (j + 1) % TUBE_SIDES
     quad = [i + j, i + following, i + TUBE_SIDES + j, i + TUBE_SIDES + following]
@@ -273,14 +337,19 @@ def _faded_below(pixels: np.ndarray) -> np.ndarray:
     return (pixels + cover * (np.array(CAPTION_COLOR) - pixels)).round().astype(np.uint8)
 
 
-def _caption(image: Image.Image, title: str, facts: list[tuple[str, str]]) -> None:
-    """Title and figures in the lower left corner."""
+def _caption(
+    image: Image.Image, title: str, facts: list[tuple[str, str]], colors: Sequence[Color] = ()
+) -> None:
+    """Title and figures in the lower left corner. colors: of the labels; without any, grey."""
     scale = image.width / 1600
     pen = ImageDraw.Draw(image)
     big, small = ImageFont.load_default(max(8, 30 * scale)), ImageFont.load_default(max(7, 19 * scale))
     left, bottom = 44 * scale, image.height - 40 * scale
     pen.text((left, bottom - 30 * scale), title, fill=(0x22, 0x2B, 0x38), font=big, anchor="ls")
-    for label, value in facts:
-        for text, fill, gap in ((label, (0x8A, 0x93, 0xA0), 7), (value, (0x3A, 0x45, 0x54), 22)):
+    for i, (label, value) in enumerate(facts):
+        for text, fill, gap in (
+            (label, colors[i] if colors else (0x8A, 0x93, 0xA0), 7),
+            (value, (0x3A, 0x45, 0x54), 22),
+        ):
             pen.text((left, bottom), text, fill=fill, font=small, anchor="ls")
             left += small.getlength(text) + gap * scale

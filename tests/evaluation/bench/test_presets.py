@@ -22,9 +22,10 @@ def test_planners_and_problems_are_known(name: str, tmp_path: Path) -> None:
 
 
 def test_a_smaller_count_and_further_problems(tmp_path: Path) -> None:
-    counts = [settings.count for settings in preset_settings("table1", tmp_path, ("shelf",), count=50)]
-    assert counts == [50, 50, 5]
-    assert preset_settings("table1", tmp_path, ("shelf",))[0].problems == ("rop", "rop_dense", "shelf")
+    counts = [settings.count for settings in preset_settings("anytime", tmp_path, ("shelf",), count=50)]
+    assert counts == [50]
+    problems = preset_settings("anytime", tmp_path, ("shelf",))[0].problems
+    assert problems == ("rop_nontrivial", "rop_dense_nontrivial", "shelf")
 
 
 def test_the_command_runs_every_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,5 +42,5 @@ def test_bad_input(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     asked = ["bench", "run", "--out", str(tmp_path)]
     assert main([*asked, "--planners", "rrt_connect"]) == 2
     assert "name --planners and --problems, or a --preset" in capfd.readouterr().err
-    assert main([*asked, "--preset", "table1", "--planners", "rrt_connect"]) == 2
+    assert main([*asked, "--preset", "anytime", "--planners", "rrt_connect"]) == 2
     assert "--preset cannot be combined with --planners" in capfd.readouterr().err

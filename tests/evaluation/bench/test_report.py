@@ -352,9 +352,7 @@ def test_runs_that_noted_nothing_with_their_calls_are_told_by_what_they_called(t
 
 
 def test_planners_are_called_what_they_are() -> None:
-    assert report.named("diffusion:guidance_steps=0:samples=4") == (
-        "diffusion: RobotDiffuse (paper's method), guidance_steps=0, samples=4"
-    )
+    assert report.named("diffusion:guidance_steps=0:samples=4") == ("diffusion, guidance_steps=0, samples=4")
     assert report.named("rrt_connect:step=0.5+restarts") == "rrt_connect, step=0.5, restarted"
     assert report.named("mpnet@mine") == "mpnet@mine"
 
@@ -394,29 +392,6 @@ def test_latex_is_escaped_and_every_row_has_all_columns(small: Path) -> None:
         lines = [line for line in body.splitlines() if line.endswith(r"\\")]
         assert lines
         assert {len(re.findall(r"(?<!\\)&", line)) for line in lines} == {len(columns) - 1}
-
-
-def test_the_paper_stands_beside_ours(small: Path) -> None:
-    with record_path(small, "diffusion").open("w") as stream:
-        for i in range(4):
-            record = solved("diffusion", f"rop/{i}", 1.0, [(0.3, 2.5)], trivial=i == 3)
-            stream.write(json.dumps(record.row()) + "\n")
-    bench = read_bench(small)
-    whole, _ = figures.sections(bench)
-    table = report.paper_table(whole, whole.main)
-    assert table is not None
-    headings = [column.heading for column in table.columns]
-    of = {row[0]: dict(zip(headings, row, strict=True)) for row in table.texts}
-    assert of["ompl_rrt_star: RRT*"]["paper: success"] == "73.3"
-    assert of["ompl_rrt_star: RRT*"]["paper: returns"] == "600"
-    assert of["diffusion: RobotDiffuse (paper's method)"]["paper: ComScore"] == "0.765"
-    assert of["robotdiffuse: hybrid"]["paper: ComScore"] == "–"
-    assert list(of)[-1] == "robotdiffuse: hybrid"
-    alike = {name: cells["ComScore"] for name, cells in of.items()}
-    assert alike["diffusion: RobotDiffuse (paper's method)"] < alike["robotdiffuse: hybrid"]
-    text = report.markdown(bench, [whole])
-    widths = [line.count("|") - line.count("\\|") for line in text.splitlines() if line.startswith("| robot")]
-    assert max(widths) == 13
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The paper's method alone: unchanged samples of the network, the shortest valid one, batch after batch."""
+"""The diffusion model alone: unchanged samples of the network, the shortest valid one, batch after batch."""
 
 from dataclasses import replace
 
@@ -89,6 +89,20 @@ def test_batches_repeat_until_one_has_a_valid_sample(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(Diffusion, "draw", draw)
     result = Diffusion().plan(PROBLEM, time_limit=60.0)
     assert result.solved and len(batches) == 3 and "of 48 samples" in result.reason
+
+
+def test_one_batch_is_drawn_without_repeats(monkeypatch: pytest.MonkeyPatch) -> None:
+    batches = []
+
+    def draw(self, *arguments, own=Diffusion.draw, **more):
+        batches.append(own(self, *arguments, **more))
+        batches[-1][:, 24] = LEFT + 1.5  # away and back: not valid
+        return batches[-1]
+
+    monkeypatch.setattr(Diffusion, "draw", draw)
+    planner = Diffusion(DiffusionSettings(samples=1, guidance_steps=0, repeat=False))
+    result = planner.plan(PROBLEM, time_limit=60.0)
+    assert not result.solved and len(batches) == 1 and "0 of 1 samples" in result.reason
 
 
 def test_more_batches_after_the_first_path_make_it_no_longer() -> None:

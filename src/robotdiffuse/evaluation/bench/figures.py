@@ -17,8 +17,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench.curves import Curve, curves
 from robotdiffuse.evaluation.bench.outcomes import Calls, Key, Outcome, calls_on, deciding_record, outcome
 from robotdiffuse.evaluation.bench.run_folder import Bench, plain_name
-from robotdiffuse.evaluation.comscore import Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric
+from robotdiffuse.evaluation.paper.comscore import Indicators, comscores
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import RESTARTED, Record
 from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
@@ -26,8 +26,6 @@ from robotdiffuse.problems.families import FAMILIES
 
 LIMITS = (0.1, 1.0, 10.0, 60.0)
 """Time limits of a report beside those of its records, up to the longest of these [s]."""
-ROP = ("rop", "rop_dense")
-"""Problem sets that are compared with the paper's figures."""
 NONTRIVIAL = ", non-trivial"
 
 

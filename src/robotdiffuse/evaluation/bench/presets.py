@@ -35,17 +35,8 @@ class Preset:
 
 
 PRESETS: dict[str, Preset] = {
-    "table1": Preset(
-        "every planner on the paper's problems, with 1, 10 and 60 s",
-        ("rop", "rop_dense"),
-        (
-            Stage(("all",), 1.0, 300, equal_time=True),
-            Stage(("all",), 10.0, 60),
-            Stage(("ompl_rrt_star", "ompl_informed_rrt_star", "ompl_bit_star"), 60.0, 5),
-        ),
-    ),
     "equal_time": Preset(
-        "path lengths at one second: search, the hybrid, the paper's method, learned baselines",
+        "path lengths at one second: search, the hybrid, diffusion, learned baselines",
         (*NONTRIVIAL_ROP, "shelf_nontrivial"),
         (
             Stage(
@@ -60,7 +51,7 @@ PRESETS: dict[str, Preset] = {
         ),
     ),
     "learning": Preset(
-        "what the network adds: the paper's method and the hybrid beside search, with 0.1 and 0.3 s",
+        "what the network adds: diffusion and the hybrid beside search, with 0.1 and 0.3 s",
         (*NONTRIVIAL_ROP, "shelf_nontrivial"),
         tuple(
             Stage(
@@ -109,7 +100,12 @@ PRESETS: dict[str, Preset] = {
 
 
 def preset_settings(
-    name: str, out: FilePath, problems: Sequence[str] = (), count: int | None = None, workers: int = 1
+    name: str,
+    out: FilePath,
+    problems: Sequence[str] = (),
+    count: int | None = None,
+    workers: int = 1,
+    cluster: str | None = None,
 ) -> list[BenchSettings]:
     """The settings of each stage of a preset.
 
@@ -130,6 +126,7 @@ def preset_settings(
             time_limit=stage.time_limit,
             count=stage.count,
             workers=workers,
+            cluster=cluster,
             equal_time=stage.equal_time,
         )
         found.append(settings if count is None else replace(settings, count=min(count, stage.count)))

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from robotdiffuse.evaluation.bench.figures import ROP, Comparison, Row, Section
+from robotdiffuse.evaluation.bench.figures import Comparison, Row, Section
 from robotdiffuse.evaluation.bench.outcomes import FAILURES
 from robotdiffuse.evaluation.bench.run_folder import Bench, base_name, plain_name
-from robotdiffuse.evaluation.comscore import PAPER_TABLE_1, Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.records import RESTARTED
 from robotdiffuse.evaluation.statistics import Paired
@@ -16,18 +15,9 @@ from robotdiffuse.evaluation.tables import Cell, Column, Figure, Table, plain, t
 from robotdiffuse.evaluation.tables import latex as latex_table
 from robotdiffuse.evaluation.tables import markdown as markdown_table
 
-IN_PAPER = {
-    "ompl_rrt_star": "RRT*",
-    "mpnet": "MPNet",
-    "mpinets": "MPiNets",
-    "mpd": "MPD",
-    "diffusion": "RobotDiffuse",
-}
-"""Planners that are rows of the paper's Table 1."""
 HYBRID = "robotdiffuse"
-"""The planner around the paper's method, which is no row of the paper's tables."""
-PAPER_METHOD = "diffusion"
-TITLES = {HYBRID: "hybrid", PAPER_METHOD: "RobotDiffuse (paper's method)"}
+"""The planner of search and network."""
+TITLES = {HYBRID: "hybrid"}
 """Additions to names of planners."""
 UNEQUAL = " †"
 UNEQUAL_NOTE = (
@@ -43,10 +33,10 @@ NOTES = (
     "and validation follows.",
     "collision: share of problems on which the validator refused the planner's last path because it "
     "collides.",
-    "link length: the paper's, the path lengths of all links together, mean over the problems that the "
-    "planner itself solved; planners that solve only easy problems seem short. If a call continued and "
-    "returned a shorter path, its length by the limit is that of the returned path, scaled by the "
-    "lengths in joint space.",
+    "link length: the paper's, the path lengths of the links that joints move together, mean over the "
+    "problems that the planner itself solved; planners that solve only easy problems seem short. If a call "
+    "continued and returned a shorter path, its length by the limit is that of the returned path, scaled by "
+    "the lengths in joint space.",
     "ratio: median of the length in joint space over that of the reference, on problems that both solve, "
     "with its 95 % interval (bootstrap over problems), at equal time: for planners that use up the limit. "
     "restarted: a planner that ends earlier is called again with other seeds until its calls have used up "
@@ -55,8 +45,7 @@ NOTES = (
     "returns; anytime planners use up the limit, and unsolved problems count with it.",
     "ComScore: as in the paper, from success, collision, length and time until the planner returns, each "
     "from 0 for the worst row of the table to 1 for the best. It depends on the rows of the table; those "
-    "with restarts are left out. Beside the paper's Table 1 it is computed among the paper's rows alone; "
-    "the hybrid's is computed in place of the paper's method.",
+    "with restarts are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.",
     "Quality: means over the solved problems of the motions that the calls returned. clearance: a lower "
     "bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. over straight "
     "line: duration over the least time along the straight line, obstacles and limits of jerk aside. stops: "
@@ -219,62 +208,10 @@ def failure_table(section: Section, comparison: Comparison) -> Table:
     return _table("Failures by reason", section, comparison, spec)
 
 
-def paper_table(section: Section, comparison: Comparison) -> Table | None:
-    """The rows of the paper's Table 1 beside the printed ones, and the hybrid; None without such rows.
-
-    ComScore is computed among the paper's rows alone; the hybrid's in place of the paper's method.
-    """
-    rows = {row.planner: row for row in comparison.rows if row.planner in (*IN_PAPER, HYBRID)}
-    if section.problem_set not in ROP or not rows:
-        return None
-    ours = {
-        p: Indicators(100 * r.success, 100 * r.collision, r.link_length, r.returned) for p, r in rows.items()
-    }
-    scores = _scores({planner: ours[planner] for planner in IN_PAPER if planner in ours})
-    if HYBRID in ours:
-        scores[HYBRID] = _scores({p: of for p, of in ours.items() if p != PAPER_METHOD})[HYBRID]
-    printed = {row.name: row for row in PAPER_TABLE_1}
-    cells: list[tuple[Cell, ...]] = []
-    for planner in sorted(ours, key=lambda p: p == HYBRID):
-        of, paper = ours[planner], printed.get(IN_PAPER.get(planner, ""))
-        theirs = None if paper is None else paper.indicators
-        cells.append(
-            (
-                named(planner) if planner in TITLES else f"{planner}: {IN_PAPER[planner]}",
-                *(of.success, theirs and theirs.success, of.collision, theirs and theirs.collision),
-                *(of.length, theirs and theirs.length, seconds(of.time), theirs and theirs.time),
-                *(scores[planner], paper and paper.comscore),
-            )
-        )
-    names = (
-        ("success", "%", ".1f"),
-        ("collision", "%", ".1f"),
-        ("link length", "m", ".2f"),
-        ("returns", "s", ""),
-    )
-    columns = [
-        column
-        for name, unit, digits in (*names, ("ComScore", "", ".3f"))
-        for column in (
-            Column(name, unit, digits),
-            Column(f"paper: {name}", "", "g" if digits == ".3f" else digits),
-        )
-    ]
-    heading = f"Beside the paper's Table 1; {title(section, comparison)}"
-    return Table.of(heading, [Column("planner"), *columns], cells)
-
-
-def _scores(rows: dict[str, Indicators]) -> dict[str, float]:
-    return dict(zip(rows, comscores(list(rows.values())).tolist(), strict=True))
-
-
 def tables(section: Section, comparison: Comparison, reference: str) -> list[Table]:
     """All tables of a comparison, without empty ones."""
-    paper = paper_table(section, comparison)
-    found = [main_table(section, comparison, reference)]
-    if paper is not None:
-        found.append(paper)
-    found += [
+    found = [
+        main_table(section, comparison, reference),
         quality_table(section, comparison),
         paired_table(section, comparison, reference),
         failure_table(section, comparison),

@@ -9,10 +9,11 @@ from datetime import UTC, datetime
 from pathlib import Path as FilePath
 
 from robotdiffuse import __version__
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
-from robotdiffuse.evaluation.bench.workers import on_ray, on_this_machine
+from robotdiffuse.evaluation.bench.workers import on_cluster, on_this_machine
 from robotdiffuse.evaluation.machine import processor, versions
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
 from robotdiffuse.evaluation.records import RESTARTED, Record, RecordFile, record_path
@@ -61,8 +62,8 @@ class BenchSettings:
         for field in ("seeds", "count", "workers"):
             if getattr(self, field) is not None and getattr(self, field) < 1:
                 raise InputError(f"{field} is {getattr(self, field)}; it must be at least 1")
-        if self.cluster not in (None, "ray"):
-            raise InputError(f"cluster is {self.cluster!r}; known: ray")
+        if self.cluster is not None and self.cluster not in CLUSTERS:
+            raise unknown_name("cluster", self.cluster, CLUSTERS)
 
     @property
     def specs(self) -> dict[str, PlannerSpec]:
@@ -103,7 +104,7 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
         if settings.cluster is None:
             execute = on_this_machine(specs, workers=settings.workers, **about)
         else:
-            execute = on_ray(specs, **about)
+            execute = on_cluster(specs, settings.cluster, **about)
         return execute_runs(todo, execute, files, lambda label, left: done(label, wanted - left, wanted))
 
 

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core import ray_cluster
+from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.evaluation.bench.planner_process import PlannerProcess
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.records import RESTARTED, Record
@@ -93,12 +93,13 @@ def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Recor
     return [run.record({"planner": label, **about, **answer}) for label, answer in found]
 
 
-def on_ray(specs: PlannerSpecs, restarts: bool, session: str, logs: FilePath) -> Executor:
-    """An executor on a Ray cluster, where each task starts a process for some runs; see `ray_cluster.on_ray`.
+def on_cluster(specs: PlannerSpecs, cluster: str, restarts: bool, session: str, logs: FilePath) -> Executor:
+    """An executor on a cluster, a name in `ray_cluster.CLUSTERS`, where each task starts a process for some
+    runs.
 
     The nodes need this package, and weights and files at the same paths.
     """
-    about = {"run": session, "workers": "ray"}
+    about = {"run": session, "workers": cluster}
 
     def execute(runs: Sequence[Run]) -> Results:
         of = {label: [run for run in runs if run.method == label] for label in specs}
@@ -108,7 +109,7 @@ def on_ray(specs: PlannerSpecs, restarts: bool, session: str, logs: FilePath) ->
             for i in range(0, len(t), RUNS_PER_TASK)
         ]
         calls = [(specs[label], task, restarts) for label, task in tasks]
-        for number, (answers, said) in ray_cluster.on_ray(_run_task, calls):
+        for number, (answers, said) in CLUSTERS[cluster](_run_task, calls):
             label, task = tasks[number]
             if said:
                 logs.mkdir(parents=True, exist_ok=True)

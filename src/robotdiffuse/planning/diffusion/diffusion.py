@@ -1,10 +1,12 @@
-"""The paper's method alone: encoder, sampling, guidance.
+"""The diffusion model alone: encoder, sampling, guidance, without search.
 
 The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
 collision guidance; every sample goes to the validator as it is, and the shortest valid one is the answer.
 Where none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line,
 no search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance
-solve. The hybrid planner (`planning.diffusion.hybrid`) surrounds it with a search.
+solve. With the settings samples=1, guidance_steps=0, repeat=false and weights of config `paper`, which have
+no clearances as inputs, it does only what the paper says. The hybrid planner (`planning.diffusion.hybrid`)
+surrounds it with a search.
 
 Path constraints are one more cost of guidance, and each waypoint of a sample is projected onto them before
 validation, which proves them between the waypoints too. The network was trained without constraints.
@@ -59,6 +61,8 @@ class GuidedSamplingSettings(SamplingSettings, LearnedSettings):
 class DiffusionSettings(GuidedSamplingSettings, name="diffusion"):
     optimize_time: NotNegative = 0.0
     """Time for more batches after the first one with a valid sample [s]; the shortest of all is returned."""
+    repeat: bool = True
+    """Whether more batches are drawn where the validator accepts no sample of the first (the paper: no)."""
 
 
 SamplerSettings = TypeVar("SamplerSettings", bound=GuidedSamplingSettings)
@@ -154,7 +158,7 @@ def _projected(
 
 
 class Diffusion(ModelSampler[DiffusionSettings]):
-    """The paper's method as a planner; see the head of this file."""
+    """The diffusion model and its guidance as a planner; see the head of this file."""
 
     name = "diffusion"
     settings_class = DiffusionSettings
@@ -168,7 +172,7 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         names, constraints = context.problem.robot.joint_names, context.validator.constraints
         costs = [] if constraints is None else [path_constraint_cost(constraints, TOLERANCE_FRACTION)]
         every, valid, until = list[Path](), list[Path](), context.request.time_limit
-        while not every or context.elapsed < until:
+        while not every or (context.elapsed < until and (valid or self.settings.repeat)):
             batch = self.draw(model, start_goal.checker, code, start, goals, rng, problem_costs=costs)
             if constraints is not None:
                 batch = [_projected(constraints, q) for q in batch]

@@ -226,23 +226,3 @@ class _NetworkBatches(_Batches):
             with self._timed("refinement"):
                 refined = planner.refine(checker, sampled)
             self._take(refined, "refinement")
-
-
-def unlearned_starts(
-    start: Float[ndarray, "dof"],
-    goal: Float[ndarray, "dof"],
-    count: int,
-    waypoints: int,
-    robot: Robot,
-    rng: np.random.Generator,
-) -> Float[ndarray, "count waypoints dof"]:
-    """The straight line, and lines with random bumps: the control that shows what refinement owes to
-    learning."""
-    t = np.linspace(0.0, 1.0, waypoints)[:, None]
-    q = np.repeat((start + t * (goal - start))[None], count, axis=0)
-    for harmonic in (1, 2):
-        bumps = np.sin(np.pi * harmonic * t) * rng.normal(0.0, 0.6 / harmonic, (count, 1, len(start)))
-        q[1:] += bumps[1:]
-    q = np.clip(q, robot.lower, robot.upper)
-    q[:, 0], q[:, -1] = start, goal
-    return q

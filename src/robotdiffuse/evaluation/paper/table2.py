@@ -7,7 +7,7 @@ without guidance, and by a control: guidance of trajectories that do not come fr
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -21,10 +21,11 @@ from robotdiffuse.core.processes import Workers
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, without_network
 from robotdiffuse.evaluation.metrics import Kinematics
+from robotdiffuse.evaluation.paper.problems import straight_line_shares
 from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.runs import run_all
-from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.evaluation.tables import Column, Table
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.training.config import EncoderTraining
@@ -38,7 +39,7 @@ from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"
 CONTROL = "no network"
-"""The straight line and random bumps in place of a network's samples."""
+"""Smooth noise about the straight line in place of a network's samples."""
 CONTROL_WAYPOINTS = 48
 """As many as those of the rows' networks."""
 STOP_TIMEOUT = 20.0
@@ -84,9 +85,11 @@ class AblationSettings:
     """Family of the problems, a name in `problems.families`."""
     candidates: int = 16
     """Trajectories sampled for each problem."""
+    seeds: int = 1
+    """Trainings of each row, with seeds 0, 1, ...; figures are means over them."""
 
     def __post_init__(self) -> None:
-        for name in ("samples", "encoder_samples", "problems", "candidates"):
+        for name in ("samples", "encoder_samples", "problems", "candidates", "seeds"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1")
         load_family(self.family)
@@ -113,6 +116,12 @@ class Evaluation:
         length = np.array([record.measures.get("link_length", np.nan) for record in records])
         return cls(single, (single > 0) * 1.0, collided, length, np.array([record.cpu for record in records]))
 
+    @classmethod
+    def mean(cls, of: "list[Evaluation]") -> "Evaluation":
+        """The mean over several trainings, of each problem; NaN lengths do not count."""
+        values = [np.stack([getattr(each, f.name) for each in of]) for f in fields(cls)]
+        return cls(*(np.ma.masked_invalid(x).mean(axis=0).filled(np.nan) for x in values))
+
 
 class RowResult(NamedTuple):
     name: str
@@ -120,6 +129,8 @@ class RowResult(NamedTuple):
     """Without guidance."""
     guided: Evaluation
     """With it."""
+    by_seed: tuple[float, ...] = ()
+    """Share of samples that pass the validator, as in the paper's row, of each training."""
 
     @property
     def as_in_paper(self) -> Evaluation:
@@ -157,24 +168,43 @@ def _run(
         )
     _check_budget(encoder / "encoder.json", "encoder_samples", settings.encoder_samples)
     configs = list(dict.fromkeys(ROWS[name].config for name in rows))
-    found: dict[tuple[str | None, bool], Evaluation] = {}
+    trainings = [Training(config, seed) for config in configs for seed in range(settings.seeds)]
+    found: dict[tuple[Training | None, bool], Evaluation] = {}
     with Workers(workers, STOP_TIMEOUT) as pool:
-        for _, config in pool.each(_train, [(settings, config) for config in configs]):
-            _check_budget(FilePath(settings.out) / config / "model.json", "samples", settings.samples)
-            report(f"trained {config}")
-        _check_same_data(settings, configs)
+        for _, training in pool.each(_train, [(settings, training) for training in trainings]):
+            file = FilePath(settings.out) / training.folder / "model.json"
+            _check_budget(file, "samples", settings.samples)
+            report(f"trained {training.folder}")
+        _check_same_data(settings, trainings)
         cases = hard_cases(settings.family, settings.problems, FilePath(settings.out) / "problems", report)
-        todo = [(settings, config, guided, cases) for config in (*configs, None) for guided in (False, True)]
-        for _, (config, guided, result) in pool.each(_evaluate, todo):
-            found[config, guided] = result
-            how = "with" if guided else "without"
-            report(
-                f"evaluated {config or CONTROL} {how} guidance: {100 * result.single.mean():.1f} % of samples"
-            )
-    results = [
-        RowResult(name, *(found[ROWS[name].config, guided] for guided in (False, True))) for name in rows
-    ]
+        todo = [(settings, which, guided, cases) for which in (*trainings, None) for guided in (False, True)]
+        for _, (which, guided, result) in pool.each(_evaluate, todo):
+            found[which, guided] = result
+            name, how = which.folder if which else CONTROL, "with" if guided else "without"
+            report(f"evaluated {name} {how} guidance: {100 * result.single.mean():.1f} % of samples")
+    results = []
+    for name in rows:
+        row = ROWS[name]
+        each = [
+            [found[Training(row.config, seed), guided] for seed in range(settings.seeds)]
+            for guided in (False, True)
+        ]
+        by_seed = tuple(float(of.single.mean()) for of in each[row.guided])
+        alone, guided = map(Evaluation.mean, each)
+        results.append(RowResult(name, alone, guided, by_seed))
     return [*results, RowResult(CONTROL, found[None, False], found[None, True])]
+
+
+class Training(NamedTuple):
+    """One training of a row's network."""
+
+    config: str
+    seed: int
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder of its weights."""
+        return f"{self.config}_seed{self.seed}" if self.seed else self.config
 
 
 def _training(file: FilePath) -> dict[str, Any]:
@@ -191,49 +221,52 @@ def _check_budget(file: FilePath, name: str, wanted: int) -> None:
         )
 
 
-def _check_same_data(settings: AblationSettings, configs: list[str]) -> None:
+def _check_same_data(settings: AblationSettings, trainings: list[Training]) -> None:
     """Raise InputError unless all networks were trained on the same data."""
-    seen = {config: _training(FilePath(settings.out) / config / "model.json")["data"] for config in configs}
+    names = [training.folder for training in trainings]
+    seen = {name: _training(FilePath(settings.out) / name / "model.json")["data"] for name in names}
     if len(set(seen.values())) > 1:
-        found = ", ".join(f"{config} {digest}" for config, digest in seen.items())
+        found = ", ".join(f"{name} {digest}" for name, digest in seen.items())
         raise InputError(f"{settings.out} holds networks of different data: {found}; use another folder")
 
 
-def _train(settings: AblationSettings, config: str) -> str:
-    out = FilePath(settings.out) / config
+def _train(settings: AblationSettings, training: Training) -> Training:
+    out, config = FilePath(settings.out) / training.folder, training.config
     if not (out / "model.json").exists():
-        given = {"data": settings.data, "samples": settings.samples}
+        given = {"data": settings.data, "samples": settings.samples, "seed": training.seed}
         alone = {"encoder": str(FilePath(settings.out) / ENCODER)}
         names_one = "encoder" in CONFIGS[config].changes
         train_planner(planner_training(config, given if names_one else given | alone), str(out))
-    return config
+    return training
 
 
 def _evaluate(
-    settings: AblationSettings, config: str | None, guided: bool, cases: list[Case]
-) -> tuple[str | None, bool, Evaluation]:
+    settings: AblationSettings, training: Training | None, guided: bool, cases: list[Case]
+) -> tuple[Training | None, bool, Evaluation]:
     robot = load_robot("panda")
-    folder = FilePath(settings.out) / (config or CONTROL.replace(" ", "_"))
-    weights = None if config is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
-    planner = _planner_settings(settings, config, guided)
+    folder = FilePath(settings.out) / (training.folder if training else CONTROL.replace(" ", "_"))
+    weights = None if training is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
+    planner = _planner_settings(settings, training, guided)
     about = json.dumps(asdict(planner) | {"weights": weights}, sort_keys=True)
     name = f"{'guided' if guided else 'unguided'} {hashlib.sha256(about.encode()).hexdigest()[:12]}"
-    alone = config is None
+    alone = training is None
     draw = without_network(planner, CONTROL_WAYPOINTS) if alone else from_network(RobotDiffuse(planner))
     method = sampled(draw, Kinematics(robot).link_length)
     return (
-        config,
+        training,
         guided,
         Evaluation.of(run_all(cases, {name: method}, seeds=(1,), folder=folder, bar=False)[name]),
     )
 
 
-def _planner_settings(settings: AblationSettings, config: str | None, guided: bool) -> RobotDiffuseSettings:
+def _planner_settings(
+    settings: AblationSettings, training: Training | None, guided: bool
+) -> RobotDiffuseSettings:
     steps = NETWORK_ALONE.guidance_steps if guided else 0
     alone = replace(NETWORK_ALONE, samples=settings.candidates, guidance_steps=steps)
-    if config is None:
+    if training is None:
         return alone
-    weights = str(FilePath(settings.out) / config)
+    weights = str(FilePath(settings.out) / training.folder)
     encoder = load_model(weights, load_robot("panda")).encoder
     assert encoder is not None  # every row has one
     return replace(alone, weights=weights, points=encoder.settings.cloud)
@@ -242,8 +275,14 @@ def _planner_settings(settings: AblationSettings, config: str | None, guided: bo
 NOTES = (
     "single: share of samples that pass the validator; best: of problems with at least one such sample.",
     "length: of the shortest such sample, over the problems that have one; to first: the mean ratio to that "
-    "of the first row, over the problems that both solve. Intervals are over problems, of one training each: "
+    "of the first row, over the problems that both solve. Intervals are over problems, not over trainings: "
     "another seed may move a row by more.",
+    f"{CONTROL}: smooth noise about the straight line, which networks start from, under the same guidance.",
+)
+LINE_NOTES = (
+    "The straight line in joint space, under the authors' own draw of problems, with inverse kinematics of "
+    "the position alone: share of problems on which it is free. The paper's rows are of all problems, "
+    "trivial ones too, so a row near these shares has shown no planner.",
 )
 
 
@@ -265,6 +304,7 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
         Column("CPU", "ms", ".0f", "less", scale=1000.0),
         replace(shares[0], heading="unguided"),
         shares[1],
+        *(("each seed",) if settings.seeds > 1 else ()),
         *("paper: suc", "col", "len", "s"),
     )
     first, rows = results[0].as_in_paper, []
@@ -281,10 +321,27 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
                 _mean(evaluation.length / first.length),
                 float(np.median(evaluation.seconds)),
                 *_share(result.alone.single),
+                *((", ".join(f"{100 * x:.1f}" for x in result.by_seed),) if settings.seeds > 1 else ()),
                 *((None,) * 4 if of is None else of.paper),
             )
         )
     return Table.of(title, columns, rows, NOTES)
+
+
+def straight_line_table(problems: int) -> Table:
+    """No planner under the authors' own draw, beside the paper's rows of Table 2."""
+    rows: list[tuple[str, float, str]] = []
+    for goals, free in straight_line_shares(problems).items():
+        low, high = (100 * x for x in wilson_interval(free, problems))
+        rows.append(
+            (f"no planner: straight line to {goals}", 100 * free / problems, f"{low:.1f} to {high:.1f}")
+        )
+    rows += [(f"paper: {name}", float(row.paper[0] or 0), "") for name, row in ROWS.items()]
+    columns = "row", Column("success", "%", ".1f"), Column("95 %", dim=True)
+    rows.sort(key=lambda row: row[1])
+    return Table.of(
+        f"No planner among the paper's rows: {problems} problems drawn", columns, rows, LINE_NOTES
+    )
 
 
 def _share(values: Float[ndarray, "n"]) -> tuple[float, str]:

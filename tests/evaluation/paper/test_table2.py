@@ -8,8 +8,8 @@ import pytest
 from helpers.example_robots import planar_arm
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.evaluation import ablation
 from robotdiffuse.evaluation.metrics import Kinematics
+from robotdiffuse.evaluation.paper import table2
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.transformer import Transformer
@@ -56,17 +56,17 @@ def test_what_is_given_beside_a_config_wins() -> None:
 
 
 def test_every_row_has_its_config() -> None:
-    assert len(ablation.ROWS) == 10
-    assert {row.config for row in ablation.ROWS.values()} == {c for c in CONFIGS if c.startswith("table2_")}
+    assert len(table2.ROWS) == 10
+    assert {row.config for row in table2.ROWS.values()} == {c for c in CONFIGS if c.startswith("table2_")}
 
 
 def test_link_path_length_by_hand() -> None:
-    """A two-link arm that turns as a whole about its base: arcs of the origins of its links and its tip."""
+    """A two-link arm that turns as a whole about its base: the arc of the origin of l2."""
     arm = planar_arm(0.5, 0.4)
     turn = np.linspace(0.0, 1.0, 2001)
     q = np.stack([turn, 0 * turn], axis=1)
-    # l1 turns in place; l2's origin is 0.5 m from the axis, the tip's 0.9 m
-    np.testing.assert_allclose(Kinematics(arm).link_length(np.stack([q, q[::-1]])), 0.5 + 0.9, rtol=1e-6)
+    # l1 turns in place; l2's origin is 0.5 m from the axis; the tip is fixed to l2
+    np.testing.assert_allclose(Kinematics(arm).link_length(np.stack([q, q[::-1]])), 0.5, rtol=1e-6)
 
 
 def test_bootstrap_covers_the_mean() -> None:
@@ -79,7 +79,7 @@ def test_bootstrap_covers_the_mean() -> None:
 
 
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    base = ["bench", "ablation", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    base = ["reproduce", "table2", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*base, "--rows", "Ourz"]) == 2
     assert "known: " in capsys.readouterr().err
     assert main([*base, "--family", "ropp"]) == 2

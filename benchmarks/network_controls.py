@@ -1,0 +1,251 @@
+"""What the network adds to search, and how its motions differ from those of search.
+
+    python benchmarks/network_controls.py [--parts hybrid,diversity,rotation] [--families rop,shelf]
+        [--problems 60] [--cases FOLDER]
+
+It prints benchmarks/results/network_controls.txt. Problems are held out; the straight line does not solve
+them, and ten seconds of search do.
+
+- hybrid: the hybrid planner beside itself with batches of smooth noise, refined by gradient steps, in place
+  of the network's, with the same seeds and time; lengths where it minimizes length, durations where it
+  minimizes time.
+- diversity: the free ones of 16 samples of `diffusion`, beside 16 first paths of `aorrtc` with different
+  seeds, brought to as many waypoints even in arc length. apart: mean over the pairs of the root mean
+  square of their distances in joint space at the same part of their lengths. classes: number of different
+  sides on which the tip passes the obstacles, of which there are four for each (left, right, above, below, as
+  seen along the line between the ends of the tip's way); then smoothness of the motions that both return.
+- rotation: distances between codes of the bundled encoder, over the mean distance between two scenes: of two
+  clouds of one scene, and of a cloud and the same one turned about the vertical.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from common import FIRST, TIME_LIMIT, draw_hard_cases, header, parse, parts_of, print_table
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.transforms import rotation_from_rpy
+from robotdiffuse.core.types import LENGTH, TIME
+from robotdiffuse.evaluation.methods import fields_of, from_network, measure_of, planned, validated
+from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.runs import Fields, Method, Run, run_all
+from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.evaluation.tables import Figure
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.planning.search.aorrtc import AORRTC
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.held_out import Case
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_origins
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.shapes import Box, Cylinder, Sphere
+from robotdiffuse.scenes.surface_points import sample_surface
+
+PANDA = load_robot("panda")
+PARTS = ("hybrid", "diversity", "rotation")
+EQUAL_TIME = 0.3
+"""Time limit of the hybrids [s]."""
+PLANNER_LIMIT = 20.0
+"""Of planners that end by themselves, for diversity [s]."""
+SEEDS = (1, 2)
+MOTIONS, WAYPOINTS = 16, 48
+TURNS = (15, 90, 180)
+"""About the vertical [degrees]."""
+SMOOTHNESS = ("turning", "jerk", "duration")
+"""Metrics of the motions that both planners return."""
+
+
+COLUMNS = ("paths", "apart", "classes", *SMOOTHNESS)
+"""Of the table of diversity."""
+
+
+class WithNoise(RobotDiffuse):
+    """The hybrid without weights: its batches are smooth noise."""
+
+    def model(self, robot: Robot) -> MotionModel | None:
+        return None
+
+
+def interval(values: Float[ndarray, "n"], digits: int) -> Figure:
+    """The mean with its 95 % interval over problems."""
+    low, high = bootstrap_interval(values)
+    mean = float(values.mean())
+    return Figure(f"{mean:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})", mean)
+
+
+def report_hybrid(every: dict[str, list[Case]]) -> None:
+    """Print lengths and durations of the hybrid over those with smooth noise in place of the network."""
+    planners = {"network": RobotDiffuse(), "smooth noise": WithNoise()}
+    for planner in planners.values():
+        planner.warm_up(next(iter(every.values()))[0].problem, TIME_LIMIT)
+    for objective, metric in ((LENGTH, "joint_length"), (TIME, "duration")):
+        methods = {
+            name: planned(planner, until=TIME_LIMIT, clearance=0.0, objective=objective)
+            for name, planner in planners.items()
+        }
+        rows, ratios = [], dict[str, ndarray]()
+        for family, cases in every.items():
+            found = run_all(cases, methods, seeds=SEEDS, limit=EQUAL_TIME, title=f"{family}, {metric}")
+            network, noise = (
+                np.array([r.measures[metric] if r.solved else np.nan for r in found[name]]).reshape(
+                    len(SEEDS), len(cases)
+                )
+                for name in planners
+            )
+            ratio = np.exp(np.log(network / noise).mean(axis=0))
+            ratios[family] = ratio[~np.isnan(ratio)]
+        for family, of in [*ratios.items(), ("all", np.concatenate(list(ratios.values())))]:
+            rows.append((family, len(of), interval(of, 4), f"{np.median(of):.4f}"))
+        print_table(
+            f"Hybrid with the network over the hybrid with smooth noise, {metric}, {EQUAL_TIME:g} s a call, "
+            f"{len(SEEDS)} seeds",
+            ["family", "problems", "mean of ratios (95 %)", "median"],
+            rows,
+        )
+
+
+def even(path: Float[ndarray, "n dof"]) -> Float[ndarray, "waypoints dof"]:
+    """The path at WAYPOINTS places even in arc length."""
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    places = np.linspace(0.0, at[-1], WAYPOINTS)
+    return np.stack([np.interp(places, at, column) for column in path.T], axis=1)
+
+
+def sides(problem: Problem, path: Float[ndarray, "waypoints dof"]) -> tuple[int, ...]:
+    """The side on which the tip passes each obstacle: 0 left, 1 right, 2 above, 3 below."""
+    tip = link_origins(problem.robot, path, problem.robot.tip)
+    along = tip[-1] - tip[0]
+    along = along / max(float(np.linalg.norm(along)), 1e-9)
+    left = np.cross([0.0, 0.0, 1.0], along)
+    left = left / np.linalg.norm(left) if np.linalg.norm(left) > 1e-6 else np.array([0.0, 1.0, 0.0])
+    axes = np.stack([left, np.cross(along, left)])
+    found = []
+    for shape in problem.scene.shapes:
+        if shape.name != "floor" and isinstance(shape, Sphere | Box | Cylinder):
+            center = shape.center
+            away = axes @ (tip[np.linalg.norm(tip - center, axis=1).argmin()] - center)
+            axis = int(np.abs(away).argmax())
+            found.append(2 * axis + int(away[axis] < 0))
+    return tuple(found)
+
+
+def spread(problem: Problem, paths: Sequence[ndarray]) -> Fields:
+    """How much motions of one problem differ."""
+    same = [even(path) for path in paths]
+    apart = [float(np.sqrt(((a - b) ** 2).sum(1).mean())) for a, b in combinations(same, 2)]
+    found: Fields = {"paths": float(len(same)), "classes": float(len({sides(problem, q) for q in same}))}
+    return found | ({"apart": float(np.mean(apart))} if apart else {})
+
+
+def of_network(planner: Diffusion) -> Method:
+    """The free samples of a batch, and the motion that the planner returns."""
+    draw = from_network(planner)
+
+    def call(run: Run) -> Iterator[Fields]:
+        q = draw(run, CollisionChecker(PANDA, run.problem.scene))
+        free = list(q[validated(run.problem, q).passed])
+        result = planner.plan(run.problem, run.limit, seed=run.index)
+        yield fields_of(result, measure_of(PANDA)) | spread(run.problem, free)
+
+    return call
+
+
+def of_search(planner: AORRTC) -> Method:
+    """First paths with different seeds, and the motion that the planner returns."""
+
+    def call(run: Run) -> Iterator[Fields]:
+        results = [
+            planner.plan(run.problem, run.limit, seed=1000 * run.index + k, until=FIRST)
+            for k in range(MOTIONS)
+        ]
+        result = planner.plan(run.problem, run.limit, seed=run.index)
+        paths = [r.path.positions for r in results if r.path is not None]
+        yield fields_of(result, measure_of(PANDA)) | spread(run.problem, paths)
+
+    return call
+
+
+def report_diversity(every: dict[str, list[Case]]) -> None:
+    """Print how motions of `diffusion` and of search differ among themselves, and how smooth they are."""
+    network, search = Diffusion(DiffusionSettings(samples=MOTIONS)), AORRTC()
+    for planner in (network, search):
+        planner.warm_up(next(iter(every.values()))[0].problem)
+    methods = {"diffusion": of_network(network), "aorrtc": of_search(search)}
+    rows = []
+    for family, cases in every.items():
+        found = run_all(cases, methods, limit=PLANNER_LIMIT, title=f"{family}, diversity")
+        # of problems on which both have several motions
+        both = [i for i in range(len(cases)) if all("apart" in of[i].measures for of in found.values())]
+        for name, records in found.items():
+            kept = [records[i] for i in both]
+            rows.append((family, name, len(kept), *(_mean(kept, key) for key in COLUMNS)))
+    print_table(
+        f"Diversity of {MOTIONS} motions and smoothness of the returned one, means over problems",
+        ["family", "planner", "problems", *(key.replace("_", " ") for key in COLUMNS)],
+        rows,
+    )
+
+
+def _mean(records: Sequence[Record], key: str) -> Figure | None:
+    values = np.array([r.measures[key] for r in records if key in r.measures])
+    if len(values) < 2:
+        return None
+    half = 1.96 * values.std(ddof=1) / len(values) ** 0.5
+    return Figure(f"{values.mean():.2f} ± {half:.2f}", float(values.mean()))
+
+
+def report_rotation(every: dict[str, list[Case]]) -> None:
+    """Print how far a turned scene's code is from the scene's own."""
+    planner, rng, rows = Diffusion(), np.random.default_rng(1), []
+    model = planner.network(PANDA)
+    of_encoder = model.settings.encoder_settings
+    assert of_encoder is not None
+    for family, cases in every.items():
+        scenes = [case.problem.scene for case in cases]
+        clouds, again = (
+            [sample_surface(scene, planner.settings.points, rng, of_encoder.region) for scene in scenes]
+            for _ in range(2)
+        )
+        codes, same = (np.stack([model.encode(c, rng) for c in of]) for of in (clouds, again))
+        apart = np.linalg.norm(codes - np.roll(codes, 1, axis=0), axis=1).mean()
+        found = [np.linalg.norm(codes - same, axis=1) / apart]
+        for angle in TURNS:
+            turn = rotation_from_rpy(0.0, 0.0, np.radians(angle))
+            turned = np.stack([model.encode(cloud @ turn.T, rng) for cloud in clouds])
+            found.append(np.linalg.norm(codes - turned, axis=1) / apart)
+        rows.append((family, len(cases), *(interval(of, 2) for of in found)))
+    print_table(
+        "Distance of codes over that of two scenes, mean (95 %)",
+        ["family", "scenes", "the same, another cloud", *(f"turned by {angle}°" for angle in TURNS)],
+        rows,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="What the network adds to search.")
+    parser.add_argument("--parts", default=",".join(PARTS), help=f"of {','.join(PARTS)} (all)")
+    parser.add_argument("--families", default="rop,rop_dense,shelf,crate,table", help="of problems")
+    parser.add_argument("--problems", type=int, default=60, help="of each family (60)")
+    parser.add_argument("--cases", type=Path, help="folder that keeps what is known of the problems")
+    arguments = parse(parser, families="rop", problems=2)
+    parts, families = parts_of(arguments.parts, PARTS), parts_of(arguments.families, FAMILIES)
+    print(header("numpy", "numba", "onnxruntime"))
+    every = {name: draw_hard_cases(name, arguments.problems, arguments.cases) for name in families}
+    if "hybrid" in parts:
+        report_hybrid(every)
+    if "diversity" in parts:
+        report_diversity(every)
+    if "rotation" in parts:
+        report_rotation(every)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""No planner: the straight line in joint space, as a control for every planner."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import OneOf, Settings
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.planning.start_goal import StartGoal
+
+NEAREST, ANY = "nearest", "any"
+
+
+@dataclass(frozen=True)
+class StraightLineSettings(Settings, name="straight_line"):
+    goals: Annotated[str, OneOf((NEAREST, ANY))] = ANY
+    """Goal configurations that are tried: the nearest one, or all, the nearest first."""
+
+
+class StraightLine(Planner[StraightLineSettings]):
+    """The shortest straight line from the start to a goal configuration that passes the validator."""
+
+    name = "straight_line"
+    settings_class = StraightLineSettings
+
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        start, goals = start_goal.rows()
+        order = np.argsort(np.linalg.norm(goals - start, axis=1))
+        tried = order[:1] if self.settings.goals == NEAREST else order
+        for goal in goals[tried]:
+            path = start_goal.complete(np.stack([start, goal]))
+            result = context.finish(path, "straight_line", "solved by the straight line")
+            if result is not None:
+                return result
+            if context.ended:
+                break
+        plural = "line is" if len(tried) == 1 else f"lines to {len(tried)} goal configurations are"
+        return context.unsolved(f"the straight {plural} refused")
