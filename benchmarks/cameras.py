@@ -46,7 +46,8 @@ from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_vo
 from robotdiffuse.perception.confidence import MIN_RISK, confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.ray_caster import DepthNoise, ray_cast
+from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.next_view import next_view, poses_around
