@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast, voxels_within
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import placed_spheres

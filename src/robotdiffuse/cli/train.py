@@ -57,7 +57,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     completion.add_argument(
         "--views",
         metavar="NAME",
-        help="cameras of the samples: around the arm, or everywhere, with the noise of sensors (default: around)",
+        help="cameras of the samples: around the arm (the default), or everywhere, of several resolutions",
     )
     completion.add_argument(
         "--weights", metavar="FOLDER", help="weights to begin with; bundled: those that come with the package"

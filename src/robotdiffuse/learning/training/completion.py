@@ -55,7 +55,7 @@ class CompletionTraining(TrainingSettings):
     views: Annotated[str, OneOf(VIEWS)] = "around"
     """Of the samples: "around" the arm, or "everywhere", with noise and several resolutions."""
     weights: str | None = None
-    """Folder with weights to begin with, "bundled" for those that come with the package; None: random ones."""
+    """Folder with weights to begin with; "bundled": those that come with the package; None: random ones."""
     minutes: Positive | None = None
     samples: Count | None = 40_000
     batch: Count = 4
