@@ -89,5 +89,5 @@ def test_points_and_free_zones() -> None:
     assert known.occupied.sum() == 1 and known.free.sum() == 30 * 30 * 35 - 1
     with pytest.raises(InputError, match="free_zone is"):
         known.declare_free(((0.3, 0.0, 0.0), (0.1, 1.0, 1.0)))
-    with pytest.raises(InputError, match="view.configuration is None; a map needs"):
+    with pytest.raises(InputError, match=r"view\.configuration is None; a map needs"):
         known.add(replace(view_from(0.0), configuration=None))

@@ -29,8 +29,8 @@ class MapSettings(Settings, name="map"):
     largest: Positive = 8.0
     """Evidence stays within this, so that a voxel can change."""
     arm_margin: NotNegative = 0.015
-    """Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise. At
-    least the error of camera calibration."""
+    """Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise.
+    At least the error of camera calibration."""
     max_age: Positive | None = None
     """Evidence older than this is forgotten [s]; None: never."""
 
@@ -122,9 +122,7 @@ class OccupancyMap:
         age = self.settings.max_age
         return True if age is None else self._seen_at >= self._now - age
 
-    def _update(
-        self, hit: Bool[ndarray, "nx ny nz"], free: Bool[ndarray, "nx ny nz"], stamp: float
-    ) -> None:
+    def _update(self, hit: Bool[ndarray, "nx ny nz"], free: Bool[ndarray, "nx ny nz"], stamp: float) -> None:
         self._now = max(self._now, stamp)
         if self.settings.max_age is not None:
             self._evidence[~np.asarray(self._fresh)] = 0.0
@@ -133,4 +131,3 @@ class OccupancyMap:
         gain[free], gain[hit] = -self.settings.miss, self.settings.hit
         most = np.float32(self.settings.largest)
         np.clip(self._evidence + gain, -most, most, out=self._evidence)
-

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Annotated, Literal
 
-
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
@@ -27,7 +26,7 @@ from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
 from robotdiffuse.core.types import FIRST
-from robotdiffuse.perception.assumptions import voxels_in
+from robotdiffuse.perception.assumptions import CARVING_MARGIN, voxels_in
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
@@ -49,6 +48,7 @@ GO, LOOK, DONE, STUCK = "go", "look", "done", "stuck"
 """What a step asks for."""
 STRICT, CHANCE, STRICT_THEN_CHANCE = "strict", "chance", "strict_then_chance"
 POLICIES = (STRICT, CHANCE, STRICT_THEN_CHANCE)
+NOTHING = Scene(())
 AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
 
@@ -68,6 +68,9 @@ class ExplorerSettings(Settings, name="explorer"):
     """Looks to which a motion is searched for in a step, the most useful first."""
     max_views: Count = 12
     """The latest views give seen points and the prediction; the map holds what all views told."""
+    predict: bool = True
+    """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
+    reach."""
     map: MapSettings = field(default_factory=MapSettings)
 
 
@@ -86,6 +89,8 @@ class Step:
     obstacles."""
     confidence: float | None = None
     """Stated probability that a motion by chance is free."""
+    seen: Scene | None = None
+    """The known scene and the points that the latest views saw; None where nothing was planned."""
 
 
 class Explorer:
@@ -95,7 +100,7 @@ class Explorer:
         self,
         robot: Robot,
         cameras: Sequence[ArmCamera] = (),
-        scene: Scene = Scene(()),
+        scene: Scene = NOTHING,
         free_zone: Corners | None = None,
         settings: ExplorerSettings = ExplorerSettings(),
         seed: int = 0,
@@ -120,7 +125,7 @@ class Explorer:
     def set_goal(self, goal: ArrayLike | Goal) -> None:
         """The next goal: configurations, or poses as `rd.Problem` takes them. What was seen is kept."""
         middle = 0.5 * (self.robot.lower + self.robot.upper)
-        self._goal = Problem(self.robot, Scene(()), middle, goal).goal
+        self._goal = Problem(self.robot, NOTHING, middle, goal).goal
         self._looks = 0
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
@@ -148,7 +153,7 @@ class Explorer:
             if step.kind != STUCK:
                 break
         self._looks += step.kind == LOOK
-        return step
+        return replace(step, seen=problem.scene)
 
     def _at_goal(self, q: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> bool:
         return bool((np.abs(goals - q).max(axis=1) < AT_GOAL).any())
@@ -185,12 +190,12 @@ class Explorer:
             return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
         wanted = swept_unseen(self.map, tentative.path, problem.start)
         predicted = self._predicted(problem) if predicted is None else predicted
+        here = voxels_in(placed_spheres(self.robot, problem.start).astype(np.float32), CARVING_MARGIN)
+        closed = ~self.map.free & ~here
         for camera in self.cameras:
-            looks = best_looks(
-                self.map, as_seen.scene, camera, wanted, predicted, problem.start, self._rng
-            )
+            looks = best_looks(self.map, as_seen.scene, camera, wanted, predicted, problem.start, self._rng)
             if policy == STRICT:
-                looks = (q for q in looks if not (self._occupied_by(q) & ~self.map.free).any())
+                looks = (q for q in looks if not (self._occupied_by(q) & closed).any())
             for there in islice(looks, self.settings.look_attempts):
                 look = Problem(self.robot, self.scene, problem.start, there, views=self._views)
                 way = self._motion(look, policy, predicted)
@@ -240,11 +245,11 @@ class Explorer:
         return voxels_in(placed_spheres(self.robot, q).astype(np.float32))
 
     def _predicted(self, problem: Problem) -> Float32[ndarray, "nx ny nz"] | None:
-        """The probability that each voxel is occupied; None for arms that the network does not cover."""
+        """The probability that each voxel is occupied; None without the network."""
         from robotdiffuse.learning.completion import predict
         from robotdiffuse.learning.completion.coverage import covers
 
-        if not covers(self.robot):
+        if not (self.settings.predict and covers(self.robot)):
             return None
         return predict(observe(problem.views, self.robot, problem.start))
 

@@ -18,7 +18,7 @@ from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.scenes.scene import Scene
 
-CONFIGURATIONS = 400
+CONFIGURATIONS = 900
 """Random configurations that a look is chosen from."""
 SPREADS = (0.3, 0.8, 2.0)
 """Standard deviations of their distances from the arm's configuration, in equal parts [rad]."""
@@ -32,13 +32,13 @@ MIN_SEEN = 0.02
 """Looks that see a smaller part of the weight are of no use."""
 
 
-def swept_unseen(
-    known: OccupancyMap, path: Path, start: Float[ndarray, "dof"]
-) -> Bool[ndarray, "nx ny nz"]:
+def swept_unseen(known: OccupancyMap, path: Path, start: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
     """The voxels that a path sweeps and that the map does not know to be free, without those at the start."""
     swept = np.zeros(FINE_SHAPE, np.bool_)
     positions = path.positions.astype(np.float32)
-    sweep(compile_robot(known.robot), positions, np.array(LOW, np.float32), np.float32(FINE_VOXEL_SIZE), swept)
+    sweep(
+        compile_robot(known.robot), positions, np.array(LOW, np.float32), np.float32(FINE_VOXEL_SIZE), swept
+    )
     here = voxels_in(placed_spheres(known.robot, start).astype(np.float32), CARVING_MARGIN)
     return swept & ~known.free & ~here
 
@@ -76,16 +76,19 @@ def best_looks(
     if not len(q):
         return
     width, height = camera.size
-    seen = seen_weights(
-        camera.poses(robot, q).astype(np.float32),
-        np.array(camera.intrinsics, np.float32),
-        (height, width),
-        at,
-        weights,
-        filled,
-        np.array(LOW, np.float32),
-        np.float32(FINE_VOXEL_SIZE),
-    ) / weights.sum()
+    seen = (
+        seen_weights(
+            camera.poses(robot, q).astype(np.float32),
+            np.array(camera.intrinsics, np.float32),
+            (height, width),
+            at,
+            weights,
+            filled,
+            np.array(LOW, np.float32),
+            np.float32(FINE_VOXEL_SIZE),
+        )
+        / weights.sum()
+    )
     score = seen / (1 + np.linalg.norm(q - start, axis=1) / FULL_COST_LENGTH)
     for best in np.argsort(-score, kind="stable"):
         if seen[best] < MIN_SEEN:

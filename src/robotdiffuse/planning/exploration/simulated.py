@@ -22,6 +22,10 @@ SIZE, FIELD_OF_VIEW = (320, 240), (1.22, 0.96)
 """Width and height of its images [pixels], and horizontal and vertical field of view [rad]."""
 MIN_DEPTH = 0.15
 """Nearer surfaces give no return [m]."""
+BESIDE_POSITION, BESIDE_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
+"""Of the camera beside the arm [m]."""
+BESIDE_SIZE, BESIDE_FOCAL_LENGTH = (640, 480), 460.0
+"""Width, height and focal length of its images [pixels]."""
 VIEWS_ON_THE_WAY = 2
 """Images that are taken during a motion, apart from that at its end."""
 
@@ -33,19 +37,36 @@ class Event:
     step: Step
     configuration: Float[ndarray, "dof"]
     """Of the arm after the step."""
-    free: bool
-    """Whether the motion is valid in the true scene; True without one."""
+    violation: str = ""
+    """Why the validator refuses the motion in the true scene; "" if it accepts it, and without a motion."""
+
+    @property
+    def free(self) -> bool:
+        return not self.violation
 
 
 def wrist_camera(robot: Robot) -> ArmCamera:
     """A camera beside the arm's tip that looks along the tip's z axis."""
-    T_tip_camera = looking_at(np.array(WRIST_OFFSET), np.array(WRIST_OFFSET) + (0.0, 0.0, 1.0))
+    T_tip_camera = looking_at(np.array(WRIST_OFFSET), np.add(WRIST_OFFSET, (0.0, 0.0, 1.0)))
     focal = [n / 2 / np.tan(angle / 2) for n, angle in zip(SIZE, FIELD_OF_VIEW, strict=True)]
     return ArmCamera(robot.tip, T_tip_camera, (*focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2), SIZE)
 
 
+def camera_beside(problem: Problem, noise: DepthNoise | None, seed: int) -> DepthView:
+    """The image of a camera that stands beside the arm, behind its shoulder, with the arm at the start."""
+    T = looking_at(np.array(BESIDE_POSITION), np.array(BESIDE_TARGET))
+    width, height = BESIDE_SIZE
+    intrinsics = (BESIDE_FOCAL_LENGTH, BESIDE_FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)
+    view = ray_cast(problem.scene, T, intrinsics, BESIDE_SIZE, problem.robot, problem.start)
+    return measured(view, np.inf, noise, np.random.default_rng(seed))
+
+
 def taken(
-    problem: Problem, camera: ArmCamera, q: Float[ndarray, "dof"], noise: DepthNoise | None, rng: np.random.Generator
+    problem: Problem,
+    camera: ArmCamera,
+    q: Float[ndarray, "dof"],
+    noise: DepthNoise | None,
+    rng: np.random.Generator,
 ) -> DepthView:
     """The image of the problem's true scene that a camera on the arm takes."""
     T = camera.poses(problem.robot, q[None])[0]
@@ -53,9 +74,7 @@ def taken(
     return measured(view, camera.range, noise, rng)
 
 
-def measured(
-    view: DepthView, reach: float, noise: DepthNoise | None, rng: np.random.Generator
-) -> DepthView:
+def measured(view: DepthView, reach: float, noise: DepthNoise | None, rng: np.random.Generator) -> DepthView:
     """An image as a sensor of a range gives it: without a return where it is too near, infinite beyond."""
     depth = np.where(view.depth > reach, np.inf, np.where(view.depth < MIN_DEPTH, 0.0, view.depth))
     view = DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)
@@ -77,18 +96,20 @@ def explore(
     while True:
         step = explorer.next(q)
         if step.motion is None or step.motion.path is None:
-            yield Event(step, q, True)
+            yield Event(step, q)
             return
         path, trajectory = step.motion.path, step.motion.trajectory
         asked = step.motion.problem
         true = Problem(problem.robot, problem.scene, asked.start, asked.goal)
-        free = verify(true, path).valid and (trajectory is None or verify_trajectory(true, trajectory).valid)
+        found = verify(true, path).violation
+        if found is None and trajectory is not None:
+            found = verify_trajectory(true, trajectory).violation
         waypoints = path.positions
         for camera in explorer.cameras:
             on_the_way = waypoints[1:-1][:: max(1, len(waypoints) // (VIEWS_ON_THE_WAY + 1))]
             for at in (*on_the_way[:VIEWS_ON_THE_WAY], waypoints[-1]):
                 explorer.observe(taken(problem, camera, at, noise, rng))
         q = waypoints[-1]
-        yield Event(step, q, free)
-        if not free:
+        yield Event(step, q, "" if found is None else found.message)
+        if found is not None:
             return
