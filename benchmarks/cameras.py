@@ -11,8 +11,9 @@
 Prints benchmarks/results/unseen.txt. Problems are held-out ones of the families that the straight line does
 not solve and a search in the true scene does. Cameras stand where a person would place them, 1.4 to 1.8 m
 away (--cameras: near, 0.8 to 1.2 m; far, 2.4 to 3 m), in front more often than behind; the floor is known,
-all else must be seen. Every method plans with AORRTC, but for `hybrid`, and has the same CPU time. A motion is free if the validator accepts path and timed
-motion in the true scene. Records are kept in FILE and not made again; --report prints their tables.
+all else must be seen. Every method plans with AORRTC, but for `hybrid`, and has the same CPU time. A motion
+is free if the validator accepts path and timed motion in the true scene. Records are kept in FILE and not
+made again; --report prints their tables.
 
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; methods are named by the folder. Those of a training that left families out are tried on

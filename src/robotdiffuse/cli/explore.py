@@ -36,6 +36,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "strict_then_chance (default: strict)",
     )
     parser.add_argument("--confidence", type=float, default=0.98, metavar="P", help="least, of chance (0.98)")
+    parser.add_argument("--time-limit", type=float, default=1.0, metavar="S", help="of each search (1)")
     parser.add_argument("--noise", action="store_true", help="simulate the noise of depth cameras")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed")
     parser.add_argument(
@@ -52,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.scenes.scene import Scene
 
     problem = load_problem(arguments.problem)
-    settings = ExplorerSettings(policy=arguments.policy, confidence=arguments.confidence)
+    settings = ExplorerSettings(arguments.policy, arguments.confidence, arguments.time_limit)
     known = Scene([shape for shape in problem.scene.shapes if shape.name == FLOOR])
     cameras = [wrist_camera(problem.robot)]
     explorer = Explorer(problem.robot, cameras, known, FREE_ZONE, settings, arguments.seed)

@@ -60,7 +60,7 @@ class ExplorerSettings(Settings, name="explorer"):
     strict_then_chance: the latter where the former leads nowhere."""
     confidence: Annotated[float, Bound(least=0.0, most=1.0)] = 0.98
     """Least stated confidence of motions by chance."""
-    time_limit: Positive = 0.5
+    time_limit: Positive = 1.0
     """Time limit of each search [s]."""
     max_looks: Natural = 8
     """Most looks on the way to a goal."""
