@@ -1,6 +1,6 @@
 """Unknown space: motions planned on depth views, validated in the true scene; and where to look next.
 
-    python benchmarks/cameras.py [--problems 300] [--views 1] [--noise] [--records FILE]
+    python benchmarks/cameras.py [--problems 300] [--views 1] [--noise] [--cameras far] [--records FILE]
     python benchmarks/cameras.py --weights FOLDER ... --families shelf clutter
     python benchmarks/cameras.py --report [--odd] --records FILE
     python benchmarks/cameras.py --next-view [--problems 210] --records FILE
@@ -10,9 +10,10 @@
 
 Prints benchmarks/results/unseen.txt. Problems are held-out ones of the families that the straight line does
 not solve and a search in the true scene does. Cameras stand where a person would place them, 1.4 to 1.8 m
-away, in front more often than behind; the floor is known, all else must be seen. Every method plans with
-AORRTC, but for `hybrid`, and has the same CPU time. A motion is free if the validator accepts path and timed
-motion in the true scene. Records are kept in FILE and not made again; --report prints their tables.
+away (--cameras: near, 0.8 to 1.2 m; far, 2.4 to 3 m), in front more often than behind; the floor is known,
+all else must be seen. Every method plans with AORRTC, but for `hybrid`, and has the same CPU time. A motion
+is free if the validator accepts path and timed motion in the true scene. Records are kept in FILE and not
+made again; --report prints their tables.
 
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; methods are named by the folder. Those of a training that left families out are tried on
@@ -44,9 +45,10 @@ from robotdiffuse.evaluation.statistics import compare, wilson_interval
 from robotdiffuse.learning.completion import Completion, exported_completion, predict
 from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
 from robotdiffuse.perception.confidence import MIN_RISK, confidence
+from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.ray_caster import DepthNoise, ray_cast
+from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.next_view import next_view, poses_around
@@ -61,7 +63,12 @@ LIMIT = 1.0
 """CPU time of every method on every problem [s]."""
 SEARCH_LIMIT = 1.0
 """CPU time of the search that says whether a problem can be solved in the true scene [s]."""
-CAMERAS = CameraPlaces(distance=(1.4, 1.8), height=(0.5, 1.4), target_spread=0.1, roll=0.0)
+RING = "ring"
+CAMERAS = {
+    RING: CameraPlaces(distance=(1.4, 1.8), height=(0.5, 1.4), target_spread=0.1, roll=0.0),
+    "near": CameraPlaces(distance=(0.8, 1.2), height=(0.3, 0.9), target_spread=0.1, roll=0.0),
+    "far": CameraPlaces(distance=(2.4, 3.0), height=(0.6, 1.6), target_spread=0.1, roll=0.0),
+}
 SIZE = (640, 480)
 HYBRID = "hybrid"
 """As `predicted`, with `robotdiffuse` in place of AORRTC."""
@@ -101,12 +108,14 @@ def _hard(problem: Problem) -> bool:
     return not trivial and PLANNER.plan(problem, time_limit=SEARCH_LIMIT, until=FIRST).solved
 
 
-def views(problem: Problem, family: str, number: int, count: int, noisy: bool) -> list[DepthView]:
+def views(
+    problem: Problem, family: str, number: int, count: int, noisy: bool, cameras: str = RING
+) -> list[DepthView]:
     """Depth views of the problem's scene from random cameras, with the arm at its start."""
     rng = np.random.default_rng([SEED, list(FAMILIES).index(family), number, 14])
     taken = []
     for _ in range(count):
-        T, angle = CAMERAS.draw(problem.scene, rng)
+        T, angle = CAMERAS[cameras].draw(problem.scene, rng)
         focal = SIZE[1] / 2 / np.tan(angle / 2)
         intrinsics = (focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
         view = ray_cast(problem.scene, T, intrinsics, SIZE, problem.robot, problem.start)
@@ -152,7 +161,7 @@ def run(arguments: argparse.Namespace) -> None:
     networks = {BY + Path(folder).name: exported_completion(folder) for folder in arguments.weights}
     methods = [*arguments.methods, *networks]
     kept = JsonLines(Path(arguments.records))
-    place = {"views": arguments.views, "noise": arguments.noise}
+    place = {"views": arguments.views, "noise": arguments.noise, "cameras": arguments.cameras}
     done = {(r["family"], r["number"], r["method"]) for r in kept.rows if place.items() <= r.items()}
     each = arguments.problems // len(arguments.families)
     warm = True
@@ -162,7 +171,7 @@ def run(arguments: argparse.Namespace) -> None:
             missing = [method for method in methods if (family, number, method) not in done]
             if not missing:
                 continue
-            taken = views(problem, family, number, arguments.views, arguments.noise)
+            taken = views(problem, family, number, *place.values())
             known = Scene(problem.scene.shapes[:1])
             began = time.process_time()
             partial = Problem(problem.robot, known, problem.start, problem.goal, views=taken)
@@ -258,11 +267,14 @@ def calibration(rows: list[Row]) -> None:
 
 def report(rows: list[Row]) -> None:
     """Print the tables of each number of views, with noise and without."""
-    places = dict.fromkeys((row["views"], row["noise"]) for row in rows)
-    for count, noisy in places:
-        some = [row for row in rows if (row["views"], row["noise"]) == (count, noisy)]
-        table(some, f"{count} {'noisy ' if noisy else ''}view{'s' if count > 1 else ''}")
-        if (count, noisy) == (1, False):
+    rows = [{"cameras": RING} | row for row in rows]
+    places = dict.fromkeys((row["views"], row["noise"], row["cameras"]) for row in rows)
+    for count, noisy, cameras in places:
+        some = [
+            row for row in rows if (row["views"], row["noise"], row["cameras"]) == (count, noisy, cameras)
+        ]
+        table(some, f"{count} {'noisy ' if noisy else ''}view{'s' if count > 1 else ''}, cameras: {cameras}")
+        if (count, noisy, cameras) == (1, False, RING):
             calibration(some)
     spent = [row["view_time"] for row in rows]
     print(f"From views to the problem's scene: {1e3 * np.median(spent):.0f} ms of CPU time (median)")
@@ -386,6 +398,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
     parser.add_argument("--views", type=int, default=1, help="(1)")
     parser.add_argument("--noise", action="store_true", help="of depth cameras")
+    parser.add_argument("--cameras", default=RING, choices=CAMERAS, help="where they stand (ring)")
     parser.add_argument("--weights", nargs="*", default=[], metavar="FOLDER", help="of completion networks")
     parser.add_argument("--records", default="unknown_space.jsonl", help="(unknown_space.jsonl)")
     parser.add_argument("--next-view", action="store_true", help="second views")

@@ -14,6 +14,9 @@ from .datasets.own_motions import write_dataset as write_dataset
 from .perception.depth_view import DepthView as DepthView
 from .planning import load_planner as load_planner
 from .planning import plan as plan
+from .planning.exploration.cameras import ArmCamera as ArmCamera
+from .planning.exploration.explorer import Explorer as Explorer
+from .planning.exploration.explorer import ExplorerSettings as ExplorerSettings
 from .planning.next_view import NextView as NextView
 from .planning.next_view import next_view as next_view
 from .planning.plan_many import plan_many as plan_many

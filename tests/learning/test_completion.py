@@ -61,6 +61,25 @@ def test_samples_agree_with_the_scene(family: str) -> None:
     assert (samples.behind[free | occupied] == 0).all()
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_samples_of_cameras_everywhere_agree_with_the_scene(seed: int) -> None:
+    """With noise of up to twice the usual strength, from hand, near, far and overhead."""
+    samples = draw_samples(("shelf", "clutter"), PANDA, range(10 * seed, 10 * seed + 8), "everywhere")
+    truth = unpack_fine(samples.truth)
+    free, occupied = (samples.seen & FREE) > 0, (samples.seen & OCCUPIED) > 0
+    assert free.mean() > 0.03 and truth[free].mean() < 5e-3
+    assert truth[occupied].any(axis=-1).mean() > 0.5, "noise moves points to the next voxel"
+
+
+def test_training_begins_with_the_weights_that_it_is_given() -> None:
+    settings = replace(TINY, network=CompletionSettings(), weights="bundled")
+    task = training.CompletionTask(settings, training.Processes("cpu"))
+    given = load_completion().state_dict()
+    assert all(torch.equal(value, given[name]) for name, value in task.module.state_dict().items())
+    with pytest.raises(InputError, match="weights bundled are of a network of"):
+        training.CompletionTask(replace(TINY, weights="bundled"), training.Processes("cpu"))
+
+
 def test_voxels_pack_and_unpack() -> None:
     scene = load_family("table").scene(np.random.default_rng(0))
     fine = true_voxels(scene)
@@ -137,7 +156,7 @@ def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path
     whole = load_completion(tmp_path / "whole")
     assert whole.temperature > 0 and not any(p.requires_grad for p in whole.parameters())
     rng, other = np.random.default_rng(2), np.random.default_rng(2)
-    ahead, alone = (SamplePrefetcher(("rop",), PANDA, 2, workers) for workers in (1, 0))
+    ahead, alone = (SamplePrefetcher(("rop",), PANDA, 2, workers, "around") for workers in (1, 0))
     for _ in range(3):
         a, b = ahead.next(rng), alone.next(other)
         assert all((x == y).all() for x, y in zip(a, b, strict=True))

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.ray_caster import MAX_RANGE, DepthNoise, looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast, voxels_within
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.scenes.scene import Scene
@@ -114,27 +113,6 @@ def test_pybullets_camera_sees_the_same() -> None:
     assert both.sum() > 1500 and np.median(off) < 1e-3 and np.mean(off > 0.01) < 0.02, "but at edges"
     alone = (image.labels < 0) & np.isfinite(view.depth)
     assert alone.mean() < 0.01
-
-
-def test_noise_is_as_its_settings_say() -> None:
-    rng = np.random.default_rng(1)
-    depth = np.full((200, 300), 2.0, np.float32)
-    depth[:, 150:] = 1.0
-    depth[:20] = np.inf
-    view = DepthView(depth, (300.0, 300.0, 150.0, 100.0), np.eye(4))
-    noisy = DepthNoise(spread=0.003, missing=0.05, flying=0.0).applied(view, rng).depth
-    missing, near, far = noisy == 0, noisy[20:, 150:], noisy[20:, :150]
-    assert abs(missing.mean() - 0.05) < 0.005
-    for part, at in ((near[near > 0], 1.0), (far[far > 0], 2.0)):
-        assert abs(part.std() / (0.003 * at**2) - 1) < 0.03 and abs(part.mean() - at) < 1e-3
-    assert not np.isfinite(noisy[:20][~missing[:20]]).any()
-    flying = DepthNoise(spread=0.0, missing=0.0, flying=0.4).applied(view, rng).depth[20:]
-    between = (flying > 1.001) & (flying < 1.999)
-    assert not np.delete(between, 149, axis=1).any() and 0.3 < between[:, 149].mean() < 0.5
-    same = DepthNoise(spread=0.0, missing=0.0, flying=0.0).applied(view, rng).depth
-    np.testing.assert_array_equal(same, depth)
-    with pytest.raises(InputError, match="missing is 1"):
-        DepthNoise(missing=1.0)
 
 
 @pytest.mark.parametrize("seed", range(3))

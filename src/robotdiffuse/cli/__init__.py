@@ -17,6 +17,7 @@ from robotdiffuse.cli import (
     completion,
     data,
     demo,
+    explore,
     export,
     live,
     plan,
@@ -37,6 +38,7 @@ from robotdiffuse.core.registry import import_modules
 COMMANDS = (
     plan.add,
     demo.add,
+    explore.add,
     view.add,
     verify.add,
     certificate.add,

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.free_space_kernel import BEHIND, FREE, OUT, SHADOW, carve
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -24,8 +24,8 @@ voxels, not between two layers."""
 SHAPE = (56, 56, 32)
 """Number of voxels along x, y and z: the space around an arm with a reach of 1.1 m on a table."""
 ARM_MARGIN = 0.015
-"""Points within this distance of the arm's covering spheres are points of the arm; larger than the error of
-depth [m]."""
+"""Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise: see
+`grown_for_noise`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +67,12 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof
                 f"view.configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints"
             )
         T = view.T_base_camera
-        spheres = placed_spheres(robot, q)
+        filtered_depth, spread = filtered(view)
+        spheres = grown_for_noise(placed_spheres(robot, q), T, spread)
         spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
         spheres[:, 3] += ARM_MARGIN
         carve(
-            for_kernels(view.depth, np.float32),
+            filtered_depth,
             np.array(view.intrinsics, np.float32),
             T.astype(np.float32),
             spheres.astype(np.float32),

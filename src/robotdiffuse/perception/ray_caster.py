@@ -1,15 +1,10 @@
-"""Renders depth images of scenes in milliseconds, and simulates the noise of depth cameras."""
-
-from dataclasses import dataclass
-from typing import Annotated
+"""Renders depth images of scenes in milliseconds."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray
-from numpy.random import Generator
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.ray_kernel import BOX, CAPSULE, CYLINDER, SPHERE, render_depth
@@ -21,7 +16,6 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
 
 MAX_RANGE = 4.0
 """Range of the cameras [m]."""
-ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 
 
 def looking_at(
@@ -110,32 +104,3 @@ def _row(shape: Shape) -> ndarray:
 
 def _sphere_row(sphere: Float[ndarray, "4"]) -> ndarray:
     return np.concatenate([sphere[:3], np.eye(3).ravel(), [sphere[3], 0.0, 0.0, sphere[3]]])
-
-
-@dataclass(frozen=True)
-class DepthNoise(Settings, name="depth_noise"):
-    """Noise of a real depth camera; the defaults resemble a stereo camera."""
-
-    spread: NotNegative = 0.002
-    """Standard deviation of depth at a distance of 1 m [m]; it grows with the square of the distance."""
-    missing: ShareBelowOne = 0.02
-    """Fraction of the pixels without a return."""
-    flying: ShareBelowOne = 0.3
-    """Fraction of the pixels at edges whose depth is between the two surfaces (flying pixels)."""
-    edge: Positive = 0.05
-    """Neighbouring pixels whose depths differ by more than this are at an edge [m]."""
-
-    def applied(self, view: DepthView, rng: Generator) -> DepthView:
-        """The view with noise."""
-        clean, depth = view.depth, view.depth.astype(np.float64)
-        for axis in (0, 1):
-            # of two neighbours with an edge between them, the first becomes a flying pixel
-            other = clean.take(np.arange(1, clean.shape[axis] + 1), axis, mode="clip")
-            both = np.isfinite(clean) & np.isfinite(other)
-            apart = np.where(both, other, 0.0) - np.where(both, clean, 0.0)
-            flies = (np.abs(apart) > self.edge) & (rng.random(clean.shape) < self.flying)
-            depth[flies] = clean[flies] + rng.random(int(flies.sum())) * apart[flies]
-        seen = np.isfinite(depth)
-        depth[seen] += self.spread * depth[seen] ** 2 * rng.standard_normal(int(seen.sum()))
-        depth[rng.random(depth.shape) < self.missing] = 0.0
-        return DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)

@@ -8,6 +8,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.core.bounds import for_kernels
+from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.perception.seen_points_kernel import (
     gather_cloud,
@@ -27,7 +28,8 @@ POINT_RADIUS = 0.01
 MIN_POINT_RADIUS = 0.001
 """Radius of points that would otherwise collide at start or goal [m]."""
 ARM_DISTANCE = 0.02
-"""Points within this distance of the arm, at its configuration in the view, are points of the arm [m]."""
+"""Points within this distance of the arm, at its configuration in the view, are points of the arm [m]; more
+with noise: see `grown_for_noise`."""
 KNOWN_DISTANCE = 0.01
 """Points within this distance of a known shape are points of the shape [m]."""
 REACH_MARGIN = 0.3
@@ -55,6 +57,8 @@ def seen_points(
         count = 0
         for view in views:
             spheres = placed_spheres(robot, start if view.configuration is None else view.configuration)
+            depth, spread = filtered(view)
+            spheres = grown_for_noise(spheres, view.T_base_camera, spread)
             spheres = (spheres + np.array([0, 0, 0, ARM_DISTANCE])).astype(np.float32)
             rest = (
                 np.float32(reach_bound(robot) + REACH_MARGIN),
@@ -68,9 +72,8 @@ def seen_points(
             if view.cloud is not None:
                 count = gather_cloud(for_kernels(view.cloud), *rest)
             else:
-                image = for_kernels(view.depth, np.float32)
                 intrinsics = tuple(map(np.float32, view.intrinsics))
-                count = gather_image(image, intrinsics, view.T_base_camera.astype(np.float32), *rest)
+                count = gather_image(depth, intrinsics, view.T_base_camera.astype(np.float32), *rest)
             if count < 0:
                 break
         if count >= 0:

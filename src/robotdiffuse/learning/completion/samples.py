@@ -14,11 +14,15 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernel_arrays import compile_scene_for
+from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
-from robotdiffuse.perception.ray_caster import DepthNoise, looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import Range, base_spheres
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -66,15 +70,52 @@ class CameraPlaces:
         return T, rng.uniform(*self.field_of_view)
 
 
-CAMERAS = CameraPlaces()
-IMAGE_SIZE = (160, 120)
-"""Width and height of images [pixels]."""
-TWO_VIEWS_SHARE = 0.3
-"""Share of the samples with two views."""
-NOISE_SHARE = 0.5
-"""Share of the samples with noise, of up to twice the usual strength."""
+@dataclass(frozen=True)
+class Views:
+    """Distribution of the views of a sample."""
+
+    places: tuple[CameraPlaces, ...]
+    """Each camera is at one of these, drawn evenly."""
+    wrist_share: float
+    """Share of the cameras that are on the arm's hand instead."""
+    sizes: tuple[tuple[int, int], ...]
+    """Widths and heights of images, drawn evenly [pixels]."""
+    counts: tuple[int, ...]
+    """Numbers of views, drawn evenly."""
+    noise_share: float
+    """Share of the samples with noise, of up to twice the usual strength."""
+
+
+VIEWS = {
+    "around": Views((CameraPlaces(),), 0.0, ((160, 120),), (1, 1, 1, 2), 0.5),
+    "everywhere": Views(
+        (
+            CameraPlaces(),
+            CameraPlaces(
+                distance=(0.4, 1.3), height=(0.1, 0.9), target_spread=0.3, field_of_view=(0.75, 1.2)
+            ),
+            CameraPlaces(distance=(0.1, 0.8), height=(1.2, 2.2), field_of_view=(0.75, 1.2), roll=0.5),
+            CameraPlaces(distance=(2.0, 3.0), height=(0.3, 2.0), field_of_view=(0.5, 1.0)),
+        ),
+        wrist_share=0.15,
+        sizes=((160, 120), (320, 240), (640, 480)),
+        counts=(1, 1, 1, 2, 3),
+        noise_share=0.65,
+    ),
+}
+"""Views by name: of cameras that stand around the arm; and of those near, low, overhead, far and on the hand,
+of several resolutions."""
+CAMERA_CLEARANCE = 0.05
+"""Cameras stand at least this far from obstacles, where a few draws find such a place [m]."""
+CAMERA_DRAWS = 8
+WRIST_TURN = 0.4
+"""Largest angle between the axes of a camera on the hand and the hand [rad]."""
+WRIST_OFFSET = 0.07
+"""Distance of a camera on the hand from the hand's axis [m]."""
 OUT_OF_RANGE_SHARE = 0.5
 """Share of the noisy samples in which surfaces out of range return no depth, as with most real cameras."""
+MISSING_SHARE = 0.02
+"""Share of the pixels without a return, anywhere, with noise of the usual strength."""
 NO_FLOOR_SHARE = 0.1
 """Share of the samples without a floor: the arm stands on a pedestal."""
 
@@ -124,12 +165,32 @@ def unpack_fine(truth: UInt8[ndarray, "*b"]) -> Bool[ndarray, "*b 8"]:
     return (truth[..., None] >> np.arange(8, dtype=np.uint8) & 1).astype(np.bool_)
 
 
-def camera_view(scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Generator) -> DepthView:
-    """A depth view of the scene from a random pose."""
-    T, angle = CAMERAS.draw(scene, rng)
-    focal = IMAGE_SIZE[1] / 2 / np.tan(angle / 2)
-    intrinsics = (focal, focal, (IMAGE_SIZE[0] - 1) / 2, (IMAGE_SIZE[1] - 1) / 2)
-    return ray_cast(scene, T, intrinsics, IMAGE_SIZE, robot, q)
+def camera_view(
+    scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Generator, views: Views
+) -> DepthView:
+    """A depth view of the scene from a random pose, without noise."""
+    width, height = views.sizes[int(rng.integers(len(views.sizes)))]
+    obstacles = compile_scene_for(robot, scene)
+    on_wrist = rng.random() < views.wrist_share
+    for _ in range(CAMERA_DRAWS):
+        places = views.places[int(rng.integers(len(views.places)))]
+        T, angle = _wrist_camera(robot, q, rng) if on_wrist else places.draw(scene, rng)
+        if not near_scene(obstacles, T[None, :3, 3].astype(np.float32), np.float32(CAMERA_CLEARANCE))[0]:
+            break
+    focal = height / 2 / np.tan(angle / 2)
+    intrinsics = (focal, focal, (width - 1) / 2, (height - 1) / 2)
+    # a camera on the hand looks past the gripper: the spheres that cover it would hide everything
+    return ray_cast(scene, T, intrinsics, (width, height), None if on_wrist else robot, q)
+
+
+def _wrist_camera(robot: Robot, q: Float[ndarray, "dof"], rng: Generator) -> tuple[ndarray, float]:
+    """T_base_camera of a camera beside the hand that looks about along its axis, and its field of view."""
+    T_base_hand = link_pose(robot, q, robot.tip)
+    turn = rng.uniform(-np.pi, np.pi)
+    aside = WRIST_OFFSET * np.array([np.cos(turn), np.sin(turn), 0.0])
+    aim = np.array([*np.tan(rng.uniform(-WRIST_TURN, WRIST_TURN, 2)), 1.0])
+    T_hand_camera = looking_at(aside, aside + aim, rng.uniform(-np.pi, np.pi))
+    return T_base_hand @ T_hand_camera, rng.uniform(0.75, 1.0)
 
 
 def random_configuration(checker: CollisionChecker, robot: Robot, rng: Generator) -> Float[ndarray, "dof"]:
@@ -139,22 +200,28 @@ def random_configuration(checker: CollisionChecker, robot: Robot, rng: Generator
     return q[free[0]] if len(free) else q[0]
 
 
-def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> Sample:
-    """A random scene of one of the families, observed by one or two cameras."""
+def draw_sample(families: Sequence[str], robot: Robot, rng: Generator, views: Views) -> Sample:
+    """A random scene of one of the families, as cameras observe it."""
     family = load_family(families[int(rng.integers(len(families)))])
     scene = family.scene(rng, base_spheres(robot))
     if rng.random() < NO_FLOOR_SHARE:
         scene = Scene([shape for shape in scene.shapes if shape is not family.floor])
     q = random_configuration(CollisionChecker(robot, scene), robot, rng)
-    views = [camera_view(scene, robot, q, rng) for _ in range(1 + (rng.random() < TWO_VIEWS_SHARE))]
-    if rng.random() < NOISE_SHARE:
+    count = views.counts[int(rng.integers(len(views.counts)))]
+    taken = [camera_view(scene, robot, q, rng, views) for _ in range(count)]
+    if rng.random() < views.noise_share:
         strength, hide_far = 2 * rng.random(), rng.random() < OUT_OF_RANGE_SHARE
         usual = DepthNoise()
         noise = DepthNoise(
-            strength * usual.spread, strength * usual.missing, min(strength * usual.flying, 0.9)
+            strength * usual.spread,
+            strength * MISSING_SHARE,
+            strength * usual.stray,
+            strength * usual.flying,
+            strength * usual.edge_missing,
+            grazing=strength * usual.grazing,
         )
-        views = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in views]
-    seen, behind = pack(observe(views, robot, q))
+        taken = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in taken]
+    seen, behind = pack(observe(taken, robot, q))
     return Sample(seen, behind, pack_fine(true_voxels(scene)))
 
 
@@ -164,7 +231,9 @@ def _without_infinity(view: DepthView) -> DepthView:
     return DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)
 
 
-def draw_samples(families: Sequence[str], robot: Robot, seeds: Sequence[int]) -> Samples:
-    """A sample for each seed."""
-    drawn = [draw_sample(families, robot, np.random.default_rng(seed)) for seed in seeds]
+def draw_samples(
+    families: Sequence[str], robot: Robot, seeds: Sequence[int], views: str = "around"
+) -> Samples:
+    """A sample for each seed; `views` is a name in VIEWS."""
+    drawn = [draw_sample(families, robot, np.random.default_rng(seed), VIEWS[views]) for seed in seeds]
     return Samples(*(np.stack(arrays) for arrays in zip(*drawn, strict=True)))

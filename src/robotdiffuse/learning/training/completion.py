@@ -11,10 +11,11 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
-from robotdiffuse.learning.checkpoint import save_completion
+from robotdiffuse.learning.checkpoint import load_completion, save_completion
 from robotdiffuse.learning.completion.network import CompletionNetwork, folded
-from robotdiffuse.learning.completion.samples import FREE, OCCUPIED, Samples, draw_samples, unpack_fine
+from robotdiffuse.learning.completion.samples import FREE, OCCUPIED, VIEWS, Samples, draw_samples, unpack_fine
 from robotdiffuse.learning.completion.volume import CompletionSettings, reachable, voxel_centers
 from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSettings
 from robotdiffuse.learning.training.loop import Validation
@@ -25,6 +26,8 @@ from robotdiffuse.perception.observed_volume import VOXEL
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.robots import load_robot
 
+BUNDLED_WEIGHTS = "bundled"
+"""Name of the weights that come with the package."""
 HELD_OUT_SEED = 20261122
 """Seed of the held-out samples; training samples are drawn from other seed sequences."""
 VALIDATION_SAMPLES = 4
@@ -49,6 +52,10 @@ class CompletionTraining(TrainingSettings):
     """Bundled name, or path to a URDF: the arm in the views."""
     families: Annotated[tuple[Annotated[str, OneOf(FAMILIES)], ...], Filled()] = tuple(FAMILIES)
     """Families of the scenes, in equal parts."""
+    views: Annotated[str, OneOf(VIEWS)] = "around"
+    """Of the samples: "around" the arm, or "everywhere", with noise and several resolutions."""
+    weights: str | None = None
+    """Folder with weights to begin with; "bundled": those that come with the package; None: random ones."""
     minutes: Positive | None = None
     samples: Count | None = 40_000
     batch: Count = 4
@@ -86,11 +93,26 @@ class CompletionTask(TrainingTask):
         self.identity = {}
         self.robot = load_robot(settings.robot)
         torch.manual_seed(settings.seed)
-        self.module = self._trained = CompletionNetwork(settings.network).to(processes.device)
-        self.prefetcher = SamplePrefetcher(settings.families, self.robot, settings.batch, settings.workers)
+        self.module = self._trained = self._initial(settings).to(processes.device)
+        self.prefetcher = SamplePrefetcher(
+            settings.families, self.robot, settings.batch, settings.workers, settings.views
+        )
         self._reachable, self._above = reachable(), voxel_centers()[..., 2] > VOXEL / 2
         self._validation_samples = self._held_out(settings.families, 0, VALIDATION_SAMPLES)
         self._figures: dict[str, Any] = {}
+
+    def _initial(self, settings: CompletionTraining) -> CompletionNetwork:
+        """The network that training begins with."""
+        network = CompletionNetwork(settings.network)
+        if settings.weights is not None:
+            given = load_completion(None if settings.weights == BUNDLED_WEIGHTS else settings.weights)
+            if given.settings != settings.network:
+                raise InputError(
+                    f"weights {settings.weights} are of a network of {shown(given.settings.to_json())}; the"
+                    f" training is of {shown(settings.network.to_json())}"
+                )
+            network.load_state_dict(given.state_dict())
+        return network
 
     def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
         return self._loss(self.prefetcher.next(rng))
@@ -145,7 +167,7 @@ class CompletionTask(TrainingTask):
             place = list(FAMILIES).index(name)
             rng = np.random.default_rng([HELD_OUT_SEED, place])
             seeds = rng.integers(SEED_LIMIT, size=first + count)[first:]
-            parts.append(draw_samples((name,), self.robot, seeds.tolist()))
+            parts.append(draw_samples((name,), self.robot, seeds.tolist(), self.settings.views))
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _counts(self, samples: Samples) -> Bool[ndarray, "n 56 56 32"]:

@@ -28,9 +28,12 @@ class SamplePrefetcher:
     A copy of the generator tells the seeds of the next batches, so a resumed run has the same batches.
     """
 
-    def __init__(self, families: Sequence[str], robot: Robot, batch: int, workers: int) -> None:
-        """workers: number of worker processes; 0: `next` draws the samples itself."""
-        self._families, self._robot, self._batch = tuple(families), robot, batch
+    def __init__(self, families: Sequence[str], robot: Robot, batch: int, workers: int, views: str) -> None:
+        """
+        workers: number of worker processes; 0: `next` draws the samples itself.
+        views: of the samples, a name in `samples.VIEWS`.
+        """
+        self._families, self._robot, self._batch, self._views = tuple(families), robot, batch, views
         self._depth = BATCHES_AHEAD * workers
         self._pool: ProcessPoolExecutor | None = None
         if workers:
@@ -42,7 +45,7 @@ class SamplePrefetcher:
         """The batch of samples with the seeds that `rng` draws."""
         seeds = self._seeds(rng)
         if self._pool is None:
-            return draw_samples(self._families, self._robot, seeds)
+            return draw_samples(self._families, self._robot, seeds, self._views)
         if not self._pending or self._pending[0][0] != seeds:
             self._pending.clear()
             self._submit(seeds)
@@ -64,7 +67,7 @@ class SamplePrefetcher:
     def _submit(self, seeds: tuple[int, ...]) -> None:
         assert self._pool is not None
         with block_interrupts_in_children():
-            job = self._pool.submit(draw_samples, self._families, self._robot, seeds)
+            job = self._pool.submit(draw_samples, self._families, self._robot, seeds, self._views)
         self._pending.append((seeds, job))
 
 

@@ -1,0 +1,171 @@
+"""Explorer: an arm with a camera at its tip goes to goals through simulated scenes.
+
+    python benchmarks/exploring.py [--problems 28] [--noise] [--methods strict ...] --records FILE
+    python benchmarks/exploring.py --report --records FILE
+
+Prints benchmarks/results/exploring.txt. Problems are those of benchmarks/cameras.py whose scene leaves the
+arm's pose "ready" free: from there the arm goes to the problem's start, and on to its goal, with one memory.
+A camera beside the arm takes one image, at first; the one on the arm (320 x 240 pixels, 70 x 55 degrees, 0.15
+to 2 m) during each motion. Every executed motion is judged by the validator in the true scene, and the loop
+ends at a collision. Looks and times are those of both legs together.
+
+The first two methods are controls: motions as planned once with unknown space taken as free, and once with
+the prediction, from the first images and one at the start of each leg.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from cameras import PLANNER, is_free, problems, views
+from common import header, parse, print_table, progress, use_processor_time
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.types import FIRST
+from robotdiffuse.evaluation.statistics import wilson_interval
+from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.planning.context import PlanRequest
+from robotdiffuse.planning.exploration.explorer import CHANCE, DONE, LOOK, STRICT, Explorer, ExplorerSettings
+from robotdiffuse.planning.exploration.simulated import explore, measured, taken, wrist_camera
+from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.problem import OPTIMISTIC, PREDICTED, JointGoal, Problem
+from robotdiffuse.scenes.scene import Scene
+
+Row = dict[str, Any]
+TIME_LIMIT = 0.5
+"""CPU time of each search [s]."""
+FREE_ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
+"""The space around the base that is declared free [m]."""
+ONCE = {"unknown is free, once": OPTIMISTIC, "predicted, once": PREDICTED}
+METHODS = {
+    "strict": ExplorerSettings(policy=STRICT, time_limit=TIME_LIMIT),
+    "strict, no network": ExplorerSettings(policy=STRICT, time_limit=TIME_LIMIT, predict=False),
+    "strict, no free zone": ExplorerSettings(policy=STRICT, time_limit=TIME_LIMIT),
+    "chance": ExplorerSettings(policy=CHANCE, time_limit=TIME_LIMIT),
+    "strict, then chance": ExplorerSettings(policy="strict_then_chance", time_limit=TIME_LIMIT),
+}
+MAX_PROBLEMS = 10_000
+"""Of a family."""
+NO_ZONE = "strict, no free zone"
+HOME = "ready"
+"""Name of the pose that the arm begins in."""
+
+
+def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -> Row:
+    """A record of one problem and method: from the arm's pose "ready" to the start, and on to the goal."""
+    noise, rng = DepthNoise() if noisy else None, np.random.default_rng([number, 16])
+    camera, known = wrist_camera(problem.robot), Scene(problem.scene.shapes[:1])
+    legs = [replace(problem, start=HOME, goal=JointGoal(problem.start[None])), problem]
+    [beside] = views(legs[0], family, number, 1, False)
+    seen, looks, reason = [measured(beside, np.inf, noise, rng)], 0, ""
+    reached = collided = False
+    zone = None if method == NO_ZONE else FREE_ZONE
+    explorer = Explorer(problem.robot, [camera], known, zone, METHODS.get(method, ExplorerSettings()))
+    began = time.process_time()
+    if method not in ONCE:
+        explorer.observe(seen[0])
+    for leg in legs:
+        if method in ONCE:
+            seen.append(taken(leg, camera, leg.start, noise, rng))
+            partial = Problem(leg.robot, known, leg.start, leg.goal, views=seen, unknown=ONCE[method])
+            result = plan_with_unknown_space(PLANNER, partial, PlanRequest(TIME_LIMIT, until=FIRST))
+            reached, reason = is_free(leg, result), result.reason
+            collided = result.solved and not reached
+        else:
+            events = list(explore(leg, explorer, noise, number))
+            reached, collided = events[-1].step.kind == DONE, not all(event.free for event in events)
+            looks += sum(event.step.kind == LOOK for event in events)
+            reason = events[-1].step.reason
+        if not reached:
+            break
+    spent = time.process_time() - began
+    return {"reached": reached, "collided": collided, "looks": looks, "reason": reason, "time": spent}
+
+
+def usable(problem: Problem) -> bool:
+    """Whether the arm's pose "ready" is free in the scene."""
+    home = replace(problem, start=HOME).start
+    return bool(CollisionChecker(problem.robot, problem.scene).free(home[None])[0])
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Make the records that are missing."""
+    kept = JsonLines(Path(arguments.records))
+    done = {(row["family"], row["number"], row["method"], row["noise"]) for row in kept.rows}
+    warm = False
+    for family in arguments.families:
+        count = arguments.problems // len(arguments.families)
+        some = list(islice((one for one in problems(family, MAX_PROBLEMS, set()) if usable(one[1])), count))
+        for number, problem in progress(some, family):
+            for method in arguments.methods:
+                if (family, number, method, arguments.noise) in done:
+                    continue
+                if not warm:
+                    play(problem, family, number, CHANCE, arguments.noise)
+                    warm = True
+                row = play(problem, family, number, method, arguments.noise)
+                place = {"family": family, "number": number, "method": method, "noise": arguments.noise}
+                kept.append(place | row)
+
+
+def report(rows: list[Row]) -> None:
+    """Print reached goals, collisions, looks and times of the methods, without noise and with."""
+    for noisy in (False, True):
+        lines = []
+        for method in (*ONCE, *METHODS):
+            mine = [row for row in rows if (row["method"], row["noise"]) == (method, noisy)]
+            if not mine:
+                continue
+            reached, collided = (sum(row[name] for row in mine) for name in ("reached", "collided"))
+            low, high = wilson_interval(reached, len(mine))
+            looks, spent = np.array([row["looks"] for row in mine]), [row["time"] for row in mine]
+            lines.append(
+                (
+                    method,
+                    len(mine),
+                    f"{100 * reached / len(mine):.0f} ({100 * low:.0f} to {100 * high:.0f})",
+                    collided,
+                    f"{looks.mean():.2f} / {np.percentile(looks, 90):.0f}",
+                    f"{np.median(spent):.2f} / {np.percentile(spent, 90):.2f}",
+                )
+            )
+        if lines:
+            columns = ["method", "problems", "reached, %", "collisions", "looks, mean / p90"]
+            title = "With the noise of sensors" if noisy else "Ideal depth"
+            print_table(title, [*columns, "CPU s, median / p90"], lines)
+    print("CPU time includes the simulated images and the validation in the true scene.")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="An arm explores simulated scenes.")
+    every = [*ONCE, *METHODS]
+    parser.add_argument("--problems", type=int, default=28, help="of all families together (28)")
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
+    parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
+    parser.add_argument("--noise", action="store_true", help="of depth cameras")
+    parser.add_argument("--records", default="exploring.jsonl", help="(exploring.jsonl)")
+    parser.add_argument("--report", action="store_true", help="print the tables of the records")
+    arguments = parse(parser, problems=1, families=["rop"], methods=["strict"])
+    if arguments.report:
+        print(header("numba", "numpy", "onnxruntime"))
+        report(JsonLines(Path(arguments.records)).rows)
+        return
+    use_processor_time()
+    if not arguments.smoke:
+        run(arguments)
+        return
+    with TemporaryDirectory() as folder:
+        arguments.records = f"{folder}/records.jsonl"
+        run(arguments)
+        report(JsonLines(Path(arguments.records)).rows)
+
+
+if __name__ == "__main__":
+    main()

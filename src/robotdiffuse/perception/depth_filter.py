@@ -1,0 +1,71 @@
+"""Noise of depth images: how large it is, and images without most of it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32
+from numpy import ndarray
+
+from robotdiffuse.core.bounds import for_kernels
+from robotdiffuse.perception.depth_filter_kernel import median_filter
+from robotdiffuse.perception.depth_view import DepthView
+
+ROW_STEP = 4
+"""Every so many rows are examined for noise."""
+MIN_BENDS = 200
+"""Fewest second differences that noise is estimated from."""
+BEND_PER_SPREAD = 0.6745 * 6**0.5
+"""The median absolute second difference of normal numbers of standard deviation 1."""
+MIN_SPREAD = 4e-4
+"""Images with less noise are taken as they are: the filter takes away what is a pixel wide. At a distance of
+1 m [m]."""
+MARGIN_SPREADS = 1.5
+"""Points of the arm may lie this many standard deviations of a pixel's depth farther from it. The median of
+nine pixels has 0.4 of the deviation of one."""
+
+
+class FilteredDepth(NamedTuple):
+    """A depth image to use, and its noise."""
+
+    depth: Float32[ndarray, "h w"]
+    """Distance along the optical axis, as in DepthView [m]."""
+    spread: float
+    """Standard deviation of a pixel's depth at a distance of 1 m before the filter [m]; it grows with the
+    square of the distance."""
+
+
+def filtered(view: DepthView) -> FilteredDepth:
+    """The view's image; if it is noisy, each pixel with a return is the median of those of the 3 x 3 around.
+
+    Images made of clouds have no pixels of their own, and count as without noise.
+    """
+    depth = for_kernels(view.depth, np.float32)
+    spread = 0.0 if view.cloud is not None else depth_spread(depth)
+    if spread < MIN_SPREAD:
+        return FilteredDepth(depth, 0.0)
+    return FilteredDepth(median_filter(depth), spread)
+
+
+def depth_spread(depth: Float32[ndarray, "h w"]) -> float:
+    """The standard deviation of an image's depth at a distance of 1 m [m], as its pixels show.
+
+    Of a flat surface, inverse depth is linear in the pixels; where the error of depth grows with its square,
+    that of inverse depth is the same everywhere. So second differences of inverse depth show it, as most
+    surfaces are flat enough. 0 for images with few returns.
+    """
+    some = depth[::ROW_STEP]
+    seen = np.isfinite(some) & (some > 0)
+    inverse = np.divide(1.0, some, out=np.zeros_like(some), where=seen)
+    bend = inverse[:, :-2] - 2 * inverse[:, 1:-1] + inverse[:, 2:]
+    bend = np.abs(bend[seen[:, :-2] & seen[:, 1:-1] & seen[:, 2:]])
+    return float(np.median(bend)) / BEND_PER_SPREAD if len(bend) >= MIN_BENDS else 0.0
+
+
+def grown_for_noise(
+    spheres: Float[ndarray, "n 4"], T_base_camera: Float[ndarray, "4 4"], spread: float
+) -> Float[ndarray, "n 4"]:
+    """The arm's spheres, in the base frame, enlarged by the noise of depth where they are."""
+    ahead = (spheres[:, :3] - T_base_camera[:3, 3]) @ T_base_camera[:3, 2]
+    grown = spheres.copy()
+    grown[:, 3] += MARGIN_SPREADS * spread * np.maximum(ahead, 0.0) ** 2
+    return grown

@@ -1,0 +1,133 @@
+"""OccupancyMap: what many depth views tell of each voxel of 2 cm around the arm, view by view."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.settings import NotNegative, Positive, Settings
+from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
+from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.free_space_kernel import FREE, carve
+from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.robots.robot import Robot
+
+Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Low and high corner of a box [m]."""
+
+
+@dataclass(frozen=True)
+class MapSettings(Settings, name="map"):
+    hit: Positive = 3.0
+    """Added to a voxel's evidence by a view with points in it."""
+    miss: Positive = 2.0
+    """Taken from it by a view that sees through all of it."""
+    largest: Positive = 8.0
+    """Evidence stays within this, so that a voxel can change."""
+    arm_margin: NotNegative = 0.015
+    """Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise.
+    At least the error of camera calibration."""
+    max_age: Positive | None = None
+    """Evidence older than this is forgotten [s]; None: never."""
+
+
+class OccupancyMap:
+    """Voxels seen free, occupied, and unknown ones, from many views, each taken into account once.
+
+    A view counts as free what it sees through, and as occupied what holds points. Noisy images are filtered
+    first, so that a stray pixel neither blocks nor fills a voxel; pixels without a return say nothing; of the
+    arm, and of what it holds, nothing is kept. Where views contradict each other, their number decides.
+
+    The voxels are those of `ObservedVolume`, halved: `FINE_SHAPE` from `LOW` on.
+    """
+
+    def __init__(self, robot: Robot, settings: MapSettings = MapSettings()) -> None:
+        self.robot, self.settings = robot, settings
+        self._evidence = np.zeros(FINE_SHAPE, np.float32)
+        """Above 0 occupied, below free, 0 unknown."""
+        self._seen_at = np.full(FINE_SHAPE, -np.inf, np.float64)
+        self._declared = np.zeros(FINE_SHAPE, np.bool_)
+        self._now = -np.inf
+        self._state, self._behind = np.empty(FINE_SHAPE, np.uint8), np.empty(FINE_SHAPE, np.float32)
+        self._counts = np.empty(FINE_SHAPE, np.int32)
+
+    def add(self, view: DepthView, stamp: float = 0.0) -> None:
+        """Take a view into account.
+
+        stamp: when it was taken [s]; `view.configuration` is the arm's at that time. Raises InputError for a
+        view without a configuration, or with one of the wrong length.
+        """
+        q = view.configuration
+        if q is None or len(q) != self.robot.dof:
+            raise InputError(
+                f"view.configuration is {shown(q)}; a map needs the {self.robot.dof} joint positions of"
+                f" {self.robot.name} when the view was taken"
+            )
+        T = view.T_base_camera
+        depth, spread = filtered(view)
+        spheres = grown_for_noise(placed_spheres(self.robot, q), T, spread)
+        spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
+        spheres[:, 3] += self.settings.arm_margin
+        carve(
+            depth,
+            np.array(view.intrinsics, np.float32),
+            T.astype(np.float32),
+            spheres.astype(np.float32),
+            np.array(LOW, np.float32),
+            np.float32(FINE_VOXEL_SIZE),
+            self._state,
+            self._behind,
+            self._counts,
+        )
+        self._update(self._counts > 0, self._state == FREE, stamp)
+
+    def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
+        """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
+        or of an OctoMap file (`scenes.point_cloud.load_points`). They say nothing about free space."""
+        at = np.floor((np.asarray(points) - LOW) / FINE_VOXEL_SIZE).astype(np.int64)
+        at = at[((at >= 0) & (at < FINE_SHAPE)).all(axis=1)]
+        hit = np.zeros(FINE_SHAPE, np.bool_)
+        hit[tuple(at.T)] = True
+        self._update(hit, np.zeros(FINE_SHAPE, np.bool_), stamp)
+
+    def declare_free(self, zone: Corners) -> None:
+        """Voxels inside a box count as seen free unless a view finds them occupied."""
+        low, high = np.asarray(zone, np.float64)
+        if not (low < high).all():
+            raise InputError(f"free_zone is {shown(zone)}; its low corner must be below its high corner")
+        first = np.maximum(np.ceil((low - LOW) / FINE_VOXEL_SIZE - 1e-6), 0).astype(int)
+        end = np.maximum(np.floor((high - LOW) / FINE_VOXEL_SIZE + 1e-6), 0).astype(int)
+        self._declared[tuple(slice(a, b) for a, b in zip(first, end, strict=True))] = True
+
+    @property
+    def occupied(self) -> Bool[ndarray, "nx ny nz"]:
+        return (self._evidence > 0) & self._fresh
+
+    @property
+    def free(self) -> Bool[ndarray, "nx ny nz"]:
+        """Seen free, or declared so and not found occupied."""
+        seen = (self._evidence < 0) & self._fresh
+        return seen | (self._declared & ~self.occupied)
+
+    @property
+    def unknown(self) -> Bool[ndarray, "nx ny nz"]:
+        return ~(self.free | self.occupied)
+
+    @property
+    def _fresh(self) -> Bool[ndarray, "nx ny nz"] | bool:
+        age = self.settings.max_age
+        return True if age is None else self._seen_at >= self._now - age
+
+    def _update(self, hit: Bool[ndarray, "nx ny nz"], free: Bool[ndarray, "nx ny nz"], stamp: float) -> None:
+        self._now = max(self._now, stamp)
+        if self.settings.max_age is not None:
+            self._evidence[~np.asarray(self._fresh)] = 0.0
+            self._seen_at[hit | free] = stamp
+        gain = np.zeros(FINE_SHAPE, np.float32)
+        gain[free], gain[hit] = -self.settings.miss, self.settings.hit
+        most = np.float32(self.settings.largest)
+        np.clip(self._evidence + gain, -most, most, out=self._evidence)

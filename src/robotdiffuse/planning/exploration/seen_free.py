@@ -1,0 +1,54 @@
+"""Obstacles that keep an arm within space that was seen free."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision.kernel_arrays import compile_scene_for
+from robotdiffuse.perception.assumptions import CARVING_MARGIN, FINE_SHAPE, FINE_VOXEL_SIZE, voxels_in
+from robotdiffuse.perception.depth_view import AssumedPoints
+from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.perception.seen_points_kernel import near_scene
+from robotdiffuse.perception.swept_voxels_kernel import surface
+from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Shape
+
+COVER_RADIUS = FINE_VOXEL_SIZE * 3**0.5 / 2
+"""Radius of the ball around a voxel's centre that covers the voxel [m]."""
+WALL = 2.0
+"""Thickness of the walls around the map [m]."""
+
+
+def not_seen_free(
+    known: OccupancyMap, known_scene: Scene, ends: Sequence[Float[ndarray, "dof"]]
+) -> tuple[Shape, ...]:
+    """Obstacles that cover all space that the map does not know to be free, apart from the known scene's.
+
+    Balls cover the voxels at the surface of that space, and walls stand around the map, so a motion that the
+    validator accepts among them enters no other voxel. ends: configurations around which CARVING_MARGIN is
+    taken as free; seen points are obstacles of their own.
+    """
+    spheres = np.concatenate([placed_spheres(known.robot, q) for q in ends]).astype(np.float32)
+    near = voxels_in(spheres, CARVING_MARGIN + FINE_VOXEL_SIZE / 2)
+    points = (surface(~known.free & ~near) + 0.5) * FINE_VOXEL_SIZE + LOW
+    if known_scene.shapes:
+        scene, inside = compile_scene_for(known.robot, known_scene), np.float32(FINE_VOXEL_SIZE / 2 - 1e-3)
+        points = points[~near_scene(scene, points.astype(np.float32), inside)]
+    return AssumedPoints(points, COVER_RADIUS, name="not seen free"), *_walls()
+
+
+def _walls() -> list[Box]:
+    """Boxes around the map."""
+    low = np.array(LOW)
+    high = low + np.array(FINE_SHAPE) * FINE_VOXEL_SIZE
+    walls = []
+    for axis in range(3):
+        for at, name in ((low[axis] - WALL / 2, "before"), (high[axis] + WALL / 2, "beyond")):
+            center, size = (low + high) / 2, high - low + 2 * WALL
+            center[axis], size[axis] = at, WALL
+            walls.append(Box(tuple(center), tuple(size), name=f"{name} the map, {'xyz'[axis]}"))
+    return walls

@@ -1,0 +1,115 @@
+"""An arm that explores a simulated scene: cameras by ray casting, motions executed as planned."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.planning.exploration.cameras import ArmCamera
+from robotdiffuse.planning.exploration.explorer import Explorer, Step
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.validation.validator import verify, verify_trajectory
+
+WRIST_OFFSET = (0.07, 0.0, 0.02)
+"""Position of the simulated camera in the frame of the arm's tip [m]."""
+SIZE, FIELD_OF_VIEW = (320, 240), (1.22, 0.96)
+"""Width and height of its images [pixels], and horizontal and vertical field of view [rad]."""
+MIN_DEPTH = 0.15
+"""Nearer surfaces give no return [m]."""
+BESIDE_POSITION, BESIDE_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
+"""Of the camera beside the arm [m]."""
+BESIDE_SIZE, BESIDE_FOCAL_LENGTH = (640, 480), 460.0
+"""Width, height and focal length of its images [pixels]."""
+VIEWS_ON_THE_WAY = 2
+"""Images that are taken during a motion, apart from that at its end."""
+
+
+@dataclass(frozen=True, eq=False)
+class Event:
+    """A step of the loop."""
+
+    step: Step
+    configuration: Float[ndarray, "dof"]
+    """Of the arm after the step."""
+    violation: str = ""
+    """Why the validator refuses the motion in the true scene; "" if it accepts it, and without a motion."""
+
+    @property
+    def free(self) -> bool:
+        return not self.violation
+
+
+def wrist_camera(robot: Robot) -> ArmCamera:
+    """A camera beside the arm's tip that looks along the tip's z axis."""
+    T_tip_camera = looking_at(np.array(WRIST_OFFSET), np.add(WRIST_OFFSET, (0.0, 0.0, 1.0)))
+    focal = [n / 2 / np.tan(angle / 2) for n, angle in zip(SIZE, FIELD_OF_VIEW, strict=True)]
+    return ArmCamera(robot.tip, T_tip_camera, (*focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2), SIZE)
+
+
+def camera_beside(problem: Problem, noise: DepthNoise | None, seed: int) -> DepthView:
+    """The image of a camera that stands beside the arm, behind its shoulder, with the arm at the start."""
+    T = looking_at(np.array(BESIDE_POSITION), np.array(BESIDE_TARGET))
+    width, height = BESIDE_SIZE
+    intrinsics = (BESIDE_FOCAL_LENGTH, BESIDE_FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)
+    view = ray_cast(problem.scene, T, intrinsics, BESIDE_SIZE, problem.robot, problem.start)
+    return measured(view, np.inf, noise, np.random.default_rng(seed))
+
+
+def taken(
+    problem: Problem,
+    camera: ArmCamera,
+    q: Float[ndarray, "dof"],
+    noise: DepthNoise | None,
+    rng: np.random.Generator,
+) -> DepthView:
+    """The image of the problem's true scene that a camera on the arm takes."""
+    T = camera.poses(problem.robot, q[None])[0]
+    view = ray_cast(problem.scene, T, camera.intrinsics, camera.size, problem.robot, q)
+    return measured(view, camera.range, noise, rng)
+
+
+def measured(view: DepthView, reach: float, noise: DepthNoise | None, rng: np.random.Generator) -> DepthView:
+    """An image as a sensor of a range gives it: without a return where it is too near, infinite beyond."""
+    depth = np.where(view.depth > reach, np.inf, np.where(view.depth < MIN_DEPTH, 0.0, view.depth))
+    view = DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)
+    return view if noise is None else noise.applied(view, rng)
+
+
+def explore(
+    problem: Problem,
+    explorer: Explorer,
+    noise: DepthNoise | None = None,
+    seed: int = 0,
+) -> Iterator[Event]:
+    """The loop from the problem's start to its goal, in the problem's scene; ends with a step without a
+    motion, and after a collision."""
+    rng, q = np.random.default_rng(seed), problem.start
+    explorer.set_goal(problem.goal)
+    for camera in explorer.cameras:
+        explorer.observe(taken(problem, camera, q, noise, rng))
+    while True:
+        step = explorer.next(q)
+        if step.motion is None or step.motion.path is None:
+            yield Event(step, q)
+            return
+        path, trajectory = step.motion.path, step.motion.trajectory
+        asked = step.motion.problem
+        true = Problem(problem.robot, problem.scene, asked.start, asked.goal)
+        found = verify(true, path).violation
+        if found is None and trajectory is not None:
+            found = verify_trajectory(true, trajectory).violation
+        waypoints = path.positions
+        for camera in explorer.cameras:
+            on_the_way = waypoints[1:-1][:: max(1, len(waypoints) // (VIEWS_ON_THE_WAY + 1))]
+            for at in (*on_the_way[:VIEWS_ON_THE_WAY], waypoints[-1]):
+                explorer.observe(taken(problem, camera, at, noise, rng))
+        q = waypoints[-1]
+        yield Event(step, q, "" if found is None else found.message)
+        if found is not None:
+            return

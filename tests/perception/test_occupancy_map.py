@@ -1,0 +1,93 @@
+"""Maps of voxels from many views, against the scenes that the views are of."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
+from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import MapSettings, OccupancyMap
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box
+
+PANDA = load_robot("panda")
+HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+FLOOR, CRATE = Box((0, 0, -0.05), (6, 6, 0.1)), Box((0.6, 0.3, 0.2), (0.3, 0.3, 0.4))
+SCENE = Scene([FLOOR, CRATE])
+
+
+def view_from(bearing: float, distance: float = 1.5, scene: Scene = SCENE) -> DepthView:
+    position = np.array([distance * np.cos(bearing), distance * np.sin(bearing), 0.8])
+    T = looking_at(position, np.array([0.2, 0.0, 0.3]))
+    return ray_cast(scene, T, (290.0, 290.0, 159.5, 119.5), (320, 240), PANDA, HOME)
+
+
+def true(margin: float) -> np.ndarray:
+    return voxels_within(SCENE, LOW, FINE_VOXEL_SIZE, FINE_SHAPE, margin)
+
+
+@pytest.mark.parametrize("noisy", (False, True))
+def test_free_voxels_hold_no_obstacle_and_most_of_the_space_is_seen(noisy: bool) -> None:
+    rng, known = np.random.default_rng(0), OccupancyMap(PANDA)
+    for bearing in np.linspace(-1.5, 1.5, 5):
+        view = view_from(bearing)
+        known.add(DepthNoise().applied(view, rng) if noisy else view)
+    assert not (known.free & known.occupied).any()
+    wrong = known.free & true(-0.0)
+    assert wrong.sum() <= (1e-3 if noisy else 1e-4) * known.free.sum()
+    before = OccupancyMap(PANDA)
+    for bearing in np.linspace(-1.5, 1.5, 5):
+        before.add(view_from(bearing))
+    assert (known.free & before.free).sum() > 0.9 * before.free.sum()
+    far = ~true(0.06)
+    assert (known.occupied & far).sum() <= 0.02 * known.occupied.sum(), "neither speckles nor the arm"
+
+
+def test_a_view_counts_once_and_the_order_does_not_matter() -> None:
+    ahead, back = OccupancyMap(PANDA), OccupancyMap(PANDA)
+    views = [view_from(b) for b in (-1.0, 0.2, 1.1)]
+    for view in views:
+        ahead.add(view)
+    for view in reversed(views):
+        back.add(view)
+    np.testing.assert_array_equal(ahead.free, back.free)
+    np.testing.assert_array_equal(ahead.occupied, back.occupied)
+
+
+def test_pixels_without_a_return_say_nothing() -> None:
+    view, known = view_from(0.0), OccupancyMap(PANDA)
+    known.add(replace(view, depth=np.zeros_like(view.depth)))
+    assert known.unknown.all()
+
+
+def test_what_went_away_becomes_free_and_old_evidence_is_forgotten() -> None:
+    middle = tuple(np.floor((np.array([0.451, 0.29, 0.31]) - LOW) / FINE_VOXEL_SIZE).astype(int))
+    known = OccupancyMap(PANDA)
+    known.add(view_from(2.8))
+    assert known.occupied[middle]
+    for _ in range(3):
+        known.add(view_from(2.8, scene=Scene([FLOOR])))
+    assert known.free[middle]
+    ageing = OccupancyMap(PANDA, MapSettings(max_age=1.0))
+    ageing.add(view_from(2.8), stamp=10.0)
+    assert ageing.occupied[middle]
+    ageing.add(view_from(-1.4, scene=Scene([FLOOR])), stamp=12.0)
+    assert not ageing.occupied[middle]
+
+
+def test_points_and_free_zones() -> None:
+    known = OccupancyMap(PANDA)
+    known.declare_free(((-0.3, -0.3, 0.0), (0.3, 0.3, 0.7)))
+    assert known.free.sum() == 30 * 30 * 35
+    known.add_points(np.array([[0.01, 0.01, 0.01], [9.0, 0.0, 0.0]]))
+    assert known.occupied.sum() == 1 and known.free.sum() == 30 * 30 * 35 - 1
+    with pytest.raises(InputError, match="free_zone is"):
+        known.declare_free(((0.3, 0.0, 0.0), (0.1, 1.0, 1.0)))
+    with pytest.raises(InputError, match=r"view\.configuration is None; a map needs"):
+        known.add(replace(view_from(0.0), configuration=None))

@@ -1,0 +1,103 @@
+"""Explorer: what its motions promise, against scenes that it sees by simulated cameras alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.perception.assumptions import CARVING_MARGIN, FINE_SHAPE, FINE_VOXEL_SIZE, voxels_in
+from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.ray_caster import voxels_within
+from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
+from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, not_seen_free
+from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+from robotdiffuse.robots.kinematics import placed_spheres
+
+PANDA = rd.load_robot("panda")
+HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+FLOOR = rd.Box((0, 0, -0.06), (6, 6, 0.1), name="floor")
+WALL = rd.Box((0.45, -0.2, 0.3), (0.5, 0.02, 0.6), name="wall")
+ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
+LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (0.5, -1.0))
+PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), LEFT, RIGHT)
+"""From one side of a wall to the other."""
+
+
+def explorer(policy: str = "strict", seen: bool = True, noise: DepthNoise | None = None) -> rd.Explorer:
+    settings = ExplorerSettings(policy=policy, time_limit=5.0, look_attempts=2, max_looks=3)
+    out = rd.Explorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
+    if seen:
+        out.observe(camera_beside(PROBLEM, noise, 0))
+    return out
+
+
+@pytest.mark.parametrize("policy", ("strict", "chance", "strict_then_chance"))
+def test_the_loop_ends_and_strict_motions_do_not_collide(policy: str) -> None:
+    events = list(explore(PROBLEM, explorer(policy)))
+    strict = [event for event in events if event.step.policy == "strict"]
+    assert all(event.free for event in strict), [event.violation for event in strict]
+    assert not events[-1].free or (events[-1].step.kind in ("done", "stuck") and events[-1].step.reason)
+    moved = [event.step for event in events if event.step.motion is not None]
+    assert all(step.policy in policy for step in moved)
+    stated = [step.confidence for step in moved if step.policy == "chance"]
+    assert all(value is None or value >= 0.98 for value in stated)
+
+
+def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
+    one = explorer()
+    one.set_goal(PROBLEM.start + 0.05)
+    step = one.next(PROBLEM.start)
+    assert step.kind == "go" and step.motion is not None and step.motion.path is not None
+    unseen = swept_unseen(one.map, step.motion.path, PROBLEM.start)
+    ends = [placed_spheres(PANDA, q).astype(np.float32) for q in (PROBLEM.start, PROBLEM.start + 0.05)]
+    # covering spheres are larger than the links that the validator checks
+    assert (unseen & ~voxels_in(np.concatenate(ends), 2 * CARVING_MARGIN)).sum() <= 0.01 * unseen.size
+
+
+def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
+    one = explorer()
+    cloud, *walls = not_seen_free(one.map, rd.Scene([FLOOR]), (HOME,))
+    assert len(walls) == 6 and np.isclose(np.sqrt(3) * FINE_VOXEL_SIZE / 2, COVER_RADIUS)
+    at = np.floor((cloud.points - LOW) / FINE_VOXEL_SIZE).astype(int)
+    assert not one.map.free[tuple(at.T)].any()
+    true = voxels_within(rd.Scene([WALL]), LOW, FINE_VOXEL_SIZE, FINE_SHAPE, -0.0)
+    assert not (one.map.free & true).sum() > 0.01 * true.sum()
+    spheres = placed_spheres(PANDA, HOME)
+    distances = np.linalg.norm(cloud.points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
+    assert distances.min() > CARVING_MARGIN
+
+
+def test_looks_see_what_is_wanted() -> None:
+    one = explorer()
+    camera, wanted = one.cameras[0], np.zeros(FINE_SHAPE, np.bool_)
+    wanted[75:80, 55:60, 20:25] = True
+    target = (np.array([77.5, 57.5, 22.5]) * FINE_VOXEL_SIZE) + LOW
+    looks = best_looks(one.map, rd.Scene([FLOOR]), camera, wanted, None, HOME, np.random.default_rng(0))
+    best = [look for look, _ in zip(looks, range(3), strict=False)]
+    assert len(best) == 3
+    for T in camera.poses(PANDA, np.stack(best)):
+        x, y, z = T[:3, :3].T @ (target - T[:3, 3])
+        fx, fy, cx, cy = camera.intrinsics
+        assert z > 0 and 0 <= fx * x / z + cx <= camera.size[0] and 0 <= fy * y / z + cy <= camera.size[1]
+
+
+def test_what_keeps_the_arm_from_going_is_said() -> None:
+    blind = explorer(seen=False)
+    with pytest.raises(InputError, match="call set_goal first"):
+        blind.next(HOME)
+    blind.set_goal(HOME)
+    assert blind.next(HOME).kind == "done"
+    blind.set_goal(HOME + 0.3)
+    step = blind.next(HOME)
+    assert step.kind == "look" and step.motion is None and "nothing was seen yet" in step.reason
+    still = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, ExplorerSettings(time_limit=1.0))
+    still.observe(camera_beside(PROBLEM, None, 0))
+    still.set_goal(PROBLEM.goal)
+    step = still.next(PROBLEM.start)
+    assert step.kind == "stuck" and "no camera is on the arm" in step.reason
+    with pytest.raises(InputError, match=r"explorer\.policy is 'bold'"):
+        replace(ExplorerSettings(), policy="bold")
