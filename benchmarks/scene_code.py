@@ -34,7 +34,8 @@ from torch import Tensor, nn
 
 from common import FIRST, header, parse, parts_of, print_table, progress, use_processor_time
 from robotdiffuse.core.output_files import JsonLines
-from robotdiffuse.datasets.shards import read_shard, shard_indices
+from robotdiffuse.datasets.rows import read_rows
+from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_indices
 from robotdiffuse.evaluation.methods import validated
 from robotdiffuse.evaluation.problem_sets import case_file, validator
 from robotdiffuse.evaluation.statistics import bootstrap_interval
@@ -82,6 +83,9 @@ BEST_OF = 16
 """Samples for each problem in the report."""
 CURVE_PROBLEMS, CURVE_SAMPLES = 100, 4
 """Problems that a checkpoint of a training is tried on, and samples for each."""
+WAYPOINTS = 48
+ERROR_LEVELS = (200, 150, 100, 50)
+"""Noise levels at which predictions are compared; 200 is noise alone."""
 CODES = ("own", "another scene's", "mean", "hidden")
 TOKENS = 32
 """Points that the waypoints attend to."""
@@ -253,7 +257,7 @@ class Study:
             trivial_share=0.05,
             target="pose",
             goals=1,
-            waypoints=48,
+            waypoints=WAYPOINTS,
             shard=min(1000, self.trajectories),
             planner="aorrtc",
             search=search,
@@ -353,54 +357,101 @@ class SceneTask(PlannerTask):
 # Evaluation
 
 
+class Results(NamedTuple):
+    samples: int
+    """Training samples that the network saw."""
+    passed: dict[str, Float[ndarray, "n count"]]
+    """For each kind of code, which samples for each problem pass the validator."""
+
+
 def tried(
     row: str, model: MotionNetwork, cases: Sequence[Case], codes: Sequence[str], count: int
 ) -> dict[str, Float[ndarray, "n count"]]:
     """For each kind of code, which of `count` samples for each problem pass the validator."""
-    rng = np.random.default_rng(5)
     scenes = PackedScenes.pack([case.problem.scene for case in cases], 2, floor=True)
     assert model.encoder is not None
-    with torch.no_grad():
-        z = model.encoder(seen(row, model.encoder, scenes, rng)).numpy().astype(np.float32)
-    by_name = {"own": z, "another scene's": np.roll(z, 1, 0), "mean": np.broadcast_to(z.mean(0), z.shape)}
-    found = {}
+    z, found = codes_of(row, model.encoder, scenes), {}
     for name in codes:
-        q = sampled_motions(model, cases, by_name.get(name), count)
+        q = sampled_motions(model, cases, z[name], count, hidden=name == "hidden")
         pairs = zip(cases, q, strict=True)
         found[name] = np.array([validated(case.problem, motions).passed for case, motions in pairs], float)
     return found
 
 
+def no_clearances(q: ndarray) -> ndarray:
+    """The networks have no clearances as inputs."""
+    return np.zeros(0, np.float32)
+
+
+def codes_of(row: str, encoder: Encoder, scenes: PackedScenes) -> dict[str, Float32[ndarray, "n code"]]:
+    """z of each scene of each kind in CODES; where it is hidden any will do."""
+    with torch.no_grad():
+        z = encoder(seen(row, encoder, scenes, np.random.default_rng(5))).numpy().astype(np.float32)
+    return dict(zip(CODES, (z, np.roll(z, 1, 0), np.repeat(z.mean(0)[None], len(z), 0), z), strict=True))
+
+
 def sampled_motions(
-    model: MotionNetwork, cases: Sequence[Case], z: Float32[ndarray, "n code"] | None, count: int
+    model: MotionNetwork, cases: Sequence[Case], z: Float32[ndarray, "n code"], count: int, hidden: bool
 ) -> Float[ndarray, "n count waypoints dof"]:
-    """Samples for each problem with its code; None: the condition is hidden."""
+    """Samples for each problem with its code, or with the condition hidden."""
     rng, motions = np.random.default_rng(11), []
-    scale = 0.0 if z is None else 1.0
     each = max(CHUNK // count, 1)
     starts, goals = (
         np.array([end(case.problem) for case in cases]) for end in (lambda problem: problem.start, goal_of)
     )
-    if z is None:
-        z = np.zeros((len(cases), model.settings.code), np.float32)
     for i in range(0, len(cases), each):
         start, goal, code = (np.repeat(part[i : i + each], count, 0) for part in (starts, goals, z))
         reference = model.reference(start, goal)
         condition = model.condition(code, start, goal)
-        predict = model.predictor(reference, condition, lambda q: np.zeros(0), scale)
+        predict = model.predictor(reference, condition, no_clearances, 0.0 if hidden else 1.0)
         x = ddim(predict, model.schedule, partial(model.draw_noise, len(start), rng), SAMPLING_STEPS)
         q = np.clip(model.joints(x, reference), PANDA.lower, PANDA.upper)
         motions.append(q.reshape(-1, count, *q.shape[1:]))
     return np.concatenate(motions)
 
 
-def results(row: str, study: Study, cases: Sequence[Case]) -> tuple[dict[str, ndarray], int]:
-    """Which samples with each code pass, and the training samples that the network saw."""
+def results(row: str, study: Study, cases: Sequence[Case], codes: Sequence[str]) -> Results:
+    """Tries the newest checkpoint with each code; what a folder has is not tried again."""
     model, samples = study.trained(row)
-    file = study.folder(row) / f"tried_{samples}_{len(cases)}.npy"
-    if not file.exists():
-        np.save(file, np.stack(list(tried(row, model, cases, CODES, BEST_OF).values())))
-    return dict(zip(CODES, np.load(file), strict=True)), samples
+    found = {}
+    for name in codes:
+        file = study.folder(row) / "tried" / f"{samples}_{len(cases)}_{CODES.index(name)}.npy"
+        if not file.exists():
+            file.parent.mkdir(exist_ok=True)
+            np.save(file, tried(row, model, cases, [name], BEST_OF)[name])
+        found[name] = np.load(file)
+    return Results(samples, found)
+
+
+def errors(row: str, study: Study) -> list[tuple[str, ...]]:
+    """Rows of the table of `report`: how far predicted motions are off, with each code, by noise level."""
+    model, _ = study.trained(row)
+    q, scenes = validation_motions(study.data)
+    assert model.encoder is not None
+    z = codes_of(row, model.encoder, scenes)
+    reference = model.reference(q[:, 0], q[:, -1])
+    clean, rows = model.normalize(q, reference), []
+    for level in ERROR_LEVELS:
+        noise = model.draw_noise(len(q), np.random.default_rng(1))
+        signal, deviation = (float(of[level]) for of in (model.schedule.signal, model.schedule.noise))
+        noisy = (signal * clean + deviation * noise).astype(np.float32)
+        found = []
+        for name, code in z.items():
+            condition = model.condition(code, q[:, 0], q[:, -1])
+            predict = model.predictor(reference, condition, no_clearances, 0.0 if name == "hidden" else 1.0)
+            found.append(f"{np.square(predict(noisy, level) - clean)[:, 1:-1].mean():.3f}")
+        rows.append((f"{ROWS[row].title}: level {level}", *found))
+    return rows
+
+
+def validation_motions(data: Path) -> tuple[Float32[ndarray, "n waypoints dof"], PackedScenes]:
+    """Motions of scenes that no training saw; the straight line is not free."""
+    motions, scenes = [], []
+    for rows in read_rows(data, PANDA, WAYPOINTS):
+        kept = (rows.split != SPLITS.index("train")) & ~rows.shard["line_free"]
+        motions.append(rows.q[kept])
+        scenes.append(rows.scenes[kept])
+    return np.concatenate(motions), PackedScenes.joined(scenes)
 
 
 def without_network(cases: Sequence[Case]) -> Float[ndarray, "n count"]:
@@ -408,7 +459,7 @@ def without_network(cases: Sequence[Case]) -> Float[ndarray, "n count"]:
     rng, found = np.random.default_rng(5), []
     for case in progress(cases, "smooth noise"):
         ends = case.problem.start, goal_of(case.problem)[None]
-        found.append(validated(case.problem, smooth_noise(*ends, BEST_OF, 48, PANDA, rng)).passed)
+        found.append(validated(case.problem, smooth_noise(*ends, BEST_OF, WAYPOINTS, PANDA, rng)).passed)
     return np.array(found, float)
 
 
@@ -424,7 +475,7 @@ def report(study: Study, rows: Sequence[str], plot: Path) -> None:
     cases = study.cases()
     table, worth, conclusion = [], [], ""
     for row in progress(rows, "networks"):
-        found, samples = results(row, study, cases)
+        samples, found = results(row, study, cases, CODES)
         for name, passed in found.items():
             single, best = passed.mean(1), passed.max(1)
             table.append((f"{ROWS[row].title}: {name}", f"{samples:,}", in_points(single), in_points(best)))
@@ -452,6 +503,11 @@ def report(study: Study, rows: Sequence[str], plot: Path) -> None:
         ["network", "single (95 %)", f"best of {BEST_OF} (95 %)"],
         worth,
         (conclusion,) if conclusion else (),
+    )
+    print_table(
+        "Error of predicted motions of unseen scenes: squared, in units of the motions' variance",
+        ["network: noise level", *CODES],
+        [line for row in rows for line in errors(row, study)],
     )
     curves = {row: curve(study, row) for row in rows}
     print_table(
