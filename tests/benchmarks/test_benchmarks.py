@@ -16,6 +16,7 @@ NEEDS = {
     "moving_obstacles": ("pybullet",),
     "planning_requests": ("pybullet", "pinocchio"),
     "robots": ("pybullet",),
+    "scene_code": ("accelerate", "matplotlib", "zarr"),
     "server": ("fastapi", "httpx"),
 }
 """Packages of extras that a script needs."""

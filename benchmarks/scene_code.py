@@ -1,0 +1,582 @@
+"""Whether a code of the whole scene can matter to the diffusion model: true obstacles beside clouds.
+
+    python benchmarks/scene_code.py [--parts data,train,report] [--rows oracle,tokens] [--out FOLDER]
+        [--samples 1600000] [--plot scene_code.png]
+
+Prints benchmarks/results/scene_code.txt and draws scene_code.png. After an interruption the same command
+continues; parts and rows can run side by side. Problems and motions are of the family rop. The networks
+have no clearances as inputs and are sampled without guidance, so all they know of the scene is its code:
+
+- oracle: kind, centre, size and turn of each true obstacle, through a perceptron that sums over obstacles and
+  is trained along;
+- tokens: points of the cloud, which the waypoints attend to, in place of one vector;
+- pointnet: PointNet, trained along;
+- cae: the paper's auto-encoder, trained alone first, then frozen.
+
+Each network is tried with the code of the problem's own scene, that of another problem's scene, the mean
+code, and with its condition hidden, as in a tenth of its training. Start and goal stay visible in the noisy
+motion.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from matplotlib.figure import Figure
+from numpy import ndarray
+from torch import Tensor, nn
+
+from common import FIRST, header, parse, parts_of, print_table, progress, use_processor_time
+from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.datasets.rows import read_rows
+from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_indices
+from robotdiffuse.evaluation.methods import validated
+from robotdiffuse.evaluation.problem_sets import case_file, validator
+from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
+from robotdiffuse.generation.factory import generate
+from robotdiffuse.generation.settings import GenerationSettings
+from robotdiffuse.learning.checkpoint import load_encoder, read_tensors, write_tensors
+from robotdiffuse.learning.denoisers.base import Denoiser
+from robotdiffuse.learning.denoisers.layers import (
+    CrossBlock,
+    LevelEmbedding,
+    positions,
+    start_at_zero,
+    two_layers,
+)
+from robotdiffuse.learning.denoisers.settings import TransformerSettings
+from robotdiffuse.learning.encoders import make_encoder
+from robotdiffuse.learning.encoders.base import Encoder, fp32
+from robotdiffuse.learning.encoders.settings import EncoderSettings, PointNetSettings
+from robotdiffuse.learning.motion_network import MotionNetwork
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.samplers.ddim import ddim
+from robotdiffuse.learning.training.batches import Batch, scene_clouds
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.training.configs import JOINT_POINT_COLLISION
+from robotdiffuse.learning.training.encoder import train_encoder
+from robotdiffuse.learning.training.loop import Validation
+from robotdiffuse.learning.training.planner import PlannerTask, model_settings
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.task import train
+from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.planning.search.aorrtc import AORRTC
+from robotdiffuse.problems.held_out import Case, goal_of
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+
+PANDA = load_robot("panda")
+FAMILY = "rop"
+PARTS = ("data", "train", "report")
+SEARCH_TIME = 3.0
+"""CPU time in which a search must solve a problem for it to count as solvable [s]."""
+SAMPLING_STEPS = 6
+BEST_OF = 16
+"""Samples for each problem in the report."""
+CURVE_PROBLEMS, CURVE_SAMPLES = 100, 4
+"""Problems that a checkpoint of a training is tried on, and samples for each."""
+WAYPOINTS = 48
+ERROR_LEVELS = (200, 150, 100, 50)
+"""Noise levels at which predictions are compared; 200 is noise alone."""
+CODES = ("own", "another scene's", "mean", "hidden")
+TOKENS = 32
+"""Points that the waypoints attend to."""
+CHUNK = 256
+"""Samples that go through a network together."""
+DECISIVE = 10.0
+"""Points by which the oracle's own code must beat the mean code, for a code of the scene to be worth it."""
+
+
+# What the networks see of a scene
+
+
+def obstacle_numbers(scenes: PackedScenes) -> Float32[Tensor, "n slots 9"]:
+    """Of each obstacle: whether it is a sphere, whether it is a cube, centre, half width [m], sine and cosine
+    of four times its turn about the vertical, and 1 if it exists; a cube is the same after a quarter turn."""
+    kinds, params = scenes.kinds, scenes.params
+    sphere, box = kinds == SPHERE, kinds == BOX
+    half = np.where(sphere, params[..., 3], params[..., 3] / 2)
+    turn = np.where(box, 8 * np.arctan2(params[..., 9], params[..., 6]), 0.0)
+    columns = (
+        sphere,
+        box,
+        *np.moveaxis(params[..., :3], -1, 0),
+        half,
+        box * np.sin(turn),
+        box * np.cos(turn),
+    )
+    numbers = np.stack([*columns, sphere | box], -1).astype(np.float32)
+    return torch.from_numpy(numbers)
+
+
+class ObstacleCode(Encoder):
+    """z = MLP(sum over obstacles of MLP(numbers of the obstacle)): the order of obstacles does not matter."""
+
+    OCTAVES = 3
+    """Wavelengths (4 m, 2 m, 1 m) of the sines and cosines of the centre that are further inputs."""
+
+    def __init__(self, settings: EncoderSettings) -> None:
+        super().__init__(settings)
+        self.each = nn.Sequential(two_layers(9 + 6 * self.OCTAVES, 192, 192), nn.GELU("tanh"))
+        self.all = two_layers(192, 192, settings.code)
+
+    def forward(self, cloud: Float[Tensor, "batch slots 9"]) -> Float[Tensor, "batch code"]:
+        with fp32(cloud):
+            angles = torch.cat([cloud[..., 2:5] * (np.pi / 2 * 2**k) for k in range(self.OCTAVES)], -1)
+            known = torch.cat([cloud, angles.sin(), angles.cos()], -1)
+            return self.all((self.each(known) * cloud[..., -1:]).sum(1))
+
+
+class PointTokens(Encoder):
+    """z is the cloud itself: the coordinates of its points."""
+
+    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        return cloud.flatten(1)
+
+
+class AttendingTransformer(Denoiser):
+    """The transformer, with attention of the waypoints to the points of the cloud after each self attention.
+    The condition is the points, start and goal."""
+
+    OCTAVES = 4
+    """Wavelengths (4 m, 2 m, ...) of the sines and cosines of coordinates that are further inputs."""
+    positions: Tensor
+
+    def __init__(
+        self, settings: TransformerSettings, waypoints: int, dof: int, features: int, condition: int
+    ) -> None:
+        super().__init__(settings, waypoints, dof, features, condition)
+        tokens, width = settings.tokens(waypoints), settings.width
+        self.embed = nn.Linear(settings.patch * features, width)
+        self.condition = two_layers(2 * dof, 2 * width, width)
+        self.points = two_layers(3 + 6 * self.OCTAVES, width, width)
+        self.level = LevelEmbedding(width)
+        self.blocks = nn.ModuleList(
+            CrossBlock(width, settings.heads, settings.hidden, settings.layers)
+            for _ in range(settings.layers)
+        )
+        self.norm_points, self.norm = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.out = nn.Linear(width, settings.patch * dof)
+        start_at_zero(self.out)
+        self.register_buffer("positions", positions(tokens, width), persistent=False)
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch waypoints features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+    ) -> Float[Tensor, "batch waypoints dof"]:
+        batch = features.shape[0]
+        points = condition[:, : -2 * self.dof].reshape(batch, -1, 3)
+        with fp32(points):
+            angles = torch.cat([points * (np.pi / 2 * 2**k) for k in range(self.OCTAVES)], -1)
+            known = torch.cat([points, angles.sin(), angles.cos()], -1)
+        memory = self.norm_points(self.points(known))
+        z_tk = self.condition(condition[:, -2 * self.dof :]) + self.level(level)
+        tokens = self.embed(features.reshape(batch, len(self.positions), -1)) + self.positions
+        x = torch.cat([z_tk[:, None].to(tokens.dtype), tokens + z_tk[:, None]], 1)
+        for block in self.blocks:
+            x = block(x, memory)
+        return self.out(self.norm(x[:, 1:])).float().reshape(batch, self.waypoints, self.dof)
+
+
+class Row(NamedTuple):
+    title: str
+    encoder: str | None
+    """Encoder of the package that stands in this place in settings; None: the frozen one of this study."""
+    settings: EncoderSettings | None = None
+    """Its settings."""
+
+
+ROWS = {
+    "oracle": Row("true obstacles, one code", "pointnet", PointNetSettings()),
+    "tokens": Row(
+        f"{TOKENS} points, attended to", "pointnet", PointNetSettings(code=3 * TOKENS, cloud=TOKENS)
+    ),
+    "pointnet": Row("PointNet, trained along", "pointnet", PointNetSettings()),
+    "cae": Row("the paper's auto-encoder, frozen", None),
+}
+
+
+def with_parts_of(row: str, model: MotionNetwork) -> MotionNetwork:
+    """The model with the parts of a row that the package does not have."""
+    settings, denoiser = model.settings.encoder_settings, model.settings.denoiser_settings
+    assert settings is not None and isinstance(denoiser, TransformerSettings)
+    if row == "oracle":
+        model.encoder = ObstacleCode(settings)
+    if row == "tokens":
+        model.encoder = PointTokens(settings)
+        sizes = model.waypoints, model.dof, model.feature_count, model.condition_count
+        model.denoiser = AttendingTransformer(denoiser, *sizes)
+    return model
+
+
+def seen(row: str, encoder: Encoder, scenes: PackedScenes, rng: np.random.Generator) -> Tensor:
+    """What the encoder of a row is given of scenes."""
+    return obstacle_numbers(scenes) if row == "oracle" else scene_clouds(encoder, scenes, rng)
+
+
+# Data, training
+
+
+@dataclass(frozen=True)
+class Study:
+    """The folders and sizes of a run of this script."""
+
+    out: Path
+    trajectories: int
+    samples: int
+    encoder_samples: int
+    problems: int
+
+    @property
+    def data(self) -> Path:
+        return self.out / "data"
+
+    def folder(self, row: str) -> Path:
+        return self.out / row
+
+    @property
+    def encoder(self) -> Path:
+        return self.out / "encoder"
+
+    def generate(self) -> None:
+        """Make the motions; they keep 6 cm to obstacles where start and goal allow it."""
+        search = AORRTCSearchSettings(safety_distance=0.06, patience=500, tries=500, gain=0.03)
+        settings = GenerationSettings(
+            trajectories=self.trajectories,
+            seed=30,
+            trivial_share=0.05,
+            target="pose",
+            goals=1,
+            waypoints=WAYPOINTS,
+            shard=min(1000, self.trajectories),
+            planner="aorrtc",
+            search=search,
+        )
+        generate(settings, self.data)
+
+    def cases(self, most: int | None = None) -> list[Case]:
+        """Held-out problems that the straight line does not solve and a search does."""
+        count = self.problems if most is None else min(most, self.problems)
+        return case_file(self.out / "problems", FAMILY).held_out(FAMILY, count, validator, first_length)
+
+    def training(self, row: str) -> PlannerTraining:
+        of = ROWS[row]
+        return PlannerTraining(
+            encoder=str(self.encoder) if of.encoder is None else of.encoder,
+            encoder_settings=of.settings,
+            data=str(self.data),
+            minutes=None,
+            samples=self.samples,
+            clearance_features=False,
+            condition_drop=0.1,
+            losses=JOINT_POINT_COLLISION,
+            turned_copies=15,
+            denoiser_settings=TransformerSettings(patch=8),
+            checkpoint_seconds=300.0,
+            device="cpu",
+        )
+
+    def train(self, row: str) -> None:
+        if ROWS[row].encoder is None and not (self.encoder / "encoder.json").exists():
+            training = EncoderTraining(
+                name="compression_autoencoder", minutes=None, samples=self.encoder_samples, max_obstacles=2
+            )
+            train_encoder(training, str(self.encoder))
+        settings, processes = self.training(row), Processes("cpu")
+        train(SceneTask(row, self, settings, processes), settings, str(self.folder(row)), processes)
+
+    def trained(self, row: str) -> tuple[MotionNetwork, int]:
+        """The averaged weights of the newest checkpoint, and the samples that it saw."""
+        settings = self.training(row)
+        if settings.jointly:
+            assert settings.encoder is not None
+            encoder = make_encoder(settings.encoder, settings.encoder_settings)
+        else:
+            encoder = load_encoder(str(self.encoder))
+        model = MotionNetwork(RobotIdentity.of(PANDA), model_settings(settings, encoder))
+        model.encoder = encoder
+        model = with_parts_of(row, model)
+        tensors, notes = read_tensors(self.folder(row) / "averaged.safetensors")
+        model.load_state_dict(tensors)
+        return model.for_inference(), notes["samples"]
+
+
+def first_length(problem: Problem) -> float | None:
+    return AORRTC().plan(problem, SEARCH_TIME, seed=1, clearance=0.0, until=FIRST).path_length
+
+
+class SceneTask(PlannerTask):
+    """The training of a row, which tries the network on held-out problems at every checkpoint."""
+
+    def __init__(self, row: str, study: Study, settings: PlannerTraining, processes: Processes) -> None:
+        super().__init__(settings, processes)
+        self.row, self.study = row, study
+        self.cases = study.cases(CURVE_PROBLEMS)
+        with_parts_of(row, self.model)
+        self.identity = {"robot": PANDA.name, "row": row}
+        if row == "oracle":
+            loss = self._loss
+            encoded = np.zeros((1, self.model.settings.code), np.float16)  # no clouds need to be made
+            self.train_data, self.validation_data = (
+                replace(data, codes=np.broadcast_to(encoded, (len(data), encoded.shape[1])))
+                for data in (self.train_data, self.validation_data)
+            )
+
+            def loss_of_oracle(batch: Batch, *rest: Any) -> Tensor:
+                return loss(replace(batch, clouds=obstacle_numbers(batch.scenes)), *rest)
+
+            self._loss = loss_of_oracle
+
+    def validate(self, fraction: float) -> Validation:
+        """Adds to the learning curve, and keeps the averaged weights."""
+        samples, folder = round(fraction * (self.own.samples or 0)), self.study.folder(self.row)
+        notes = {"samples": samples, "motions": len(self.train_data)}
+        write_tensors(folder / "averaged.safetensors", self.model.state_dict(), notes)
+        found = tried(self.row, self.model, self.cases, ("own", "hidden"), CURVE_SAMPLES)
+        shares = {name: float(passed.mean()) for name, passed in found.items()}
+        JsonLines(folder / "curve.jsonl").append(notes | shares)
+        return Validation(super().validate(fraction).loss, shares["own"])
+
+    def success(self, rng: np.random.Generator) -> None:
+        """Not measured on the data: `validate` takes held-out problems."""
+
+    def save(self, folder: Path, training: dict[str, Any]) -> None:
+        """Nothing more: `validate` keeps the weights."""
+
+
+# Evaluation
+
+
+class Results(NamedTuple):
+    samples: int
+    """Training samples that the network saw."""
+    passed: dict[str, Float[ndarray, "n count"]]
+    """For each kind of code, which samples for each problem pass the validator."""
+
+
+def tried(
+    row: str, model: MotionNetwork, cases: Sequence[Case], codes: Sequence[str], count: int
+) -> dict[str, Float[ndarray, "n count"]]:
+    """For each kind of code, which of `count` samples for each problem pass the validator."""
+    scenes = PackedScenes.pack([case.problem.scene for case in cases], 2, floor=True)
+    assert model.encoder is not None
+    z, found = codes_of(row, model.encoder, scenes), {}
+    for name in codes:
+        q = sampled_motions(model, cases, z[name], count, hidden=name == "hidden")
+        pairs = zip(cases, q, strict=True)
+        found[name] = np.array([validated(case.problem, motions).passed for case, motions in pairs], float)
+    return found
+
+
+def no_clearances(q: ndarray) -> ndarray:
+    """The networks have no clearances as inputs."""
+    return np.zeros(0, np.float32)
+
+
+def codes_of(row: str, encoder: Encoder, scenes: PackedScenes) -> dict[str, Float32[ndarray, "n code"]]:
+    """z of each scene of each kind in CODES; where it is hidden any will do."""
+    with torch.no_grad():
+        z = encoder(seen(row, encoder, scenes, np.random.default_rng(5))).numpy().astype(np.float32)
+    return dict(zip(CODES, (z, np.roll(z, 1, 0), np.repeat(z.mean(0)[None], len(z), 0), z), strict=True))
+
+
+def sampled_motions(
+    model: MotionNetwork, cases: Sequence[Case], z: Float32[ndarray, "n code"], count: int, hidden: bool
+) -> Float[ndarray, "n count waypoints dof"]:
+    """Samples for each problem with its code, or with the condition hidden."""
+    rng, motions = np.random.default_rng(11), []
+    each = max(CHUNK // count, 1)
+    starts, goals = (
+        np.array([end(case.problem) for case in cases]) for end in (lambda problem: problem.start, goal_of)
+    )
+    for i in range(0, len(cases), each):
+        start, goal, code = (np.repeat(part[i : i + each], count, 0) for part in (starts, goals, z))
+        reference = model.reference(start, goal)
+        condition = model.condition(code, start, goal)
+        predict = model.predictor(reference, condition, no_clearances, 0.0 if hidden else 1.0)
+        x = ddim(predict, model.schedule, partial(model.draw_noise, len(start), rng), SAMPLING_STEPS)
+        q = np.clip(model.joints(x, reference), PANDA.lower, PANDA.upper)
+        motions.append(q.reshape(-1, count, *q.shape[1:]))
+    return np.concatenate(motions)
+
+
+def results(row: str, study: Study, cases: Sequence[Case], codes: Sequence[str]) -> Results:
+    """Tries the newest checkpoint with each code; what a folder has is not tried again."""
+    model, samples = study.trained(row)
+    found = {}
+    for name in codes:
+        file = study.folder(row) / "tried" / f"{samples}_{len(cases)}_{CODES.index(name)}.npy"
+        if not file.exists():
+            file.parent.mkdir(exist_ok=True)
+            np.save(file, tried(row, model, cases, [name], BEST_OF)[name])
+        found[name] = np.load(file)
+    return Results(samples, found)
+
+
+def errors(row: str, study: Study) -> list[tuple[str, ...]]:
+    """Rows of the table of `report`: how far predicted motions are off, with each code, by noise level."""
+    model, _ = study.trained(row)
+    q, scenes = validation_motions(study.data)
+    assert model.encoder is not None
+    z = codes_of(row, model.encoder, scenes)
+    reference = model.reference(q[:, 0], q[:, -1])
+    clean, rows = model.normalize(q, reference), []
+    for level in ERROR_LEVELS:
+        noise = model.draw_noise(len(q), np.random.default_rng(1))
+        signal, deviation = (float(of[level]) for of in (model.schedule.signal, model.schedule.noise))
+        noisy = (signal * clean + deviation * noise).astype(np.float32)
+        found = []
+        for name, code in z.items():
+            condition = model.condition(code, q[:, 0], q[:, -1])
+            predict = model.predictor(reference, condition, no_clearances, 0.0 if name == "hidden" else 1.0)
+            found.append(f"{np.square(predict(noisy, level) - clean)[:, 1:-1].mean():.3f}")
+        rows.append((f"{ROWS[row].title}: level {level}", *found))
+    return rows
+
+
+def validation_motions(data: Path) -> tuple[Float32[ndarray, "n waypoints dof"], PackedScenes]:
+    """Motions of scenes that no training saw; the straight line is not free."""
+    motions, scenes = [], []
+    for rows in read_rows(data, PANDA, WAYPOINTS):
+        kept = (rows.split != SPLITS.index("train")) & ~rows.shard["line_free"]
+        motions.append(rows.q[kept])
+        scenes.append(rows.scenes[kept])
+    return np.concatenate(motions), PackedScenes.joined(scenes)
+
+
+def without_network(cases: Sequence[Case]) -> Float[ndarray, "n count"]:
+    """Which samples of smooth noise about the straight line pass."""
+    rng, found = np.random.default_rng(5), []
+    for case in progress(cases, "smooth noise"):
+        ends = case.problem.start, goal_of(case.problem)[None]
+        found.append(validated(case.problem, smooth_noise(*ends, BEST_OF, WAYPOINTS, PANDA, rng)).passed)
+    return np.array(found, float)
+
+
+def in_points(values: Float[ndarray, "n"], sign: str = "") -> str:
+    """A mean in per cent or points, with its 95 % interval over problems."""
+    low, high = (100 * x for x in bootstrap_interval(values))
+    return f"{100 * values.mean():{sign}.1f} ({low:{sign}.1f} to {high:{sign}.1f})"
+
+
+def report(study: Study, rows: Sequence[str], plot: Path) -> None:
+    """Print the tables and draw the learning curves of the rows that have a checkpoint."""
+    rows = [row for row in rows if (study.folder(row) / "averaged.safetensors").exists()]
+    cases = study.cases()
+    table, worth, conclusion = [], [], ""
+    for row in progress(rows, "networks"):
+        samples, found = results(row, study, cases, CODES)
+        for name, passed in found.items():
+            single, best = passed.mean(1), passed.max(1)
+            table.append((f"{ROWS[row].title}: {name}", f"{samples:,}", in_points(single), in_points(best)))
+        own, mean = found["own"], found["mean"]
+        for name in CODES[1:]:
+            less = own.mean(1) - found[name].mean(1), own.max(1) - found[name].max(1)
+            worth.append((f"{ROWS[row].title}: over {name}", *(in_points(part, "+") for part in less)))
+        if row == "oracle":
+            points = 100 * float(own.mean() - mean.mean())
+            verdict = "can matter" if points >= DECISIVE else "is the bottleneck, not the encoder"
+            over = in_points(own.mean(1) - mean.mean(1), "+")
+            conclusion = (
+                f"After {samples:,} training samples the oracle's own code is worth {over} points of single "
+                f"samples over the mean code of the same network: a code of the whole scene {verdict}."
+            )
+    noise = without_network(cases)
+    table.append(("no network: smooth noise", "", in_points(noise.mean(1)), in_points(noise.max(1))))
+    print_table(
+        f"{len(cases)} held-out problems of {FAMILY}, {BEST_OF} samples each, no guidance: passed, %",
+        ["network: code", "training samples", "single (95 %)", f"best of {BEST_OF} (95 %)"],
+        table,
+    )
+    print_table(
+        "The own code over others in the same network, paired, points",
+        ["network", "single (95 %)", f"best of {BEST_OF} (95 %)"],
+        worth,
+        (conclusion,) if conclusion else (),
+    )
+    print_table(
+        "Error of predicted motions of unseen scenes: squared, in units of the motions' variance",
+        ["network: noise level", *CODES],
+        [line for row in rows for line in errors(row, study)],
+    )
+    curves = {row: curve(study, row) for row in rows}
+    print_table(
+        f"Learning curves: single samples that pass, %, on {min(CURVE_PROBLEMS, len(cases))} of the problems",
+        ["network", "training samples", "own code", "hidden"],
+        [
+            (ROWS[row].title, f"{at['samples']:,}", f"{100 * at['own']:.1f}", f"{100 * at['hidden']:.1f}")
+            for row, points in curves.items()
+            for at in points
+        ],
+    )
+    draw(curves, plot)
+
+
+def curve(study: Study, row: str) -> list[dict[str, Any]]:
+    """The checkpoints of a training in their order; after an interruption the later of two counts."""
+    found = {at["samples"]: at for at in JsonLines(study.folder(row) / "curve.jsonl").rows}
+    return [found[samples] for samples in sorted(found)]
+
+
+COLORS = ("#14487f", "#d1495b", "#3f7fc4", "#8a94a3")
+
+
+def draw(curves: dict[str, list[dict[str, Any]]], file: Path) -> None:
+    """Draw single-sample success over training samples."""
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for color, (row, points) in zip(COLORS, curves.items(), strict=False):
+        at = [point["samples"] / 1e3 for point in points]
+        for name, line in (("own", "o-"), ("hidden", "--")):
+            values = [100 * point[name] for point in points]
+            label = f"{ROWS[row].title}" if name == "own" else f"{ROWS[row].title}, hidden"
+            axes.plot(at, values, line, color=color, label=label, ms=3)
+    axes.set_xlabel("training samples [thousand]")
+    axes.set_ylabel("single samples that pass [%]")
+    axes.set_ylim(bottom=0)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
+    figure.savefig(file, dpi=150)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--parts", default=",".join(PARTS))
+    parser.add_argument("--rows", default=",".join(ROWS))
+    parser.add_argument("--out", type=Path, default=Path("runs/scene_code"), help="keeps data and networks")
+    parser.add_argument("--trajectories", type=int, default=140_000, help="motions to make")
+    parser.add_argument("--samples", type=int, default=1_600_000, help="of each training")
+    parser.add_argument("--encoder-samples", type=int, default=1_000_000, help="clouds for the auto-encoder")
+    parser.add_argument("--problems", type=int, default=300)
+    parser.add_argument("--plot", type=Path, default=Path("scene_code.png"))
+    arguments = parse(parser, trajectories=40, samples=128, encoder_samples=64, problems=2)
+    use_processor_time()
+    parts, rows = parts_of(arguments.parts, PARTS), parts_of(arguments.rows, ROWS)
+    sizes = arguments.trajectories, arguments.samples, arguments.encoder_samples, arguments.problems
+    study = Study(arguments.out, *sizes)
+    if "data" in parts:
+        study.generate()
+    if "train" in parts:
+        for row in rows:
+            study.train(row)
+    if "report" in parts:
+        print(header("numpy", "torch"))
+        motions = sum(len(read_shard(study.data, i, ("family",))) for i in shard_indices(study.data))
+        print(f"{motions:,} motions, each in a scene of its own")
+        report(study, rows, arguments.plot)
+
+
+if __name__ == "__main__":
+    main()
