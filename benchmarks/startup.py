@@ -4,9 +4,9 @@ bits; and what a first plan costs.
     python benchmarks/startup.py [--seed 0] [--only clearances,gradients]
     python benchmarks/startup.py --first-plan
 
-The second command prints benchmarks/results/first_plan.txt.
+The first command prints benchmarks/results/cold_cache.txt, the second the CPU time of a process that plans.
 
-Prints benchmarks/results/cold_cache.txt. Each part runs in a process of its own: first with an empty cache,
+Each part of the first runs in a process of its own: first with an empty cache,
 which compiles; then twice with the cache that this left, in the same order and in reverse. Every number that
 a part returns is compared.
 """

@@ -43,6 +43,7 @@ from robotdiffuse.collision.kernels.motion_certificate import (
 )
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.core.bounds import for_kernels
+from robotdiffuse.core.loading import loading
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
@@ -193,9 +194,10 @@ class ContinuousCollision:
 
     @cached_property
     def _exact(self) -> "ExactCollision":
-        from robotdiffuse.collision.exact_meshes import (
-            ExactCollision,  # imports Coal, which most motions do not need
-        )
+        with loading():
+            from robotdiffuse.collision.exact_meshes import (
+                ExactCollision,  # imports Coal, which most motions do not need
+            )
 
         return ExactCollision(self.robot, self.scene)
 

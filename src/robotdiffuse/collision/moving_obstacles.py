@@ -23,6 +23,7 @@ from robotdiffuse.collision.kernels import moving_obstacles as kernel
 from robotdiffuse.collision.kernels.moving_obstacles import CLEARANCE_CAP, Links, Tasks, Tracks
 from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.bounds import for_kernels
+from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
@@ -153,9 +154,10 @@ class MovingCollision:
 
     @cached_property
     def _exact(self) -> "tuple[ExactCollision, ...]":
-        from robotdiffuse.collision.exact_meshes import (
-            ExactCollision,  # imports Coal, which most motions do not need
-        )
+        with loading():
+            from robotdiffuse.collision.exact_meshes import (
+                ExactCollision,  # imports Coal, which most motions do not need
+            )
 
         return tuple(ExactCollision(self.robot, Scene([obstacle.shape])) for obstacle in self.moving)
 

@@ -11,6 +11,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning.context import PlanningContext
@@ -177,7 +178,8 @@ def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
     clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
     worst = int(clearances.argmin())
     link, other = [*((link, None) for link in checker.links), *checker.pairs][worst]
-    from robotdiffuse.collision.exact_meshes import ExactCollision  # imports Coal, rarely needed
+    with loading():
+        from robotdiffuse.collision.exact_meshes import ExactCollision  # imports Coal, rarely needed
 
     exact = ExactCollision(checker.robot, checker.scene)
     check = [frozenset(check) for check in exact.checks].index(frozenset((link, other)))
@@ -265,9 +267,10 @@ def _free_goals(
 def _pose_goals(
     context: PlanningContext, goal: PoseGoal | PosesGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    from robotdiffuse.planning.pose_goals import (
-        pose_configurations,  # imports inverse kinematics, rarely needed
-    )
+    with loading():
+        from robotdiffuse.planning.pose_goals import (
+            pose_configurations,  # imports inverse kinematics, rarely needed
+        )
 
     problem, robot, scene = context.problem, context.problem.robot, context.problem.scene
     constraints, rng = context.validator.constraints, context.rng
@@ -315,6 +318,7 @@ def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Float[nda
 
 def _explained(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:
     """The message of `explain_collision`, imported here because it imports Coal."""
-    from robotdiffuse.collision.exact_meshes import explain_collision
+    with loading():
+        from robotdiffuse.collision.exact_meshes import explain_collision
 
     return explain_collision(robot, scene, q)

@@ -29,6 +29,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural
 from robotdiffuse.learning.guidance import CollisionGuidance
@@ -96,7 +97,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         """See `planning.planner.Planner`."""
         settings, robot = self.settings, context.problem.robot
         if context.problem.constraints:
-            from robotdiffuse.planning.search.constrained import plan_constrained
+            with loading():
+                from robotdiffuse.planning.search.constrained import plan_constrained
 
             return plan_constrained(context, start_goal, settings.search)
         search = AnytimeSearch(context, start_goal, settings.search, AORRTC.name)
