@@ -51,11 +51,13 @@ from robotdiffuse.scenes.surface_points import sample_surface
 
 PANDA = load_robot("panda")
 PARTS = ("hybrid", "diversity", "rotation")
-EQUAL_TIME = 0.3
+EQUAL_TIME = 1.0
 """Time limit of the hybrids [s]."""
 PLANNER_LIMIT = 20.0
 """Of planners that end by themselves, for diversity [s]."""
 SEEDS = (1, 2)
+BATCH_STAGES = ("network", "refinement", "smooth_noise")
+"""Stages of answers that come from batches."""
 MOTIONS, WAYPOINTS = 16, 48
 TURNS = (15, 90, 180)
 """About the vertical [degrees]."""
@@ -92,6 +94,7 @@ def report_hybrid(every: dict[str, list[Case]]) -> None:
             for name, planner in planners.items()
         }
         rows, ratios = [], dict[str, ndarray]()
+        answers = {name: list[bool]() for name in planners}
         for family, cases in every.items():
             found = run_all(cases, methods, seeds=SEEDS, limit=EQUAL_TIME, title=f"{family}, {metric}")
             network, noise = (
@@ -100,6 +103,8 @@ def report_hybrid(every: dict[str, list[Case]]) -> None:
                 )
                 for name in planners
             )
+            for name, records in found.items():
+                answers[name] += [r.stage in BATCH_STAGES for r in records if r.solved]
             ratio = np.exp(np.log(network / noise).mean(axis=0))
             ratios[family] = ratio[~np.isnan(ratio)]
         for family, of in [*ratios.items(), ("all", np.concatenate(list(ratios.values())))]:
@@ -109,6 +114,7 @@ def report_hybrid(every: dict[str, list[Case]]) -> None:
             f"{len(SEEDS)} seeds",
             ["family", "problems", "mean of ratios (95 %)", "median"],
             rows,
+            [f"answers of batches: {', '.join(f'{k} {np.mean(v):.0%}' for k, v in answers.items())}"],
         )
 
 

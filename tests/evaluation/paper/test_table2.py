@@ -90,3 +90,24 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["train", "planner", "--config", "papr", "--data", "d", "--encoder", "e", "--out", "o"]
     assert main(command) == 2
     assert "table2_jpc" in capsys.readouterr().err
+
+
+def test_the_mean_of_two_trainings_leaves_unsolved_problems_out() -> None:
+    def evaluation(single: list[float], length: list[float]) -> table2.Evaluation:
+        each = np.array(single, float)
+        return table2.Evaluation(each, each, each, np.array(length, float), each)
+
+    nan = float("nan")
+    mean = table2.Evaluation.mean([evaluation([0, 1, 0], [nan, 4, nan]), evaluation([1, 1, 0], [3, 6, nan])])
+    np.testing.assert_array_equal(mean.single, [0.5, 1, 0])
+    np.testing.assert_array_equal(mean.length, [3, 5, nan])
+    assert [table2.Training("table2_jpc", seed).folder for seed in (0, 1)] == [
+        "table2_jpc",
+        "table2_jpc_seed1",
+    ]
+
+
+def test_straight_lines_stand_among_the_papers_rows() -> None:
+    table = table2.straight_line_table(4)
+    shares = [float(str(row[1])) for row in table.rows]
+    assert shares == sorted(shares) and len(table.rows) == 3 + len(table2.ROWS)
