@@ -46,5 +46,5 @@ def test_a_floor_at_a_grazing_angle_gives_no_return(angle: float) -> None:
     view = DepthView(depth, (focal, focal, 20.0, -1.0), np.eye(4))
     noise = DepthNoise(spread=0.0, stray=0.0, flying=0.0, edge_missing=0.0, grazing=angle)
     seen = (noise.applied(view, np.random.default_rng(0)).depth > 0).all(axis=1)
-    expected = np.arctan(rows / focal) > angle
+    expected = np.asarray(np.arctan(rows / focal) > angle)
     assert (seen[5:-5] == expected[5:-5]).mean() > 0.97, "differences of pixels, not derivatives"

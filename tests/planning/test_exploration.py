@@ -22,13 +22,13 @@ HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 FLOOR = rd.Box((0, 0, -0.06), (6, 6, 0.1), name="floor")
 WALL = rd.Box((0.45, -0.2, 0.3), (0.5, 0.02, 0.6), name="wall")
 ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
-LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (0.5, -1.0))
+LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (0.5, -1.7))
 PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), LEFT, RIGHT)
 """From one side of a wall to the other."""
 
 
 def explorer(policy: str = "strict", seen: bool = True, noise: DepthNoise | None = None) -> rd.Explorer:
-    settings = ExplorerSettings(policy=policy, time_limit=5.0, look_attempts=2, max_looks=3)
+    settings = ExplorerSettings(policy=policy, time_limit=1.0, look_attempts=2, max_looks=2)
     out = rd.Explorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
     if seen:
         out.observe(camera_beside(PROBLEM, noise, 0))
@@ -51,9 +51,9 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
     one = explorer()
     one.set_goal(PROBLEM.start + 0.05)
     step = one.next(PROBLEM.start)
-    assert step.kind == "go" and step.motion is not None and step.motion.path is not None
+    assert step.kind in ("go", "look") and step.motion is not None and step.motion.path is not None
     unseen = swept_unseen(one.map, step.motion.path, PROBLEM.start)
-    ends = [placed_spheres(PANDA, q).astype(np.float32) for q in (PROBLEM.start, PROBLEM.start + 0.05)]
+    ends = [placed_spheres(PANDA, q).astype(np.float32) for q in step.motion.path.positions[[0, -1]]]
     # covering spheres are larger than the links that the validator checks
     assert (unseen & ~voxels_in(np.concatenate(ends), 2 * CARVING_MARGIN)).sum() <= 0.01 * unseen.size
 
@@ -61,7 +61,11 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
 def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
     one = explorer()
     cloud, *walls = not_seen_free(one.map, rd.Scene([FLOOR]), (HOME,))
-    assert len(walls) == 6 and np.isclose(np.sqrt(3) * FINE_VOXEL_SIZE / 2, COVER_RADIUS)
+    assert (
+        isinstance(cloud, rd.PointCloud)
+        and len(walls) == 6
+        and np.isclose(np.sqrt(3) * FINE_VOXEL_SIZE / 2, COVER_RADIUS)
+    )
     at = np.floor((cloud.points - LOW) / FINE_VOXEL_SIZE).astype(int)
     assert not one.map.free[tuple(at.T)].any()
     true = voxels_within(rd.Scene([WALL]), LOW, FINE_VOXEL_SIZE, FINE_SHAPE, -0.0)
@@ -95,9 +99,10 @@ def test_what_keeps_the_arm_from_going_is_said() -> None:
     step = blind.next(HOME)
     assert step.kind == "look" and step.motion is None and "nothing was seen yet" in step.reason
     still = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, ExplorerSettings(time_limit=1.0))
-    still.observe(camera_beside(PROBLEM, None, 0))
+    view = camera_beside(PROBLEM, None, 0)
+    still.observe(replace(view, depth=np.zeros_like(view.depth)))
     still.set_goal(PROBLEM.goal)
     step = still.next(PROBLEM.start)
     assert step.kind == "stuck" and "no camera is on the arm" in step.reason
-    with pytest.raises(InputError, match=r"explorer\.policy is 'bold'"):
+    with pytest.raises(InputError, match=r"unknown explorer\.policy"):
         replace(ExplorerSettings(), policy="bold")

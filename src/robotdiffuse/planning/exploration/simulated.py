@@ -1,25 +1,29 @@
 """An arm that explores a simulated scene: cameras by ray casting, motions executed as planned."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.explorer import Explorer, Step
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
-WRIST_OFFSET = (0.07, 0.0, 0.02)
+WRIST_OFFSET = (0.04, 0.0, 0.03)
 """Position of the simulated camera in the frame of the arm's tip [m]."""
 SIZE, FIELD_OF_VIEW = (320, 240), (1.22, 0.96)
 """Width and height of its images [pixels], and horizontal and vertical field of view [rad]."""
+LENS_RADIUS = 0.005
+"""A camera nearer to an obstacle than this sees nothing [m]."""
 MIN_DEPTH = 0.15
 """Nearer surfaces give no return [m]."""
 BESIDE_POSITION, BESIDE_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
@@ -71,6 +75,10 @@ def taken(
     """The image of the problem's true scene that a camera on the arm takes."""
     T = camera.poses(problem.robot, q[None])[0]
     view = ray_cast(problem.scene, T, camera.intrinsics, camera.size, problem.robot, q)
+    obstacles = compile_scene_for(problem.robot, problem.scene)
+    if near_scene(obstacles, T[None, :3, 3].astype(np.float32), np.float32(LENS_RADIUS))[0]:
+        # the ray caster leaves out shapes around a camera, which would be seen as free
+        view = replace(view, depth=np.zeros_like(view.depth))
     return measured(view, camera.range, noise, rng)
 
 
