@@ -485,7 +485,7 @@ def report(study: Study, rows: Sequence[str], plot: Path) -> None:
             worth.append((f"{ROWS[row].title}: over {name}", *(in_points(part, "+") for part in less)))
         if row == "oracle":
             points = 100 * float(own.mean() - mean.mean())
-            verdict = "can matter" if points >= DECISIVE else "is the bottleneck, not the encoder"
+            verdict = "can matter" if points >= DECISIVE else "is the bottleneck so far, not its encoder"
             over = in_points(own.mean(1) - mean.mean(1), "+")
             conclusion = (
                 f"After {samples:,} training samples the oracle's own code is worth {over} points of single "
