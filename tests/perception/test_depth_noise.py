@@ -45,6 +45,6 @@ def test_a_floor_at_a_grazing_angle_gives_no_return(angle: float) -> None:
     depth = np.broadcast_to((focal / rows)[:, None], (len(rows), 40))
     view = DepthView(depth, (focal, focal, 20.0, -1.0), np.eye(4))
     noise = DepthNoise(spread=0.0, stray=0.0, flying=0.0, edge_missing=0.0, grazing=angle)
-    seen = (noise.applied(view, np.random.default_rng(0)).depth > 0).all(axis=1)
+    seen = np.asarray((noise.applied(view, np.random.default_rng(0)).depth > 0).all(axis=1))
     expected = np.asarray(np.arctan(rows / focal) > angle)
     assert (seen[5:-5] == expected[5:-5]).mean() > 0.97, "differences of pixels, not derivatives"

@@ -16,12 +16,7 @@ from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.weights_registry import weights_for
 from robotdiffuse.planning.diffusion import hybrid
 from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
-from robotdiffuse.planning.diffusion.hybrid import (
-    BATCH_WORK,
-    RobotDiffuse,
-    RobotDiffuseSettings,
-    unlearned_starts,
-)
+from robotdiffuse.planning.diffusion.hybrid import BATCH_WORK, RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.search.anytime import AnytimeSearch
@@ -267,14 +262,6 @@ def test_encodings_distinguish_scenes():
     far = CollisionChecker(PANDA, Scene([Box([-0.4, 0.4, 0.5], [0.2, 0.2, 0.2])]))
     a, b, c = (encode(model, checker, 320, rng) for checker in (near, near, far))
     assert np.linalg.norm(a - b) < 0.5 * np.linalg.norm(a - c)
-
-
-def test_unlearned_starts_keep_ends_and_limits():
-    q = unlearned_starts(LEFT, RIGHT, 16, 48, PANDA, np.random.default_rng(0))
-    assert q.shape == (16, 48, 7)
-    assert (q[:, 0] == LEFT).all() and (q[:, -1] == RIGHT).all()
-    assert (q >= PANDA.lower).all() and (q <= PANDA.upper).all()
-    assert np.allclose(np.diff(q[0], axis=0), (RIGHT - LEFT) / 47)
 
 
 def test_the_guidance_scale_reaches_the_network():

@@ -40,6 +40,7 @@ def test_a_jerk_limit_holds_from_the_start_velocity_on(jerk: float) -> None:
     task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[0.6, 0.1, 0.2, -0.3, 0, 0, 0.5])
     found = rd.load_planner("rrt_connect").plan(task, 5.0, jerk=jerk)
     assert found.trajectory is not None, found.reason
+    assert task.start_velocity is not None
     assert np.allclose(found.trajectory.velocities[0], task.start_velocity, atol=1e-9)
     assert (np.abs(found.trajectory.at(0.0).jerks) <= jerk).all()
     steps = np.diff(found.trajectory.times)[:, None]
