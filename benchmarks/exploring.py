@@ -151,19 +151,15 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
     parser.add_argument("--noise", action="store_true", help="of depth cameras")
     parser.add_argument("--records", default="exploring.jsonl", help="(exploring.jsonl)")
-    parser.add_argument("--report", action="store_true", help="print the tables of the records")
+    parser.add_argument("--report", action="store_true", help="only print the tables of the records")
     arguments = parse(parser, problems=1, families=["rop"], methods=["strict"])
-    if arguments.report:
-        print(header("numba", "numpy", "onnxruntime"))
-        report(JsonLines(Path(arguments.records)).rows)
-        return
     use_processor_time()
-    if not arguments.smoke:
-        run(arguments)
-        return
     with TemporaryDirectory() as folder:
-        arguments.records = f"{folder}/records.jsonl"
-        run(arguments)
+        if arguments.smoke:
+            arguments.records = f"{folder}/records.jsonl"
+        if not arguments.report:
+            run(arguments)
+        print(header("numba", "numpy", "onnxruntime"))
         report(JsonLines(Path(arguments.records)).rows)
 
 

@@ -18,6 +18,7 @@ FIRST_CALLS = """
 import sys, time
 import numpy as np
 import robotdiffuse as rd
+import robotdiffuse.core.kernels  # its listener must hear of Numba's work before the one below
 from numba.core import event
 
 late, real = [0.0], time.perf_counter

@@ -63,6 +63,7 @@ VALUES: dict[type[Value], Callable[[], Value]] = {
     rd.MovingObstacle: lambda: rd.MovingObstacle(rd.Box([0, 0, 0], HALF), times=TIMES, poses=[POSE, POSE]),
     rd.DepthView: lambda: rd.DepthView(IMAGE, (1.0, 1.0, 0.0, 0.0), POSE, ROWS[0], CORNERS),
     rd.NextView: lambda: rd.NextView(POSE, 0.5),
+    rd.ArmCamera: lambda: rd.ArmCamera("l3", POSE, (1.0, 1.0, 0.0, 0.0), (4, 3)),
     Joint: lambda: Joint("j", "revolute", "a", "b", POSE, UP),
     Robot: robot,
     ConvexMesh: lambda: ConvexMesh(CORNERS, FACES),

@@ -7,8 +7,6 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_RATE, within
 from robotdiffuse.core.errors import InputError, shown
@@ -63,7 +61,7 @@ class PlanResult:
     unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner, in the base frame [m], of a box around the crossed unknown space that is most
     likely occupied; None if the motion crosses none."""
-    corner_deviations: Float[ndarray, "n"] | None = field(default=None, repr=False)
+    corner_deviations: tuple[float, ...] | None = field(default=None, repr=False)
     """How far the motion may leave each waypoint of the path [rad, joint-space L2]; None: the default of
     timing. Files do not hold it."""
     trees: tuple[Tree, ...] = field(default=(), repr=False)

@@ -12,10 +12,12 @@ from robotdiffuse.perception.depth_view import DepthView
 
 ROW_STEP = 4
 """Every so many rows are examined for noise."""
-MIN_BENDS = 200
-"""Fewest second differences that noise is estimated from."""
-BEND_PER_SPREAD = 0.6745 * 6**0.5
-"""The median absolute second difference of normal numbers of standard deviation 1."""
+ORDER = 4
+"""Order of the differences that noise is estimated from: those of a sphere a few pixels wide are near 0."""
+MIN_DIFFERENCES = 200
+"""Fewest differences that noise is estimated from."""
+DIFFERENCE_PER_SPREAD = 0.6745 * 70**0.5
+"""The median absolute fourth difference of normal numbers of standard deviation 1."""
 MIN_SPREAD = 4e-4
 """Images with less noise are taken as they are: the filter takes away what is a pixel wide. At a distance of
 1 m [m]."""
@@ -49,16 +51,17 @@ def filtered(view: DepthView) -> FilteredDepth:
 def depth_spread(depth: Float32[ndarray, "h w"]) -> float:
     """The standard deviation of an image's depth at a distance of 1 m [m], as its pixels show.
 
-    Of a flat surface, inverse depth is linear in the pixels; where the error of depth grows with its square,
-    that of inverse depth is the same everywhere. So second differences of inverse depth show it, as most
-    surfaces are flat enough. 0 for images with few returns.
+    Of a flat surface, inverse depth is linear in the pixels, and of a curved one nearly a polynomial; where
+    the error of depth grows with its square, that of inverse depth is the same everywhere. So differences of
+    high order of inverse depth show it. 0 for images with few returns.
     """
     some = depth[::ROW_STEP]
     seen = np.isfinite(some) & (some > 0)
-    inverse = np.divide(1.0, some, out=np.zeros_like(some), where=seen)
-    bend = inverse[:, :-2] - 2 * inverse[:, 1:-1] + inverse[:, 2:]
-    bend = np.abs(bend[seen[:, :-2] & seen[:, 1:-1] & seen[:, 2:]])
-    return float(np.median(bend)) / BEND_PER_SPREAD if len(bend) >= MIN_BENDS else 0.0
+    differences = np.divide(1.0, some, out=np.zeros_like(some), where=seen)
+    for _ in range(ORDER):
+        differences, seen = np.diff(differences, axis=1), seen[:, 1:] & seen[:, :-1]
+    found = np.abs(differences[seen])
+    return float(np.median(found)) / DIFFERENCE_PER_SPREAD if len(found) >= MIN_DIFFERENCES else 0.0
 
 
 def grown_for_noise(

@@ -264,7 +264,7 @@ class PlanningContext:
             stage=stage,
             path=path,
             trajectory=trajectory,
-            corner_deviations=deviations,
+            corner_deviations=None if deviations is None else tuple(deviations.tolist()),
             min_clearance=min(scene, itself),
             scene_clearance=scene,
             self_clearance=itself,

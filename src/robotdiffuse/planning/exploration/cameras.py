@@ -2,17 +2,17 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.robots.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
-class ArmCamera:
+class ArmCamera(Value):
     """A depth camera on a link of the arm. Its body should be part of the robot, as a held object is."""
 
     link: str
@@ -28,7 +28,10 @@ class ArmCamera:
     def __post_init__(self) -> None:
         if not self.range > 0:
             raise InputError(f"camera.range is {self.range}; it must be positive [m]")
+        pose = rigid_transform("camera.T_link_camera", self.T_link_camera)
+        object.__setattr__(self, "T_link_camera", pose)
+        super().__post_init__()
 
     def poses(self, robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 4 4"]:
         """T_base_camera at configurations."""
-        return link_poses(robot, q, self.link) @ np.asarray(self.T_link_camera)
+        return link_poses(robot, q, self.link) @ self.T_link_camera

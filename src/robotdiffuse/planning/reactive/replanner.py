@@ -151,6 +151,7 @@ class Replanner:
         """Make two steps on a copy, so that the compiled code is loaded before the first step is due."""
         rehearsal = copy(self)
         rehearsal._seen, rehearsal._rng = dict(self._seen), np.random.default_rng(self.seed)
+        rehearsal._filter = copy(self._filter)
         for k in range(2):
             rehearsal.step({}, k * self.settings.period)
 
