@@ -55,7 +55,7 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
     unseen = swept_unseen(one.map, step.motion.path, PROBLEM.start)
     ends = [placed_spheres(PANDA, q).astype(np.float32) for q in step.motion.path.positions[[0, -1]]]
     # covering spheres are larger than the links that the validator checks
-    assert (unseen & ~voxels_in(np.concatenate(ends), 2 * CARVING_MARGIN)).sum() <= 0.01 * unseen.size
+    assert (unseen & ~voxels_in(np.concatenate(ends), 2 * CARVING_MARGIN)).sum() <= 20
 
 
 def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
@@ -98,7 +98,7 @@ def test_what_keeps_the_arm_from_going_is_said() -> None:
     blind.set_goal(HOME + 0.3)
     step = blind.next(HOME)
     assert step.kind == "look" and step.motion is None and "nothing was seen yet" in step.reason
-    still = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, ExplorerSettings(time_limit=1.0))
+    still = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), settings=ExplorerSettings(time_limit=1.0))
     view = camera_beside(PROBLEM, None, 0)
     still.observe(replace(view, depth=np.zeros_like(view.depth)))
     still.set_goal(PROBLEM.goal)
