@@ -6,7 +6,7 @@
 Prints benchmarks/results/exploring.txt. Problems are those of benchmarks/cameras.py whose scene leaves the
 arm's pose "ready" free: from there the arm goes to the problem's start, and on to its goal, with one memory.
 A camera beside the arm takes one image, at first; the one on the arm (320 x 240 pixels, 70 x 55 degrees, 0.15
-to 2 m) during each motion. Every executed motion is judged by the validator in the true scene, and the loop
+to 2 m) during each motion. Every executed motion is checked by the validator in the true scene, and the loop
 ends at a collision. Looks and times are those of both legs together.
 
 The first two methods are controls: motions as planned once with unknown space taken as free, and once with

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
@@ -66,22 +66,7 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof
             raise InputError(
                 f"view.configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints"
             )
-        T = view.T_base_camera
-        filtered_depth, spread = filtered(view)
-        spheres = grown_for_noise(placed_spheres(robot, q), T, spread)
-        spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
-        spheres[:, 3] += ARM_MARGIN
-        carve(
-            filtered_depth,
-            np.array(view.intrinsics, np.float32),
-            T.astype(np.float32),
-            spheres.astype(np.float32),
-            np.array(LOW, np.float32),
-            np.float32(VOXEL),
-            state,
-            depth,
-            counts,
-        )
+        carve_view(view, robot, q, ARM_MARGIN, VOXEL, state, depth, counts)
         occupied |= counts > 0
         free |= state == FREE
         shadow |= state == SHADOW
@@ -91,3 +76,35 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof
     known = free | occupied
     behind[~np.isfinite(behind) | known] = 0.0
     return ObservedVolume(occupied, free, shadow & ~known, out, behind)
+
+
+def carve_view(
+    view: DepthView,
+    robot: Robot,
+    q: Float[ndarray, "dof"],
+    arm_margin: float,
+    voxel: float,
+    state: UInt8[ndarray, "nx ny nz"],
+    behind: Float32[ndarray, "nx ny nz"],
+    counts: Int32[ndarray, "nx ny nz"],
+) -> None:
+    """Write what one view tells of each voxel from `LOW` on, by its filtered image; see `carve`.
+
+    q: the arm's configuration in the view. arm_margin: points within this distance of its covering spheres
+    are points of the arm; more with noise [m]. voxel: edge of a voxel [m].
+    """
+    T, (depth, spread) = view.T_base_camera, filtered(view)
+    spheres = grown_for_noise(placed_spheres(robot, q), T, spread)
+    spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
+    spheres[:, 3] += arm_margin
+    carve(
+        depth,
+        np.array(view.intrinsics, np.float32),
+        T.astype(np.float32),
+        spheres.astype(np.float32),
+        np.array(LOW, np.float32),
+        np.float32(voxel),
+        state,
+        behind,
+        counts,
+    )

@@ -9,11 +9,9 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
 from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
-from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.free_space_kernel import FREE, carve
-from robotdiffuse.perception.observed_volume import LOW
-from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.perception.free_space_kernel import FREE
+from robotdiffuse.perception.observed_volume import LOW, carve_view
 from robotdiffuse.robots.robot import Robot
 
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -67,27 +65,13 @@ class OccupancyMap:
                 f"view.configuration is {shown(q)}; a map needs the {self.robot.dof} joint positions of"
                 f" {self.robot.name} when the view was taken"
             )
-        T = view.T_base_camera
-        depth, spread = filtered(view)
-        spheres = grown_for_noise(placed_spheres(self.robot, q), T, spread)
-        spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
-        spheres[:, 3] += self.settings.arm_margin
-        carve(
-            depth,
-            np.array(view.intrinsics, np.float32),
-            T.astype(np.float32),
-            spheres.astype(np.float32),
-            np.array(LOW, np.float32),
-            np.float32(FINE_VOXEL_SIZE),
-            self._state,
-            self._behind,
-            self._counts,
-        )
+        margin = self.settings.arm_margin
+        carve_view(view, self.robot, q, margin, FINE_VOXEL_SIZE, self._state, self._behind, self._counts)
         self._update(self._counts > 0, self._state == FREE, stamp)
 
     def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
-        or of an OctoMap file (`scenes.point_cloud.load_points`). They say nothing about free space."""
+        or of `rd.PointCloud.from_file`. They say nothing about free space."""
         at = np.floor((np.asarray(points) - LOW) / FINE_VOXEL_SIZE).astype(np.int64)
         at = at[((at >= 0) & (at < FINE_SHAPE)).all(axis=1)]
         hit = np.zeros(FINE_SHAPE, np.bool_)

@@ -23,7 +23,7 @@ CONFIGURATIONS = 900
 SPREADS = (0.3, 0.8, 2.0)
 """Standard deviations of their distances from the arm's configuration, in equal parts [rad]."""
 MAX_VOXELS = 1500
-"""Most swept voxels that looks are judged by."""
+"""Most swept voxels from which looks are scored."""
 FULL_COST_LENGTH = 3.0
 """A look this far away counts half [rad, joint-space L2]."""
 UNSEEN_WEIGHT = 0.05
