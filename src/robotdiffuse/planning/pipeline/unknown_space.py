@@ -43,7 +43,6 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.scenes.scene import Scene
 
 MAX_FIRST_MOTIONS, MIN_FIRST_MOTIONS = 8, 4
 """First motions under an assumption that the one of least probability is chosen from: most and fewest ..."""
@@ -208,7 +207,7 @@ def with_assumption(problem: Problem, assumption: Assumption, goals: Float[ndarr
     needed = np.array([assumption.touched(spheres) for spheres in at_goals] if len(at_goals) > 1 else [0])
     easiest = np.flatnonzero(needed == needed.min())
     obstacles = assumption.obstacles(np.concatenate([start, *(at_goals[i] for i in easiest)]))
-    scene = Scene([*problem.scene.shapes, obstacles])
+    scene = problem.scene.with_shapes([*problem.scene.shapes, obstacles])
     return replace(problem, scene=scene, goal=JointGoal(goals[easiest]), views=())
 
 

@@ -309,7 +309,8 @@ class DStarLiteSearch(_Search[DStarLiteSettings]):
         kept = {id(shape) for shape in before} & {id(shape) for shape in after}
         moved = [shape for shape in (*before, *after) if id(shape) not in kept]
         known = slice(1, self.nodes + 1)
-        if checker.padding != self.checker.padding:
+        before, after = self.checker.scene.allowed_contacts, checker.scene.allowed_contacts
+        if checker.padding != self.checker.padding or before != after:
             near[known] = -np.inf
         elif moved:
             margin = float(self._search.space.padding) + ROUNDING
