@@ -191,9 +191,9 @@ def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float
         return float(value)
     within = float(np.clip(value, joint.lower, joint.upper))
     if abs(value - within) > LIMIT_SLACK:
-        raise InputError(
-            f"{field}: {joint.name} is {value:g} {unit}; its limits are {joint.lower:g} to {joint.upper:g}"
-        )
+        hint = " (angles are in radians)" if unit == "rad" and abs(value) > 2 * np.pi else ""
+        limits = f"{joint.lower:g} to {joint.upper:g}"
+        raise InputError(f"{field}: {joint.name} is {value:g} {unit}; its limits are {limits}{hint}")
     if value != within:
         notes.append(f"{field}: {joint.name} clamped from {float(value)!r} to its limit {within!r} {unit}")
     return within

@@ -399,6 +399,21 @@ def holding_at(robot: Robot, held: MoveItAttached, start: list[float]) -> Robot:
     return robot.with_body(AttachedBody(held.name, held.link, T_link_body, shapes, touch))
 
 
+def linkable(robot: Robot, request: MoveItRequest | None) -> tuple[str, ...]:
+    """Names of the robot's links and of what it holds at the start."""
+    return (*robot.link_names, *(held.name for held in (request.attached if request else ())))
+
+
+def mimic_notes(robot: Robot, start: dict[str, float]) -> tuple[str, ...]:
+    """Notes on mimic joints whose value in a start state differs from what the joint they mimic implies."""
+    mimics = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
+    return tuple(
+        f"start_state: {name} is {start[name]:g}; planned at {robot.locked[name]:g}, which {master} implies"
+        for name, master in mimics.items()
+        if name in start and name in robot.locked and abs(robot.locked[name] - start[name]) > MIMIC_SLACK
+    )
+
+
 def _joint_goal(where: str, goal: object) -> dict[str, float]:
     goal = mapping_of(where, goal)
     if any(goal.get(f"{kind}_constraints") for kind in ("position", "orientation", "visibility")):

@@ -23,6 +23,8 @@ from robotdiffuse.problems.files.goals import goal_entry, read_goal, read_waypoi
 from robotdiffuse.problems.files.moveit import (
     MoveItRequest,
     holding_at,
+    linkable,
+    mimic_notes,
     moveit_frames,
     moveit_model,
     moveit_request,
@@ -49,7 +51,7 @@ from robotdiffuse.problems.problem import (
     moved_goal,
 )
 from robotdiffuse.robots import ROBOTS, load_robot
-from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
+from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.files import check_fields, contacts_entry, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
 
@@ -89,6 +91,8 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
     """
     file = file_name(file, "problem file")
     check_type("index", index, Integral, "a whole number from 0 on")
+    if file.is_dir():
+        raise InputError(f"{file} is a folder; give a file in it, or the folder to `robotdiffuse bench run`")
     if file.suffix.lower() not in WRITERS:
         raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
     text = read_text(file)
@@ -271,7 +275,7 @@ def _moveit_problem(scene_file: Path, robot: Robot | None, ignore_joints: bool) 
         where = request_file
         request = moveit_request(read_yaml(request_file), frames, scene_file.parent)
         where = scene_file
-        scene = moveit_scene(data, frames, scene_file.parent, _links(robot, request))
+        scene = moveit_scene(data, frames, scene_file.parent, linkable(robot, request))
         where = request_file
         notes += request_robot_notes(request, robot, moveit_model(data), ignore_joints)
         return _requested(robot, scene, replace(request, notes=(*request.notes, *notes)), {})
@@ -285,7 +289,7 @@ def _requested(robot: Robot, scene: Scene, request: MoveItRequest, options: Prob
     unplanned = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     unplanned -= {*robot.joint_names}
     robot = robot.with_locked({name: value for name, value in request.start.items() if name in unplanned})
-    notes = (*request.notes, *_mimic_notes(robot, request.start))
+    notes = (*request.notes, *mimic_notes(robot, request.start))
 
     def values(where: str, positions: dict[str, float]) -> list[float]:
         missing = [name for name in robot.joint_names if name not in positions]
@@ -303,21 +307,6 @@ def _requested(robot: Robot, scene: Scene, request: MoveItRequest, options: Prob
         rows = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
         goal = JointGoal(rows)
     return Problem(robot, scene, start, goal, **{**options, "notes": notes})
-
-
-def _links(robot: Robot, request: MoveItRequest | None) -> tuple[str, ...]:
-    """Names of the robot's links and of what it holds at the start."""
-    return (*robot.link_names, *(held.name for held in (request.attached if request else ())))
-
-
-def _mimic_notes(robot: Robot, start: dict[str, float]) -> tuple[str, ...]:
-    """Notes on mimic joints whose value in a start state differs from what the joint they mimic implies."""
-    mimics = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
-    return tuple(
-        f"start_state: {name} is {start[name]:g}; planned at {robot.locked[name]:g}, which {master} implies"
-        for name, master in mimics.items()
-        if name in start and name in robot.locked and abs(robot.locked[name] - start[name]) > MIMIC_SLACK
-    )
 
 
 def _problem(
@@ -357,7 +346,7 @@ def _problem(
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
         if isinstance(values["scene"], str):
-            scene = moveit_scene(content, frames, file.parent, _links(robot, request), contacts)
+            scene = moveit_scene(content, frames, file.parent, linkable(robot, request), contacts)
         else:
             scene, scene_notes = read_scene(values["scene"], folder, contacts)
             notes += scene_notes
