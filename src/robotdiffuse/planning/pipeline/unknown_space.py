@@ -116,17 +116,13 @@ def plan_with_unknown_space(
                 return _with_notes(context, result, policy_note, _lesser(failed, assumption.name))
             failed.append(assumption.name)
     result = attempts.best(as_seen, AS_SEEN, limit)
+    took = f"preparing it took {prepared:.2g} s of the time limit of {limit:g} s"
+    late = f"no time for the policy {policy}: {took}"
     if policy == OPTIMISTIC or not result.solved:
-        return _with_notes(context, result)
+        return _with_notes(context, result, "" if policy == OPTIMISTIC or failed else late)
     if failed:
         return _with_notes(context, result, policy_note, _lesser(failed, FREE_UNKNOWN_SPACE))
-    late = f"preparing it took {prepared:.2g} s of the time limit of {limit:g} s"
-    return _with_notes(
-        context,
-        result,
-        policy_note,
-        f"no time for the policy {policy}: {late}; planned with {FREE_UNKNOWN_SPACE}",
-    )
+    return _with_notes(context, result, policy_note, f"{late}; planned with {FREE_UNKNOWN_SPACE}")
 
 
 def policy_for(problem: Problem) -> tuple[str, str]:
