@@ -307,10 +307,10 @@ class DStarLiteSearch(_Search[DStarLiteSettings]):
         near = np.full(len(self._table.keys), np.inf, np.float32)
         before, after = self.checker.scene.shapes, checker.scene.shapes
         kept = {id(shape) for shape in before} & {id(shape) for shape in after}
+        kept = kept if self.checker.scene.allowed_contacts == checker.scene.allowed_contacts else set()
         moved = [shape for shape in (*before, *after) if id(shape) not in kept]
         known = slice(1, self.nodes + 1)
-        before, after = self.checker.scene.allowed_contacts, checker.scene.allowed_contacts
-        if checker.padding != self.checker.padding or before != after:
+        if checker.padding != self.checker.padding:
             near[known] = -np.inf
         elif moved:
             margin = float(self._search.space.padding) + ROUNDING
