@@ -222,3 +222,34 @@ def test_the_demo_of_another_arm_is_not_solved_by_the_straight_line() -> None:
     assert isinstance(problem.goal, JointGoal)
     lines = [Path_(problem.robot.joint_names, np.stack([problem.start, q])) for q in problem.goal.positions]
     assert not any(verify(problem, line).valid for line in lines)
+
+
+def test_plan_ignores_joints_where_it_is_told_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`plan --ignore-joints` was accepted, and did nothing."""
+    state = "robot_state: {joint_state: {name: [gripper], position: [0.1]}}"
+    Path("stranger.yaml").write_text(state)
+    Path("problem.json").write_text(json.dumps(PROBLEM | {"scene": "stranger.yaml"}))
+    asked = ("plan", "problem.json", "--planner", "rrt_connect")
+    assert run(*asked) == 2
+    assert "has values of gripper, movable joints that panda lacks" in capsys.readouterr().err
+    assert run(*asked, "--ignore-joints") == 0
+    assert "ignored gripper" in capsys.readouterr().out
+
+
+def test_a_folder_and_degrees_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("plan", ".") == 2
+    assert ". is a folder" in capsys.readouterr().err
+    Path("degrees.json").write_text(json.dumps(PROBLEM | {"start": [0, -45, 0, -135, 0, 90, 45]}))
+    assert run("plan", "degrees.json") == 2
+    assert "(angles are in radians)" in capsys.readouterr().err
+
+
+def test_plan_and_verify_name_allowed_contacts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("p.json").write_text(json.dumps(PROBLEM | {"allowed_contacts": {"sphere": ["panda_hand"]}}))
+    note = "contact of sphere with panda_hand is allowed"
+    assert run("plan", "p.json", "--planner", "rrt_connect", "--out", "r.json") == 0
+    assert note in capsys.readouterr().out
+    assert run("verify", "r.json", "--certificate", "c.json") == 0
+    assert note in capsys.readouterr().out
+    assert run("certificate", "check", "c.json") == 0
+    assert note in capsys.readouterr().out

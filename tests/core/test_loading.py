@@ -20,7 +20,9 @@ import numpy as np
 import robotdiffuse as rd
 import robotdiffuse.core.kernels  # its listener must hear of Numba's work before the one below
 from numba.core import event
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 
+FINGERS = ["panda_leftfinger", "panda_rightfinger"]
 late, real = [0.0], time.perf_counter
 time.perf_counter = lambda: real() + late[0]
 
@@ -42,12 +44,17 @@ cloud = rd.PointCloud([[0.45, 0.3, 0.3], [0.45, 0.3, 0.4]], 0.02)
 pose = rd.PoseGoal(robot.tip, robot.fk(goal, robot.tip))
 ball = rd.MovingObstacle(rd.Sphere([0.5, -0.9, 0.5], 0.08), velocity=[0.0, 0.1, 0.0])
 upright = rd.AxisCone(robot.tip, [0, 0, 1], [0, 0, -1], 0.6)
+camera = looking_at(np.array([-0.5, 1.1, 1.2]), np.array([0.6, 0.0, 0.5]))
+view = ray_cast(rd.Scene([box]), camera, (60, 60, 40, 30), (80, 60))
+holding = robot.attach(rd.Box(center=[0, 0, 0.15], size=[0.05, 0.05, 0.1], name="cup"), "panda_hand", FINGERS)
 calls = [
     rd.Problem(robot, rd.Scene([box]), q, goal),
     rd.Problem(robot, rd.Scene([box, cloud]), q, pose, waypoints=(way,), blend=0.1),
     rd.Problem(robot, rd.Scene([box]), q, goal, moving=(ball,)),
     rd.Problem(robot, rd.Scene([box]), q, goal, start_velocity=[0.2, 0, 0, 0, 0, 0, 0]),
     rd.Problem(robot, rd.Scene([box]), q, goal, constraints=(upright,)),
+    rd.Problem(robot, rd.Scene(), q, goal, views=[view]),
+    rd.Problem(holding, rd.Scene([box, cloud]), q, goal),
 ]
 event.register("numba:compiler_lock", Slow())
 sys.meta_path.insert(0, SlowImports())
@@ -104,7 +111,7 @@ def test_first_calls_load_outside_their_time() -> None:
     limit."""
     done = subprocess.run([sys.executable, "-c", FIRST_CALLS], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert [line.split()[0] for line in done.stdout.splitlines()] == ["solved"] * 5, done.stdout
+    assert [line.split()[0] for line in done.stdout.splitlines()] == ["solved"] * 7, done.stdout
 
 
 def test_python_cannot_call_an_inner_kernel() -> None:

@@ -2,13 +2,11 @@
 
     python tests/golden/golden.py            compares with golden.json; exit status 1 if anything differs
     python tests/golden/golden.py --write    makes golden.json anew; a commit that does says which and why
-    ... [--only problems,shard,weights,plans,unsteady]
+    ... [--only problems,shard]
 
 An entry has a digest of its numbers, rounded, and their projection on a fixed random direction. Compilers and
 processors differ in the last bits: a projection within TOLERANCE counts as the same where the digest differs.
-So do the process that compiles and those that find its code in the cache: after a move, run it twice.
-Planners that search until time runs out and then return their best give another path at every call; they are
-not here: OMPL's RRT*, Informed RRT*, BIT*, AORRTC, and its PRM, which has a second thread.
+Motions are not here: they depend on the processor; `tests/planning/test_reproducibility.py` plans them twice.
 """
 
 import argparse
@@ -19,7 +17,6 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
-from functools import partial
 from itertools import starmap
 from pathlib import Path
 from unittest.mock import patch
@@ -27,14 +24,11 @@ from unittest.mock import patch
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from llvmlite.binding import get_host_cpu_name
 from numpy import ndarray
-from safetensors.numpy import load_file
 
 from robotdiffuse.cli import main as main_of_cli
 from robotdiffuse.datasets.shards import read_shard
 from robotdiffuse.generation import factory
-from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem
@@ -45,28 +39,7 @@ DECIMALS = 6
 TOLERANCE = 1e-4
 """Of projections, relative to what numbers of this size and count have by chance."""
 PROBLEMS = 20
-PLANS = (("rop", 1), ("rop_dense", 0), ("shelf", 0), ("crate", 0), ("table", 0))
-PLANNERS = (
-    *("robotdiffuse", "aorrtc", "rrt_connect", "shared_tree_rrt_star", "mpnet", "mpinets"),
-    *("a_star", "d_star_lite", "ompl_rrt", "ompl_rrt_connect"),
-)
-UNSTEADY = ("mpd", "edmp")
-"""Their guides follow many small gradients: how a process happened to compile them can decide a path, most of
-all on shelves. What differs is printed, and counts for nothing: no test asks for it."""
-SEED = 3
-TIME_LIMIT = 60.0
-STEPS, BATCH = 100, 8
-TRAIN = {
-    "point_autoencoder": ("encoder", "--encoder", "point_autoencoder"),
-    "compression_autoencoder": ("encoder", "--encoder", "compression_autoencoder"),
-    "compact": ("planner", "--data", "{data}", "--encoder", "{point_autoencoder}"),
-    "mpnet": ("baseline", "mpnet", "--data", "{data}"),
-    "mpinets": ("baseline", "mpinets", "--data", "{data}"),
-    "trajectory_prior": ("baseline", "trajectory_prior", "--data", "{data}"),
-}
-"""Every trainable thing but the completing network, which draws its samples itself: what follows
-`robotdiffuse train`."""
-
+MIX = ("rop", "rop_dense", "shelf", "crate", "table")
 Entry = dict[str, object]
 
 
@@ -122,7 +95,7 @@ def command(*arguments: str) -> None:
 
 
 def make_data(folder: Path) -> None:
-    mix = ",".join(f"{name}=1" for name, _ in PLANS)
+    mix = ",".join(f"{name}=1" for name in MIX)
     sizes = ("--trajectories", "60", "--shard", "60", "--goals", "3", "--seed", "5", "--workers", "1")
     with patch.object(
         factory, "on_this_machine", lambda call, calls, _: (one for one in enumerate(starmap(call, calls)))
@@ -137,37 +110,7 @@ def shard() -> Iterator[tuple[str, Entry]]:
             yield name, entry(values)
 
 
-def weights() -> Iterator[tuple[str, Entry]]:
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        places = {"data": str(folder / "data"), **{run: str(folder / run) for run in TRAIN}}
-        make_data(folder / "data")
-        for run, arguments in TRAIN.items():
-            sizes = ("--samples", str(STEPS * BATCH), "--batch", str(BATCH), "--out", places[run])
-            command("train", *(text.format(**places) for text in arguments), *sizes)
-            [file] = {*folder.joinpath(run).glob("*.safetensors")} - {folder / run / "training.safetensors"}
-            tensors = load_file(file)
-            yield run, entry(np.concatenate([tensors[key].astype(float).ravel() for key in sorted(tensors)]))
-
-
-def plans(planners: tuple[str, ...] = PLANNERS) -> Iterator[tuple[str, Entry]]:
-    asked = [(family, index, held_out_problem(family, index)) for family, index in PLANS]
-    for name in planners:
-        planner = load_planner(name)
-        for family, index, problem in asked:
-            limit = TIME_LIMIT if name not in ("mpnet", "mpinets", "mpd", "edmp", "ompl_rrt") else 10.0
-            result = planner.plan(problem, time_limit=limit, seed=SEED)
-            label = f"{name} {family}/{index}"
-            yield label, {"shape": []} if result.path is None else entry(result.path.positions)
-
-
-SECTIONS: dict[str, Callable[[], Iterator[tuple[str, Entry]]]] = {
-    "problems": problems,
-    "shard": shard,
-    "weights": weights,
-    "plans": plans,
-    "unsteady": partial(plans, UNSTEADY),
-}
+SECTIONS: dict[str, Callable[[], Iterator[tuple[str, Entry]]]] = {"problems": problems, "shard": shard}
 
 
 def compare(section: str) -> list[str]:
@@ -178,7 +121,7 @@ def compare(section: str) -> list[str]:
     for name, new in found.items():
         verdict = same(new, golden[name]) if name in golden else "new"
         print(f"{section:10} {name:32} {verdict}", flush=True)
-        if verdict in ("differs", "new") and section != "unsteady":
+        if verdict in ("differs", "new"):
             lines.append(f"{section}: {name} {verdict}: {new} in place of {golden.get(name)}")
     return lines
 
@@ -194,7 +137,6 @@ def main() -> int:
         print("\n".join(lines) or "everything is the same")
         return int(bool(lines))
     golden = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else {}
-    golden["processor"] = get_host_cpu_name()
     for section in asked:
         golden[section] = dict(SECTIONS[section]())
     GOLDEN.write_text(json.dumps(golden, indent=1) + "\n")

@@ -60,7 +60,8 @@ def test_what_views_see_in_reach_is_no_scene_beyond_it() -> None:
     view = ray_cast(scene, T_base_camera, (75.0, 75.0, 39.5, 29.5), (80, 60), PANDA, np.array(START))
     far = rd.Scene([rd.Sphere([0, 5, 0], 0.2)])
     problem = rd.Problem(PANDA, far, START, GOAL, views=[view], unknown="padded")
-    assert not load_planner("aorrtc").plan(problem).notes
+    notes = load_planner("aorrtc").plan(problem).notes
+    assert all(note.startswith("compiled for") for note in notes), notes
 
 
 def test_a_cloud_that_the_arm_stands_in_is_noted() -> None:

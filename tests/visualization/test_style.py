@@ -8,9 +8,11 @@ import pytest
 from helpers.three_bars import CORNERS, CUBE
 from helpers.visual_bundles import visual_meshes, write_visual
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path
+from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.visual_meshes import VisualMesh, load_visual
-from robotdiffuse.visualization.style import creased, dense, robot_surfaces, tool_point, trace
+from robotdiffuse.robots.visual_meshes import VisualMesh, has_visual, load_visual
+from robotdiffuse.visualization.style import creased, dense, facts, robot_surfaces, tool_point, trace
 
 
 def test_trace_follows_the_outer_end_of_the_tip(arm, motion):
@@ -58,6 +60,24 @@ def test_visual_meshes_survive_the_file_and_must_agree(arm, tmp_path, monkeypatc
     np.testing.assert_array_equal(drawn["tip"][0].faces, CUBE)
     np.testing.assert_array_equal(drawn["tip"][0].colors, colors)
     np.testing.assert_array_equal(drawn["arm"][0].vertices, arm.meshes["arm"][0].vertices)
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "ur5e", "ur10", "xarm7"])
+def test_bundled_visual_meshes_are_drawn(name):
+    robot = load_robot(name)
+    assert has_visual(robot)
+    plain = {
+        link
+        for link, drawn in load_visual(robot).items()
+        if len(robot.meshes.get(link, ())) and len(drawn[0].faces) == len(robot.meshes[link][0].faces)
+    }
+    assert plain <= {"ee_link"}, "these links are drawn by their collision geometry"
+
+
+def test_the_caption_says_that_collision_geometry_is_drawn():
+    motion = Path(("a",), np.zeros((2, 1)))
+    assert ("drawn by", "collision geometry") in facts(motion, None, load_robot("iiwa14"))
+    assert ("drawn by", "collision geometry") not in facts(motion, None, load_robot("ur5e"))
 
 
 def test_visual_meshes_of_a_urdf(tmp_path):

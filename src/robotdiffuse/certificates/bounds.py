@@ -94,6 +94,11 @@ class Prover:
         self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
         self._of = {link: k for k, link in enumerate(self.linkage.links)}
         self._moved = self.linkage.moved
+        self.may_touch = np.array(
+            [[scene.may_touch(link, name) for name in self.obstacles.names] for link in self.linkage.links],
+            bool,
+        ).reshape(len(self.linkage.links), len(self.obstacles.names))
+        """[links, obstacles] allowed contacts, which are checked nowhere."""
         balls = [_balls(robot, link) for link in self.linkage.links]
         self._balls = np.concatenate([np.zeros((0, 4)), *balls])
         counts = [len(rows) for rows in balls]
@@ -189,7 +194,10 @@ class Prover:
             moved = moved & ~self._moved[nearer]
             distances = self._to_links(postures, at, centers, nearer[row])
         else:
-            distances = self.obstacles.distances(centers).min(axis=1, initial=CLEARANCE_CAP)
+            apart = self.obstacles.distances(centers)
+            if self.may_touch.any():
+                apart[self.may_touch[further[row]]] = CLEARANCE_CAP
+            distances = apart.min(axis=1, initial=CLEARANCE_CAP)
         went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
         clearance = np.minimum.reduceat(distances - radius, begin)
         return np.minimum(clearance, CLEARANCE_CAP), np.maximum.reduceat(went, begin) + others
@@ -259,6 +267,7 @@ class Prover:
                 bodies = self.others(claim, T, part)
                 if claim.against == SCENE:
                     apart = next(to_scene) - part.radius
+                    apart[self.may_touch[self._of[claim.link]]] = CLEARANCE_CAP
                 else:
                     apart = self.balls_apart(part, bodies)
                 apart, along = apart.copy(), apart - displacement[k]

@@ -40,8 +40,11 @@ def robot_parts(robot: Robot) -> dict[str, str]:
 
 
 def scene_parts(scene: Scene) -> dict[str, str]:
-    """Hashes of the obstacles, by name."""
-    return {shape.name: _hash(shape.kind, *_numbers(shape)) for shape in scene.shapes}
+    """Hashes of the obstacles, by name, and of the contacts that are allowed."""
+    parts = {shape.name: _hash(shape.kind, *_numbers(shape)) for shape in scene.shapes}
+    for name, links in scene.allowed_contacts:
+        parts[f"links that may touch {name}"] = _hash(links if isinstance(links, str) else sorted(links))
+    return parts
 
 
 def request_parts(problem: Problem) -> dict[str, str]:

@@ -60,6 +60,8 @@ class PlaneFinder:
             apart = prover.balls_apart(part, bodies)
             first = self._parts[claim.link][p]
             first = first._replace(T=T_base_link @ first.T)
+            if claim.against == SCENE:
+                apart[prover.may_touch[links.index(claim.link)]] = np.inf
             for o, body in enumerate(bodies):
                 if apart[o] >= needed:
                     continue

@@ -30,10 +30,16 @@ def add(commands: argparse._SubParsersAction) -> None:
 def run_check(arguments: argparse.Namespace) -> int:
     from robotdiffuse.certificates.certificate import load_certificate
     from robotdiffuse.cli.console import clearances
-    from robotdiffuse.problems.files import load_problem
+    from robotdiffuse.problems.files import load_problem, problem_from_record
+    from robotdiffuse.scenes.scene import contact_notes
 
-    certificate = load_certificate(arguments.file)
-    problem = None if arguments.problem is None else load_problem(arguments.problem)
+    certificate, problem = load_certificate(arguments.file), None
+    if arguments.problem is not None:
+        problem = load_problem(arguments.problem)
+    elif certificate.problem is not None:
+        problem = problem_from_record(certificate.problem)
+    for note in () if problem is None else contact_notes(problem.scene):
+        print(f"note: {note}")
     found = certificate.check(problem).differences
     for line in found:
         print(line)

@@ -176,7 +176,7 @@ def _problem(arguments: argparse.Namespace) -> "Problem":
     """The problem of the file, changed by --unknown and --blend."""
     from robotdiffuse.problems.files import load_problem
 
-    problem = load_problem(arguments.problem, arguments.index)
+    problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     if arguments.unknown is not None:
         problem = with_policy(problem, arguments.unknown)
     if arguments.next_view:

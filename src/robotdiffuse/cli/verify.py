@@ -58,10 +58,11 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.scenes.scene import contact_notes
 
     out = None if arguments.certificate is None else check_output(arguments.certificate, (".json",))
     problem, motions, notes = _read(arguments)
-    for note in notes:
+    for note in (*notes, *contact_notes(problem.scene)):
         print(f"note: {note}")
     valid = all([_validated(problem, what, motion, arguments.all) for what, motion in motions.items()])
     if out is not None and valid:

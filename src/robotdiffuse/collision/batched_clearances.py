@@ -124,6 +124,7 @@ def _scene(empty, floors, floor, kinds, params, rows):
         empty.grid,
         empty.nearest,
         empty.grid_frame,
+        empty.may_touch,
     )
 
 

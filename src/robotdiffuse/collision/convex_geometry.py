@@ -121,8 +121,13 @@ def solids_of(scene: Scene) -> tuple[Solid, ...]:
     return tuple(solid for solid in map(_solid, scene.shapes) if solid is not None)
 
 
-def solid_arrays(solids: tuple[Solid, ...]) -> Solids:
-    """The arrays of solids for compiled code."""
+def solid_arrays(robot: Robot, scene: Scene) -> Solids:
+    """The arrays of the obstacles for compiled code."""
+    solids = solids_of(scene)
+    may_touch = np.zeros((0, 0), np.bool_)
+    if scene.allowed_contacts:
+        rows = [[scene.may_touch(check.link, s.shape.name) for s in solids] for check in checks_of(robot)]
+        may_touch = np.array(rows, np.bool_).reshape(-1, len(solids))
     T = np.array([solid.T_base_box for solid in solids]).reshape(-1, 4, 4)
     return Solids(
         np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),
@@ -131,6 +136,7 @@ def solid_arrays(solids: tuple[Solid, ...]) -> Solids:
         np.array([solid.disc for solid in solids], np.float64),
         np.array([solid.rounding for solid in solids], np.float64),
         np.array([solid.bounds for solid in solids], np.bool_),
+        may_touch,
     )
 
 

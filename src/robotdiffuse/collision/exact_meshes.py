@@ -8,7 +8,7 @@ represented by its spheres. Where convex parts of two grazing links touch, their
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -180,7 +180,7 @@ class ExactCollision:
     """Moving links against the scene, then the pairs of links."""
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
-        self.robot, self._solids = robot, solids_of(scene)
+        self.robot, self.scene, self._solids = robot, scene, solids_of(scene)
         self._pieces, self._obstacles = _pieces(robot), _obstacles(scene)
         self.checks = checks_of(robot)
         self.links = tuple(check.link for check in self.checks if check.other is None)
@@ -192,15 +192,14 @@ class ExactCollision:
         self._contacts.num_max_contacts = MAX_CONTACTS
         self._collide = coal.CollisionRequest()
 
-    @cached_property
-    def _boxes(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """The obstacles' boxes: R_box_base [o,3,3], centres [o,3], half sizes [o,3] and roundings [o]."""
-        T = np.stack([solid.T_base_box for solid in self._solids])
+    def _boxes(self, solids: Sequence[Solid]) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """The boxes of obstacles: R_box_base [o,3,3], centres [o,3], half sizes [o,3] and roundings [o]."""
+        T = np.stack([solid.T_base_box for solid in solids])
         return (
             np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),
             np.ascontiguousarray(T[:, :3, 3]),
-            np.stack([solid.half + solid.disc * np.array([1.0, 1.0, 0.0]) for solid in self._solids]),
-            np.array([solid.rounding for solid in self._solids]),
+            np.stack([solid.half + solid.disc * np.array([1.0, 1.0, 0.0]) for solid in solids]),
+            np.array([solid.rounding for solid in solids]),
         )
 
     @cached_property
@@ -218,10 +217,12 @@ class ExactCollision:
                 lambda frames: kernel.pair_bounds(frames, *balls, *other_balls),
                 surface_pairs(self.robot).get(check),
             )
-        if not self._obstacles:
+        kept = [i for i, one in enumerate(self._obstacles) if not self.scene.may_touch(check.link, one.name)]
+        if not kept:
             return _Candidates(firsts, (), lambda frames: np.zeros((len(frames), 0)))
-        boxes = self._boxes
-        return _Candidates(firsts, self._obstacles, lambda frames: kernel.scene_bounds(frames, *balls, boxes))
+        boxes = self._boxes([self._solids[i] for i in kept])
+        obstacles = tuple(self._obstacles[i] for i in kept)
+        return _Candidates(firsts, obstacles, lambda frames: kernel.scene_bounds(frames, *balls, boxes))
 
     def _place(self, piece: _Piece, frames: ndarray) -> coal.Transform3s:
         T = frames[piece.frame]

@@ -17,6 +17,7 @@ from robotdiffuse.collision.point_cloud_grid import (
     PointGrid,
     build_grid,
     cover_triangles,
+    join_to_few,
     thin_points,
 )
 from robotdiffuse.collision.sphere_pair_tables import build_pair_tables, no_tables
@@ -71,7 +72,7 @@ class RobotArrays(NamedTuple):
 
 class SceneArrays(NamedTuple):
     """Obstacles by type. Rows of oriented shapes: centre, world-to-shape rotation (row-major), three
-    dimensions."""
+    dimensions. Surfaces that links may touch are spheres among the solids."""
 
     spheres: ndarray
     """[n, 4] centre, radius."""
@@ -102,6 +103,8 @@ class SceneArrays(NamedTuple):
     grid_frame: ndarray
     """[14] origin x y z; edges of voxel and cell; largest and smallest radius of a point; band; numbers of
     voxels nx, ny, nz; numbers of cells."""
+    may_touch: ndarray
+    """[groups, solids] whether a group of the robot may touch a solid; [0, 0] without allowed contacts."""
 
 
 def robot_groups(robot: Robot) -> tuple[str, ...]:
@@ -234,19 +237,23 @@ def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
     """The arrays of the part of a scene that the robot can come near. The last few are cached, because a
     search and the validator use the same."""
     largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
-    return compile_scene(scene, reach_bound(robot), largest)
+    return compile_scene(scene, reach_bound(robot), largest, robot_groups(robot))
 
 
-def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> SceneArrays:
+def compile_scene(
+    scene: Scene, reach: float = np.inf, radius: float = 0.0, groups: tuple[str, ...] = ()
+) -> SceneArrays:
     """The arrays of a scene around a robot that reaches `reach` far from its base's origin [m].
 
-    Points well beyond that are left out. `radius` is that of the robot's largest sphere [m].
+    Points well beyond that are left out. `radius` is that of the robot's largest sphere [m]; `groups` are its
+    links with spheres, for allowed contacts.
     """
     spheres, boxes, cylinders, capsules, points = [], [], [], [], []
+    touched = {name for name, _ in scene.allowed_contacts}
     for shape in scene.shapes:
         match shape:
             case Sphere():
-                spheres.append(shape)
+                spheres.append((shape.name, np.array([[*shape.center, shape.radius]])))
             case Box():
                 boxes.append(shape)
             case Cylinder():
@@ -254,16 +261,34 @@ def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> S
             case Capsule():
                 capsules.append(shape)
             case PointCloud() | Triangulated():
-                points.append(shape)
-    balls = np.array([[*shape.center, shape.radius] for shape in spheres]).reshape(-1, 4)
+                if shape.name in touched:
+                    spheres.append((shape.name, join_to_few(_cover(shape, reach))))
+                else:
+                    points.append(shape)
+    balls = np.concatenate([NO_SPHERES, *(rows for _, rows in spheres)])
     edges = np.array([shape.size for shape in boxes]).reshape(-1, 3)
+    names = [name for name, rows in spheres for _ in rows]
+    names += [shape.name for shape in (*boxes, *cylinders, *capsules)]
     by_type = (
         _grown(balls, slice(3, 4)).astype(np.float32),
         _oriented(boxes, edges / 2, (0, 1, 2), reach),
         _round(cylinders, reach),
         _round(capsules, reach),
     )
-    return SceneArrays(*by_type, *_solids(*by_type), *_grid_around(tuple(points), reach, radius))
+    return SceneArrays(
+        *by_type,
+        *_solids(*by_type),
+        *_grid_around(tuple(points), reach, radius),
+        _may_touch(scene, groups, names),
+    )
+
+
+def _may_touch(scene: Scene, groups: tuple[str, ...], names: list[str]) -> ndarray:
+    """`SceneArrays.may_touch` for solids with these names."""
+    if not scene.allowed_contacts:
+        return np.zeros((0, 0), np.bool_)
+    allowed = {name: [scene.may_touch(link, name) for link in groups] for name in dict.fromkeys(names)}
+    return np.array([allowed[name] for name in names], np.bool_).reshape(len(names), len(groups)).T.copy()
 
 
 def _solids(
@@ -287,6 +312,13 @@ def _solids(
     return rows, by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), EMPTY_BOX)
 
 
+def _cover(shape: PointCloud | Triangulated, reach: float) -> ndarray:
+    """Spheres [n, 4] that contain the points or triangles that the robot can come near."""
+    if isinstance(shape, PointCloud):
+        return thin_points(shape.points, shape.point_radius, reach)
+    return cover_triangles(shape.mesh.world_vertices[shape.mesh.faces], reach)
+
+
 @lru_cache(maxsize=8)
 def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, radius: float) -> PointGrid:
     """The grid of point clouds and meshes, cached, so that scenes with the same clouds and meshes share
@@ -295,10 +327,7 @@ def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, ra
     for i, shape in enumerate(shapes):
         points = sum(map(len, clouds))
         check_time(f"{len(shapes) - i} of {len(shapes)} meshes and clouds after {points:,} points")
-        if isinstance(shape, PointCloud):
-            clouds.append(thin_points(shape.points, shape.point_radius, reach))
-        else:
-            clouds.append(cover_triangles(shape.mesh.world_vertices[shape.mesh.faces], reach))
+        clouds.append(_cover(shape, reach))
     cloud = np.concatenate(clouds) if clouds else NO_SPHERES
     check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS_PER_POINT * len(cloud))
     return build_grid(cloud, radius)

@@ -26,7 +26,6 @@ from robotdiffuse.collision.convex_geometry import (
     checks_of,
     hulls_of,
     solid_arrays,
-    solids_of,
     surfaces_decide,
 )
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
@@ -128,7 +127,7 @@ class ContinuousCollision:
         self.robot, self.scene, self.contact, self.tightness = robot, scene, contact, tightness
         self.arm, self.checks = _arm(robot), _checks(robot)
         self.scene_arrays = compile_scene_for(robot, scene)
-        self.solids = solid_arrays(solids_of(scene))
+        self.solids = solid_arrays(robot, scene)
 
     def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
         """Certify the motion along straight lines in joint space through the waypoints (at least one)."""

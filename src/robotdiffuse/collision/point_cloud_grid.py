@@ -18,6 +18,9 @@ THINNING = 0.5
 MAX_POINTS = 400_000
 """Spheres of a mesh obstacle at most, about; larger meshes are divided more coarsely, or their pieces
 merged."""
+JOIN_VOXEL, MAX_SOLIDS = 0.004, 1000
+"""Edge of the voxels by which spheres of surfaces that links may touch are first joined [m], and the number
+that is left at most: these spheres are not in the grid, but checked one by one."""
 EXACT_RANGE = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
 VOXELS_PER_RANGE = 10
@@ -69,6 +72,15 @@ def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]
     away = spheres[:, :3] - np.repeat(centres, counts, axis=0)
     radii = np.maximum.reduceat(np.sqrt(np.einsum("ij,ij->i", away, away)) + spheres[:, 3], starts)
     return np.column_stack([centres, radii])
+
+
+def join_to_few(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "m 4"]:
+    """At most MAX_SOLIDS spheres that contain all of these."""
+    voxel = JOIN_VOXEL
+    while len(spheres) > MAX_SOLIDS:
+        spheres = _join(spheres, voxel)
+        voxel *= 1.5
+    return spheres
 
 
 def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:

@@ -18,6 +18,7 @@ from robotdiffuse.core.settings import Bound, Natural, OneOf, Settings
 from robotdiffuse.core.types import CONVERGED, OBJECTIVES, TIME, UNTIL, Path, Status, Trajectory
 from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem
 from robotdiffuse.problems.units import unit_notes
+from robotdiffuse.scenes.scene import contact_notes
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
     NO_EXTRA_LIMITS,
@@ -96,7 +97,7 @@ class PlanningContext:
         expected = _validation_seconds.get(problem.robot.name, 0.0)
         self._reserved = min(expected, MAX_RESERVED_FRACTION * request.time_limit)
         self.validator = verifier(problem)
-        self.notes = [*unit_notes(problem), *problem.notes]
+        self.notes = [*unit_notes(problem), *contact_notes(problem.scene), *problem.notes]
         """Notes of the result, on what was changed or ignored; planners may add to them."""
         self.prepared = 0.0
         """When the search began [s since the call]."""

@@ -27,6 +27,7 @@ from robotdiffuse.problems.goals import PosesGoal as PosesGoal
 from robotdiffuse.problems.problem_fields import (
     base_pose,
     blend_radii,
+    check_contacts,
     checked_configuration,
     checked_goal,
     checked_payload,
@@ -136,6 +137,7 @@ class Problem(Value):
             raise InputError(f"robot is {shown(self.robot)}; it must be a Robot, e.g. rd.load_robot('panda')")
         if not isinstance(self.scene, Scene):
             raise InputError(f"scene is {shown(self.scene)}; it must be a Scene, e.g. rd.Scene([shape, ...])")
+        check_contacts(self.robot, self.scene)
         notes = list(self.notes)
         checked: dict[str, Any] = {
             "start": checked_configuration(self.robot, "start", self.start, notes),
@@ -229,7 +231,7 @@ class Problem(Value):
     def known_scene(self) -> Scene:
         """The scene as it was given: without the points that the views observed."""
         known = [shape for shape in self.scene.shapes if not isinstance(shape, SeenPoints)]
-        return self.scene if len(known) == len(self.scene.shapes) else Scene(known)
+        return self.scene if len(known) == len(self.scene.shapes) else self.scene.with_shapes(known)
 
     load: ClassVar[Callable[..., "Problem"]]
     """`problems.files.load_problem`, assigned by the package: files import problems, not the reverse."""
@@ -290,4 +292,4 @@ def _scene_with_views(
     from robotdiffuse.perception.seen_points import seen_shapes  # compiled code, which only views need
 
     goals = goal.positions if isinstance(goal, JointGoal) else start[None]
-    return Scene([*known.shapes, *seen_shapes(views, robot, known, start, goals)])
+    return known.with_shapes([*known.shapes, *seen_shapes(views, robot, known, start, goals)])

@@ -16,7 +16,7 @@ from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.robots.named_poses import named_pose
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene import ALL_LINKS, Scene
 
 LIMIT_SLACK = 1e-5
 """Configurations beyond a joint limit by at most this are clamped to it, with a note [rad] or [m]."""
@@ -93,6 +93,14 @@ def _check_planned_joint_moves(robot: Robot, field: str, frame: str) -> None:
         raise unknown_name(f"link in {field}:", frame, moved)
     if frame not in moved:
         raise InputError(f"{field}: no planned joint moves {frame!r}; they move {', '.join(moved)}")
+
+
+def check_contacts(robot: Robot, scene: Scene) -> None:
+    """Raises InputError for allowed contacts of links that the robot lacks."""
+    for obstacle, links in scene.allowed_contacts:
+        for link in () if links == ALL_LINKS else links:
+            if link not in robot.link_names:
+                raise unknown_name(f"link in allowed_contacts of {obstacle}:", link, robot.link_names)
 
 
 def moving_obstacles(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]:
@@ -183,9 +191,9 @@ def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float
         return float(value)
     within = float(np.clip(value, joint.lower, joint.upper))
     if abs(value - within) > LIMIT_SLACK:
-        raise InputError(
-            f"{field}: {joint.name} is {value:g} {unit}; its limits are {joint.lower:g} to {joint.upper:g}"
-        )
+        hint = " (angles are in radians)" if unit == "rad" and abs(value) > 2 * np.pi else ""
+        limits = f"{joint.lower:g} to {joint.upper:g}"
+        raise InputError(f"{field}: {joint.name} is {value:g} {unit}; its limits are {limits}{hint}")
     if value != within:
         notes.append(f"{field}: {joint.name} clamped from {float(value)!r} to its limit {within!r} {unit}")
     return within

@@ -34,7 +34,7 @@ def load_visual(robot: Robot) -> dict[str, tuple[VisualMesh, ...]]:
     spheres.
 
     A bundled mesh that differs from the robot's collision geometry is not used, so that pictures show the
-    robot that was planned for.
+    robot that was planned for. It may be smaller on links that no planned joint moves.
     """
     bundled = _read_bundled(robot.name)
     drawn: dict[str, tuple[VisualMesh, ...]] = {}
@@ -42,7 +42,7 @@ def load_visual(robot: Robot) -> dict[str, tuple[VisualMesh, ...]]:
     for link in robot.link_names:
         collision = _collision_geometry(robot, link, colors.get(link, LINK_COLOR))
         visual = bundled.get(link)
-        if visual is not None and (not collision or _agree(visual, collision)):
+        if visual is not None and (not collision or _agree(visual, collision, robot.link_frame(link) > 0)):
             drawn[link] = (visual,)
         elif collision:
             drawn[link] = collision
@@ -65,10 +65,15 @@ def _plain(vertices: ndarray, faces: ndarray, color: tuple[int, int, int]) -> Vi
     return VisualMesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int64), colors)
 
 
-def _agree(visual: VisualMesh, collision: tuple[VisualMesh, ...]) -> bool:
+def _agree(visual: VisualMesh, collision: tuple[VisualMesh, ...], both_ways: bool) -> bool:
     points = np.concatenate([mesh.vertices for mesh in collision])
-    gap = np.abs([visual.vertices.min(0) - points.min(0), visual.vertices.max(0) - points.max(0)])
-    return bool(gap.max() < MAX_BOX_DIFFERENCE)
+    beyond = np.array([points.min(0) - visual.vertices.min(0), visual.vertices.max(0) - points.max(0)])
+    return bool((np.abs(beyond) if both_ways else beyond).max() < MAX_BOX_DIFFERENCE)
+
+
+def has_visual(robot: Robot) -> bool:
+    """Whether visual meshes of the arm are bundled; else `load_visual` draws its collision geometry."""
+    return bool(_read_bundled(robot.name))
 
 
 def _read_bundled(name: str) -> dict[str, VisualMesh]:

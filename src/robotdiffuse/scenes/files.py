@@ -54,8 +54,11 @@ def _without_rpy(where: str, data: dict[str, Any]) -> dict[str, Any]:
     return rest | {"wxyz": quaternion_from_rotation(rotation).tolist()}
 
 
-def read_scene(entries: object, folder: Path, field: str = "scene") -> tuple[Scene, tuple[str, ...]]:
-    """The scene of a list in a problem file, and notes on changes to it.
+def read_scene(
+    entries: object, folder: Path, contacts: object = (), field: str = "scene"
+) -> tuple[Scene, tuple[str, ...]]:
+    """The scene of a list in a problem file, and notes on changes to it; `contacts` is its
+    `allowed_contacts`.
 
     File names are relative to `folder`. Raises InputError for unknown shapes and fields, values of the wrong
     type and files that cannot be read; the message starts with the place in the file, e.g. scene[2].
@@ -78,7 +81,7 @@ def read_scene(entries: object, folder: Path, field: str = "scene") -> tuple[Sce
         if kind not in SHAPES:
             raise unknown_name(f"shape in {where}:", kind, SHAPES)
         shapes.append(_shape(f"{where}.{kind}", SHAPES[kind], values, folder, notes))
-    return Scene(shapes), tuple(notes)
+    return Scene(shapes, contacts), tuple(notes)  # type: ignore[arg-type]
 
 
 def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: list[str]) -> Shape:
@@ -124,6 +127,11 @@ def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str,
     """The scene as `read_scene` reads it, exactly. Shapes that were read from files are written as file
     names."""
     return [{shape.kind: _values(shape, folder)} for shape in scene.shapes]
+
+
+def contacts_entry(scene: Scene) -> dict[str, object]:
+    """The allowed contacts as problem files hold them."""
+    return {name: links if isinstance(links, str) else list(links) for name, links in scene.allowed_contacts}
 
 
 def _values(shape: Shape, folder: Path | None) -> dict[str, object]:

@@ -1,6 +1,6 @@
 """Scene: the static obstacles around a robot."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
 from typing import no_type_check
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import Value
-from robotdiffuse.core.errors import InputError, joined, unknown_name
+from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -18,18 +18,34 @@ from robotdiffuse.scenes.shapes import Shape
 
 SHOWN_NAMES = 5
 """Names of shapes in the text of a scene."""
+ALL_LINKS = "all"
+"""Stands for all links of a robot in `Scene.allowed_contacts`."""
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Scene(Value):
-    """Obstacles in the frame of the robot's base. A number is appended to names that are not unique."""
+    """Obstacles in the frame of the robot's base. A number is appended to names that are not unique.
+
+    allowed_contacts: for obstacles by name, the links that may touch them, or "all", such as
+    {"mug": ["panda_hand", "panda_leftfinger"], "table": "all"}. Held objects and tools are links too. A name
+    that several shapes were given stands for all of them. Contact that is allowed is no collision to
+    searches, validators and certificates, and does not count for clearances.
+
+    Raises InputError for anything but shapes, and for allowed contacts with unknown obstacles.
+    """
 
     shapes: tuple[Shape, ...] = ()
+    allowed_contacts: tuple[tuple[str, tuple[str, ...] | str], ...] = ()
+    """Names of obstacles, each with the names of links that may touch it, or ALL_LINKS."""
 
-    def __init__(self, shapes: Iterable[Shape] = ()) -> None:
+    def __init__(
+        self,
+        shapes: Iterable[Shape] = (),
+        allowed_contacts: Mapping[str, Sequence[str] | str] | Iterable[tuple[str, Sequence[str] | str]] = (),
+    ) -> None:
         named: list[Shape] = []
-        taken, last = set[str](), dict[str, int]()
+        taken, last, given = set[str](), dict[str, int](), dict[str, list[str]]()
         for i, shape in enumerate(shapes):
             if not isinstance(shape, Shape):
                 raise InputError(
@@ -41,8 +57,10 @@ class Scene(Value):
                 name = f"{shape.name}_{number}"
             taken.add(name)
             last[shape.name] = number
+            given.setdefault(shape.name, []).append(name)
             named.append(shape if name == shape.name else dataclass_replace(shape, name=name))  # type: ignore[type-var]
         object.__setattr__(self, "shapes", tuple(named))
+        object.__setattr__(self, "allowed_contacts", _contacts(allowed_contacts, given, taken))
 
     def __repr__(self) -> str:
         count = f"{len(self.shapes)} shape" + ("" if len(self.shapes) == 1 else "s")
@@ -51,7 +69,23 @@ class Scene(Value):
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Scene":
         """The scene after the rigid motion T."""
-        return Scene([shape.moved(T) for shape in self.shapes])
+        return self.with_shapes([shape.moved(T) for shape in self.shapes])
+
+    def with_shapes(self, shapes: Iterable[Shape]) -> "Scene":
+        """A scene of other shapes, with the allowed contacts of those that have the name of one of these."""
+        scene = Scene(shapes)
+        if self.allowed_contacts:
+            names = {shape.name for shape in scene.shapes}
+            kept = tuple(contact for contact in self.allowed_contacts if contact[0] in names)
+            object.__setattr__(scene, "allowed_contacts", kept)
+        return scene
+
+    def may_touch(self, link: str, obstacle: str) -> bool:
+        """Whether contact of this link with this obstacle is allowed."""
+        return any(
+            name == obstacle and (links == ALL_LINKS or link in links)
+            for name, links in self.allowed_contacts
+        )
 
     def attach(
         self,
@@ -72,7 +106,8 @@ class Scene(Value):
         link = robot.tip if link is None else link
         robot.link_frame(link)  # raises InputError, with the known links, for an unknown one
         held = self.shapes[names.index(name)].moved(inverse(link_pose(robot, np.asarray(q, float), link)))
-        return Scene([s for s in self.shapes if s.name != name]), robot.attach(held, link, touch_links)
+        left = self.with_shapes([shape for shape in self.shapes if shape.name != name])
+        return left, robot.attach(held, link, touch_links)
 
     def detach(self, name: str, robot: Robot, q: Float[ndarray, "dof"]) -> tuple["Scene", Robot]:
         """The scene with an object that the robot releases at configuration q, and the robot without it."""
@@ -80,4 +115,41 @@ class Scene(Value):
         [body] = [body for body in robot.attached if body.name == name]
         T_base_link = link_pose(robot, np.asarray(q, float), body.link)
         left = [shape.moved(T_base_link) for shape in body.shapes if isinstance(shape, Shape)]
-        return Scene([*self.shapes, *left]), freed
+        return self.with_shapes([*self.shapes, *left]), freed
+
+
+def contact_notes(scene: Scene) -> tuple[str, ...]:
+    """A note on each obstacle that links may touch."""
+    return tuple(
+        f"contact of {name} with {'all links' if links == ALL_LINKS else joined(links)} is allowed"
+        for name, links in scene.allowed_contacts
+    )
+
+
+def _contacts(
+    allowed: object, given: dict[str, list[str]], names: set[str]
+) -> tuple[tuple[str, tuple[str, ...] | str], ...]:
+    """Checked `Scene.allowed_contacts`. `given` maps the names that shapes were given to their unique
+    ones."""
+    try:
+        entries = allowed.items() if isinstance(allowed, Mapping) else [(a, b) for a, b in allowed]  # type: ignore
+    except (TypeError, ValueError):
+        raise InputError(
+            f"allowed_contacts is {shown(allowed)}; it must map obstacles to lists of links or to {ALL_LINKS}"
+        ) from None
+    found: dict[str, tuple[str, ...] | str] = {}
+    for obstacle, links in entries:
+        if not isinstance(obstacle, str) or (obstacle not in given and obstacle not in names):
+            raise unknown_name("obstacle in allowed_contacts:", obstacle, names)
+        if links != ALL_LINKS:
+            if not isinstance(links, list | tuple) or not all(isinstance(link, str) for link in links):
+                raise InputError(
+                    f"allowed_contacts: {obstacle} has {shown(links)}; it must be a list of links, or "
+                    f"{ALL_LINKS}"
+                )
+            links = tuple(dict.fromkeys(links))
+        for name in given.get(obstacle, [obstacle]):
+            before = found.get(name, ())
+            both = ALL_LINKS in (before, links)
+            found[name] = ALL_LINKS if both else tuple(dict.fromkeys((*before, *links)))
+    return tuple((name, links) for name, links in found.items() if links)

@@ -68,6 +68,8 @@ class PyBulletOracle:
         best: OracleContact | None = None
         for link in world.moving:
             for name, body in world.obstacles.items():
+                if world.scene.may_touch(link, name):
+                    continue
                 best = self._closer(best, within, link, name, body, -1)
         for a, b in world.pairs:
             best = self._closer(best, within, a, b, world.body, world.links[b])

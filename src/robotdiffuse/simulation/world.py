@@ -40,7 +40,7 @@ class World:
     """A robot on a fixed base, and replaceable obstacles. Call `close`, or use it in a `with` statement.
 
     Collisions are enabled for exactly the pairs that RobotDiffuse checks: links that a planned joint moves
-    against obstacles, and links on different frames unless they are allowed to touch.
+    against obstacles that they may not touch, and links on different frames unless they may touch.
     """
 
     def __init__(self, robot: Robot, scene: Scene, visuals: bool = False, density: float = DENSITY) -> None:
@@ -85,6 +85,7 @@ class World:
         self._filter_links(solid)
         for index, value in self.held.items():
             pybullet.resetJointState(self.body, index, value, physicsClientId=self.client)
+        self.scene = scene
         self.obstacles: dict[str, int] = {}
         """PyBullet's body index of each obstacle, by name."""
         self.mesh_shapes: dict[tuple[bytes, bytes], int] = {}
@@ -108,12 +109,13 @@ class World:
         """Replace all obstacles; the robot stays loaded."""
         for body in self.obstacles.values():
             pybullet.removeBody(body, physicsClientId=self.client)
-        self.obstacles = {}
+        self.scene, self.obstacles = scene, {}
         unmoved = [index for link, index in self.links.items() if self.robot.link_frame(link) == 0]
         for i, shape in enumerate(scene.shapes):
             body = self._add(shape, OBSTACLE_COLORS[i % len(OBSTACLE_COLORS)])
             self.obstacles[shape.name] = body
-            for index in unmoved:
+            allowed = [index for link, index in self.links.items() if scene.may_touch(link, shape.name)]
+            for index in {*unmoved, *allowed}:
                 pybullet.setCollisionFilterPair(self.body, body, index, -1, 0, physicsClientId=self.client)
 
     def place(self, q: Float[ndarray, "dof"]) -> None:

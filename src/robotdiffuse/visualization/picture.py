@@ -89,7 +89,7 @@ def write_picture(
     settings = settings or PictureSettings()
     pixels, _ = render(robot, scene, motion, settings)
     image = Image.fromarray(_faded_below(pixels))
-    _caption(image, title or robot.name, style.facts(motion, result))
+    _caption(image, title or robot.name, style.facts(motion, result, robot))
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=False)
     write_atomically(path, buffer.getvalue())

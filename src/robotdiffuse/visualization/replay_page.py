@@ -97,7 +97,7 @@ def _page_data(
         "candidates": [_candidate(robot, tool, path) for path in candidates],
         "start_color": START,
         "goal_color": GOAL,
-        "facts": style.facts(motion, result),
+        "facts": style.facts(motion, result, robot),
         "camera": _camera(robot, scene, surfaces, tool, motion.positions),
     }
 

@@ -12,7 +12,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.visual_meshes import load_visual
+from robotdiffuse.robots.visual_meshes import has_visual, load_visual
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
@@ -226,8 +226,11 @@ def decimated(
     return vertices, faces
 
 
-def facts(motion: Path | Trajectory, result: PlanResult | None) -> list[tuple[str, str]]:
-    """Labels and values of facts about a motion, for headers and captions."""
+def facts(
+    motion: Path | Trajectory, result: PlanResult | None, robot: Robot | None = None
+) -> list[tuple[str, str]]:
+    """Labels and values of facts about a motion, for headers and captions; of a robot whose visual meshes are
+    not bundled, how it is drawn."""
     length = result.path_length if result is not None else None
     if length is None:
         length = Path(motion.joint_names, motion.positions).length
@@ -246,4 +249,6 @@ def facts(motion: Path | Trajectory, result: PlanResult | None) -> list[tuple[st
         rows.append(("duration", f"{motion.duration:.2f} s"))
     else:
         rows.append(("duration", "untimed"))
+    if robot is not None and not has_visual(robot):
+        rows.append(("drawn by", "collision geometry"))
     return rows

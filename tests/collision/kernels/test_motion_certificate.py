@@ -13,7 +13,7 @@ from numpy import ndarray
 from helpers.box_arm import box_mesh
 from helpers.example_robots import example_robot
 from robotdiffuse.collision.checker import CollisionChecker
-from robotdiffuse.collision.convex_geometry import checks_of, hulls_of, solid_arrays, solids_of
+from robotdiffuse.collision.convex_geometry import checks_of, hulls_of, solid_arrays
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernels import convex_bounds, motion_certificate
 from robotdiffuse.collision.kernels.motion_certificate import Motion, Pieces
@@ -136,7 +136,7 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
     q = rng.uniform(robot.lower, robot.upper)
     exact, arrays, (arm, parts) = (
         ExactCollision(robot, scene),
-        solid_arrays(solids_of(scene)),
+        solid_arrays(robot, scene),
         hulls_of(robot),
     )
     posture = convex_bounds.make_posture(arm, arrays, robot.dof)

@@ -185,7 +185,7 @@ WRONG: dict[str, tuple[object, str]] = {
     "empty": (None, "problem is None"),
     "unknown field": (
         GOOD | {"strat": []},
-        "unknown field of problem: 'strat'; known: attached, base, blend, clearance, constraints, goal",
+        "unknown field of problem: 'strat'; known: allowed_contacts, attached, base, blend",
     ),
     "field not a text": (GOOD | {1: 2}, "unknown field of problem: '?1'?"),
     "no start": (without("start"), "problem has no start"),

@@ -79,8 +79,8 @@ def _close(around, part, x, y, z, reach):
 
 
 @allocation_free(forceinline=True)
-def _row_cost(robot, scene, row, frame, margin, nearest, wrench):
-    """Cost of a row of spheres towards the scene; adds their forces to the wrench."""
+def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
+    """Cost of a group's row of spheres towards the scene; adds their forces to the wrench."""
     cost, around, bound = _ZERO, scene.solid_boxes, robot.row_bounds[row]
     u, v, w = placed(frame, bound[0], bound[1], bound[2])
     reach, any_close = bound[3] + margin, 0
@@ -102,6 +102,8 @@ def _row_cost(robot, scene, row, frame, margin, nearest, wrench):
         while close:
             k = part * W + first_lane(close)
             close &= close - 1
+            if len(scene.may_touch) and scene.may_touch[g, k]:
+                continue
             d = _signed_distances(x, y, z, scene.solids[k])
             nearer = d < best
             best = minimum(best, d)
@@ -167,7 +169,7 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
             continue
         wrench[:], of_link = _ZERO, _ZERO
         for row in range(robot.first_row[g], robot.first_row[g + 1]):
-            of_link += _row_cost(robot, scene, row, frames[index], margin, work.nearest, wrench)
+            of_link += _row_cost(robot, scene, g, row, frames[index], margin, work.nearest, wrench)
         if of_link > _ZERO:
             cost += of_link
             _pull(robot, frames, index, wrench, grad)

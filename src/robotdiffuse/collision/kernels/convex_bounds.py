@@ -53,6 +53,8 @@ class Solids(NamedTuple):
     """[n] radius of the ball."""
     bounds: np.ndarray
     """[n] whether the sum only bounds a surface or point cloud, whose exact distance only Coal computes."""
+    may_touch: np.ndarray
+    """[checks, n] whether the link of a check may touch the obstacle; [0, 0] without allowed contacts."""
 
 
 class Posture(NamedTuple):

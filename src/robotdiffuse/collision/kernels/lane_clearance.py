@@ -11,7 +11,7 @@ from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, points_distan
 from robotdiffuse.collision.kernels.simd import load, reduce_min
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
-_ZERO = np.float32(0.0)
+_ZERO, _FAR = np.float32(0.0), np.float32(1e9)
 
 
 @allocation_free(fastmath=True)
@@ -99,9 +99,19 @@ def _to_points(at, s, scene, radius, out):
         out[0, i] = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit)
 
 
+@allocation_free()
+def _pass_over_allowed(may_touch, g, out):
+    """Moves the solids that a group may touch out of its way, in the distances of its bounding sphere."""
+    for k in range(may_touch.shape[1]):
+        if may_touch[g, k]:
+            for i in range(W):
+                out[k, i] = _FAR
+
+
 @allocation_free(inline="always")
 def to_scene(at, s, scene, radius, near, mark, out):
-    """Distances to all obstacles; see `_to_spheres`."""
+    """Distances to all obstacles; see `_to_spheres`. With `mark`, s is a group and `at` holds the centres of
+    all bounding spheres."""
     n = 0
     _to_spheres(at, s, scene.spheres, near, n, mark, out)
     n += len(scene.spheres)
@@ -111,6 +121,8 @@ def to_scene(at, s, scene, radius, near, mark, out):
     n += len(scene.cylinders)
     _to_round(at, s, scene.capsules, False, near, n, mark, out)
     n += len(scene.capsules)
+    if mark and len(scene.may_touch):
+        _pass_over_allowed(scene.may_touch, s, out)
     if len(scene.points):
         if mark:
             _bound_points(at, s, scene, radius, n, out)

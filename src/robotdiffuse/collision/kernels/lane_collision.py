@@ -300,6 +300,8 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
             while close:
                 k = row * W + first_lane(close)
                 close &= close - 1
+                if len(scene.may_touch) and scene.may_touch[g, k]:
+                    continue
                 near = _touching(x, y, z, reach, solids, k) & ~hits
                 if near:
                     hits |= _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first)

@@ -342,6 +342,8 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     for p in range(checks.parts[c, 0], checks.parts[c, 1]):
         speed = meshes.part_speed(hulls, p, base, posture)
         for o in others:
+            if against_scene and len(solids.may_touch) and solids.may_touch[c, o]:
+                continue
             if against_scene:
                 middle = meshes.ball_to_solid(hulls, p, solids, o, posture)
             else:

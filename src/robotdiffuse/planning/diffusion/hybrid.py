@@ -124,7 +124,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         )
         if model is not None or result.stage == "straight_line":
             return result
-        note = f"there are no weights for {robot.name}; planned by search and smooth noise"
+        how = "search and smooth noise" if batches.drawn else "search alone"
+        note = f"there are no weights for {robot.name}; planned by {how}"
         return replace(result, notes=(*result.notes, note))
 
     def code(
@@ -160,6 +161,11 @@ class _Batches:
         """Whether the batches had less than their part of the work, and there is time for another one."""
         batches, share = self._spent + BATCH_WORK, self.planner.settings.network_share
         return batches <= share * (self.search.work + batches) and self._can()
+
+    @property
+    def drawn(self) -> bool:
+        """Whether there was a batch."""
+        return self._spent > 0
 
     def offer(self) -> None:
         """Draw a batch and offer its shortest free trajectories to the search, if there is time."""

@@ -222,7 +222,7 @@ class Explorer:
         outside = [int((self.map.unknown & self._occupied_by(q)).sum()) for q in goals]
         goal = goals[int(np.argmin(outside))]
         obstacles = not_seen_free(self.map, self.scene, (problem.start, goal))
-        scene = Scene([*problem.scene.shapes, *obstacles])
+        scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None]), views=()))
         if result.solved:
             return result

@@ -30,7 +30,6 @@ from robotdiffuse.planning.pipeline.moving_obstacles_kernel import earliest
 from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
 from robotdiffuse.planning.search.constrained import corner_kept
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.trajectories.stops import MIN_DISTANCE, SPEED_FACTORS, StopGraph
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.tolerances import goal_error
@@ -67,7 +66,8 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
         scene = problem.scene
         if attempts % 2:  # paths around the obstacles where they are at some time
             time = float(rng.uniform(0.0, horizon))
-            scene = Scene([*scene.shapes, *(one.at(time) for one in problem.moving if one.known)])
+            standing = (one.at(time) for one in problem.moving if one.known)
+            scene = scene.with_shapes([*scene.shapes, *standing])
         limit = max(PATH_TIME_FRACTION * (request.time_limit - context.elapsed), 1e-3)
         of_path = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
         found = plan_path(solver, replace(still, scene=scene), of_path)

@@ -43,7 +43,6 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.scenes.scene import Scene
 
 MAX_FIRST_MOTIONS, MIN_FIRST_MOTIONS = 8, 4
 """First motions under an assumption that the one of least probability is chosen from: most and fewest ..."""
@@ -117,17 +116,13 @@ def plan_with_unknown_space(
                 return _with_notes(context, result, policy_note, _lesser(failed, assumption.name))
             failed.append(assumption.name)
     result = attempts.best(as_seen, AS_SEEN, limit)
+    took = f"preparing it took {prepared:.2g} s of the time limit of {limit:g} s"
+    late = f"no time for the policy {policy}: {took}"
     if policy == OPTIMISTIC or not result.solved:
-        return _with_notes(context, result)
+        return _with_notes(context, result, "" if policy == OPTIMISTIC or failed else late)
     if failed:
         return _with_notes(context, result, policy_note, _lesser(failed, FREE_UNKNOWN_SPACE))
-    late = f"preparing it took {prepared:.2g} s of the time limit of {limit:g} s"
-    return _with_notes(
-        context,
-        result,
-        policy_note,
-        f"no time for the policy {policy}: {late}; planned with {FREE_UNKNOWN_SPACE}",
-    )
+    return _with_notes(context, result, policy_note, f"{late}; planned with {FREE_UNKNOWN_SPACE}")
 
 
 def policy_for(problem: Problem) -> tuple[str, str]:
@@ -208,7 +203,7 @@ def with_assumption(problem: Problem, assumption: Assumption, goals: Float[ndarr
     needed = np.array([assumption.touched(spheres) for spheres in at_goals] if len(at_goals) > 1 else [0])
     easiest = np.flatnonzero(needed == needed.min())
     obstacles = assumption.obstacles(np.concatenate([start, *(at_goals[i] for i in easiest)]))
-    scene = Scene([*problem.scene.shapes, obstacles])
+    scene = problem.scene.with_shapes([*problem.scene.shapes, obstacles])
     return replace(problem, scene=scene, goal=JointGoal(goals[easiest]), views=())
 
 

@@ -40,7 +40,6 @@ from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.goals import Goal
 from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.trajectories.speed_limits import Jerk
 from robotdiffuse.validation.validator import verifier
 
@@ -299,7 +298,9 @@ class Replanner:
         that; or back to the present path, where that is free."""
         settings, self._searches = self.settings, self._searches + 1
         later = time + PREDICTION_DELAYS[self._searches % len(PREDICTION_DELAYS)]
-        checker = CollisionChecker(self._robot, Scene([*self._still.scene.shapes, *predicted.shapes(later)]))
+        still = self._still.scene
+        scene = still.with_shapes([*still.shapes, *predicted.shapes(later)])
+        checker = CollisionChecker(self._robot, scene)
         roots, after = list(self._goals), [np.zeros((0, self._robot.dof))] * len(self._goals)
         if self._path.to_goal and not (settings.from_scratch or self._left):
             old = self._path.remaining(float(self._motion.s[-1]))

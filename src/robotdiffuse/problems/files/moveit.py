@@ -5,7 +5,7 @@ In these files, vectors may be lists or mappings (x, y, z), and quaternions are 
 https://docs.ros.org/en/noetic/api/moveit_msgs/html/msg/PlanningScene.html and MotionPlanRequest.html.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
+from robotdiffuse.problems.files.moveit_contacts import list_of, mapping_of, matrix_contacts
 from robotdiffuse.problems.files.moveit_shapes import cone, plane
 from robotdiffuse.robots.bodies import AttachedBody
 from robotdiffuse.robots.kinematics import link_pose
@@ -79,15 +80,17 @@ def read_moveit_scene(
 
     The pose of the root of the robot's URDF comes from robot_state.multi_dof_joint_state, the pose of its
     base relative to the root from the robot (None: base and root are the same), and frames from
-    fixed_frame_transforms and from the links that are fixed to the base. The allowed collision matrix is
-    ignored, because the robot has its own. Raises InputError, naming file and object, for a missing or
+    fixed_frame_transforms and from the links that are fixed to the base. Contacts of the robot's links with
+    objects are allowed as in the allowed collision matrix; its pairs of links are ignored, because the robot
+    has its own. Raises InputError, naming file and object, for a missing or
     damaged file, unknown frames, shapes that are not supported (prisms), and, unless
     `ignore_joints`, joints that the robot lacks.
     """
     data = read_yaml(file)
     try:
         notes = () if robot is None else scene_robot_notes(data, robot, ignore_joints)
-        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent), notes
+        links = () if robot is None else robot.link_names
+        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent, links), notes
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 
@@ -99,8 +102,8 @@ def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -
     only noted: the same arm has many names, and all joints are known. Names of multi-dof joints are ignored:
     they are virtual joints of an SRDF, whose transforms give the pose of the robot's root.
     """
-    data = _mapping("a planning scene", data)
-    state = _mapping("robot_state", data.get("robot_state"))
+    data = mapping_of("a planning scene", data)
+    state = mapping_of("robot_state", data.get("robot_state"))
     values = _joint_state("robot_state.joint_state", state.get("joint_state"))
     model = moveit_model(data)
     notes = joint_notes("robot_state.joint_state", values, robot, model, ignore_joints)
@@ -176,7 +179,7 @@ class MoveItFrames(dict[str, ndarray]):
 
     def of(self, where: str, entry: dict[str, Any]) -> Float[ndarray, "4 4"]:
         """T_base_frame of the frame that the header of an entry names."""
-        name = str(_mapping(f"{where}.header", entry.get("header")).get("frame_id") or "").removeprefix("/")
+        name = str(mapping_of(f"{where}.header", entry.get("header")).get("frame_id") or "").removeprefix("/")
         if name in self:
             return self[name]
         known = [frame for frame in self if frame]
@@ -194,11 +197,11 @@ def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
     The scene's own frame is the one in which robot_state.multi_dof_joint_state gives the pose of the robot,
     by default `world`. Raises InputError if it has more than one transform, that of the robot's root.
     """
-    state = _mapping("robot_state", _mapping("a planning scene", data).get("robot_state"))
+    state = mapping_of("robot_state", mapping_of("a planning scene", data).get("robot_state"))
     if state.get("attached_collision_objects"):
         raise InputError("attached_collision_objects are for the start_state of a request")
-    floating = _mapping("multi_dof_joint_state", state.get("multi_dof_joint_state"))
-    transforms = _list("multi_dof_joint_state.transforms", floating.get("transforms"))
+    floating = mapping_of("multi_dof_joint_state", state.get("multi_dof_joint_state"))
+    transforms = list_of("multi_dof_joint_state.transforms", floating.get("transforms"))
     T_own_root = np.eye(4)
     if len(transforms) > 1:
         raise InputError(
@@ -206,14 +209,16 @@ def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
         )
     if transforms:
         T_own_root = _pose("multi_dof_joint_state.transforms[0]", transforms[0], "translation", "rotation")
-    header = _mapping("multi_dof_joint_state.header", floating.get("header"))
+    header = mapping_of("multi_dof_joint_state.header", floating.get("header"))
     named = str(header.get("frame_id") or "").removeprefix("/")
     root = "" if robot is None else robot.root or robot.base
     frames = MoveItFrames(robot, T_own_root, ("", "world" if named in ("", root) else named))
-    fixed = _list("fixed_frame_transforms", _mapping("a planning scene", data).get("fixed_frame_transforms"))
+    fixed = list_of(
+        "fixed_frame_transforms", mapping_of("a planning scene", data).get("fixed_frame_transforms")
+    )
     for i, entry in enumerate(fixed):
         where = f"fixed_frame_transforms[{i}]"
-        entry = _mapping(where, entry)
+        entry = mapping_of(where, entry)
         child = str(entry.get("child_frame_id", "")).removeprefix("/")
         T = _pose(f"{where}.transform", entry.get("transform"), "translation", "rotation")
         if not frames.lost and child not in frames.links:
@@ -221,23 +226,32 @@ def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
     return frames
 
 
-def moveit_scene(data: object, frames: MoveItFrames, folder: Path) -> Scene:
-    """`read_moveit_scene` for a parsed file; names of mesh files are relative to `folder`."""
-    world = _mapping("world", _mapping("a planning scene", data).get("world"))
-    shapes = _octomap(_mapping("world.octomap", world.get("octomap")), frames)
-    for i, entry in enumerate(_list("world.collision_objects", world.get("collision_objects"))):
-        shown_id = _mapping(f"collision object {i}", entry).get("id", i)
+def moveit_scene(
+    data: object, frames: MoveItFrames, folder: Path, links: Collection[str] = (), contacts: object = ()
+) -> Scene:
+    """`read_moveit_scene` for a parsed file; names of mesh files are relative to `folder`.
+
+    links: names of the robot's links and held objects; contacts: allowed contacts besides those of the file,
+    as in `Scene`.
+    """
+    world = mapping_of("world", mapping_of("a planning scene", data).get("world"))
+    shapes = _octomap(mapping_of("world.octomap", world.get("octomap")), frames)
+    for i, entry in enumerate(list_of("world.collision_objects", world.get("collision_objects"))):
+        shown_id = mapping_of(f"collision object {i}", entry).get("id", i)
         try:
-            shapes.extend(_object(_mapping("it", entry), frames, folder))
+            shapes.extend(_object(mapping_of("it", entry), frames, folder))
         except InputError as error:
             raise InputError(f"collision object {shown_id}: {error}") from None
-    return Scene(shapes)
+    names = dict.fromkeys(shape.name for shape in shapes)
+    matrix = mapping_of("a planning scene", data).get("allowed_collision_matrix")
+    given = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
+    return Scene(shapes, (*matrix_contacts(matrix, names, links).items(), *given))
 
 
 def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
     """The occupied voxels of an OctomapWithPose as a cloud of spheres around them; none without data."""
-    message = _mapping("world.octomap.octomap", entry.get("octomap"))
-    data = _list("world.octomap.octomap.data", message.get("data"))
+    message = mapping_of("world.octomap.octomap", entry.get("octomap"))
+    data = list_of("world.octomap.octomap.data", message.get("data"))
     if not data:
         return []
     if not message.get("binary"):
@@ -256,18 +270,18 @@ def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
 def _object(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> list[Shape]:
     T_base_object = frames.of("header", entry) @ _pose("pose", entry.get("pose") or NO_POSE)
     name = str(entry.get("id") or "object")
-    planes = _list("planes", entry.get("planes"))
-    poses = _list("plane_poses", entry.get("plane_poses")) or [NO_POSE] * len(planes)
+    planes = list_of("planes", entry.get("planes"))
+    poses = list_of("plane_poses", entry.get("plane_poses")) or [NO_POSE] * len(planes)
     if len(poses) != len(planes):
         raise InputError(f"has {len(planes)} planes and {len(poses)} plane_poses; it must be one for each")
     shapes: list[Shape] = []
     for i, (part, pose) in enumerate(zip(planes, poses, strict=True)):
-        coefficients = vector(f"planes[{i}]", "coef", _mapping(f"planes[{i}]", part).get("coef"), 4)
+        coefficients = vector(f"planes[{i}]", "coef", mapping_of(f"planes[{i}]", part).get("coef"), 4)
         shapes.append(plane(coefficients, name).moved(T_base_object @ _pose(f"plane_poses[{i}]", pose)))
     for key, build in (("primitive", _primitive), ("mesh", _mesh)):
         plural = "meshes" if key == "mesh" else "primitives"
-        parts = _list(plural, entry.get(plural))
-        poses = _list(f"{key}_poses", entry.get(f"{key}_poses"))
+        parts = list_of(plural, entry.get(plural))
+        poses = list_of(f"{key}_poses", entry.get(f"{key}_poses"))
         if not poses and entry.get("pose"):
             poses = [NO_POSE] * len(parts)
         if len(poses) != len(parts):
@@ -278,7 +292,7 @@ def _object(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> list[S
             T = T_base_object @ _pose(f"{key}_poses[{i}]", pose)
             where = f"{plural}[{i}]"
             wxyz = quaternion_from_rotation(T[:3, :3])
-            shapes.append(build(where, _mapping(where, part), T[:3, 3], wxyz, name, folder))
+            shapes.append(build(where, mapping_of(where, part), T[:3, 3], wxyz, name, folder))
     return shapes
 
 
@@ -301,9 +315,9 @@ def _mesh(where: str, part: dict[str, Any], xyz: ndarray, wxyz: ndarray, name: s
         vertices, faces = read_triangles(folder / file)
         vertices = vertices * vector(where, "dimensions", part.get("dimensions", [1, 1, 1]), 3)
     else:
-        rows = _list(f"{where}.vertices", part.get("vertices"))
+        rows = list_of(f"{where}.vertices", part.get("vertices"))
         vertices = np.array([_xyz(f"{where}.vertices", row) for row in rows]).reshape(-1, 3)
-        triangles = _list(f"{where}.triangles", part.get("triangles"))
+        triangles = list_of(f"{where}.triangles", part.get("triangles"))
         indices = [t.get("vertex_indices") if isinstance(t, dict) else t for t in triangles]
         faces = np.array([vector(where, "triangles", triangle, 3) for triangle in indices])
     return Mesh(vertices, faces, xyz, wxyz, name=name)
@@ -316,22 +330,22 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     are a pose goal at the centre of the region, whose size and tolerances are ignored. Raises InputError for
     anything else, and for path constraints, because ignoring them would change the problem.
     """
-    data = _mapping("a motion plan request", data)
+    data = mapping_of("a motion plan request", data)
     for name in ("path_constraints", "trajectory_constraints"):
-        if any(_mapping(name, data.get(name)).values()):
+        if any(mapping_of(name, data.get(name)).values()):
             raise InputError(f"{name} are not supported")
     for name in ("reference_trajectories", "max_cartesian_speed"):
         if data.get(name):
             raise InputError(f"{name} is not supported; leave it out")
     notes = _scaling_notes(data)
-    state = _mapping("start_state", data.get("start_state"))
-    held = _list("attached_collision_objects", state.get("attached_collision_objects"))
+    state = mapping_of("start_state", data.get("start_state"))
+    held = list_of("attached_collision_objects", state.get("attached_collision_objects"))
     attached = tuple(_attached(i, entry, frames, folder) for i, entry in enumerate(held))
     start = _joint_state("start_state.joint_state", state.get("joint_state"))
-    goals = _list("goal_constraints", data.get("goal_constraints"))
+    goals = list_of("goal_constraints", data.get("goal_constraints"))
     if not goals:
         raise InputError("goal_constraints is empty; it must hold at least one goal")
-    if len(goals) == 1 and _mapping("goal_constraints[0]", goals[0]).get("position_constraints"):
+    if len(goals) == 1 and mapping_of("goal_constraints[0]", goals[0]).get("position_constraints"):
         return MoveItRequest(start, pose_goal=_pose_goal(goals[0], frames), attached=attached, notes=notes)
     each = tuple(_joint_goal(f"goal_constraints[{i}]", goal) for i, goal in enumerate(goals))
     return MoveItRequest(start, each, attached=attached, notes=notes)
@@ -339,9 +353,9 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
 
 def _joint_state(where: str, value: object) -> dict[str, float]:
     """Joint values by name."""
-    state = _mapping(where, value)
-    names = _list(f"{where}.name", state.get("name"))
-    positions = vector(where, "position", _list(f"{where}.position", state.get("position")), len(names))
+    state = mapping_of(where, value)
+    names = list_of(f"{where}.name", state.get("name"))
+    positions = vector(where, "position", list_of(f"{where}.position", state.get("position")), len(names))
     return dict(zip(map(str, names), positions.tolist(), strict=True))
 
 
@@ -360,9 +374,9 @@ def _scaling_notes(data: dict[str, Any]) -> tuple[str, ...]:
 
 def _attached(i: int, entry: object, frames: MoveItFrames, folder: Path) -> MoveItAttached:
     where = f"attached_collision_objects[{i}]"
-    entry = _mapping(where, entry)
-    link, given = str(entry.get("link_name") or ""), _mapping(f"{where}.object", entry.get("object"))
-    header = _mapping(f"{where}.object.header", given.get("header"))
+    entry = mapping_of(where, entry)
+    link, given = str(entry.get("link_name") or ""), mapping_of(f"{where}.object", entry.get("object"))
+    header = mapping_of(f"{where}.object.header", given.get("header"))
     in_link = str(header.get("frame_id") or "").removeprefix("/") == link
     if in_link:  # the shapes are already in the frame of the link
         frames = MoveItFrames(None, np.eye(4), (link,))
@@ -370,7 +384,7 @@ def _attached(i: int, entry: object, frames: MoveItFrames, folder: Path) -> Move
         shapes = tuple(_object(given, frames, folder))
     except InputError as error:
         raise InputError(f"{where}.object: {error}") from None
-    touch = tuple(map(str, _list(f"{where}.touch_links", entry.get("touch_links"))))
+    touch = tuple(map(str, list_of(f"{where}.touch_links", entry.get("touch_links"))))
     return MoveItAttached(str(given.get("id") or "object"), link, shapes, in_link, touch)
 
 
@@ -385,25 +399,40 @@ def holding_at(robot: Robot, held: MoveItAttached, start: list[float]) -> Robot:
     return robot.with_body(AttachedBody(held.name, held.link, T_link_body, shapes, touch))
 
 
+def linkable(robot: Robot, request: MoveItRequest | None) -> tuple[str, ...]:
+    """Names of the robot's links and of what it holds at the start."""
+    return (*robot.link_names, *(held.name for held in (request.attached if request else ())))
+
+
+def mimic_notes(robot: Robot, start: dict[str, float]) -> tuple[str, ...]:
+    """Notes on mimic joints whose value in a start state differs from what the joint they mimic implies."""
+    mimics = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
+    return tuple(
+        f"start_state: {name} is {start[name]:g}; planned at {robot.locked[name]:g}, which {master} implies"
+        for name, master in mimics.items()
+        if name in start and name in robot.locked and abs(robot.locked[name] - start[name]) > MIMIC_SLACK
+    )
+
+
 def _joint_goal(where: str, goal: object) -> dict[str, float]:
-    goal = _mapping(where, goal)
+    goal = mapping_of(where, goal)
     if any(goal.get(f"{kind}_constraints") for kind in ("position", "orientation", "visibility")):
         raise InputError(f"{where} must have joint_constraints alone, or be the only goal and a pose")
     values: dict[str, float] = {}
-    for i, entry in enumerate(_list(f"{where}.joint_constraints", goal.get("joint_constraints"))):
+    for i, entry in enumerate(list_of(f"{where}.joint_constraints", goal.get("joint_constraints"))):
         at = f"{where}.joint_constraints[{i}]"
-        entry = _mapping(at, entry)
+        entry = mapping_of(at, entry)
         values[str(entry.get("joint_name"))] = float(vector(at, "position", [entry.get("position")], 1)[0])
     return values
 
 
 def _pose_goal(goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray]:
     where = "goal_constraints[0]"
-    places = _list(f"{where}.position_constraints", goal.get("position_constraints"))
-    turns = _list(f"{where}.orientation_constraints", goal.get("orientation_constraints"))
+    places = list_of(f"{where}.position_constraints", goal.get("position_constraints"))
+    turns = list_of(f"{where}.orientation_constraints", goal.get("orientation_constraints"))
     if len(places) != 1 or len(turns) != 1 or goal.get("joint_constraints"):
         raise InputError(f"{where} must have one position and one orientation constraint, and no others")
-    place, turn = (_mapping(where, entry) for entry in (places[0], turns[0]))
+    place, turn = (mapping_of(where, entry) for entry in (places[0], turns[0]))
     link = place.get("link_name")
     if link != turn.get("link_name"):
         raise InputError(
@@ -411,8 +440,8 @@ def _pose_goal(goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray
         )
     if _xyz("target_point_offset", place.get("target_point_offset") or [0, 0, 0]).any():
         raise InputError(f"{where}.position_constraints[0].target_point_offset must be zero")
-    region = _mapping("constraint_region", place.get("constraint_region"))
-    poses = _list("constraint_region.primitive_poses", region.get("primitive_poses"))
+    region = mapping_of("constraint_region", place.get("constraint_region"))
+    poses = list_of("constraint_region.primitive_poses", region.get("primitive_poses"))
     if len(poses) != 1:
         raise InputError(f"{where}: constraint_region has {len(poses)} primitive_poses; it must have one")
     T_base_region = frames.of("header", place) @ _pose("constraint_region.primitive_poses[0]", poses[0])
@@ -421,26 +450,13 @@ def _pose_goal(goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray
     return str(link), transform(T_base_region[:3, 3], rotation)
 
 
-def _mapping(where: str, value: object) -> dict[str, Any]:
-    """The mapping; None counts as empty, as in the messages."""
-    if value is not None and not isinstance(value, dict):
-        raise InputError(f"{where} is {shown(value)}; it must be a mapping")
-    return value or {}
-
-
-def _list(where: str, value: object) -> list[Any]:
-    if value is not None and not isinstance(value, list):
-        raise InputError(f"{where} is {shown(value)}; it must be a list")
-    return value or []
-
-
 def _xyz(where: str, value: object) -> ndarray:
     value = [value.get(axis) for axis in "xyz"] if isinstance(value, dict) else value
     return vector(where, "xyz", value, 3)
 
 
 def _pose(where: str, value: object, position: str = "position", orientation: str = "orientation") -> ndarray:
-    value = _mapping(where, value)
+    value = mapping_of(where, value)
     turn = value.get(orientation)
     xyzw = [turn.get(axis) for axis in "xyzw"] if isinstance(turn, dict) else turn
     x, y, z, w = unit_quaternion(where, xyzw, orientation)

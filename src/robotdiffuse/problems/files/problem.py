@@ -23,6 +23,8 @@ from robotdiffuse.problems.files.goals import goal_entry, read_goal, read_waypoi
 from robotdiffuse.problems.files.moveit import (
     MoveItRequest,
     holding_at,
+    linkable,
+    mimic_notes,
     moveit_frames,
     moveit_model,
     moveit_request,
@@ -49,15 +51,15 @@ from robotdiffuse.problems.problem import (
     moved_goal,
 )
 from robotdiffuse.robots import ROBOTS, load_robot
-from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
-from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
+from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.scenes.files import check_fields, contacts_entry, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
 
 REQUIRED_FIELDS = ("robot", "scene", "start", "goal")
 REQUIRED_WITH_REQUEST = ("robot", "scene", "request")
 OPTIONAL_FIELDS = (
     *("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unknown"),
-    *("moving", "start_velocity", "blend", "payload"),
+    *("moving", "start_velocity", "blend", "payload", "allowed_contacts"),
 )
 NOT_WITH_REQUEST = ("waypoints", "blend", "moving", "start_velocity")
 
@@ -89,6 +91,8 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
     """
     file = file_name(file, "problem file")
     check_type("index", index, Integral, "a whole number from 0 on")
+    if file.is_dir():
+        raise InputError(f"{file} is a folder; give a file in it, or the folder to `robotdiffuse bench run`")
     if file.suffix.lower() not in WRITERS:
         raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
     text = read_text(file)
@@ -163,6 +167,8 @@ def problem_record(
         "start": problem.start.tolist(),
         "goal": written(goal_entry(goal)),
     }
+    if scene.allowed_contacts:
+        record["allowed_contacts"] = contacts_entry(scene)
     if waypoints:
         record["waypoints"] = written([goal_entry(waypoint) for waypoint in waypoints])
     if any(problem.blend):
@@ -266,9 +272,11 @@ def _moveit_problem(scene_file: Path, robot: Robot | None, ignore_joints: bool) 
             robot = _robot(robot_name, {}, scene_file.parent)
         notes = scene_robot_notes(data, robot, ignore_joints)
         frames = moveit_frames(data, robot)
-        scene = moveit_scene(data, frames, scene_file.parent)
         where = request_file
         request = moveit_request(read_yaml(request_file), frames, scene_file.parent)
+        where = scene_file
+        scene = moveit_scene(data, frames, scene_file.parent, linkable(robot, request))
+        where = request_file
         notes += request_robot_notes(request, robot, moveit_model(data), ignore_joints)
         return _requested(robot, scene, replace(request, notes=(*request.notes, *notes)), {})
     except InputError as error:
@@ -281,7 +289,7 @@ def _requested(robot: Robot, scene: Scene, request: MoveItRequest, options: Prob
     unplanned = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     unplanned -= {*robot.joint_names}
     robot = robot.with_locked({name: value for name, value in request.start.items() if name in unplanned})
-    notes = (*request.notes, *_mimic_notes(robot, request.start))
+    notes = (*request.notes, *mimic_notes(robot, request.start))
 
     def values(where: str, positions: dict[str, float]) -> list[float]:
         missing = [name for name in robot.joint_names if name not in positions]
@@ -299,16 +307,6 @@ def _requested(robot: Robot, scene: Scene, request: MoveItRequest, options: Prob
         rows = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
         goal = JointGoal(rows)
     return Problem(robot, scene, start, goal, **{**options, "notes": notes})
-
-
-def _mimic_notes(robot: Robot, start: dict[str, float]) -> tuple[str, ...]:
-    """Notes on mimic joints whose value in a start state differs from what the joint they mimic implies."""
-    mimics = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
-    return tuple(
-        f"start_state: {name} is {start[name]:g}; planned at {robot.locked[name]:g}, which {master} implies"
-        for name, master in mimics.items()
-        if name in start and name in robot.locked and abs(robot.locked[name] - start[name]) > MIMIC_SLACK
-    )
 
 
 def _problem(
@@ -338,14 +336,19 @@ def _problem(
         if "clearance" in values:
             options["clearance"] = check_clearance(values["clearance"])
         frames, model = moveit_frames({}, robot), ""
+        contacts = values.get("allowed_contacts", {})
         if isinstance(values["scene"], str):
             file = folder / values["scene"]
             content = read_yaml(file)
             notes += scene_robot_notes(content, robot, ignore_joints)
             frames, model = moveit_frames(content, robot), moveit_model(content)
-            scene = moveit_scene(content, frames, file.parent)
+        request = None
+        if requested:
+            request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
+        if isinstance(values["scene"], str):
+            scene = moveit_scene(content, frames, file.parent, linkable(robot, request), contacts)
         else:
-            scene, scene_notes = read_scene(values["scene"], folder)
+            scene, scene_notes = read_scene(values["scene"], folder, contacts)
             notes += scene_notes
         options["views"], view_notes = read_views(values.get("views", []), folder)
         options["unknown"] = values.get("unknown")
@@ -354,8 +357,7 @@ def _problem(
                 raise InputError(f"{name} cannot be combined with request")
         options["constraints"] = read_constraints(values.get("constraints", []))
         options["payload"] = read_payload(values["payload"]) if "payload" in values else None
-        if requested:
-            request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
+        if request is not None:
             notes += request_robot_notes(request, robot, model, ignore_joints)
             request = replace(request, notes=(*request.notes, *notes, *view_notes))
             return _requested(robot, scene, request, options)  # type: ignore[arg-type]

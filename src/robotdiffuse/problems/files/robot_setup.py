@@ -48,7 +48,7 @@ def equipped(robot: Robot, tool: object, attached: object, folder: Path) -> tupl
     notes: list[str] = []
     if tool is not None:
         values = check_fields("tool", tool, ("link",), ("name", "xyz", "wxyz", "shapes", "touch_links"))
-        shapes, more = read_scene(values.get("shapes", []), folder, "tool.shapes")
+        shapes, more = read_scene(values.get("shapes", []), folder, field="tool.shapes")
         notes += more
         T, name = pose_of("tool", values), _text("tool.name", values.get("name", TOOL))
         touch = _names("tool.touch_links", values.get("touch_links", []))
@@ -100,7 +100,7 @@ def rounded(value: Any) -> Any:
 def one_shape(where: str, entry: dict[str, Any], folder: Path) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
     """The one shape of an entry such as {box: {...}}, as a tuple, and notes. Raises InputError."""
     try:
-        scene, notes = read_scene([entry], folder, where)
+        scene, notes = read_scene([entry], folder, field=where)
     except InputError as error:
         raise InputError(str(error).replace(f"{where}[0]", where, 1)) from None
     return scene.shapes, notes

@@ -12,6 +12,7 @@ from robotdiffuse.problems.files.goals import TOLERANCES
 from robotdiffuse.problems.problem import UNKNOWN_POLICIES
 from robotdiffuse.robots import ROBOTS
 from robotdiffuse.scenes.files import FILE_CONTENT, SHAPES
+from robotdiffuse.scenes.scene import ALL_LINKS
 
 Schema = dict[str, Any]
 NUMBER: Schema = {"type": "number"}
@@ -54,6 +55,11 @@ def problem_schema() -> Schema:
         "unknown": {"enum": list(UNKNOWN_POLICIES)},
         "moving": {"type": "array", "items": {"type": "object"}},
         "start_velocity": NUMBERS,
+        "allowed_contacts": {
+            "type": "object",
+            "additionalProperties": {"oneOf": [_texts(), {"const": ALL_LINKS}]},
+            "description": "obstacles, each with the links that may touch it",
+        },
         "payload": _object({"mass": NUMBER, "com": NUMBERS, "link": TEXT, "moments": NUMBERS}, ["mass"]),
     }
     return {

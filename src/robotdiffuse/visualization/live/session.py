@@ -27,7 +27,6 @@ from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, in
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.validation.validator import Report, verify_trajectory
 from robotdiffuse.visualization.live.latest_task import LatestTask
@@ -221,7 +220,9 @@ class Session:
             self._set_scene([change(shape) if shape.name == name else shape for shape in shapes])
 
     def _set_scene(self, shapes: list[Shape]) -> None:
-        self._state = replace(self._state, problem=replace(self._state.problem, scene=Scene(shapes)))
+        problem = self._state.problem
+        scene = problem.scene.with_shapes(shapes)
+        self._state = replace(self._state, problem=replace(problem, scene=scene))
         self._changed()
 
     def _changed(self) -> None:

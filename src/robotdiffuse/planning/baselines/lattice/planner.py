@@ -307,6 +307,7 @@ class DStarLiteSearch(_Search[DStarLiteSettings]):
         near = np.full(len(self._table.keys), np.inf, np.float32)
         before, after = self.checker.scene.shapes, checker.scene.shapes
         kept = {id(shape) for shape in before} & {id(shape) for shape in after}
+        kept = kept if self.checker.scene.allowed_contacts == checker.scene.allowed_contacts else set()
         moved = [shape for shape in (*before, *after) if id(shape) not in kept]
         known = slice(1, self.nodes + 1)
         if checker.padding != self.checker.padding:
