@@ -59,7 +59,7 @@ def best_looks(
     there is one, against the way to get there.
 
     scene: the arm does not collide with it at the configurations. A voxel counts by the chance that nothing
-    hides it: neither what is occupied nor what is predicted.
+    hides it: neither the arm, nor what is occupied or predicted.
     """
     robot = known.robot
     at = np.argwhere(wanted)
@@ -81,9 +81,12 @@ def best_looks(
         q = q[checker.free(q)]
         seen = (
             seen_weights(
+                compile_robot(robot),
+                q.astype(np.float32),
                 camera.poses(robot, q).astype(np.float32),
                 np.array(camera.intrinsics, np.float32),
                 (height, width),
+                np.float32(camera.range),
                 at,
                 weights,
                 filled,

@@ -42,9 +42,7 @@ def near_ends(known: OccupancyMap, ends: Sequence[Float[ndarray, "dof"]]) -> Boo
     return voxels_in(spheres, CARVING_MARGIN + FINE_VOXEL_SIZE / 2)
 
 
-def cover(
-    known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], name: str
-) -> AssumedPoints:
+def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], name: str) -> AssumedPoints:
     """Balls that cover the voxels of these indices, without those in the known scene."""
     points = (voxels + 0.5) * FINE_VOXEL_SIZE + LOW
     if known_scene.shapes:

@@ -28,9 +28,9 @@ DRAWER_SHAPES = 5
 class Cabinet(Furniture):
     """A grid of cells between thin or thick boards, from a desk to a tall bookcase. Lengths in [m].
 
-    A cell is open, has a door that is shut or stands at any angle, or a drawer that is pulled out. The cabinet
-    stands on the ground or on legs, or hangs. Regions are open cells, the insides of drawers, where the hand
-    points down, the top, and the space between the legs.
+    A cell is open, has a door that is shut or stands at any angle, or a drawer that is pulled out. The
+    cabinet stands on the ground or on legs, or hangs. Regions are open cells, the insides of drawers, where
+    the hand points down, the top, and the space between the legs.
     """
 
     turn: Range = (-0.7, 0.7)
