@@ -96,7 +96,7 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
 def free_zone(scene: Scene) -> Corners | None:
     """The largest box around the base without obstacles, as a person who knows the cell would declare it."""
     filled = true_voxels(Scene(scene.shapes[1:]))[:, :, : round((ZONE_HEIGHT - LOW[2]) / FINE_VOXEL_SIZE)]
-    columns = filled.any(axis=2)
+    columns = np.asarray(filled.any(axis=2))
 
     def has_obstacle(low: tuple[float, float], high: tuple[float, float]) -> bool:
         first, end = (np.rint((np.array(at) - LOW[:2]) / FINE_VOXEL_SIZE).astype(int) for at in (low, high))

@@ -52,7 +52,7 @@ def test_what_hides_counts_as_often_as_it_is_there() -> None:
     stacked = np.stack([*poses, away]).astype(np.float32)
     weights, far = np.array([2.0], np.float32), np.float32(np.inf)
     above = np.tile(np.zeros(PANDA.dof, np.float32), (3, 1))
-    scene = voxel, weights, filled, low + np.float32([0, 1, 0]), np.float32(0.1)
+    scene = voxel, weights, filled, low + np.array([0, 1, 0], np.float32), np.float32(0.1)
     stacked[:, :3, 3] += [0, 1, 0]  # beside the arm
     seen = seen_weights(compile_robot(PANDA), above, stacked, intrinsics, (81, 101), far, *scene)
     np.testing.assert_allclose(seen, [1.0, 2.0, 0.0], rtol=1e-6)
@@ -62,7 +62,11 @@ def test_what_hides_counts_as_often_as_it_is_there() -> None:
 
 def test_the_arm_hides_what_is_behind_it() -> None:
     """Single voxels, beside and behind what the ray caster shows of the arm."""
-    filled, low, edge = np.zeros((60, 60, 50), np.float32), np.float32([-0.6, -0.6, 0.0]), np.float32(0.02)
+    filled, low, edge = (
+        np.zeros((60, 60, 50), np.float32),
+        np.array([-0.6, -0.6, 0.0], np.float32),
+        np.float32(0.02),
+    )
     camera = (600.0, 600.0, 319.5, 239.5)
     arm = ray_cast(Scene(), BEYOND, camera, (640, 480), PANDA, START).depth
     voxels = np.argwhere(filled == 0)[::397]

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive, Share
@@ -12,6 +14,7 @@ from robotdiffuse.problems.families.furniture import (
     DOWN,
     MIN_GAP,
     Build,
+    Corner,
     Furniture,
     FurnitureFrame,
     LooseObject,
@@ -21,7 +24,13 @@ from robotdiffuse.scenes.shapes import Box, Sphere
 
 MIN_OPENING = 0.16
 """Minimum height and width of an opening that the hand is to enter [m]."""
+TOP_HEIGHT = 0.3
+"""Height of the region above a cabinet [m]."""
+MIN_REGION = 0.1
+"""Minimum edge of a region [m]."""
 DRAWER_SHAPES = 5
+Cell = tuple[float, float, float, float]
+"""Right and left side, bottom and top [m]."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +42,12 @@ class Cabinet(Furniture):
     the hand points down, the top, and the space between the legs.
     """
 
-    turn: Range = (-0.7, 0.7)
+    turn: Range = (-0.5, 0.5)
     reach: Positive = 0.85
     object_width: PositiveRange = (0.03, 0.14)
     object_height: PositiveRange = (0.03, 0.35)
     objects: tuple[Natural, Natural] = (0, 6)
-    distance: PositiveRange = (0.35, 0.8)
+    distance: PositiveRange = (0.35, 0.65)
     """From the base to the middle of the front."""
     lowest: tuple[NotNegative, NotNegative] = (0.0, 0.7)
     """Height of the underside of the lowest board of a cabinet that does not stand on the ground."""
@@ -47,10 +56,10 @@ class Cabinet(Furniture):
     legs_share: Share = 0.6
     """Fraction of the other cabinets that have legs; the rest hang."""
     rows: tuple[Count, Count] = (1, 4)
-    row_height: PositiveRange = (0.12, 0.55)
+    row_height: PositiveRange = (0.18, 0.55)
     columns: tuple[Count, Count] = (1, 3)
-    column_width: PositiveRange = (0.2, 0.7)
-    depth: PositiveRange = (0.15, 0.6)
+    column_width: PositiveRange = (0.24, 0.7)
+    depth: PositiveRange = (0.15, 0.5)
     thickness: PositiveRange = (0.004, 0.05)
     """Thickness of all boards; its logarithm is uniform."""
     back_share: Share = 0.6
@@ -64,15 +73,17 @@ class Cabinet(Furniture):
     shut_share: Share = 0.3
     """Fraction of the doors that are shut."""
     drawer_share: Share = 0.15
-    """Fraction of the cells with a drawer."""
+    """Fraction of the cells with a drawer, up to `max_drawers`. Beside drawers, doors open to a right angle
+    at most."""
+    max_drawers: Natural = 2
     pulled: PositiveRange = (0.3, 0.95)
     """How far a drawer is pulled out, as a fraction of the depth."""
 
     @property
     def max_obstacles(self) -> int:
-        rows, columns = self.rows[1], self.columns[1]
+        boards, uprights, doors = self.rows[1] + 1, self.columns[1] + 1, self.rows[1] * self.columns[1]
         legs, back = 4, 1
-        return rows + 1 + columns + 1 + DRAWER_SHAPES * rows * columns + legs + back + self.objects[1]
+        return boards + uprights + legs + back + doors + DRAWER_SHAPES * self.max_drawers + self.objects[1]
 
     def build(self, rng: Generator) -> Build:
         frame = FurnitureFrame(self, self.distance, rng)
@@ -90,34 +101,64 @@ class Cabinet(Furniture):
         shapes += [frame.box((0.0, y, low), (depth, y + t, height), "upright") for y in sides.tolist()]
         if rng.random() < self.back_share:
             shapes.append(frame.box((depth, left, low), (depth + t, right, height), "back"))
-        regions = []
+        regions: list[tuple[Corner, Corner, Float[ndarray, "3"]]] = []
         if not on_ground and rng.random() < self.legs_share:
             w = 2 * t
             for x in (0.0, depth - w):
                 for y in (left, right - w):
                     shapes.append(frame.box((x, y, 0.0), (x + w, y + w, low), "leg"))
         if low > MIN_OPENING:
-            regions.append(frame.region((0.0, left + 2 * t, 0.0), (depth / 2, right - 2 * t, low), AHEAD))
+            regions.append(((0.0, left + 2 * t, 0.0), (depth / 2, right - 2 * t, low), AHEAD))
         if len(boards) == len(tops):
-            regions.append(frame.region((0.0, left, height), (depth, right, height + 0.3), AHEAD))
+            regions.append(((0.0, left, height), (depth, right, height + TOP_HEIGHT), AHEAD))
+        cells = [
+            (y + t, end, z, ceiling)
+            for z, ceiling in zip(tops[:-1].tolist(), (tops[1:] - t).tolist(), strict=True)
+            for y, end in zip(sides[:-1].tolist(), sides[1:].tolist(), strict=True)
+        ]
+        kinds = rng.random(len(cells))
+        drawers = np.flatnonzero(kinds < self.drawer_share)[: self.max_drawers]
+        widest = min(self.door_angle[1], np.pi / 2) if len(drawers) else self.door_angle[1]
         free = []
-        for z, ceiling in zip(tops[:-1].tolist(), (tops[1:] - t).tolist(), strict=True):
-            for y, end in zip((sides[:-1] + t).tolist(), sides[1:].tolist(), strict=True):
-                kind = rng.random()
-                if kind < self.door_share:
-                    shut = rng.random() < self.shut_share
-                    angle = 0.0 if shut else rng.uniform(*self.door_angle)
-                    shapes.append(_door(frame, (y, end, z, ceiling), t, angle, rng.random() < 0.5))
-                    if shut:
-                        continue
-                elif kind < self.door_share + self.drawer_share:
-                    front = -depth * rng.uniform(*self.pulled)
-                    top = z + (ceiling - z) * rng.uniform(0.4, 1.0)
-                    shapes += _drawer(frame, (front, y, z), (front + depth, end, top), t)
-                    inside = (front + t, y + t, z + t), (min(0.0, front + depth), end - t, top)
-                    regions.append(frame.region(*inside, DOWN))
-                    continue
-                free.append([y, end, z, ceiling])
+        for i, cell in enumerate(cells):
+            if i in drawers:
+                walls, inside = self._drawer(frame, cell, depth, t, rng)
+                shapes += walls
+                regions.append((*inside, DOWN))
+            elif kinds[i] > 1 - self.door_share:
+                shut = rng.random() < self.shut_share
+                angle = 0.0 if shut else rng.uniform(self.door_angle[0], widest)
+                shapes.append(_door(frame, cell, t, angle, rng.random() < 0.5))
+                free += [] if shut else [[*cell]]
+            else:
+                free.append([*cell])
+        shapes += self._loose_objects(frame, depth, free, rng)
+        regions += [((t, y, z), (depth, end, ceiling), AHEAD) for y, end, z, ceiling in free]
+        return shapes, [frame.region(*region) for region in regions if _is_wide(*region)]
+
+    def _drawer(
+        self, frame: FurnitureFrame, cell: Cell, depth: float, t: float, rng: Generator
+    ) -> tuple[list[Box | Sphere], tuple[Corner, Corner]]:
+        """The bottom, front, back and sides of a drawer that is pulled out of a cell, and the part of its
+        inside that is in front of the cabinet."""
+        y, end, z, ceiling = cell
+        x, top = -depth * rng.uniform(*self.pulled), z + (ceiling - z) * rng.uniform(0.4, 1.0)
+        far = x + depth
+        corners = (
+            ((x, y, z), (far, end, z + t)),
+            ((x, y, z + t), (x + t, end, top)),
+            ((far - t, y, z + t), (far, end, top)),
+            ((x + t, y, z + t), (far - t, y + t, top)),
+            ((x + t, end - t, z + t), (far - t, end, top)),
+        )
+        inside = (x + t, y + t, z + t), (min(0.0, far - t), end - t, top)
+        return [frame.box(a, b, "drawer") for a, b in corners], inside
+
+    def _loose_objects(
+        self, frame: FurnitureFrame, depth: float, free: list[list[float]], rng: Generator
+    ) -> list[Box | Sphere]:
+        """Objects in free cells, whose free part becomes narrower."""
+        shapes: list[Box | Sphere] = []
         things = min(count(self.objects, rng), len(free))
         for i in rng.permutation(len(free))[:things]:
             y, end, z, ceiling = free[i]
@@ -128,23 +169,22 @@ class Cabinet(Furniture):
             at = rng.uniform(y + loose.half, end - loose.half)
             shapes.append(loose.placed(frame, x, at, z))
             free[i][:2] = (at + loose.half, end) if at < (y + end) / 2 else (y, at - loose.half)
-        regions += [
-            frame.region((0.0, y, z), (depth, end, ceiling), AHEAD)
-            for y, end, z, ceiling in free
-            if min(end - y, ceiling - z) > MIN_OPENING
-        ]
-        return shapes, regions
+        return shapes
 
 
-def _edges(sizes: np.ndarray, t: float) -> np.ndarray:
+def _edges(sizes: Float[ndarray, "n"], t: float) -> Float[ndarray, "n+1"]:
     """Positions of the boards between gaps of these sizes, beginning with 0."""
     return np.concatenate([[0.0], np.cumsum(sizes + t)])
 
 
-def _door(
-    frame: FurnitureFrame, cell: tuple[float, float, float, float], t: float, angle: float, on_left: bool
-) -> Box:
-    """A door of a cell (right, left, bottom, top), open by an angle about its left or right edge [rad]."""
+def _is_wide(low: Corner, high: Corner, approach: Float[ndarray, "3"]) -> bool:
+    """Whether the hand gets into a region."""
+    size = np.subtract(high, low)
+    return bool(size.min() > MIN_REGION and (approach is DOWN or size[1:].min() > MIN_OPENING))
+
+
+def _door(frame: FurnitureFrame, cell: Cell, t: float, angle: float, on_left: bool) -> Box:
+    """A door of a cell, open by an angle about its left or right edge [rad]."""
     y, end, z, ceiling = cell
     hinge, side = (end, -1.0) if on_left else (y, 1.0)
     half = (end - y) / 2
@@ -152,21 +192,6 @@ def _door(
     low = (middle[0] - t / 2, middle[1] - half, z)
     high = (middle[0] + t / 2, middle[1] + half, ceiling)
     return frame.box(low, high, "door", side * angle)
-
-
-def _drawer(
-    frame: FurnitureFrame, low: tuple[float, float, float], high: tuple[float, float, float], t: float
-) -> list[Box]:
-    """The bottom, front, back and sides of a drawer."""
-    (x, y, z), (far, end, top) = low, high
-    corners = (
-        (low, (far, end, z + t)),
-        ((x, y, z + t), (x + t, end, top)),
-        ((far - t, y, z + t), (far, end, top)),
-        ((x + t, y, z + t), (far - t, y + t, top)),
-        ((x + t, end - t, z + t), (far - t, end, top)),
-    )
-    return [frame.box(a, b, "drawer") for a, b in corners]
 
 
 CABINET = Cabinet()
