@@ -8,10 +8,11 @@
     python benchmarks/cameras.py --fit --records FILE
     python benchmarks/cameras.py --times
 
-Prints benchmarks/results/unseen.txt. Problems are held-out ones of the families that the straight line does
-not solve and a search in the true scene does. Cameras stand where a person would place them, 1.4 to 1.8 m
-away (--cameras: near, 0.8 to 1.2 m; far, 2.4 to 3 m), in front more often than behind; the floor is known,
-all else must be seen. Every method plans with AORRTC, but for `hybrid`, and has the same CPU time. A motion
+Prints benchmarks/results/unseen.txt. Problems are held-out ones of the families, or those of folders of
+MotionBenchMaker, that the straight line does not solve and a search in the true scene does. Cameras stand
+where a person would place them, 1.4 to 1.8 m away (--cameras: near, 0.8 to 1.2 m; far, 2.4 to 3 m; overhead),
+in front more often than behind; the floor is known, all else must be seen. Every method plans with AORRTC,
+but for `hybrid`, and has the same CPU time. A motion
 is free if the validator accepts path and timed motion in the true scene. Records are kept in FILE and not
 made again; --report prints their tables.
 
@@ -27,7 +28,9 @@ half a turn about the base.
 """
 
 import argparse
+import itertools
 import time
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -54,6 +57,7 @@ from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.next_view import next_view, poses_around
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.files import load_problems
 from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
 from robotdiffuse.problems.problem import PREDICTED, Problem
 from robotdiffuse.scenes.scene import Scene
@@ -68,6 +72,7 @@ CAMERAS = {
     RING: CameraPlaces(distance=(1.4, 1.8), height=(0.5, 1.4), target_spread=0.1, roll=0.0),
     "near": CameraPlaces(distance=(0.8, 1.2), height=(0.3, 0.9), target_spread=0.1, roll=0.0),
     "far": CameraPlaces(distance=(2.4, 3.0), height=(0.6, 1.6), target_spread=0.1, roll=0.0),
+    "overhead": CameraPlaces(distance=(0.1, 0.6), height=(1.6, 2.0), target_spread=0.1, roll=0.3),
 }
 SIZE = (640, 480)
 HYBRID = "hybrid"
@@ -93,14 +98,24 @@ Row = dict[str, Any]
 
 
 def problems(family: str, count: int, known: set[int]) -> Iterator[tuple[int, Problem]]:
-    """Held-out problems, with their numbers, that are neither trivial nor unsolved in the true scene. Up to
-    the largest of the `known` numbers, these are all."""
-    number = 0
-    while count:
-        if number in known or (number > max(known, default=-1) and _hard(held_out_problem(family, number))):
-            yield number, held_out_problem(family, number)
-            count -= 1
-        number += 1
+    """Problems of a family, held out, or of a folder, with their numbers, that are neither trivial nor
+    unsolved in the true scene. Up to the largest of the `known` numbers, these are all."""
+    numbered = (
+        ((i, held_out_problem(family, i)) for i in itertools.count())
+        if family in FAMILIES
+        else ((i, entry.load()) for i, entry in enumerate(load_problems(Path(family))))
+    )
+    hard = (one for one in numbered if one[0] in known or (one[0] > max(known, default=-1) and _hard(one[1])))
+    yield from itertools.islice(hard, count)
+
+
+def known_scene(problem: Problem) -> Scene:
+    """What is known without views: the floor."""
+    return Scene([shape for shape in problem.scene.shapes if shape.name == "floor"])
+
+
+def unknown_scene(problem: Problem) -> Scene:
+    return Scene([shape for shape in problem.scene.shapes if shape.name != "floor"])
 
 
 def _hard(problem: Problem) -> bool:
@@ -112,7 +127,8 @@ def views(
     problem: Problem, family: str, number: int, count: int, noisy: bool, cameras: str = RING
 ) -> list[DepthView]:
     """Depth views of the problem's scene from random cameras, with the arm at its start."""
-    rng = np.random.default_rng([SEED, list(FAMILIES).index(family), number, 14])
+    place = list(FAMILIES).index(family) if family in FAMILIES else zlib.crc32(Path(family).name.encode())
+    rng = np.random.default_rng([SEED, place, number, 14])
     taken = []
     for _ in range(count):
         T, angle = CAMERAS[cameras].draw(problem.scene, rng)
@@ -128,7 +144,7 @@ def plan(problem: Problem, partial: Problem, method: str, network: Completion | 
 
     `network` predicts in place of the bundled one.
     """
-    voxels = true_voxels(Scene(problem.scene.shapes[1:])).astype(np.float32) if method == TRUE else None
+    voxels = true_voxels(unknown_scene(problem)).astype(np.float32) if method == TRUE else None
     began = time.process_time()
     if network is not None:
         voxels = predict(observe(partial.views, partial.robot, partial.start), network)
@@ -172,8 +188,8 @@ def run(arguments: argparse.Namespace) -> None:
             if not missing:
                 continue
             taken = views(problem, family, number, *place.values())
-            known = Scene(problem.scene.shapes[:1])
             began = time.process_time()
+            known = known_scene(problem)
             partial = Problem(problem.robot, known, problem.start, problem.goal, views=taken)
             spent = time.process_time() - began
             if warm:
@@ -362,7 +378,7 @@ def plan_with_second_views(problem: Problem, family: str, number: int) -> Row:
 
 
 def _plan_on(problem: Problem, *seen: DepthView) -> tuple[Problem, PlanResult]:
-    known = Scene(problem.scene.shapes[:1])
+    known = known_scene(problem)
     partial = Problem(problem.robot, known, problem.start, problem.goal, views=seen, unknown=PREDICTED)
     return partial, plan_with_unknown_space(PLANNER, partial, PlanRequest(LIMIT))
 
@@ -393,7 +409,12 @@ def report_next_view(rows: list[Row]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Planning on depth views, validated in the true scene.")
     parser.add_argument("--problems", type=int, default=300, help="of all families together (300)")
-    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
+    parser.add_argument(
+        "--families",
+        nargs="+",
+        default=list(FAMILIES),
+        help="families, or folders of MotionBenchMaker (all families)",
+    )
     every = [*METHODS, TRUE]
     parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
     parser.add_argument("--views", type=int, default=1, help="(1)")

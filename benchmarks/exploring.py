@@ -16,7 +16,7 @@ the prediction, from the first images and one at the start of each leg.
 import argparse
 import time
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -29,7 +29,10 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.types import FIRST
 from robotdiffuse.evaluation.statistics import wilson_interval
+from robotdiffuse.learning.completion.samples import FINE_VOXEL_SIZE, true_voxels
 from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import Corners
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.exploration.explorer import CHANCE, DONE, LOOK, STRICT, Explorer, ExplorerSettings
 from robotdiffuse.planning.exploration.simulated import explore, measured, taken, wrist_camera
@@ -41,8 +44,9 @@ from robotdiffuse.scenes.scene import Scene
 Row = dict[str, Any]
 TIME_LIMIT = 0.5
 """CPU time of each search [s]."""
-FREE_ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
-"""The space around the base that is declared free [m]."""
+ZONE_SIDES = np.arange(0.12, 0.37, 0.04)
+"""Distances of the sides of the box that is declared free from the base's axis [m]."""
+ZONE_HEIGHT = 0.7
 ONCE = {"unknown is free, once": OPTIMISTIC, "predicted, once": PREDICTED}
 METHODS = {
     "strict": ExplorerSettings(policy=STRICT, time_limit=TIME_LIMIT),
@@ -66,7 +70,7 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
     [beside] = views(legs[0], family, number, 1, False)
     seen, looks, reason = [measured(beside, np.inf, noise, rng)], 0, ""
     reached = collided = False
-    zone = None if method == NO_ZONE else FREE_ZONE
+    zone = None if method == NO_ZONE else free_zone(problem.scene)
     explorer = Explorer(problem.robot, [camera], known, zone, METHODS.get(method, ExplorerSettings()))
     began = time.process_time()
     if method not in ONCE:
@@ -87,6 +91,23 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
             break
     spent = time.process_time() - began
     return {"reached": reached, "collided": collided, "looks": looks, "reason": reason, "time": spent}
+
+
+def free_zone(scene: Scene) -> Corners | None:
+    """The largest box around the base without obstacles, as a person who knows the cell would declare it."""
+    filled = true_voxels(Scene(scene.shapes[1:]))[:, :, : round((ZONE_HEIGHT - LOW[2]) / FINE_VOXEL_SIZE)]
+    columns = np.asarray(filled.any(axis=2))
+
+    def has_obstacle(low: tuple[float, float], high: tuple[float, float]) -> bool:
+        first, end = (np.rint((np.array(at) - LOW[:2]) / FINE_VOXEL_SIZE).astype(int) for at in (low, high))
+        return bool(columns[first[0] : end[0], first[1] : end[1]].any())
+
+    boxes = [((-a, -c), (b, d)) for a, b, c, d in product(ZONE_SIDES.tolist(), repeat=4)]
+    boxes.sort(key=lambda box: -float(np.prod(np.subtract(box[1], box[0]))))
+    for low, high in boxes:
+        if not has_obstacle(low, high):
+            return (*low, 0.0), (*high, ZONE_HEIGHT)
+    return None
 
 
 def usable(problem: Problem) -> bool:

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.assumptions import CARVING_MARGIN, FINE_SHAPE, FINE_VOXEL_SIZE, voxels_in
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.observed_volume import LOW
 from robotdiffuse.perception.ray_caster import voxels_within
+from robotdiffuse.perception.swept_voxels_kernel import sweep
 from robotdiffuse.planning.exploration.explorer import ExplorerSettings
-from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
+from robotdiffuse.planning.exploration.looks import best_looks
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, not_seen_free
 from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -52,7 +54,10 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
     one.set_goal(PROBLEM.start + 0.05)
     step = one.next(PROBLEM.start)
     assert step.kind in ("go", "look") and step.motion is not None and step.motion.path is not None
-    unseen = swept_unseen(one.map, step.motion.path, PROBLEM.start)
+    swept, low = np.zeros(FINE_SHAPE, np.bool_), np.array(LOW, np.float32)
+    positions = step.motion.path.positions.astype(np.float32)
+    sweep(compile_robot(PANDA), positions, np.float32(0), low, np.float32(FINE_VOXEL_SIZE), swept)
+    unseen = swept & ~one.map.free
     ends = [placed_spheres(PANDA, q).astype(np.float32) for q in step.motion.path.positions[[0, -1]]]
     # covering spheres are larger than the links that the validator checks
     assert (unseen & ~voxels_in(np.concatenate(ends), 2 * CARVING_MARGIN)).sum() <= 20

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from robotdiffuse.cli import main
+from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.perception.visibility_kernel import seen_weights
+from robotdiffuse.perception.visibility_kernel import CELL, seen_weights
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.next_view import next_view, poses_around
 from robotdiffuse.problems.problem import Problem
@@ -49,9 +50,39 @@ def test_what_hides_counts_as_often_as_it_is_there() -> None:
     away = looking_at(middle + np.array([3, 0, 0]), middle + np.array([6, 0, 0]))
     intrinsics = np.array([100, 100, 50, 40], np.float32)
     stacked = np.stack([*poses, away]).astype(np.float32)
-    weights = np.array([2.0], np.float32)
-    seen = seen_weights(stacked, intrinsics, (81, 101), voxel, weights, filled, low, np.float32(0.1))
+    weights, far = np.array([2.0], np.float32), np.float32(np.inf)
+    above = np.tile(np.zeros(PANDA.dof, np.float32), (3, 1))
+    scene = voxel, weights, filled, low + np.array([0, 1, 0], np.float32), np.float32(0.1)
+    stacked[:, :3, 3] += [0, 1, 0]  # beside the arm
+    seen = seen_weights(compile_robot(PANDA), above, stacked, intrinsics, (81, 101), far, *scene)
     np.testing.assert_allclose(seen, [1.0, 2.0, 0.0], rtol=1e-6)
+    seen = seen_weights(compile_robot(PANDA), above, stacked, intrinsics, (81, 101), np.float32(2.9), *scene)
+    np.testing.assert_allclose(seen, [0.0, 0.0, 0.0])
+
+
+def test_the_arm_hides_what_is_behind_it() -> None:
+    """Single voxels, beside and behind what the ray caster shows of the arm."""
+    filled, low, edge = (
+        np.zeros((60, 60, 50), np.float32),
+        np.array([-0.6, -0.6, 0.0], np.float32),
+        np.float32(0.02),
+    )
+    camera = (600.0, 600.0, 319.5, 239.5)
+    arm = ray_cast(Scene(), BEYOND, camera, (640, 480), PANDA, START).depth
+    voxels = np.argwhere(filled == 0)[::397]
+    x, y, z = (((voxels + 0.5) * edge + low - BEYOND[:3, 3]) @ BEYOND[:3, :3]).T
+    rows, columns = np.rint(600 * y / z + 239.5).astype(int), np.rint(600 * x / z + 319.5).astype(int)
+    image, q = (np.array(camera, np.float32), (480, 640)), START.astype(np.float32)[None]
+    pose, seen, expected = BEYOND[None].astype(np.float32), [], []
+    for i in np.flatnonzero((abs(rows - 240) < 239) & (abs(columns - 320) < 319)):
+        around = np.s_[max(rows[i] - CELL, 0) : rows[i] + CELL, max(columns[i] - CELL, 0) : columns[i] + CELL]
+        behind = arm[around] < z[i] - 0.2
+        if behind.all() or np.isinf(arm[around]).all():
+            one = voxels[i : i + 1], np.ones(1, np.float32), filled, low, edge
+            expected.append(0.0 if behind.all() else 1.0)
+            seen += seen_weights(compile_robot(PANDA), q, pose, *image, np.float32(np.inf), *one).tolist()
+    assert min(expected.count(0.0), expected.count(1.0)) >= 3
+    assert seen == expected
 
 
 def test_it_looks_from_where_nothing_is_in_the_way(problem: Problem, result: PlanResult) -> None:

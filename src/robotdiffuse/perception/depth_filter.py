@@ -1,5 +1,6 @@
 """Noise of depth images: how large it is, and images without most of it."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -36,10 +37,12 @@ class FilteredDepth(NamedTuple):
     square of the distance."""
 
 
+@lru_cache(maxsize=32)
 def filtered(view: DepthView) -> FilteredDepth:
     """The view's image; if it is noisy, each pixel with a return is the median of those of the 3 x 3 around.
 
-    Images made of clouds have no pixels of their own, and count as without noise.
+    Images made of clouds have no pixels of their own, and count as without noise. The last results are
+    cached: a call with views asks for the same ones several times.
     """
     depth = for_kernels(view.depth, np.float32)
     spread = 0.0 if view.cloud is not None else depth_spread(depth)

@@ -12,8 +12,9 @@ MIN_MOVE = np.float32(0.1)
 
 
 @njit(cache=True, nogil=True)
-def sweep(robot, path, low, voxel, swept):
-    """Mark the voxels with centres that the moving covering spheres pass over; `swept` is bool[nx, ny, nz].
+def sweep(robot, path, margin, low, voxel, swept):
+    """Mark the voxels with centres that the moving covering spheres, inflated by `margin` [m], pass over;
+    `swept` is bool[nx, ny, nz].
 
     robot: RobotArrays; path float32[n, dof]; low [3] corner of the voxels and `voxel`, their edge [m].
     """
@@ -37,7 +38,7 @@ def sweep(robot, path, low, voxel, swept):
                     if (x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2 <= still:
                         continue
                     at[0], at[1], at[2] = x, y, z
-                    _mark(x, y, z, sphere[3], low, voxel, swept)
+                    _mark(x, y, z, sphere[3] + margin, low, voxel, swept)
 
 
 @njit(cache=True, nogil=True)

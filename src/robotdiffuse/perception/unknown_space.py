@@ -49,8 +49,8 @@ class UnknownSpace:
     def crossed(self, path: Path) -> "CrossedSpace":
         """The unknown voxels that the arm passes through on a path."""
         swept = np.zeros(FINE_SHAPE, np.bool_)
-        positions = path.positions.astype(np.float32)
-        sweep(self._robot, positions, np.array(LOW, np.float32), np.float32(FINE_VOXEL_SIZE), swept)
+        positions, voxel = path.positions.astype(np.float32), np.float32(FINE_VOXEL_SIZE)
+        sweep(self._robot, positions, np.float32(0.0), np.array(LOW, np.float32), voxel, swept)
         return CrossedSpace(swept & self.unknown, self.probability)
 
 

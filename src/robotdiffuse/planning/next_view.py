@@ -7,16 +7,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.perception.assumptions import FINE_VOXEL_SIZE, refined, voxels_in
+from robotdiffuse.perception.assumptions import FINE_VOXEL_SIZE, refined
 from robotdiffuse.perception.observed_volume import LOW, observe
 from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.perception.visibility_kernel import seen_weights
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
 from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
-from robotdiffuse.robots.kinematics import placed_spheres
 
 RING_RADIUS = 1.6
 """Distance of the default camera poses from the base's axis [m]."""
@@ -88,12 +88,15 @@ def next_view(
     filled = refined(volume.occupied).astype(np.float32)
     if predicted is not None:
         np.maximum(filled, predicted, out=filled)
-    filled[voxels_in(placed_spheres(problem.robot, problem.start).astype(np.float32))] = 1.0
     image = problem.views[0]
+    start = problem.start.astype(np.float32)
     seen = seen_weights(
+        compile_robot(problem.robot),
+        np.tile(start, (len(candidates), 1)),
         np.stack(candidates).astype(np.float32),
         np.array(image.intrinsics, np.float32),
         image.depth.shape,
+        np.float32(np.inf),
         at,
         weights,
         filled,

@@ -106,7 +106,14 @@ def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Plann
     swept = np.zeros(FINE_SHAPE, np.bool_)
     assert first.path is not None and chosen.swept_probability is not None
     path = first.path.positions.astype(np.float32)
-    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(FINE_VOXEL_SIZE), swept)
+    sweep(
+        compile_robot(PANDA),
+        path,
+        np.float32(0),
+        np.array(LOW, np.float32),
+        np.float32(FINE_VOXEL_SIZE),
+        swept,
+    )
     assert chosen.swept_probability <= 0.01 * (swept & unknown & ~voxels_in(ends)).sum() * (1 + 1e-3)
 
 
@@ -121,7 +128,7 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
     assert result.path is not None
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, near)]).astype(np.float32)
     swept, path = np.zeros(SHAPE, np.bool_), result.path.positions.astype(np.float32)
-    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(VOXEL), swept)
+    sweep(compile_robot(PANDA), path, np.float32(0), np.array(LOW, np.float32), np.float32(VOXEL), swept)
     unknown = observe(problem.views, PANDA, START).unknown & ~voxels_in(
         ends, CARVING_MARGIN + VOXEL / 2, VOXEL
     )

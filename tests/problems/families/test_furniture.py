@@ -8,6 +8,7 @@ import pytest
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families import furniture
+from robotdiffuse.problems.families.cabinet import CABINET
 from robotdiffuse.problems.families.clutter import CLUTTER
 from robotdiffuse.problems.families.crate import CRATE
 from robotdiffuse.problems.families.family import base_spheres
@@ -36,6 +37,7 @@ FURNITURE: dict[str, Furniture] = {
     "table": TABLE,
     "clutter": CLUTTER,
     "kitchen": KITCHEN,
+    "cabinet": CABINET,
 }
 every_family = pytest.mark.parametrize("name", FURNITURE)
 
@@ -62,7 +64,7 @@ def gaps(shape: Shape, points: np.ndarray) -> np.ndarray:
 @every_family
 def test_scenes_pack_and_stand_on_the_ground(name: str) -> None:
     slots = FURNITURE[name].max_obstacles
-    assert slots <= 32
+    assert slots <= 48
     for furnished in drawn(name, 30):
         floor, *shapes = furnished.scene.shapes
         assert floor is FLOOR
@@ -140,10 +142,31 @@ def test_tables_as_their_settings_say() -> None:
     assert {len(named(f, "wall")) + len(named(f, "pillar")) for f in scenes} == {0, 1}
 
 
+def test_doors_hang_on_the_edges_of_cells_and_drawers_have_room_inside() -> None:
+    """Every door begins at an upright, whatever its angle; some are shut, some open beyond a right angle."""
+    cabinet = replace(CABINET, turn=(0.0, 0.0), bearing=(0.0, 0.0), distance=(0.6, 0.6))
+    angles, drawers = [], 0
+    rng = np.random.default_rng(8)
+    for _ in range(60):
+        shapes, regions = cabinet.build(rng)
+        uprights = [s for s in shapes if s.name == "upright" and isinstance(s, Box)]
+        for door in (s for s in shapes if s.name == "door" and isinstance(s, Box)):
+            ends = door.center + np.array([[0.5], [-0.5]]) * door.size[1] * door.rotation[:, 1]
+            edges = [u.center[1] + side * u.size[1] / 2 for u in uprights for side in (-1, 1)]
+            gaps_to_front = [np.hypot(end[0] - 0.6, end[1] - edge) for end in ends for edge in edges]
+            assert min(gaps_to_front) < 1e-9
+            angles.append(abs(np.arctan2(door.rotation[0, 1], door.rotation[1, 1])))
+        fronts = [s for s in shapes if s.name == "drawer"]
+        drawers += len(fronts)
+        assert len(fronts) <= 5 * CABINET.max_drawers
+        assert sum(region.approach[2] == -1 for region in regions) <= len(fronts) / 5
+    assert drawers and 0.0 in np.round(angles, 9) and max(angles) > 2.0
+
+
 @every_family
 def test_same_seed_same_scene(name: str) -> None:
     (a,), (b,) = drawn(name, 1, seed=3), drawn(name, 1, seed=3)
-    packed = PackedScenes.pack([a.scene, b.scene], 25)
+    packed = PackedScenes.pack([a.scene, b.scene], 48)
     assert (packed.params[0] == packed.params[1]).all()
     targets = [sample_target(f.regions[0], np.random.default_rng(4)) for f in (a, b)]
     assert (targets[0] == targets[1]).all()

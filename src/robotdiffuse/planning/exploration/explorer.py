@@ -26,7 +26,7 @@ from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
 from robotdiffuse.core.types import FIRST
-from robotdiffuse.perception.assumptions import CARVING_MARGIN, voxels_in
+from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
@@ -35,7 +35,7 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
-from robotdiffuse.planning.exploration.seen_free import not_seen_free
+from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.goals import Goal
@@ -49,6 +49,14 @@ GO, LOOK, DONE, STUCK = "go", "look", "done", "stuck"
 STRICT, CHANCE, STRICT_THEN_CHANCE = "strict", "chance", "strict_then_chance"
 POLICIES = (STRICT, CHANCE, STRICT_THEN_CHANCE)
 NOTHING = Scene(())
+QUICK_FRACTION = 0.3
+"""Part of the time limit for a search that a look, or another search, may follow."""
+TENTATIVE_MOTIONS = 6
+"""Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
+MAX_LOOKS_FOR = 2
+"""Voxels that this many looks did not show are avoided by the motions that looks are made for."""
+WAY_BACK_SHARES = (0.25, 0.5, 1.0)
+"""Parts of the way in that the arm may go back."""
 AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
 
@@ -121,12 +129,17 @@ class Explorer:
         self._views: list[DepthView] = []
         self._goal: Goal | None = None
         self._looks = 0
+        self._looked_for = np.zeros(FINE_SHAPE, np.uint8)
+        """How many looks were made for each voxel."""
+        self._way_in: Float[ndarray, "n dof"] | None = None
+        """Waypoints of the latest motion that was returned."""
 
     def set_goal(self, goal: ArrayLike | Goal) -> None:
         """The next goal: configurations, or poses as `rd.Problem` takes them. What was seen is kept."""
         middle = 0.5 * (self.robot.lower + self.robot.upper)
         self._goal = Problem(self.robot, NOTHING, middle, goal).goal
         self._looks = 0
+        self._looked_for[:] = 0
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
@@ -153,6 +166,8 @@ class Explorer:
             if step.kind != STUCK:
                 break
         self._looks += step.kind == LOOK
+        if step.motion is not None and step.motion.path is not None:
+            self._way_in = step.motion.path.positions
         return replace(step, seen=problem.scene)
 
     def _at_goal(self, q: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> bool:
@@ -161,15 +176,27 @@ class Explorer:
     def _step(self, problem: Problem, policy: str) -> Step:
         """The step under one policy."""
         predicted = self._predicted(problem) if policy == CHANCE else None
-        motion = self._motion(problem, policy, predicted)
+        may_look = bool(self.cameras) and self._looks < self.settings.max_looks
+        limit = self.settings.time_limit
+        motion = self._motion(problem, policy, predicted, QUICK_FRACTION * limit if may_look else limit)
+        if self._good(motion, policy):
+            return self._go(motion, policy)
+        look = self._look(problem, policy, predicted, motion)
+        if look.kind == STUCK and may_look and policy == STRICT:
+            motion = self._motion(problem, policy, predicted, limit)
+            if motion.solved:
+                return self._go(motion, policy)
+        return look
+
+    def _good(self, motion: PlanResult, policy: str) -> bool:
+        """Whether a motion keeps to the policy."""
+        if not motion.solved or policy == STRICT:
+            return motion.solved
+        return motion.confidence is not None and motion.confidence >= self.settings.confidence
+
+    def _go(self, motion: PlanResult, policy: str) -> Step:
         stated = motion.confidence if policy == CHANCE else None
-        if motion.solved and (stated is None or stated >= self.settings.confidence):
-            return Step(GO, _said(policy, stated), policy, motion, stated)
-        if stated is not None:
-            why = f"the motion's confidence is {stated:.2f}, below {self.settings.confidence:g}"
-        else:
-            why = motion.reason
-        return self._look(problem, policy, predicted, motion, why)
+        return Step(GO, _said(stated), policy, motion, stated)
 
     def _look(
         self,
@@ -177,45 +204,94 @@ class Explorer:
         policy: str,
         predicted: Float32[ndarray, "nx ny nz"] | None,
         motion: PlanResult,
-        why: str,
     ) -> Step:
-        """A look at what a tentative motion sweeps unseen, or why there is none."""
+        """A look at what a tentative motion sweeps unseen, or why there is none. `motion`: the one to the
+        goal that does not keep to the policy."""
+        why = motion.reason
+        if motion.solved:
+            why = f"the motion's confidence is {motion.confidence:.2f}, below {self.settings.confidence:g}"
         if not self.cameras:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
         if self._looks >= self.settings.max_looks:
             return Step(STUCK, f"{why}, after {self._looks} looks", policy)
         as_seen = replace(problem, views=())
-        tentative = motion if motion.solved else self._planned(as_seen)
-        if tentative.path is None:
-            return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
-        wanted = swept_unseen(self.map, tentative.path, problem.start)
+        wanted = swept_unseen(self.map, motion.path) if motion.path else self._least_unseen(as_seen)
+        if isinstance(wanted, str):
+            return Step(STUCK, f"no motion among what was seen: {wanted}", policy)
         predicted = self._predicted(problem) if predicted is None else predicted
-        here = voxels_in(placed_spheres(self.robot, problem.start).astype(np.float32), CARVING_MARGIN)
-        closed = ~self.map.free & ~here
+        allowed = as_seen.scene
+        if policy == STRICT:
+            obstacles = not_seen_free(self.map, self.scene, (problem.start,))
+            allowed = as_seen.scene.with_shapes([*as_seen.scene.shapes, *obstacles])
         for camera in self.cameras:
-            looks = best_looks(self.map, as_seen.scene, camera, wanted, predicted, problem.start, self._rng)
-            if policy == STRICT:
-                looks = (q for q in looks if not (self._occupied_by(q) & closed).any())
+            looks = best_looks(self.map, allowed, camera, wanted, predicted, problem.start, self._rng)
             for there in islice(looks, self.settings.look_attempts):
-                look = Problem(self.robot, self.scene, problem.start, there, views=self._views)
-                way = self._motion(look, policy, predicted)
-                stated = way.confidence if policy == CHANCE else None
-                if way.solved and (stated is None or stated >= self.settings.confidence):
+                look = replace(problem, goal=JointGoal(there[None]))
+                if policy == STRICT:
+                    way = self._planned(replace(look, scene=allowed, views=()), self._quick_limit)
+                else:
+                    way = self._by_chance(look, predicted, self._quick_limit)
+                if self._good(way, policy):
+                    stated = way.confidence if policy == CHANCE else None
+                    self._looked_for += wanted
                     return Step(LOOK, f"{why}; look there first", policy, way, stated)
+        back = self._way_back(problem) if policy == STRICT else None
+        if back is not None:
+            return Step(LOOK, f"{why}; back on the way in, to look from there", policy, back)
         return Step(STUCK, f"{why}; no look that would help can be reached", policy)
 
+    def _way_back(self, problem: Problem) -> PlanResult | None:
+        """A motion that leaves by the way in, as far as there is more room; None if there is none."""
+        way = self._way_in
+        if way is None or np.abs(way[-1] - problem.start).max() > AT_GOAL:
+            return None
+        for share in WAY_BACK_SHARES:
+            waypoints = _first_part(way[::-1], share)
+            obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
+            scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
+            leaving = replace(problem, scene=scene, goal=JointGoal(waypoints[-1:]), views=())
+            context = PlanningContext(self._planner.name, leaving, PlanRequest(self.settings.time_limit))
+            found = context.finish(waypoints, "the way in", "back on the way in")
+            if found is not None:
+                return replace(found, problem=leaving)
+        return None
+
+    def _least_unseen(self, as_seen: Problem) -> Bool[ndarray, "nx ny nz"] | str:
+        """What a motion among what was seen sweeps unseen: the least of several motions, which avoid voxels
+        that looks were made for in vain if they can; or why there is none."""
+        goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
+        ends = near_ends(self.map, (as_seen.start, *goals))
+        in_vain = np.argwhere((self._looked_for >= MAX_LOOKS_FOR) & self.map.unknown & ~ends)
+        avoided = cover(self.map, self.scene, in_vain, "looked for in vain")
+        avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
+        best = reason = None
+        for i in range(TENTATIVE_MOTIONS):
+            tentative = self._planned(avoiding, self._quick_limit, self._seed + i)
+            if tentative.path is None and len(in_vain) and best is None:
+                avoiding, in_vain = as_seen, in_vain[:0]
+                tentative = self._planned(as_seen, self._quick_limit, self._seed + i)
+            if tentative.path is None:
+                reason = tentative.reason
+                break
+            wanted = swept_unseen(self.map, tentative.path)
+            if best is None or wanted.sum() < best.sum():
+                best = wanted
+        return best if best is not None else str(reason)
+
+    @property
+    def _quick_limit(self) -> float:
+        return QUICK_FRACTION * self.settings.time_limit
+
     def _motion(
-        self, problem: Problem, policy: str, predicted: Float32[ndarray, "nx ny nz"] | None
+        self,
+        problem: Problem,
+        policy: str,
+        predicted: Float32[ndarray, "nx ny nz"] | None,
+        limit: float,
     ) -> PlanResult:
-        """A motion to the problem's goal that keeps to a policy."""
+        """A motion to the problem's goal by a policy, found within a time limit [s]."""
         if policy == CHANCE:
-            asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
-            request = PlanRequest(self.settings.time_limit, self._seed, FIRST)
-            result = plan_with_unknown_space(self._planner, asked, request, predicted)
-            if result.swept_probability is not None:
-                stated = confidence("predicted", result.swept_probability)
-                result = replace(result, confidence=stated)
-            return replace(result, problem=asked)
+            return self._by_chance(problem, predicted, limit)
         goals = self._goals(problem)
         if isinstance(goals, PlanResult):
             return goals
@@ -223,14 +299,26 @@ class Explorer:
         goal = goals[int(np.argmin(outside))]
         obstacles = not_seen_free(self.map, self.scene, (problem.start, goal))
         scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-        result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None]), views=()))
+        result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None]), views=()), limit)
         if result.solved:
             return result
         return replace(result, reason=f"no motion within space seen free: {result.reason}")
 
-    def _planned(self, problem: Problem) -> PlanResult:
-        """A first motion in the problem's scene as it is."""
-        return self._planner.plan(problem, self.settings.time_limit, self._seed, FIRST)
+    def _by_chance(
+        self, problem: Problem, predicted: Float32[ndarray, "nx ny nz"] | None, limit: float
+    ) -> PlanResult:
+        """A motion among what was seen and predicted, with its confidence."""
+        asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
+        request = PlanRequest(limit, self._seed, FIRST)
+        result = plan_with_unknown_space(self._planner, asked, request, predicted)
+        if result.swept_probability is not None:
+            stated = confidence("predicted", result.swept_probability)
+            result = replace(result, confidence=stated)
+        return replace(result, problem=asked)
+
+    def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
+        """A first motion in the problem's scene as it is, found within a time limit [s]."""
+        return self._planner.plan(problem, limit, self._seed if seed is None else seed, FIRST)
 
     def _goals(self, problem: Problem) -> Float[ndarray, "n dof"] | PlanResult:
         """The goal configurations, or the result that says why there is none."""
@@ -254,7 +342,15 @@ class Explorer:
         return predict(observe(problem.views, self.robot, problem.start))
 
 
-def _said(policy: str, stated: float | None) -> str:
-    if policy == STRICT:
+def _first_part(waypoints: Float[ndarray, "n dof"], share: float) -> Float[ndarray, "m dof"]:
+    """The part of a path before a share of its length."""
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
+    end = share * at[-1]
+    last = np.array([np.interp(end, at, joint) for joint in waypoints.T])
+    return np.concatenate([waypoints[at < end], last[None]])
+
+
+def _said(stated: float | None) -> str:
+    if stated is None:
         return "a motion through space seen free alone"
-    return "a motion" if stated is None else f"a motion that is free with a probability of {stated:.2f}"
+    return f"a motion that is free with a probability of {stated:.2f}"

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
@@ -32,13 +32,23 @@ def not_seen_free(
     validator accepts among them enters no other voxel. ends: configurations around which CARVING_MARGIN is
     taken as free; seen points are obstacles of their own.
     """
+    points = surface(~known.free & ~near_ends(known, ends))
+    return cover(known, known_scene, points, "not seen free"), *_walls()
+
+
+def near_ends(known: OccupancyMap, ends: Sequence[Float[ndarray, "dof"]]) -> Bool[ndarray, "nx ny nz"]:
+    """The voxels around the arm at these configurations that count as free."""
     spheres = np.concatenate([placed_spheres(known.robot, q) for q in ends]).astype(np.float32)
-    near = voxels_in(spheres, CARVING_MARGIN + FINE_VOXEL_SIZE / 2)
-    points = (surface(~known.free & ~near) + 0.5) * FINE_VOXEL_SIZE + LOW
+    return voxels_in(spheres, CARVING_MARGIN + FINE_VOXEL_SIZE / 2)
+
+
+def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], name: str) -> AssumedPoints:
+    """Balls that cover the voxels of these indices, without those in the known scene."""
+    points = (voxels + 0.5) * FINE_VOXEL_SIZE + LOW
     if known_scene.shapes:
         scene, inside = compile_scene_for(known.robot, known_scene), np.float32(FINE_VOXEL_SIZE / 2 - 1e-3)
         points = points[~near_scene(scene, points.astype(np.float32), inside)]
-    return AssumedPoints(points, COVER_RADIUS, name="not seen free"), *_walls()
+    return AssumedPoints(points, COVER_RADIUS, name=name)
 
 
 def _walls() -> list[Box]:

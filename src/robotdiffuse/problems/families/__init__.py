@@ -18,6 +18,7 @@ FAMILIES = Registry(
         "table": Entry(f"{HERE}.table:TABLE", "between the objects on a table, and beneath it"),
         "clutter": Entry(f"{HERE}.clutter:CLUTTER", "between many small objects on a table"),
         "kitchen": Entry(f"{HERE}.kitchen:KITCHEN", "in ovens and cupboards and on a counter"),
+        "cabinet": Entry(f"{HERE}.cabinet:CABINET", "in cabinets of any proportions, with doors and drawers"),
     },
     group="robotdiffuse.families",
 )
