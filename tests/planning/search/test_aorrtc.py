@@ -16,7 +16,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status, Trajectory
 from robotdiffuse.planning import context
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.anytime import usual_clearances
+from robotdiffuse.planning.search.anytime_search import usual_clearances
 from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.held_out import held_out_problem

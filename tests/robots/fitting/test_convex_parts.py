@@ -5,14 +5,8 @@ import pytest
 import trimesh
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.fitting.convex_parts import (
-    PartSettings,
-    Surface,
-    convex_hull,
-    convex_parts,
-    planes_of,
-    simplified,
-)
+from robotdiffuse.robots.fitting.convex_hulls import convex_hull, planes_of
+from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_parts, simplified
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:
