@@ -37,7 +37,8 @@ from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.validation.validator import Report, VerifySettings, verify, verify_trajectory
+from robotdiffuse.validation.report import Report
+from robotdiffuse.validation.validator import VerifySettings, verify, verify_trajectory
 
 PLANNERS = {
     "RRTConnect": og.RRTConnect,

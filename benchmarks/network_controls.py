@@ -1,6 +1,6 @@
 """What the network adds to search, and how its motions differ from those of search.
 
-    python benchmarks/network_controls.py [--parts hybrid,diversity,rotation] [--families rop,shelf]
+    python benchmarks/network_controls.py [--parts hybrid,diversity] [--families rop,shelf]
         [--problems 60] [--cases FOLDER]
 
 It prints benchmarks/results/network_controls.txt. Problems are held out; the straight line does not solve
@@ -14,8 +14,6 @@ them, and ten seconds of search do.
   square of their distances in joint space at the same part of their lengths. classes: number of different
   sides on which the tip passes the obstacles, of which there are four for each (left, right, above, below, as
   seen along the line between the ends of the tip's way); then smoothness of the motions that both return.
-- rotation: distances between codes of the bundled encoder, over the mean distance between two scenes: of two
-  clouds of one scene, and of a cloud and the same one turned about the vertical.
 """
 
 import argparse
@@ -29,7 +27,6 @@ from numpy import ndarray
 
 from common import FIRST, TIME_LIMIT, draw_hard_cases, header, parse, parts_of, print_table
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.transforms import rotation_from_rpy
 from robotdiffuse.core.types import LENGTH, TIME
 from robotdiffuse.evaluation.methods import fields_of, from_network, measure_of, planned, validated
 from robotdiffuse.evaluation.records import Record
@@ -47,10 +44,9 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box, Cylinder, Sphere
-from robotdiffuse.scenes.surface_points import sample_surface
 
 PANDA = load_robot("panda")
-PARTS = ("hybrid", "diversity", "rotation")
+PARTS = ("hybrid", "diversity")
 EQUAL_TIME = 1.0
 """Time limit of the hybrids [s]."""
 PLANNER_LIMIT = 20.0
@@ -59,8 +55,6 @@ SEEDS = (1, 2)
 BATCH_STAGES = ("network", "refinement", "smooth_noise")
 """Stages of answers that come from batches."""
 MOTIONS, WAYPOINTS = 16, 48
-TURNS = (15, 90, 180)
-"""About the vertical [degrees]."""
 SMOOTHNESS = ("turning", "jerk", "duration")
 """Metrics of the motions that both planners return."""
 
@@ -208,33 +202,6 @@ def _mean(records: Sequence[Record], key: str) -> Figure | None:
     return Figure(f"{values.mean():.2f} ± {half:.2f}", float(values.mean()))
 
 
-def report_rotation(every: dict[str, list[Case]]) -> None:
-    """Print how far a turned scene's code is from the scene's own."""
-    planner, rng, rows = Diffusion(), np.random.default_rng(1), []
-    model = planner.network(PANDA)
-    of_encoder = model.settings.encoder_settings
-    assert of_encoder is not None
-    for family, cases in every.items():
-        scenes = [case.problem.scene for case in cases]
-        clouds, again = (
-            [sample_surface(scene, planner.settings.points, rng, of_encoder.region) for scene in scenes]
-            for _ in range(2)
-        )
-        codes, same = (np.stack([model.encode(c, rng) for c in of]) for of in (clouds, again))
-        apart = np.linalg.norm(codes - np.roll(codes, 1, axis=0), axis=1).mean()
-        found = [np.linalg.norm(codes - same, axis=1) / apart]
-        for angle in TURNS:
-            turn = rotation_from_rpy(0.0, 0.0, np.radians(angle))
-            turned = np.stack([model.encode(cloud @ turn.T, rng) for cloud in clouds])
-            found.append(np.linalg.norm(codes - turned, axis=1) / apart)
-        rows.append((family, len(cases), *(interval(of, 2) for of in found)))
-    print_table(
-        "Distance of codes over that of two scenes, mean (95 %)",
-        ["family", "scenes", "the same, another cloud", *(f"turned by {angle}°" for angle in TURNS)],
-        rows,
-    )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description="What the network adds to search.")
     parser.add_argument("--parts", default=",".join(PARTS), help=f"of {','.join(PARTS)} (all)")
@@ -249,8 +216,6 @@ def main() -> None:
         report_hybrid(every)
     if "diversity" in parts:
         report_diversity(every)
-    if "rotation" in parts:
-        report_rotation(every)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ SCRIPTS = sorted(file.stem for file in FOLDER.glob("*.py") if file.stem != "comm
 NEEDS = {
     "certificates": ("ompl",),
     "constraints": ("pybullet",),
-    "learning": ("matplotlib", "pybullet"),
+    "learning": ("pybullet",),
     "moving_obstacles": ("pybullet",),
     "planning_requests": ("pybullet", "pinocchio"),
     "robots": ("pybullet",),

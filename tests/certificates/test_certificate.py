@@ -25,7 +25,8 @@ from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.validation.validator import Report, VerifySettings, verify
+from robotdiffuse.validation.report import Report
+from robotdiffuse.validation.validator import VerifySettings, verify
 
 SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3], [0.6, 0.9, 0.3]])
 

@@ -15,7 +15,7 @@ from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collisio
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.bodies import Surface
-from robotdiffuse.robots.fitting.convex_parts import convex_hull
+from robotdiffuse.robots.fitting.convex_hulls import convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -170,7 +170,12 @@ BAXTER = {
 """Configurations, found by sampling, in which convex parts of the torso and a link overlap."""
 
 
-@pytest.mark.parametrize("name, link", BAXTER)
+FOREARM, *OTHERS = BAXTER
+
+
+@pytest.mark.parametrize(
+    "name, link", [FOREARM, *(pytest.param(*other, marks=pytest.mark.slow) for other in OTHERS)]
+)
 def test_baxters_torso_and_arms_graze_as_trimesh_finds_too(name: str, link: str) -> None:
     robot, q, links = load_robot(name), np.array(BAXTER[name, link]), ("torso", link)
     by_parts = replace(robot, surfaces={}, grazing=frozenset())

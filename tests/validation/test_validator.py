@@ -24,14 +24,8 @@ from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, S
 from robotdiffuse.trajectories.speed_limits import TimingSettings
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
-from robotdiffuse.validation.validator import (
-    Report,
-    VerifySettings,
-    Violation,
-    verifier,
-    verify,
-    verify_trajectory,
-)
+from robotdiffuse.validation.report import Report, Violation
+from robotdiffuse.validation.validator import VerifySettings, verifier, verify, verify_trajectory
 
 Z = np.array([0.0, 0.0, 1.0])
 RATES = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)

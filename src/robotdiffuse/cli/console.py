@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from robotdiffuse.certificates.certificate import Certificate
     from robotdiffuse.core.results import PlanResult
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.validation.validator import Report
+    from robotdiffuse.validation.report import Report
 
 
 SPINNER_DELAY = 2.0

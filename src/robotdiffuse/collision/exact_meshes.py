@@ -314,11 +314,11 @@ class ExactCollision:
         return best if apart is None else min(max(best, apart), cutoff)
 
     def link_distances(self, q: Float[ndarray, "dof"]) -> tuple[Distance, ...]:
-        """Signed distance of every moving link to the nearest obstacle (infinite in an empty scene)."""
+        """Signed distance of every moving link to the nearest obstacle [m], infinite in an empty scene."""
         return self._all(q, range(len(self.links)))
 
     def pair_distances(self, q: Float[ndarray, "dof"]) -> tuple[Distance, ...]:
-        """Signed distance of every checked pair of links."""
+        """Signed distance of every checked pair of links [m], negative where they overlap."""
         return self._all(q, range(len(self.links), len(self.checks)))
 
     def distance_from_moved_base(

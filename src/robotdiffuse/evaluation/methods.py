@@ -30,7 +30,8 @@ from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.held_out import goal_of
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.validation.validator import Report, VerifySettings, verifier
+from robotdiffuse.validation.report import Report
+from robotdiffuse.validation.validator import VerifySettings, verifier
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel

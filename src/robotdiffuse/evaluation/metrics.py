@@ -15,7 +15,7 @@ from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.straight_line import straight_line_time
-from robotdiffuse.validation.validator import Report
+from robotdiffuse.validation.report import Report
 
 STEP = 0.02
 """Longest step for link paths [rad, joint-space L2]; arcs are then measured 2e-5 too short."""

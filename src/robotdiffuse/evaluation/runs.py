@@ -24,11 +24,11 @@ from robotdiffuse.problems.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One call of a method, to be made."""
+    """One call that a benchmark makes: a method on a problem, with a seed and a time limit."""
 
     case: Case
     index: int
-    """Of the case among all."""
+    """Place of the case among all cases."""
     method: str
     """Its name in records."""
     seed: int

@@ -17,7 +17,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
+from robotdiffuse.planning.search.anytime_search import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import END_MARGIN, StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import TURN

@@ -116,7 +116,8 @@ def _times(value: object, count: int) -> tuple[Float[ndarray, "n"] | None, tuple
 
 @dataclass(frozen=True, eq=False)
 class RobotMotion:
-    """A motion of a robot's planned joints, and notes on the conversion."""
+    """A recorded motion as one of a robot's planned joints, and notes on what the conversion changed or left
+    out."""
 
     motion: Path | Trajectory
     notes: tuple[str, ...]

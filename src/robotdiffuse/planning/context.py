@@ -29,7 +29,8 @@ from robotdiffuse.trajectories.speed_limits import (
     TimingSettings,
 )
 from robotdiffuse.trajectories.timing import time_parameterize
-from robotdiffuse.validation.validator import Report, Verifier, Violation, verifier
+from robotdiffuse.validation.report import Report, Violation
+from robotdiffuse.validation.validator import Verifier, verifier
 
 DEFAULT_CLEARANCE = 0.01
 """Clearance where neither the request nor the problem sets one [m]."""

@@ -11,7 +11,8 @@ class JointNormalizer:
     """Maps lower limits to -1 and upper limits to 1, joint by joint; computed in float64."""
 
     def __init__(self, lower: Float[ndarray, "dof"], upper: Float[ndarray, "dof"]) -> None:
-        """Limits [rad], [m] for prismatic joints. Raises InputError for an empty or infinite range."""
+        """`lower` and `upper` are joint limits [rad], [m] for prismatic joints. Raises InputError for an
+        empty or infinite range."""
         for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
             if not (np.isfinite(low) and np.isfinite(high) and low < high):
                 raise InputError(

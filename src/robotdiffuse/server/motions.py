@@ -9,7 +9,7 @@ from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, form, numbers, wi
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.scenes.files import check_fields
-from robotdiffuse.validation.validator import Report
+from robotdiffuse.validation.report import Report
 
 MOTIONS = ("path", "trajectory")
 

@@ -31,7 +31,8 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.server.motions import MOTIONS, read_motion, report_record
 from robotdiffuse.server.settings import GRACE_TIME
-from robotdiffuse.validation.validator import Report, Verifier
+from robotdiffuse.validation.report import Report
+from robotdiffuse.validation.validator import Verifier
 
 PLAN, VERIFY = "plan", "verify"
 DEFAULT_SEED, DEFAULT_TIME_LIMIT = 0, 1.0

@@ -4,7 +4,7 @@ Freedom from collision between waypoints is certified, not sampled: see collisio
 trajectory are computed from its positions and times: see rates.py. The validator does not depend on planners.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,7 @@ from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
+from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, first_place_within, goal_error
 from robotdiffuse.validation.torques import Pieces, first_excess, static_pieces, trajectory_pieces
 
@@ -30,53 +31,6 @@ if TYPE_CHECKING:  # what most problems do not need is imported where one does
 
 MAX_DURATION = 1e5
 """Longest motion that is validated, about a day [s]."""
-
-
-@dataclass(frozen=True)
-class Violation:
-    """A requirement that a motion violates."""
-
-    kind: str
-    """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, waypoint or
-    goal; for trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
-    time: float
-    """Its place: for a path, waypoint index plus fraction of the segment; for a trajectory, time [s]."""
-    message: str
-    """One line."""
-    subject: str | None = None
-    """The link that collides or is constrained, or the joint that is out of limits."""
-    other: str | None = None
-    """The obstacle, the other link or the kind of constraint."""
-    excess: float | None = None
-    """Amount of the violation: the greatest depth until the contact ends [m], the greatest value of a
-    constraint until it is kept again, or the excess over a limit or error at the goal in its unit."""
-
-
-@dataclass(frozen=True)
-class Report:
-    """The result of a validation."""
-
-    valid: bool
-    violation: Violation | None
-    """The first violation; None if and only if the motion is valid."""
-    scene_clearance: float | None
-    """Certified lower bound on the distance of all moving links to all obstacles over the whole motion [m],
-    at most 1 m. None for an invalid motion."""
-    self_clearance: float | None
-    """The same between links that are checked against each other [m]."""
-    jerk_share: float | None = None
-    """The largest jerk of a valid trajectory as a share of the joint's limit (`jerk_limits`); infinite if
-    accelerations jump at the ends. Not a requirement: above 1 the motion is valid, but some controllers
-    refuse it."""
-    found: tuple[Violation, ...] = ()
-    """All violations that were found, the first of each kind; `violations` also finds every contact."""
-
-    @property
-    def min_clearance(self) -> float | None:
-        """The smaller of both clearances [m]."""
-        if self.scene_clearance is None or self.self_clearance is None:
-            return None
-        return min(self.scene_clearance, self.self_clearance)
 
 
 def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT) -> Report:

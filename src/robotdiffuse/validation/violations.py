@@ -6,14 +6,8 @@ from robotdiffuse.collision.contacts import contacts
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.validation.rates import sample_cubics
-from robotdiffuse.validation.validator import (
-    DEFAULT,
-    Report,
-    VerifySettings,
-    Violation,
-    collision_violation,
-    verifier,
-)
+from robotdiffuse.validation.report import Report, Violation
+from robotdiffuse.validation.validator import DEFAULT, VerifySettings, collision_violation, verifier
 
 RATE_KINDS = ("rest", "rates", "velocity", "acceleration", "jump")
 CONTACT_KINDS = ("scene_collision", "self_collision")

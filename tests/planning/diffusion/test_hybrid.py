@@ -19,7 +19,7 @@ from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettin
 from robotdiffuse.planning.diffusion.hybrid import BATCH_WORK, RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.anytime import AnytimeSearch
+from robotdiffuse.planning.search.anytime_search import AnytimeSearch
 from robotdiffuse.planning.search.aorrtc import AORRTCSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem

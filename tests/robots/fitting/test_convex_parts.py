@@ -5,14 +5,8 @@ import pytest
 import trimesh
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.fitting.convex_parts import (
-    PartSettings,
-    Surface,
-    convex_hull,
-    convex_parts,
-    planes_of,
-    simplified,
-)
+from robotdiffuse.robots.fitting.convex_hulls import convex_hull, planes_of
+from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_parts, simplified
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:
@@ -49,12 +43,17 @@ BOWL = trimesh.creation.icosphere(3, 0.1).slice_plane([0, 0, 0], [0, 0, -1])  # 
 MESHES = {"L": L, "frame": FRAME, "tube": TUBE, "bowl": BOWL}
 
 
+SLOW_MESHES = ("bowl", "tube")
+
+
 def beyond(parts: tuple, points: np.ndarray) -> np.ndarray:
     """Largest distance of points from the nearest part."""
     return np.min([(points @ n.T - o).max(1) for n, o in map(planes_of, parts)], axis=0)
 
 
-@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_MESHES else []) for name in MESHES]
+)
 def test_parts_hold_all_of_the_mesh(name: str) -> None:
     parts = convex_parts((surface(MESHES[name]),))
     points = trimesh.sample.sample_surface(MESHES[name], 20_000, seed=1)[0]

@@ -7,7 +7,7 @@ import trimesh
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.fitting.convex_parts import convex_hull
+from robotdiffuse.robots.fitting.convex_hulls import convex_hull
 from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours, neighbours
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
 from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Solid

@@ -15,7 +15,7 @@ from robotdiffuse.core.transforms import rotation_from_rpy
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.fitting.add import add_robot
 from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, convex_hull
+from robotdiffuse.robots.fitting.convex_hulls import MIN_THICKNESS, convex_hull
 from robotdiffuse.robots.fitting.preparation import PreparationSettings
 from robotdiffuse.robots.fitting.sphere_fitting import covered
 from robotdiffuse.robots.joints import CONTINUOUS_LIMIT

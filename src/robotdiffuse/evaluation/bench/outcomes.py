@@ -84,7 +84,7 @@ def deciding_record(records: Sequence[Record], limit: float) -> Record | None:
 
 
 def outcome(record: Record, limit: float) -> Outcome:
-    """What the call of a record had found within a limit [s]."""
+    """Returns what a recorded call had found by a time limit [s]."""
     late = max(LATE_SHARE * limit, LATE_SECONDS) if record.time_limit == limit else 0.0
     by_then = [(at, length) for at, length in record.progress if record.solved and at <= limit + late]
     if not by_then:

@@ -38,7 +38,8 @@ from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.diffusion.diffusion import GuidedSamplingSettings, ModelSampler, encode
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.learned import nearest_goals
-from robotdiffuse.planning.search.anytime import AnytimeSearch, anytime
+from robotdiffuse.planning.search.anytime import anytime
+from robotdiffuse.planning.search.anytime_search import AnytimeSearch
 from robotdiffuse.planning.search.aorrtc import AORRTC, IMPROVEMENT_STEP, AORRTCSettings
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot

@@ -12,7 +12,8 @@ from robotdiffuse.core.settings import Bound, Natural
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planning.search.anytime import anytime
+from robotdiffuse.planning.search.anytime_search import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal
 
 IMPROVEMENT_STEP = 1_000

@@ -11,7 +11,8 @@ from numpy import ndarray
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search import constrained_kernel
-from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planning.search.anytime import anytime
+from robotdiffuse.planning.search.anytime_search import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 

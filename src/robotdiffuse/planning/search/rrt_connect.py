@@ -7,7 +7,8 @@ from robotdiffuse.core.settings import Count, NotNegative
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.planning.search.anytime import CLOCK_INTERVAL, AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planning.search.anytime import anytime
+from robotdiffuse.planning.search.anytime_search import CLOCK_INTERVAL, AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal
 
 

@@ -8,20 +8,17 @@ surface count as solid, so holes smaller than a voxel, inner walls and overlappi
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 from numpy import ndarray
-from scipy import ndimage
-from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
+from scipy.spatial import HalfspaceIntersection, QhullError
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.bodies import ConvexMesh, Surface
+from robotdiffuse.robots.fitting.convex_hulls import convex_hull, face_normals, hull_volume, planes_of
+from robotdiffuse.robots.fitting.distance_grid import DistanceGrid, split
 
-MIN_THICKNESS = 1e-3
-"""Smallest thickness of a hull [m]: spheres and distances need a sheet to have a volume."""
 CUT_FRACTIONS = np.arange(1, 10) / 10
 """Candidate cuts along each axis, as fractions of the part's length."""
 WALL_OFFSET = 1e-4
@@ -34,11 +31,6 @@ MAX_CUT_POINTS = 1200
 """Approximate largest number of surface points for choosing a cut."""
 MAX_NORMALS = 1000
 """A hull with more faces has similar normals merged before it is simplified."""
-MAX_SPLITS = 60
-"""Largest number of times that a triangle is halved."""
-TIGHT_FRACTION, TIGHT_SLOPE = 0.125, 0.3
-"""At a tight place, parts may stick out by this fraction of the usual distance; the allowance grows by this
-slope with the distance from there."""
 TIGHT_PART_FACTOR = 4
 """A link with tight places may have this many times as many parts."""
 SIMPLIFIED_GROWTH = 1e-7
@@ -90,7 +82,8 @@ def convex_parts(
     """
     settings = settings or PartSettings()
     soups = [surface.vertices[surface.faces] for surface in surfaces]
-    space = _DistanceGrid.around(soups, settings if tight is None else settings.finer())
+    grid = settings if tight is None else settings.finer()
+    space = DistanceGrid.around(soups, grid.voxels, grid.finest)
     parts = [_Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
     parts = _cut(parts, space, settings, max(settings.most, 2 * len(parts)))
     if tight is not None:
@@ -100,7 +93,7 @@ def convex_parts(
     return tuple(_without_contained(_merged([part.hull for part in parts], space, settings)))
 
 
-def _cut(parts: list["_Part"], space: "_DistanceGrid", settings: PartSettings, most: int) -> list["_Part"]:
+def _cut(parts: list["_Part"], space: DistanceGrid, settings: PartSettings, most: int) -> list["_Part"]:
     """Parts cut in two, the most concave first, until all are within `settings.concavity` or there are
     `most`."""
     parts = list(parts)
@@ -110,43 +103,6 @@ def _cut(parts: list["_Part"], space: "_DistanceGrid", settings: PartSettings, m
             break
         parts[worst : worst + 1] = parts[worst].halves(space, settings)
     return parts
-
-
-def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
-    """Convex hull with outward faces; a point set thinner than `MIN_THICKNESS` in a direction is thickened to
-    it."""
-    points = _thickened(points)
-    hull = ConvexHull(points)
-    used, index = np.unique(hull.simplices, return_inverse=True)
-    vertices, faces = points[used], index.reshape(hull.simplices.shape)
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    inwards = np.einsum("fd,fd->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inwards] = faces[inwards][:, ::-1]
-    return ConvexMesh(vertices, faces)
-
-
-def _thickened(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
-    """The points, or copies shifted to both sides along the principal axes in which the set is too thin."""
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    for axis in axes[np.ptp(points @ axes.T, axis=0) < MIN_THICKNESS]:
-        points = np.concatenate([points - axis * MIN_THICKNESS / 2, points + axis * MIN_THICKNESS / 2])
-    return points
-
-
-def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:
-    """Outward unit normals of the faces; zero for a face without area."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    normals = np.cross(b - a, c - a)
-    size = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(size > 1e-14, normals / np.maximum(size, 1e-14), 0.0)
-
-
-def planes_of(mesh: ConvexMesh) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p"]]:
-    """Normals and offsets of the distinct planes of a convex mesh."""
-    normals = face_normals(mesh)
-    normals = np.unique(np.round(normals[np.linalg.norm(normals, axis=1) > 0.5], 9), axis=0)
-    # offsets from the farthest vertex, so that rounding does not put a plane inside the mesh
-    return normals, (mesh.vertices @ normals.T).max(0)
 
 
 def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: int = 120) -> ConvexMesh:
@@ -190,11 +146,11 @@ class _Part:
     concavity: float
 
     @staticmethod
-    def of(triangles: ndarray, points: ndarray, space: "_DistanceGrid", settings: PartSettings) -> "_Part":
+    def of(triangles: ndarray, points: ndarray, space: DistanceGrid, settings: PartSettings) -> "_Part":
         hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
         return _Part(triangles, points, hull, space.concavity(hull))
 
-    def halves(self, space: "_DistanceGrid", settings: PartSettings) -> list["_Part"]:
+    def halves(self, space: DistanceGrid, settings: PartSettings) -> list["_Part"]:
         """The two parts on the sides of the plane that gives hulls of least volume; the part itself if too
         small to cut."""
         low, size = self.hull.vertices.min(0), np.ptp(self.hull.vertices, axis=0)
@@ -207,7 +163,7 @@ class _Part:
                 for side in (points[height <= 0], points[height > 0]):
                     edge = side[np.abs(side[:, axis] - at) <= apart]
                     edge[:, axis] = at  # approximates the intersection of surface and plane
-                    volume += _volume(np.concatenate([side, edge]))
+                    volume += hull_volume(np.concatenate([side, edge]))
                 if volume < IMPROVEMENT * least:
                     best, least = (int(axis), float(at)), volume
         halves = _sides(self.triangles, *best) if best else ()
@@ -216,83 +172,6 @@ class _Part:
         low_points = self.points[:, best[0]] <= best[1]
         points = (self.points[low_points], self.points[~low_points])
         return [_Part.of(side, near, space, settings) for side, near in zip(halves, points, strict=True)]
-
-
-@dataclass(frozen=True, eq=False)
-class _DistanceGrid:
-    """Distances of voxels from a solid, zero inside [m]."""
-
-    origin: Float[ndarray, "3"]
-    pitch: float
-    distance: Float[ndarray, "nx ny nz"]
-
-    @staticmethod
-    def around(soups: list[Float[ndarray, "n 3 3"]], settings: PartSettings) -> "_DistanceGrid":
-        corners = np.concatenate(soups).reshape(-1, 3)
-        low, high = corners.min(0), corners.max(0)
-        size = np.maximum(high - low, settings.finest)
-        pitch = max(float(np.prod(size) / settings.voxels) ** (1 / 3), size.max() / 300, settings.finest)
-        origin = low - 2.5 * pitch
-        shape = np.ceil((high - origin) / pitch).astype(int) + 3
-        occupied = np.zeros(shape, dtype=bool)
-        for soup in soups:
-            _mark(occupied, split(soup, pitch / 2), origin, pitch)
-        found: Any = ndimage.label(~occupied)
-        free = found[0] == found[0][0, 0, 0]
-        return _DistanceGrid(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
-
-    def near_tight(
-        self, tight: Float[ndarray, "n 3"], concavity: float
-    ) -> tuple["_DistanceGrid", "_DistanceGrid"]:
-        """Two copies with distances enlarged near `tight` places, so that sticking out there counts more.
-
-        The first is zero elsewhere; the second keeps the other distances.
-        """
-        near = np.argwhere((self.distance > 0) & (self.distance < 3 * concavity))
-        far = KDTree(tight).query(self.origin + (near + 0.5) * self.pitch)[0]
-        allowed = TIGHT_FRACTION * concavity + TIGHT_SLOPE * np.maximum(far - 2 * concavity, 0.0)
-        near, allowed = near[allowed < concavity], allowed[allowed < concavity]
-        alone = np.zeros_like(self.distance)
-        alone[tuple(near.T)] = self.distance[tuple(near.T)] * concavity / allowed
-        return replace(self, distance=alone), replace(self, distance=np.maximum(alone, self.distance))
-
-    def concavity(self, hull: ConvexMesh) -> float:
-        """How far a hull sticks out of the solid, approximately [m]."""
-        low = np.floor((hull.vertices.min(0) - self.origin) / self.pitch).astype(int)
-        high = np.ceil((hull.vertices.max(0) - self.origin) / self.pitch).astype(int) + 1
-        return _farthest_inside(self.distance, self.origin, self.pitch, low, high, *planes_of(hull))
-
-
-@njit(cache=True)
-def _mark(occupied, triangles, origin, pitch):
-    """Mark the voxels that contain corners of triangles."""
-    for t in range(len(triangles)):
-        for k in range(3):
-            i = int((triangles[t, k, 0] - origin[0]) / pitch)
-            j = int((triangles[t, k, 1] - origin[1]) / pitch)
-            occupied[i, j, int((triangles[t, k, 2] - origin[2]) / pitch)] = True
-
-
-@njit(cache=True)
-def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
-    """Largest value of `distance` among voxels whose centres are within the planes."""
-    best = 0.0
-    for i in range(max(low[0], 0), min(high[0], distance.shape[0])):
-        x = origin[0] + (i + 0.5) * pitch
-        for j in range(max(low[1], 0), min(high[1], distance.shape[1])):
-            y = origin[1] + (j + 0.5) * pitch
-            for k in range(max(low[2], 0), min(high[2], distance.shape[2])):
-                if distance[i, j, k] <= best:
-                    continue
-                z = origin[2] + (k + 0.5) * pitch
-                inside = True
-                for f in range(len(offsets)):
-                    if normals[f, 0] * x + normals[f, 1] * y + normals[f, 2] * z > offsets[f]:
-                        inside = False
-                        break
-                if inside:
-                    best = distance[i, j, k]
-    return best
 
 
 def _wall_cuts(heights: Float[ndarray, "n"], pitch: float) -> list[float]:
@@ -326,13 +205,6 @@ def _one_per_cube(points: Float[ndarray, "n 3"], size: float) -> Float[ndarray, 
     return points[first]
 
 
-def _volume(points: Float[ndarray, "n 3"]) -> float:
-    try:
-        return ConvexHull(points).volume
-    except (QhullError, ValueError):  # flat, or fewer than four points
-        return 0.0
-
-
 def _sides(
     triangles: Float[ndarray, "n 3 3"], axis: int, at: float
 ) -> tuple[Float[ndarray, "a 3 3"], Float[ndarray, "b 3 3"]]:
@@ -356,7 +228,7 @@ def _sides(
     )
 
 
-def _merged(hulls: list[ConvexMesh], space: _DistanceGrid, settings: PartSettings) -> list[ConvexMesh]:
+def _merged(hulls: list[ConvexMesh], space: DistanceGrid, settings: PartSettings) -> list[ConvexMesh]:
     """Hulls merged pairwise, least common concavity first, while it is within `settings.concavity`."""
     hulls = list(hulls)
     known: dict[tuple[int, int], tuple[float, ConvexMesh]] = {}
@@ -386,42 +258,3 @@ def _without_contained(hulls: list[ConvexMesh]) -> list[ConvexMesh]:
         if any((hull.vertices @ normals.T <= offsets).all() for normals, offsets in others):
             kept.remove(hull)
     return kept
-
-
-def split(triangles: Float[ndarray, "n 3 3"], size: "float | Float[ndarray, 'n']") -> Float[ndarray, "m 3 3"]:
-    """Halve triangles at their longest edge until no edge is longer than `size` [m]."""
-    sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
-    return _split(np.ascontiguousarray(triangles, np.float64), sizes**2)
-
-
-@njit(cache=True)
-def _split(triangles, squares):
-    out, count = np.empty((4 * len(triangles) + 64, 3, 3)), 0
-    open_ones = np.empty((MAX_SPLITS + 2, 3, 3))
-    for t in range(len(triangles)):
-        open_ones[0], left = triangles[t], 1
-        while left > 0:
-            left -= 1
-            longest, k = -1.0, 0
-            for i in range(3):
-                j = (i + 1) % 3
-                square = 0.0
-                for d in range(3):
-                    square += (open_ones[left, i, d] - open_ones[left, j, d]) ** 2
-                if square > longest:
-                    longest, k = square, i
-            if longest <= squares[t] or left >= MAX_SPLITS:
-                if count == len(out):
-                    out = np.concatenate((out, np.empty_like(out)))
-                out[count] = open_ones[left]
-                count += 1
-                continue
-            for d in range(3):
-                a, b = open_ones[left, k, d], open_ones[left, (k + 1) % 3, d]
-                c = open_ones[left, (k + 2) % 3, d]
-                middle = 0.5 * (a + b)
-                open_ones[left, 0, d], open_ones[left, 1, d], open_ones[left, 2, d] = a, middle, c
-                open_ones[left + 1, 0, d], open_ones[left + 1, 1, d] = middle, b
-                open_ones[left + 1, 2, d] = c
-            left += 2
-    return out[:count].copy()

@@ -14,7 +14,7 @@ from scipy.optimize import linprog
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
-from robotdiffuse.robots.fitting.convex_parts import planes_of
+from robotdiffuse.robots.fitting.convex_hulls import planes_of
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
 from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 from robotdiffuse.robots.robot import Robot

@@ -21,7 +21,7 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fitting.convex_parts import split
+from robotdiffuse.robots.fitting.distance_grid import split
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     DIRECTIONS,
     assign,

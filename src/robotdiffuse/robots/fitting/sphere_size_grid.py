@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fitting.convex_parts import planes_of
+from robotdiffuse.robots.fitting.convex_hulls import planes_of
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import max_radii_at, plane_depths
 
 GRID_POINTS = 200_000

@@ -15,7 +15,8 @@ from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import parse_xml, read_triangles
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull
+from robotdiffuse.robots.fitting.convex_hulls import convex_hull
+from robotdiffuse.robots.fitting.convex_parts import Surface
 from robotdiffuse.robots.inertias import Inertia, inertia_of
 from robotdiffuse.robots.joints import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
 from robotdiffuse.robots.parsing.joint_groups import passive_notes, planned_joints, refuse_linkages

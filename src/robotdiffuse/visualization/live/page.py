@@ -18,7 +18,7 @@ from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
-from robotdiffuse.validation.validator import Violation
+from robotdiffuse.validation.report import Violation
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
 from robotdiffuse.visualization.live.access import SECRET, AccessProxy

@@ -28,7 +28,8 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
 from robotdiffuse.scenes.shapes import Shape
-from robotdiffuse.validation.validator import Report, verify_trajectory
+from robotdiffuse.validation.report import Report
+from robotdiffuse.validation.validator import verify_trajectory
 from robotdiffuse.visualization.live.latest_task import LatestTask
 from robotdiffuse.visualization.live.obstacles import handle_pose, moved_to, new_obstacle, resized
 

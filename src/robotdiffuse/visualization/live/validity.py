@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
-from robotdiffuse.validation.validator import Report
+from robotdiffuse.validation.report import Report
 from robotdiffuse.visualization.live.session import State
 
 VALID, INVALID, NO_MOTION, PENDING = "valid", "invalid", "none", "pending"

@@ -14,10 +14,8 @@ Passages narrower than a step are not found: no path on the lattice does not mea
 single-joint steps is up to sqrt(dof) times as long as the straight line that it follows.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
 from itertools import combinations, product
 from math import comb, sqrt
 from typing import Annotated, Generic, TypeVar
@@ -27,13 +25,14 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.motions import FINEST_RESOLUTION, largest_motion_radii, search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning.baselines.lattice import kernel, table
-from robotdiffuse.planning.baselines.lattice.kernel import UNITS, Lattice
+from robotdiffuse.planning.baselines.lattice.kernel import UNITS, Lattice, Outcome
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal
@@ -58,8 +57,9 @@ class LatticeSettings(Settings):
     """Step of the lattice [rad], [m] for prismatic joints."""
     joints_per_move: Count = 1
     """Largest number of joints that an edge moves, each by one step."""
-    max_nodes: Annotated[int, Bound(least=1.0, below=2.0**31 - 1)] = 2_000_000
-    """Largest number of nodes in memory; each takes 60 to 80 bytes, more with `joints_per_move`."""
+    max_nodes: Annotated[int, Bound(least=1.0, most=2e9)] = 2_000_000
+    """Largest number of nodes in memory; each takes about 80 bytes. D* Lite needs one more byte for each goal
+    and for each pair of edges, and has room for the nodes around the goals besides."""
     resolution: Positive = 0.05
     """No point of the arm moves further than this between two checks of an edge [m]; after a path that the
     validator refuses, the search starts again at half the distance."""
@@ -84,18 +84,6 @@ class DStarLiteSettings(LatticeSettings, name="d_star_lite"):
 
 
 LatticePlannerSettings = TypeVar("LatticePlannerSettings", bound=LatticeSettings)
-
-
-class Outcome(Enum):
-    """State of a search."""
-
-    GOING = kernel.GOING
-    """Stopped; it can be continued."""
-    FOUND = kernel.FOUND
-    EXHAUSTED = kernel.EXHAUSTED
-    """No path on the lattice."""
-    FULL = kernel.FULL
-    """`max_nodes` nodes are in use."""
 
 
 def make_lattice(
@@ -136,22 +124,22 @@ def _steps(distance: Float[ndarray, "dof"], spacing: float) -> Int[ndarray, "dof
 def lattice_moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
     """One of each pair of opposite moves, that in which the first moving joint moves up; those of few joints
     first."""
-    if joints == 1:
-        return np.eye(dof, dtype=np.int64)
-    moves = []
-    for count in range(1, min(joints, dof) + 1):
-        signs = [(1, *others) for others in product((1, -1), repeat=count - 1)]
-        rows = np.zeros((comb(dof, count), len(signs), dof), np.int64)
-        for row, moving in zip(rows, combinations(range(dof), count), strict=True):
-            row[:, moving] = signs
-        moves += sorted(rows.reshape(-1, dof).tolist(), key=lambda move: [step % 3 for step in move])
-    return np.array(moves, np.int64)
+    moves = list(np.eye(dof, dtype=np.int64)[:: 1 if joints == 1 else -1])
+    for count in range(2, min(joints, dof) + 1):
+        rows = []
+        for moving, signs in product(combinations(range(dof), count), product((1, -1), repeat=count - 1)):
+            rows.append(np.zeros(dof, np.int64))
+            rows[-1][list(moving)] = (1, *signs)
+        moves += sorted(rows, key=lambda move: list(move % 3))
+    return np.array(moves)
 
 
-class _Search(ABC, Generic[LatticePlannerSettings]):
-    """Base of both searches: the lattice, the table of nodes, and the path along it."""
+class _Search(Generic[LatticePlannerSettings]):
+    """The lattice, the nodes in memory, the search and the path along it."""
 
-    remembers_edges: bool
+    checker: CollisionChecker
+    _table: table.Table
+    _search: kernel.Search
 
     def __init__(
         self,
@@ -164,40 +152,57 @@ class _Search(ABC, Generic[LatticePlannerSettings]):
         """`padding` is the distance to obstacles that paths keep [m]."""
         self.settings, self.padding, self.goals = settings, padding, goals
         self._lattice, key = make_lattice(checker.robot, start, goals, settings)
-        moves, dof = self._lattice.moves.shape
-        self._expansions = max(CLOCK_INTERVAL // moves, 1)
-        self._table = table.make_table(settings.max_nodes, self.remembers_edges * moves // 2)
-        self._last = np.zeros((len(goals), self.remembers_edges * 2**dof), np.uint8)
-        self._start = self._table.values[table.START] = table.find_or_add(self._table, key)
-        self._use(checker)
-        self._begin()
+        self._expansions = max(CLOCK_INTERVAL // len(self._lattice.moves), 1)
+        self._begin(checker, key)
 
-    def _use(self, checker: CollisionChecker) -> None:
-        self.checker = checker
+    def _begin(self, checker: CollisionChecker, start_key: int) -> None:
+        """Make the table, and queue the nodes of the source."""
+        raise NotImplementedError
+
+    def _use(
+        self,
+        checker: CollisionChecker,
+        targets: Float[ndarray, "n dof"],
+        cell: int,
+        inflation: float,
+        ties: int,
+    ) -> None:
+        """The compiled search among the obstacles of a checker; see `kernel.Search`."""
         space = search_space(checker, self.settings.resolution, self.padding)
-        self._search = kernel.make_search(space, self._lattice, self._table, self._last)
+        edges, dof = len(self._lattice.moves) + len(self.goals), checker.robot.dof
+        near, steps, near_other, steps_other = np.empty((4, edges), np.int64)
+        a, b = np.empty((2, dof), np.float32)
+        self.checker = checker
+        self._search = kernel.Search(
+            *(space, self._lattice, self._table, targets, cell, float(inflation), ties),
+            *(near, steps, near_other, steps_other, np.empty(dof, np.int64), np.empty(W, np.int64)),
+            *(a, b, np.empty((dof, W), np.float32), make_workspace(space.robot, space.scene)),
+        )
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
         """Search until there is a path, there is none, memory is full, or `stop` returns True."""
         while True:
-            outcome = Outcome(self._expand())
+            outcome = Outcome(kernel.search(self._search, self._expansions))
             if outcome is not Outcome.GOING or stop():
                 return outcome
 
     def path(self) -> Float[ndarray, "n dof"] | None:
         """The start, the nodes at which the path found so far turns, and the goal; None if there is none."""
-        if self._units() >= table.INFINITE:
+        nodes = [int(self._table.values[table.TARGET])]
+        if self._table.rhs[nodes[0]] >= table.INFINITE:
             return None
-        keys = self._path_keys()
-        turns = np.ones(len(keys), np.bool_)
-        turns[1:-1] = (np.diff(self._coordinates(keys), 2, axis=0) != 0).any(axis=1)
-        goal = self.goals[self._table.values[table.GOAL]].astype(np.float64)
-        return np.concatenate([self._configurations(keys[turns]), goal[None]])
+        while (parent := int(self._table.parent[nodes[-1]])) >= 0:
+            nodes.append(parent)
+        *nodes, goal = nodes if nodes[-1] < len(self.goals) else reversed(nodes)
+        at = self._coordinates(self._table.keys[nodes])
+        turns = np.ones(len(at), np.bool_)
+        turns[1:-1] = (np.diff(at, 2, axis=0) != 0).any(axis=1)
+        return np.concatenate([self._configurations(at[turns]), self.goals[[goal]].astype(np.float64)])
 
     @property
     def cost(self) -> float:
         """Length of the path found so far [rad]; infinite if there is none."""
-        units = self._units()
+        units = int(self._table.rhs[self._table.values[table.TARGET]])
         return float("inf") if units >= table.INFINITE else units * self.settings.spacing / UNITS
 
     @property
@@ -208,79 +213,53 @@ class _Search(ABC, Generic[LatticePlannerSettings]):
     @property
     def nodes(self) -> int:
         """Nodes in memory."""
-        return int(self._table.values[table.NODES]) - 1
+        return int(self._table.values[table.NODES]) - len(self.goals)
 
     def _coordinates(self, keys: Int[ndarray, "n"]) -> Int[ndarray, "n dof"]:
         return keys[:, None] // self._lattice.strides % self._lattice.counts
 
-    def _configurations(self, keys: Int[ndarray, "n"]) -> Float[ndarray, "n dof"]:
+    def _configurations(self, at: Int[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
         robot, lattice = self.checker.robot, self._lattice
-        q = lattice.origin + lattice.spacing * self._coordinates(keys)
-        return np.clip(q, robot.lower.astype(float), robot.upper.astype(float))
-
-    @abstractmethod
-    def _begin(self) -> None:
-        """Fill the queue."""
-
-    @abstractmethod
-    def _expand(self) -> int:
-        """Some expansions; returns the value of an Outcome."""
-
-    @abstractmethod
-    def _units(self) -> int:
-        """Cost of the path found so far [units]."""
-
-    @abstractmethod
-    def _path_keys(self) -> Int[ndarray, "n"]:
-        """The keys of the path's nodes."""
+        return np.clip(lattice.origin + lattice.spacing * at, robot.lower, robot.upper)
 
 
 class AStarSearch(_Search[AStarSettings]):
     """Weighted A* from the start, which must be free, to the nearest goal."""
 
-    remembers_edges = False
-
-    def _begin(self) -> None:
-        self._table.g[self._start], self._table.state[self._start] = 0, table.FREE
-        table.put(self._table, self._start, 0, 0)
-
-    def _expand(self) -> int:
-        return kernel.a_star(self._search, float(self.settings.inflation), self._expansions)
-
-    def _units(self) -> int:
-        return int(self._table.g[table.AT_GOAL])
-
-    def _path_keys(self) -> Int[ndarray, "n"]:
-        nodes = [self._table.rhs[table.AT_GOAL]]
-        while nodes[-1] != self._start:
-            nodes.append(self._table.rhs[nodes[-1]])
-        return self._table.keys[nodes[::-1]]
+    def _begin(self, checker: CollisionChecker, start_key: int) -> None:
+        self._table = table.make_table(len(self.goals), self.settings.max_nodes, 0)
+        [start] = table.add_nodes(self._table, np.array([start_key]))
+        self._table.rhs[start], self._table.state[start] = 0, table.FREE
+        table.put(self._table, start, 0, 0)
+        self._use(checker, self._lattice.goals_at, 1, self.settings.inflation, -1)
 
 
 class DStarLiteSearch(_Search[DStarLiteSettings]):
     """D* Lite from the goals, which can be repaired when obstacles or the arm have moved. Needs memory for
-    2^dof edges to each goal."""
+    the 2^dof nodes around each goal."""
 
-    remembers_edges = True
-
-    def _begin(self) -> None:
-        moves = np.abs(self._lattice.moves[: len(self._lattice.moves) // 2])
-        reaches = 0.5 * self.settings.spacing * moves @ largest_motion_radii(self.checker.robot)
+    def _begin(self, checker: CollisionChecker, start_key: int) -> None:
+        goals, lattice = len(self.goals), self._lattice
+        half = len(lattice.moves) // 2
+        corners = np.floor(lattice.goals_at).astype(np.int64)[:, None] + list(
+            product((0, 1), repeat=len(lattice.counts))
+        )
+        corners = corners[((corners >= 0) & (corners < lattice.counts)).all(axis=2)]
+        keys = np.unique(corners @ lattice.strides)
+        self._table = table.make_table(goals, self.settings.max_nodes + len(keys), half + goals)
+        self._table.g[:goals] = self._table.rhs[:goals] = 0
+        table.add_nodes(self._table, np.array([start_key, *keys]))
+        self._table.values[table.TARGET] = goals
+        radii = largest_motion_radii(checker.robot)
+        reaches = 0.5 * self.settings.spacing * np.abs(lattice.moves[:half]) @ radii
         self._reaches = reaches.astype(np.float32)
         """How far any point of the arm moves by half of each move [m]."""
-        self._has_room = self._repair(np.full(len(self._table.keys), np.inf, np.float32))
+        self._update(checker, np.full(len(self._table.keys), np.inf, np.float32))
 
-    def _repair(self, near: Float[ndarray, "capacity"]) -> bool:
-        return kernel.update(self._search, near, self._reaches)
-
-    def _expand(self) -> int:
-        return kernel.d_star_lite(self._search, self._expansions) if self._has_room else kernel.FULL
-
-    def _units(self) -> int:
-        return int(self._table.rhs[self._start])
-
-    def _path_keys(self) -> Int[ndarray, "n"]:
-        return kernel.path_keys(self._search)
+    def _update(self, checker: CollisionChecker, distances: Float[ndarray, "capacity"]) -> None:
+        start = self._table.keys[self._table.values[table.TARGET]]
+        self._use(checker, self._coordinates(start[None]).astype(np.float64), 0, 1.0, 1)
+        kernel.update(self._search, distances, self._reaches)
 
     def update(self, checker: CollisionChecker, start: Float[ndarray, "dof"] | None = None) -> None:
         """Take over a changed scene, and a new start at another node of the lattice; `run` then repairs the
@@ -297,27 +276,26 @@ class DStarLiteSearch(_Search[DStarLiteSettings]):
             )
         if start is not None:
             self._move_start(start)
-        near = self._distances_to_changes(checker)
-        self._use(checker)
-        self._has_room = self._repair(near)
+        self._update(checker, self._distances_to_changes(checker))
 
     def _distances_to_changes(self, checker: CollisionChecker) -> Float[ndarray, "capacity"]:
         """A lower bound of the distance of the arm at each node from shapes that were added, removed or moved
         [m]."""
-        near = np.full(len(self._table.keys), np.inf, np.float32)
+        distances = np.full(len(self._table.keys), np.inf, np.float32)
         before, after = self.checker.scene.shapes, checker.scene.shapes
         kept = {id(shape) for shape in before} & {id(shape) for shape in after}
         kept = kept if self.checker.scene.allowed_contacts == checker.scene.allowed_contacts else set()
         moved = [shape for shape in (*before, *after) if id(shape) not in kept]
-        known = slice(1, self.nodes + 1)
+        known = slice(len(self.goals), self._table.values[table.NODES])
         if checker.padding != self.checker.padding:
-            near[known] = -np.inf
+            distances[known] = -np.inf
         elif moved:
             margin = float(self._search.space.padding) + ROUNDING
-            q, limit = self._configurations(self._table.keys[known]), float(self._reaches.max()) + 2 * margin
+            q = self._configurations(self._coordinates(self._table.keys[known]))
+            limit = float(self._reaches.max()) + 2 * margin
             clearances = CollisionChecker(checker.robot, Scene(moved)).link_clearances(q, limit=limit)
-            near[known] = clearances.min(axis=1, initial=np.inf) - margin
-        return near
+            distances[known] = clearances.min(axis=1, initial=np.inf) - margin
+        return distances
 
     def _move_start(self, start: Float[ndarray, "dof"]) -> None:
         lattice = self._lattice
@@ -325,15 +303,15 @@ class DStarLiteSearch(_Search[DStarLiteSettings]):
         whole = np.round(at).astype(np.int64)
         if np.abs(at - whole).max() > 1e-3 or (whole < 0).any() or (whole >= lattice.counts).any():
             raise InputError(f"start is {np.round(start, 4)}; it must be a node of the lattice")
-        node = table.find_or_add(self._table, int(whole @ lattice.strides))
+        [node] = table.add_nodes(self._table, np.array([whole @ lattice.strides]))
         if node < 0:
             raise InputError(
                 f"start is {np.round(start, 4)}; the search has not reached it, and memory is full"
             )
-        if node != self._start:
+        if node != self._table.values[table.TARGET]:
             # rounded up: queued keys must stay lower bounds
-            self._table.values[table.OFFSET] += kernel.heuristic(lattice, whole, self._search.start_at, 0) + 2
-        self._start = self._table.values[table.START] = node
+            self._table.values[table.OFFSET] += kernel.heuristic(lattice, whole, self._search.targets, 0) + 2
+        self._table.values[table.TARGET] = node
 
 
 class _LatticePlanner(Planner[LatticePlannerSettings]):

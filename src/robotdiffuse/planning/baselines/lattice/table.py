@@ -4,35 +4,37 @@ with the place of each node in it."""
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from robotdiffuse.core.kernels import allocation_free
 
 INFINITE = 1 << 60
 """Cost of nodes that are not reached."""
-UNKNOWN, FREE, BLOCKED, CLOSED = 0, 1, 2, 3
-"""States of nodes and edges; CLOSED is a free node that A* has expanded."""
-NODES, QUEUED, EXPANSIONS, GOAL, START, OFFSET = range(6)
+UNKNOWN, FREE, BLOCKED = 0, 1, 2
+"""States of nodes and edges."""
+NODES, QUEUED, EXPANSIONS, TARGET, OFFSET = range(5)
 """Places in `Table.values`."""
-AT_GOAL = 0
-"""The node that stands for the goals."""
 _FACTOR_1, _FACTOR_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 
 class Table(NamedTuple):
-    """The nodes seen so far, and the queue. Node AT_GOAL stands for the goals and is in no slot."""
+    """The nodes seen so far, and the queue. The first nodes are the goals, which are in no slot."""
 
     slots: np.ndarray
     """[a power of two] node + 1 at the place of its key or after it, 0 where empty."""
     keys: np.ndarray
     """[capacity]"""
     g: np.ndarray
-    """[capacity] A*: cost from the start; D* Lite: to the goal, by the last expansion [units]."""
+    """[capacity] cost from the source, by the last expansion [units]."""
     rhs: np.ndarray
-    """[capacity] D* Lite: cost to the goal, by the neighbours' g [units]; A*: the node before."""
+    """[capacity] cost from the source, by the neighbors' g [units]."""
+    parent: np.ndarray
+    """[capacity] the neighbor that gives rhs; -1 for none."""
     state: np.ndarray
     """[capacity]"""
     edges: np.ndarray
-    """[capacity, moves / 2] D* Lite: state of the motion of each move of the first half."""
+    """[capacity, moves / 2 + goals] state of the edge by each move of the first half, and to each goal; no
+    columns if edges are not remembered."""
     heap: np.ndarray
     """[capacity] queued nodes."""
     place: np.ndarray
@@ -41,23 +43,21 @@ class Table(NamedTuple):
     second: np.ndarray
     """[capacity] the keys by which the queue is sorted."""
     values: np.ndarray
-    """[6] numbers of nodes, queued nodes and expansions; the path's goal; the start and k_m of D* Lite."""
+    """[5] numbers of nodes, queued nodes and expansions; the target of the search; k_m of D* Lite."""
 
 
-def make_table(max_nodes: int, edges: int) -> Table:
-    """An empty table for `max_nodes` nodes, each with room for `edges` edges; the system allocates its memory
-    as it is used."""
-    capacity = max_nodes + 1
-    table = Table(
-        np.zeros(1 << (2 * capacity - 1).bit_length(), np.int32),
-        *(np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity, np.int64)),
-        *(np.zeros(capacity, np.uint8), np.zeros((capacity, edges), np.uint8)),
-        *(np.empty(capacity, np.int32), np.zeros(capacity, np.int32)),
-        *(np.empty(capacity, np.int64), np.empty(capacity, np.int64)),
-        np.zeros(6, np.int64),
-    )
-    table.values[NODES] = 1
-    table.keys[AT_GOAL], table.g[AT_GOAL] = -1, INFINITE
+def make_table(goals: int, max_nodes: int, edges: int) -> Table:
+    """A table of the goals, with room for more nodes; the system allocates its memory as it is used."""
+    n = goals + max_nodes
+    slots = np.zeros(1 << (2 * n - 1).bit_length(), np.int32)
+    keys, g, rhs, first, second = (np.empty(n, np.int64) for _ in range(5))
+    parent, heap, place = np.empty(n, np.int32), np.empty(n, np.int32), np.zeros(n, np.int32)
+    state, known = np.zeros(n, np.uint8), np.zeros((n, edges), np.uint8)
+    values = np.zeros(5, np.int64)
+    table = Table(slots, keys, g, rhs, parent, state, known, heap, place, first, second, values)
+    table.values[NODES] = goals
+    table.g[:goals] = table.rhs[:goals] = INFINITE
+    table.parent[:goals], table.state[:goals] = -1, FREE
     return table
 
 
@@ -76,31 +76,26 @@ def _slot(table, key):
 
 
 @allocation_free()
-def find(table, key):
-    """The node of a key; -1 if there is none yet."""
-    return np.int64(table.slots[_slot(table, key)]) - 1
-
-
-@allocation_free(inner=False)
-def find_or_add(table, key):
-    """The node of a key, added if it is new; -1 if memory is full."""
+def find(table, key, add):
+    """The node of a key, added if it is new and `add`; -1 if there is none, or no memory for one."""
     i = _slot(table, key)
-    if table.slots[i] != 0:
-        return np.int64(table.slots[i]) - 1
     node = table.values[NODES]
-    if node == len(table.keys):
-        return np.int64(-1)
-    table.values[NODES] += 1
-    table.slots[i] = node + 1
-    table.keys[node], table.g[node], table.rhs[node] = key, INFINITE, INFINITE
-    return node
+    if table.slots[i] == 0 and add and node < len(table.keys):
+        table.values[NODES] += 1
+        table.slots[i] = node + 1
+        table.keys[node], table.g[node], table.rhs[node], table.parent[node] = key, INFINITE, INFINITE, -1
+    return np.int64(table.slots[i]) - 1
+
+
+@njit(cache=True)
+def add_nodes(table, keys):
+    """The nodes of keys, added where they are new; -1 where memory is full."""
+    return np.array([find(table, key, True) for key in keys])
 
 
 @allocation_free()
 def _before(table, a, b):
-    return table.first[a] < table.first[b] or (
-        table.first[a] == table.first[b] and table.second[a] < table.second[b]
-    )
+    return (table.first[a], table.second[a]) < (table.first[b], table.second[b])
 
 
 @allocation_free()
