@@ -76,7 +76,7 @@ def time_parameterize(
     rows = _distinct(path.positions)
     if len(rows) == 1:
         return _resting_trajectory(path, settings)
-    most = np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
+    most = _largest_deviations(rows, settings, deviations)
     given = path.positions[rows], most[1:-1]
     return _round_and_time(robot, path, *given, valid, free, settings, keeps, start_speed, extra)[1]
 
@@ -89,16 +89,24 @@ def rounded_corners(
     settings: TimingSettings = DEFAULT,
     keeps: Callable[[ndarray], bool] = lambda _: True,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
+    deviations: Float[ndarray, "n"] | None = None,
     stops: Sequence[int] = (),
 ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "corners"]]:
     """The distinct waypoints of a path, at least two, and by how much `time_parameterize` would round each
     corner [rad]. Corners at the path's rows `stops` are not rounded."""
     _check_limits(robot)
     rows = _distinct(path.positions)
-    most = np.full(len(rows), settings.corner_deviation)
+    most = _largest_deviations(rows, settings, deviations)
     most[np.searchsorted(rows, stops, side="right") - 1] = 0.0
     given = path.positions[rows], most[1:-1]
     return given[0], _round_and_time(robot, path, *given, valid, free, settings, keeps, 0.0, extra)[0]
+
+
+def _largest_deviations(
+    rows: Int[ndarray, "m"], settings: TimingSettings, deviations: Float[ndarray, "n"] | None
+) -> Float[ndarray, "m"]:
+    """How far the motion may leave each of these rows of a path [rad]; a new array."""
+    return np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
 
 
 def _round_and_time(
