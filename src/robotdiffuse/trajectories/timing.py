@@ -22,6 +22,7 @@ from robotdiffuse.trajectories.speed_limits import (
     can_begin,
     time_line,
 )
+from robotdiffuse.trajectories.timing_kernel import evaluate, rounded_line
 
 SHRINK_FACTOR = 0.5
 """Factor by which the deviation of a corner shrinks each time its rounding fails."""
@@ -33,6 +34,8 @@ MAX_SLOWER_TIMINGS = 4
 """Of these, the first ones, which may lower the accelerations of a motion whose corners are each free."""
 CORNER_SAMPLES = 17
 """Configurations of a rounded corner that are checked."""
+CORNER_PLACES = np.linspace(-1, 1, CORNER_SAMPLES)
+"""Their places, in half widths from its middle."""
 SAME_WAYPOINT_DISTANCE = 1e-6
 """Consecutive waypoints closer than this are merged [rad]."""
 
@@ -163,20 +166,20 @@ def _shrunk(
     deviations, accepted = deviations.copy(), np.zeros(len(deviations))
     while True:
         # a corner becomes wider where its neighbour leaves it more of their segment
-        widths = half_widths(waypoints, deviations)
-        doubtful = (deviations > 0) & (widths > accepted * (1 + 1e-9))
-        if not doubtful.any():
-            break
-        corners = _corner_configurations(waypoints, deviations)
+        line = rounded_line(waypoints, deviations)
+        widths = line[3]
+        doubtful = np.flatnonzero((deviations > 0) & (widths > accepted * (1 + 1e-9)))
+        if not len(doubtful):
+            return deviations
+        corners = _corner_configurations(line, doubtful)
         smaller = np.maximum(_smaller(deviations), np.minimum(deviations, least))
-        for i in np.flatnonzero(doubtful):
-            if accepts(corners[i]):
+        for i, corner in zip(doubtful.tolist(), corners, strict=True):
+            if accepts(corner):
                 accepted[i] = widths[i]
             elif smaller[i] < deviations[i]:
                 deviations[i] = smaller[i]
             else:
                 accepted[i] = np.inf
-    return deviations
 
 
 def _check_limits(robot: Robot) -> None:
@@ -209,14 +212,11 @@ def _resting_trajectory(path: Path, settings: TimingSettings) -> Trajectory:
 
 
 def _corner_configurations(
-    waypoints: Float[ndarray, "n dof"], deviations: Float[ndarray, "corners"]
-) -> list[Float[ndarray, "k dof"]]:
-    """Configurations along each rounded corner; for a corner that is not rounded, the waypoint alone."""
-    widths = half_widths(waypoints, deviations)
-    line = BlendedPolyline(waypoints, widths)
-    along = line.knots[1:-1, None] + widths[:, None] * np.linspace(-1, 1, CORNER_SAMPLES)
-    rounded = line(along.ravel(), 0).reshape(-1, CORNER_SAMPLES, waypoints.shape[1])
-    return [rounded[i] if d > 0 else waypoints[i + 1 : i + 2] for i, d in enumerate(widths)]
+    line: tuple[ndarray, ndarray, ndarray, ndarray], corners: Int[ndarray, "k"]
+) -> Float[ndarray, "k m dof"]:
+    """Configurations along these rounded corners of a line, as `rounded_line` returns it."""
+    along = line[1][1 + corners, None] + line[3][corners, None] * CORNER_PLACES
+    return evaluate(line, along.ravel(), 0).reshape(len(corners), CORNER_SAMPLES, -1)
 
 
 def _can_begin(
