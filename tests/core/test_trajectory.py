@@ -3,7 +3,7 @@ import pytest
 
 from helpers.box_arm import box_arm
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import ROWS, Trajectory
 from robotdiffuse.validation.rates import RateTolerances, rate_violations
 
 
@@ -74,7 +74,7 @@ def test_resampled_rates_still_keep_limits(rate):
         assert rate_violations(box_arm(), motion.resample(rate), tolerances) == []
 
 
-@pytest.mark.parametrize("rate", [0, -5, np.inf, np.nan])
+@pytest.mark.parametrize("rate", [0, -5, np.inf, np.nan, 1e12, "500", None, True, [500]])
 def test_rates_that_are_not_positive_are_refused(rate):
     with pytest.raises(InputError, match="rate is"):
         cubic().resample(rate)
@@ -88,3 +88,19 @@ def test_a_wait_is_one_stop():
 def test_saved_at_a_rate(tmp_path):
     cubic().save(tmp_path / "motion.csv", rate=100)
     assert np.allclose(np.diff(np.loadtxt(tmp_path / "motion.csv", delimiter=",", skiprows=1)[:, 0]), 0.01)
+
+
+@pytest.mark.parametrize("time", ["soon", None, True, [0.0, "1"], np.nan, 3.0])
+def test_times_that_are_no_numbers_are_refused(time):
+    with pytest.raises(InputError, match="time is"):
+        cubic().at(time)
+
+
+def test_a_trajectory_of_one_row_rests_there():
+    """Its positions were not numbers, and resampling gave it two rows at the same time."""
+    motion = cubic()
+    one = Trajectory(motion.joint_names, *(getattr(motion, name)[:1] for name in ("times", *ROWS)))
+    state = one.at([0.0, 0.0])
+    assert (state.positions == motion.positions[:1]).all() and not state.jerks.any()
+    assert one.at(0.0).positions.shape == (3,)
+    assert len(one.resample(500).times) == 1
