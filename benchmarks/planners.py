@@ -58,6 +58,8 @@ SEED = 20261122
 PLANNERS = ("aorrtc", "robotdiffuse", "rrt_connect")
 JERK = 100.0
 """[rad/s³]"""
+FIRST_CALLS = 5
+"""Equal calls until the first motion; the one of least CPU time counts, since other work only adds to it."""
 OVERRUN_LIMITS = (0.001, 0.01, 0.05, 0.1, 1.0)
 """Time limits whose overrun is measured [s]."""
 TIMED_PATHS = 500
@@ -106,9 +108,10 @@ def by_family(cases: Sequence[Case]) -> Iterator[tuple[str, list[Case]]]:
 
 
 def first(cases: Sequence[Case]) -> None:
-    """Print when aorrtc has its first path, and when its call returns."""
+    """Print when aorrtc has its first path, and when its call returns, each the least of several calls."""
     method = {"aorrtc": planned(warm("aorrtc", cases), until=FIRST, clearance=0.0)}
-    found = {r.name: r for r in run_all(cases, method, limit=5.0, title="first")["aorrtc"]}
+    calls = [run_all(cases, method, limit=5.0, title="first")["aorrtc"] for _ in range(FIRST_CALLS)]
+    found = {of[0].name: min(of, key=lambda r: r.cpu or np.inf) for of in zip(*calls, strict=True)}
     rows = []
     for family, of in by_family(cases):
         records = [found[case.name] for case in of]
