@@ -3,6 +3,7 @@
 import argparse
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from datetime import date
 from itertools import pairwise
 from pathlib import Path
@@ -106,9 +107,16 @@ class MeshContacts(NamedTuple):
     """Whether any does."""
 
 
-def contacts_on_meshes(problem: Problem, q: ndarray, tolerance: float = ORACLE_TOLERANCE) -> MeshContacts:
-    """Check configurations by Coal and by PyBullet; a robot with a base or tool stands as in the world."""
+def contacts_on_meshes(
+    problem: Problem, q: ndarray, tolerance: float = ORACLE_TOLERANCE, oracle: PyBulletOracle | None = None
+) -> MeshContacts:
+    """Check configurations by Coal and by PyBullet; a robot with a base or tool stands as in the world.
+
+    `oracle`: of the same robot; it is kept open and gets the scene. Loading a robot takes 30 ms.
+    """
     robot, scene = problem.standing()
     coal = int(ExactCollision(problem.robot, problem.scene).collides(q).sum())
-    with PyBulletOracle(robot, scene) as oracle:
-        return MeshContacts(coal, oracle.check_frames(q, tolerance) is not None)
+    with nullcontext(oracle) if oracle else PyBulletOracle(robot, scene) as bullet:
+        if oracle:
+            bullet.set_scene(scene)
+        return MeshContacts(coal, bullet.check_frames(q, tolerance) is not None)

@@ -50,6 +50,7 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder
+from robotdiffuse.simulation.validator import PyBulletOracle
 from robotdiffuse.trajectories.timing import TimingSettings, time_parameterize
 
 PANDA = load_robot("panda")
@@ -57,6 +58,8 @@ SEED = 20261122
 PLANNERS = ("aorrtc", "robotdiffuse", "rrt_connect")
 JERK = 100.0
 """[rad/s³]"""
+FIRST_CALLS = 5
+"""Equal calls until the first motion; the one of least CPU time counts, since other work only adds to it."""
 OVERRUN_LIMITS = (0.001, 0.01, 0.05, 0.1, 1.0)
 """Time limits whose overrun is measured [s]."""
 TIMED_PATHS = 500
@@ -105,9 +108,10 @@ def by_family(cases: Sequence[Case]) -> Iterator[tuple[str, list[Case]]]:
 
 
 def first(cases: Sequence[Case]) -> None:
-    """Print when aorrtc has its first path, and when its call returns."""
+    """Print when aorrtc has its first path, and when its call returns, each the least of several calls."""
     method = {"aorrtc": planned(warm("aorrtc", cases), until=FIRST, clearance=0.0)}
-    found = {r.name: r for r in run_all(cases, method, limit=5.0, title="first")["aorrtc"]}
+    calls = [run_all(cases, method, limit=5.0, title="first")["aorrtc"] for _ in range(FIRST_CALLS)]
+    found = {of[0].name: min(of, key=lambda r: r.cpu or np.inf) for of in zip(*calls, strict=True)}
     rows = []
     for family, of in by_family(cases):
         records = [found[case.name] for case in of]
@@ -223,23 +227,26 @@ def collisions(motions: int, seed: int) -> None:
     stop on the way, and the largest shares of the limits of velocity, acceleration and jerk."""
     rng, rows = np.random.default_rng(seed), []
     families = [load_family(name) for name in FAMILIES]
-    for name in ("aorrtc", "robotdiffuse"):
-        planner, hits, checked, configurations = load_planner(name), [0, 0, 0], 0, 0
-        shares = np.zeros(3)
-        for i in progress(range(motions // 2), name):
-            problem = families[i % len(families)].draw(PANDA, np.random.default_rng([seed, i])).problem(PANDA)
-            problem = with_thin_obstacles(problem, rng) if i % 2 else problem
-            result = planner.plan(problem, 0.05, seed=i, clearance=0.0)
-            if result.trajectory is None:
-                continue
-            q = dense(result.trajectory.positions, MESH_STEP)
-            checked, configurations = checked + 1, configurations + len(q)
-            contacts = contacts_on_meshes(problem, q, tolerance=0.0)
-            hits[0] += contacts.coal > 0
-            hits[1] += contacts.pybullet
-            hits[2] += bool(result.stops)
-            shares = np.maximum(shares, limit_shares(PANDA, result.trajectory))
-        rows.append((name, checked, configurations, *hits, *(f"{share:.5f}" for share in shares)))
+    numbers = np.array_split(np.arange(motions), 2)  # every motion has a problem of its own
+    with PyBulletOracle(PANDA, Scene()) as oracle:
+        for name, of in zip(("aorrtc", "robotdiffuse"), numbers, strict=True):
+            planner, hits, checked, configurations = load_planner(name), [0, 0, 0], 0, 0
+            shares = np.zeros(3)
+            for i in progress(of.tolist(), name):
+                family = families[i % len(families)]
+                problem = family.draw(PANDA, np.random.default_rng([seed, i])).problem(PANDA)
+                problem = with_thin_obstacles(problem, rng) if i % 2 else problem
+                result = planner.plan(problem, 0.05, seed=i, clearance=0.0)
+                if result.trajectory is None:
+                    continue
+                q = dense(result.trajectory.positions, MESH_STEP)
+                checked, configurations = checked + 1, configurations + len(q)
+                contacts = contacts_on_meshes(problem, q, tolerance=0.0, oracle=oracle)
+                hits[0] += contacts.coal > 0
+                hits[1] += contacts.pybullet
+                hits[2] += bool(result.stops)
+                shares = np.maximum(shares, limit_shares(PANDA, result.trajectory))
+            rows.append((name, checked, configurations, *hits, *(f"{share:.5f}" for share in shares)))
     columns = ["planner", "motions", "configurations", "in collision by Coal", "by PyBullet", "with stops"]
     columns += ["velocity", "acceleration", "jerk"]
     print_table("Returned motions on meshes", columns, rows)

@@ -3,7 +3,7 @@ import pytest
 
 from helpers.box_arm import box_arm
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import ROWS, Trajectory
 from robotdiffuse.validation.rates import RateTolerances, rate_violations
 
 
@@ -25,6 +25,17 @@ def smooth(legs: int = 1, rate: float = 40.0) -> Trajectory:
     shift = [(1.5 * k + u[:, 0], q + k * far) for k in range(legs)]
     times, positions = np.concatenate([s[0] for s in shift]), np.concatenate([s[1] for s in shift])
     return Trajectory(("a", "b", "c"), times, positions, np.tile(v, (legs, 1)), np.tile(a, (legs, 1)))
+
+
+def pulse(step: float = 0.004, count: int = 6) -> Trajectory:
+    """Two pulses of acceleration, the second one braking, each `count` steps up and down at constant jerk: at
+    125 Hz, the first and the last step have most of it."""
+    half = np.concatenate([np.arange(count), np.arange(count, 0, -1)])
+    a = 2.0 * np.concatenate([half, -half, [0]])[:, None] * np.array([[1.0, 0.5, -1.0]]) / count
+    v = np.concatenate([np.zeros((1, 3)), np.cumsum((a[1:] + a[:-1]) / 2 * step, axis=0)])
+    moved = step * (v[1:] + v[:-1]) / 2 - step**2 * (a[1:] - a[:-1]) / 12
+    q = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
+    return Trajectory(("a", "b", "c"), step * np.arange(len(a)), q, v, a)
 
 
 def test_a_cubic_is_exact_at_any_time():
@@ -69,12 +80,12 @@ def test_resampled_times(rate):
 @pytest.mark.parametrize("rate", [125, 250, 500, 1000])
 def test_resampled_rates_still_keep_limits(rate):
     tolerances = RateTolerances(slack=0.01, agreement=0.25, jump=1.5, resolution=1e-6)
-    for motion in (smooth(), smooth(2)):
+    for motion in (smooth(), smooth(2), pulse()):
         assert rate_violations(box_arm(), motion, tolerances) == []
         assert rate_violations(box_arm(), motion.resample(rate), tolerances) == []
 
 
-@pytest.mark.parametrize("rate", [0, -5, np.inf, np.nan])
+@pytest.mark.parametrize("rate", [0, -5, np.inf, np.nan, 1e12])
 def test_rates_that_are_not_positive_are_refused(rate):
     with pytest.raises(InputError, match="rate is"):
         cubic().resample(rate)
@@ -88,3 +99,19 @@ def test_a_wait_is_one_stop():
 def test_saved_at_a_rate(tmp_path):
     cubic().save(tmp_path / "motion.csv", rate=100)
     assert np.allclose(np.diff(np.loadtxt(tmp_path / "motion.csv", delimiter=",", skiprows=1)[:, 0]), 0.01)
+
+
+@pytest.mark.parametrize("time", [np.nan, np.inf, -1.0, 2.1])
+def test_times_outside_of_the_motion_are_refused(time):
+    with pytest.raises(InputError, match="time is"):
+        cubic().at(time)
+
+
+def test_a_trajectory_of_one_row_rests_there():
+    """Its positions were not numbers, and resampling gave it two rows at the same time."""
+    motion = cubic()
+    one = Trajectory(motion.joint_names, *(getattr(motion, name)[:1] for name in ("times", *ROWS)))
+    state = one.at(np.zeros(2))
+    assert (state.positions == motion.positions[:1]).all() and not state.jerks.any()
+    assert one.at(0.0).positions.shape == (3,)
+    assert len(one.resample(500).times) == 1

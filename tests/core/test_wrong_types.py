@@ -17,6 +17,7 @@ problem = rd.Problem(panda, rd.Scene([]), middle, middle)
 path = rd.Path(panda.joint_names, np.array([middle]))
 of_lists, of_none = rd.Path(panda.joint_names, [[0.0] * 7]), rd.Path(None, path.positions)
 still = rd.Trajectory(panda.joint_names, None, path.positions, path.positions, path.positions)
+motion = rd.Trajectory(panda.joint_names, np.arange(2.0), *3 * [np.zeros((2, 7))])
 calls = {
     "plan": rd.plan,
     "plan: time_limit": lambda wrong: rd.plan(problem, time_limit=wrong),
@@ -44,6 +45,8 @@ calls = {
     "Replanner": rd.Replanner,
     "show": rd.show,
     "RopDataset": rd.RopDataset,
+    "trajectory.at": motion.at,
+    "trajectory.resample": motion.resample,
 }
 for name, call in calls.items():
     for wrong in (None, -1.5, "x", b"x", [], {"a": 1}, np.zeros(2), rd.plan, of_lists, of_none, still):
@@ -65,7 +68,8 @@ except rd.InputError as error:
 def test_arguments_of_the_wrong_type_are_one_line() -> None:
     ended = subprocess.run([sys.executable, "-c", CALLS], capture_output=True, text=True, timeout=300)
     rightly = ["plan_many []", *(f"load_planner: {what} None" for what in ("settings", "weights"))]
-    taken = [f"{call} is taken" for call in (*rightly, "load_robot: locked -1.5")]
+    at = "trajectory.at []", "trajectory.at array([0., 0.])"
+    taken = [f"{call} is taken" for call in (*rightly, "load_robot: locked -1.5", *at)]
     right = (
         "problem is 'shelf.yaml'; it must be a Problem: rd.load_problem('shelf.yaml') reads one from a file"
     )

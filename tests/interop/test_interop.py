@@ -391,7 +391,7 @@ def test_a_motion_alone_says_what_it_solves() -> None:
 
 
 def test_unknown_endings_list_the_known_ones(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"unknown motion format to write '\.foo'; known: \.mcap"):
+    with pytest.raises(InputError, match=r"unknown ending '\.foo'; known: \.json, \.csv, \.mcap"):
         write_motion(*planned, tmp_path / "m.foo")
     with pytest.raises(InputError, match=r"unknown motion format '\.foo'; known: \.csv"):
         read_motion(tmp_path / "m.foo")

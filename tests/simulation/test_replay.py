@@ -60,9 +60,10 @@ def test_a_panda_tracks_a_timed_motion_the_better_the_finer_the_step() -> None:
     fine = replay(robot, Scene(), trajectory, ReplaySettings(time_step=1 / 960))
     assert coarse.free and fine.free
     assert coarse.times[-1] >= trajectory.duration + 0.25
-    assert coarse.max_errors.max() < 2e-3 and coarse.tip_errors.max() < 1e-3
+    # with Bullet's default of 50 solver iterations, tips are off by up to 0.6 mm
+    assert coarse.max_errors.max() < 2e-5 and coarse.tip_errors.max() < 2e-5
     assert (coarse.rms_errors <= coarse.max_errors).all()
-    assert 1e-7 < fine.max_errors.max() < coarse.max_errors.max() / 4
+    assert 1e-7 < fine.max_errors.max() < coarse.max_errors.max() / 2
     assert coarse.positions[-1] == pytest.approx(trajectory.positions[-1], abs=1e-4)
     # the error of the tip against our own kinematics
     k = int(coarse.tip_errors.argmax())

@@ -54,5 +54,6 @@ def validated_motion(file: str, rate: float | None = None) -> "tuple[Problem, Tr
     trajectory = result.trajectory if rate is None else result.trajectory.resample(rate)
     violation = verify_trajectory(problem, trajectory).violation
     if violation is not None:
-        raise InputError(f"{file} is not exported: its motion is not valid: {violation.message}")
+        rows = "" if rate is None else f" with rows at {rate:g} Hz"
+        raise InputError(f"{file} is not exported: its motion{rows} is not valid: {violation.message}")
     return problem, trajectory

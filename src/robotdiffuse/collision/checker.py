@@ -1,5 +1,7 @@
 """CollisionChecker: the compiled kernels for one robot in one scene."""
 
+from functools import cached_property
+
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
@@ -26,11 +28,17 @@ class CollisionChecker:
         self.robot, self.scene, self.padding = robot, scene, np.float32(padding)
         self.robot_arrays = compile_robot(robot)
         self.scene_arrays = compile_scene_for(robot, scene)
-        groups = robot_groups(robot)
-        self.links = tuple(link for link in groups if robot.link_frame(link) > 0)
+
+    @cached_property
+    def links(self) -> tuple[str, ...]:
         """The moving links with spheres, in the order of `link_clearances`."""
-        self.pairs = tuple((groups[a], groups[b]) for a, b in self.robot_arrays.pairs[:, :2])
+        return tuple(link for link in robot_groups(self.robot) if self.robot.link_frame(link) > 0)
+
+    @cached_property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
         """The checked pairs of links, in the order of `pair_clearances`."""
+        groups = robot_groups(self.robot)
+        return tuple((groups[a], groups[b]) for a, b in self.robot_arrays.pairs[:, :2])
 
     def free(self, q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
         """Whether each configuration is free of collision."""

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import Value
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.bounds import Value, numbers
+from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.one_line import one_line
 from robotdiffuse.core.output_files import check_output, write_atomically
 
@@ -21,6 +21,8 @@ ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
 REST = 1e-3
 """Speed, as a share of a motion's greatest one, at which the arm rests."""
+MAX_RATE = 1e5
+"""Largest rate at which trajectories are resampled [Hz]."""
 TIME_TOLERANCE = 1e-9
 """Times this far outside of a trajectory [s] are taken as its ends; rows are no closer when resampled."""
 
@@ -141,12 +143,22 @@ class Trajectory(Value):
 
         Positions are on the cubics, velocities are their derivatives; accelerations are linear between rows
         and jerks are their slopes, at a row that of the step after it. At rows, the first three are the rows'
-        own. Raises InputError for a time outside of [0, duration].
+        own. A trajectory of one row rests there. Raises InputError for a time outside of [0, duration].
         """
-        asked = np.asarray(time, np.float64)
+        asked = numbers(time)
+        if asked is None:
+            raise InputError(f"time is {shown(time)}; it must be a number or an array of numbers [s]")
         outside = ~((asked >= -TIME_TOLERANCE) & (asked <= self.duration + TIME_TOLERANCE))
         if outside.any():
-            raise InputError(f"time is {asked[outside].flat[0]:g} s; it must be in [0, {self.duration:g}]")
+            wrong = float(asked[outside].flat[0])
+            raise InputError(f"time is {wrong:.9g} s; it must be in [0, {self.duration:.9g}]")
+        if len(self.times) == 1:
+            rows = (
+                np.broadcast_to(getattr(self, name)[0], (*asked.shape, self.positions.shape[1]))
+                for name in ROWS
+            )
+            q, v, a = (row.copy() for row in rows)
+            return State(q, v, a, np.zeros_like(q))
         row = np.clip(np.searchsorted(self.times, asked, side="right") - 1, 0, len(self.times) - 2)
         h = np.asarray(self.times[row + 1] - self.times[row])[..., None]
         u = np.clip(np.asarray(asked - self.times[row])[..., None] / h, 0.0, 1.0)
@@ -161,10 +173,18 @@ class Trajectory(Value):
         """Rows of `at` at each multiple of 1 / `rate` [Hz], and the last row, which ends the motion.
 
         The new rows lie on this motion; between them the motion may differ from it where its rows were
-        closer, so validate it again. Raises InputError for a rate that is not positive and finite.
+        closer, so validate it again. Raises InputError for a rate that is not in (0, MAX_RATE].
         """
-        if not 0 < rate < np.inf:
-            raise InputError(f"rate is {rate}; it must be a positive number [Hz]")
+        if (
+            not isinstance(rate, int | float | np.number)
+            or isinstance(rate, bool)
+            or not 0 < rate <= MAX_RATE
+        ):
+            raise InputError(
+                f"rate is {shown(rate)}; it must be a positive number, at most {MAX_RATE:g} [Hz]"
+            )
+        if len(self.times) == 1:
+            return self
         count = int(np.ceil((self.duration - TIME_TOLERANCE) * rate))
         times = np.append(np.arange(max(count, 1)) / rate, self.duration)
         state = self.at(times)
@@ -172,6 +192,7 @@ class Trajectory(Value):
 
     def save(self, file: str | FilePath, rate: float | int | None = None) -> None:
         """Write .json or .csv, by the file's ending; resampled at `rate` [Hz] if it is given.
+        `robotdiffuse.interop.write_motion` writes the formats of ROS 2, Foxglove and Rerun.
 
         The CSV header is time, then <joint>_position, <joint>_velocity and <joint>_acceleration. Raises
         InputError for another ending or a file that cannot be written.

@@ -52,7 +52,7 @@ def check_export(file: str | Path) -> Path:
     """
     path = file_name(file)
     ending = path.suffix.lower()
-    if ending not in TRAJECTORY_ENDINGS:
+    if ending in WRITERS:
         WRITERS.load(ending)
     return path if path.is_dir() and ending == BAG else check_output(path, (*TRAJECTORY_ENDINGS, *WRITERS))
 

@@ -25,15 +25,19 @@ ADVICE = "lengths are in metres: divide millimetres by 1000"
 def unit_notes(problem: Problem) -> tuple[str, ...]:
     """Notes on obstacles that are all out of reach or too large: they may be given in millimetres."""
     reach = reach_bound(problem.robot)
-    shapes = [shape for shape in problem.scene.shapes if not isinstance(shape, SeenPoints | AssumedPoints)]
+    shapes = [shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))]
     seen = len(shapes) < len(problem.scene.shapes)
-    notes = [_size_note(shape) for shape in shapes]
+    bounds = np.array([shape.bounds for shape in shapes]).reshape(-1, 2, 3)
+    extents = bounds[:, 1] - bounds[:, 0]
+    large = np.flatnonzero(extents.max(axis=1) > MAX_EXTENT)
+    notes = [_size_note(shapes[i], extents[i]) for i in large]
     notes += [_view_note(i, view, reach) for i, view in enumerate(problem.views)]
     found = tuple(note for note in notes if note)
-    away = [_distance(shape.bounds) for shape in shapes if not _is_empty(shape)]
-    if not found and away and min(away) > reach and not (seen or problem.views or problem.moving):
+    solid = [not _is_empty(shape) for shape in shapes]
+    away = _distances(bounds[solid])
+    if not found and len(away) and away.min() > reach and not (seen or problem.views or problem.moving):
         what = f"all {len(away)} obstacles are" if len(away) > 1 else f"the obstacle {shapes[0].name} is"
-        where = f"beyond the arm's reach of {reach:.1f} m, at least {min(away):.1f} m from its base"
+        where = f"beyond the arm's reach of {reach:.1f} m, at least {away.min():.1f} m from its base"
         found = (f"check the units: {what} {where}; {ADVICE}",)
     return found
 
@@ -53,8 +57,7 @@ def arm_in_cloud_note(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> s
     )
 
 
-def _size_note(shape: Shape) -> str:
-    extents = np.ptp(shape.bounds, axis=0)
+def _size_note(shape: Shape, extents: Float[ndarray, "3"]) -> str:
     scanned = isinstance(shape, Mesh | PointCloud)
     if (extents.max() if scanned else extents.min()) <= MAX_EXTENT:
         return ""
@@ -77,9 +80,9 @@ def _is_empty(shape: Shape) -> bool:
     return isinstance(shape, PointCloud) and len(shape.points) == 0
 
 
-def _distance(bounds: Float[ndarray, "2 3"]) -> float:
-    """Distance of an axis-aligned box from the origin [m]."""
-    return float(np.linalg.norm(np.maximum(np.maximum(bounds[0], -bounds[1]), 0.0)))
+def _distances(bounds: Float[ndarray, "n 2 3"]) -> Float[ndarray, "n"]:
+    """Distances of axis-aligned boxes from the origin [m]."""
+    return np.linalg.norm(np.maximum(np.maximum(bounds[:, 0], -bounds[:, 1]), 0.0), axis=1)
 
 
 def _points_within(points: Float[ndarray, "n 3"], spheres: Float[ndarray, "m 4"]) -> int:

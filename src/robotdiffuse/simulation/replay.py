@@ -22,6 +22,10 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import DENSITY, World
 
+SOLVER_ITERATIONS = 500
+"""Iterations of Bullet's constraint solver in a time step. With its default of 50, motors miss their targets
+by up to 0.6 mm at the tip, whatever the motion; with 500 by a few micrometres."""
+
 
 @dataclass(frozen=True)
 class ReplaySettings:
@@ -145,7 +149,9 @@ def _simulate(
     settings: ReplaySettings,
 ) -> tuple[Float[ndarray, "n dof"], tuple[ReplayContact, ...]]:
     client, body, dof = world.client, world.body, len(world.joints)
-    pybullet.setPhysicsEngineParameter(fixedTimeStep=settings.time_step, physicsClientId=client)
+    pybullet.setPhysicsEngineParameter(
+        fixedTimeStep=settings.time_step, numSolverIterations=SOLVER_ITERATIONS, physicsClientId=client
+    )
     pybullet.setGravity(0, 0, -settings.gravity, physicsClientId=client)
     world.place(reference[0])
     for index, value in world.held.items():

@@ -52,22 +52,23 @@ class StopGraph:
         step: float,
         keeps: Callable[[ndarray], bool] = lambda _: True,
         extra: ExtraLimits = NO_EXTRA_LIMITS,
+        deviations: Float[ndarray, "n"] | None = None,
         required_stops: Sequence[int] = (),
     ) -> None:
         """Every motion lasts a whole number of time steps `step` [s].
 
-        Corners are rounded as in `time_parameterize`, with its arguments `valid`, `free`, `keeps` and
-        `extra`. Every motion ends at the path's rows `required_stops`; none passes through them.
+        Corners are rounded as in `time_parameterize`, with its arguments `valid`, `free`, `keeps`, `extra`
+        and `deviations`. Every motion ends at the path's rows `required_stops`; none passes through them.
         """
         self.joint_names, self.step, self._extra = path.joint_names, step, extra
-        waypoints, deviations = rounded_corners(
-            robot, path, valid, free, settings, keeps, extra, required_stops
+        waypoints, rounded = rounded_corners(
+            robot, path, valid, free, settings, keeps, extra, deviations, required_stops
         )
-        self.line = BlendedPolyline(waypoints, half_widths(waypoints, deviations))
-        self.stops = self._find_stops(deviations)
+        self.line = BlendedPolyline(waypoints, half_widths(waypoints, rounded))
+        self.stops = self._find_stops(rounded)
         """Their values of s along the path, in order."""
         self.motions = [
-            motion for pair in self._pairs(deviations) for motion in self._between(robot, settings, *pair)
+            motion for pair in self._pairs(rounded) for motion in self._between(robot, settings, *pair)
         ]
 
     def _find_stops(self, deviations: Float[ndarray, "corners"]) -> Float[ndarray, "k"]:

@@ -22,6 +22,7 @@ from robotdiffuse.trajectories.speed_limits import (
     can_begin,
     time_line,
 )
+from robotdiffuse.trajectories.timing_kernel import evaluate, rounded_line
 
 SHRINK_FACTOR = 0.5
 """Factor by which the deviation of a corner shrinks each time its rounding fails."""
@@ -33,6 +34,8 @@ MAX_SLOWER_TIMINGS = 4
 """Of these, the first ones, which may lower the accelerations of a motion whose corners are each free."""
 CORNER_SAMPLES = 17
 """Configurations of a rounded corner that are checked."""
+CORNER_PLACES = np.linspace(-1, 1, CORNER_SAMPLES)
+"""Their places, in half widths from its middle."""
 SAME_WAYPOINT_DISTANCE = 1e-6
 """Consecutive waypoints closer than this are merged [rad]."""
 
@@ -76,7 +79,7 @@ def time_parameterize(
     rows = _distinct(path.positions)
     if len(rows) == 1:
         return _resting_trajectory(path, settings)
-    most = np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
+    most = _largest_deviations(rows, settings, deviations)
     given = path.positions[rows], most[1:-1]
     return _round_and_time(robot, path, *given, valid, free, settings, keeps, start_speed, extra)[1]
 
@@ -89,16 +92,24 @@ def rounded_corners(
     settings: TimingSettings = DEFAULT,
     keeps: Callable[[ndarray], bool] = lambda _: True,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
+    deviations: Float[ndarray, "n"] | None = None,
     stops: Sequence[int] = (),
 ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "corners"]]:
     """The distinct waypoints of a path, at least two, and by how much `time_parameterize` would round each
     corner [rad]. Corners at the path's rows `stops` are not rounded."""
     _check_limits(robot)
     rows = _distinct(path.positions)
-    most = np.full(len(rows), settings.corner_deviation)
+    most = _largest_deviations(rows, settings, deviations)
     most[np.searchsorted(rows, stops, side="right") - 1] = 0.0
     given = path.positions[rows], most[1:-1]
     return given[0], _round_and_time(robot, path, *given, valid, free, settings, keeps, 0.0, extra)[0]
+
+
+def _largest_deviations(
+    rows: Int[ndarray, "m"], settings: TimingSettings, deviations: Float[ndarray, "n"] | None
+) -> Float[ndarray, "m"]:
+    """How far the motion may leave each of these rows of a path [rad]; a new array."""
+    return np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
 
 
 def _round_and_time(
@@ -155,20 +166,20 @@ def _shrunk(
     deviations, accepted = deviations.copy(), np.zeros(len(deviations))
     while True:
         # a corner becomes wider where its neighbour leaves it more of their segment
-        widths = half_widths(waypoints, deviations)
-        doubtful = (deviations > 0) & (widths > accepted * (1 + 1e-9))
-        if not doubtful.any():
-            break
-        corners = _corner_configurations(waypoints, deviations)
+        line = rounded_line(waypoints, deviations)
+        widths = line[3]
+        doubtful = np.flatnonzero((deviations > 0) & (widths > accepted * (1 + 1e-9)))
+        if not len(doubtful):
+            return deviations
+        corners = _corner_configurations(line, doubtful)
         smaller = np.maximum(_smaller(deviations), np.minimum(deviations, least))
-        for i in np.flatnonzero(doubtful):
-            if accepts(corners[i]):
+        for i, corner in zip(doubtful.tolist(), corners, strict=True):
+            if accepts(corner):
                 accepted[i] = widths[i]
             elif smaller[i] < deviations[i]:
                 deviations[i] = smaller[i]
             else:
                 accepted[i] = np.inf
-    return deviations
 
 
 def _check_limits(robot: Robot) -> None:
@@ -201,14 +212,11 @@ def _resting_trajectory(path: Path, settings: TimingSettings) -> Trajectory:
 
 
 def _corner_configurations(
-    waypoints: Float[ndarray, "n dof"], deviations: Float[ndarray, "corners"]
-) -> list[Float[ndarray, "k dof"]]:
-    """Configurations along each rounded corner; for a corner that is not rounded, the waypoint alone."""
-    widths = half_widths(waypoints, deviations)
-    line = BlendedPolyline(waypoints, widths)
-    along = line.knots[1:-1, None] + widths[:, None] * np.linspace(-1, 1, CORNER_SAMPLES)
-    rounded = line(along.ravel(), 0).reshape(-1, CORNER_SAMPLES, waypoints.shape[1])
-    return [rounded[i] if d > 0 else waypoints[i + 1 : i + 2] for i, d in enumerate(widths)]
+    line: tuple[ndarray, ndarray, ndarray, ndarray], corners: Int[ndarray, "k"]
+) -> Float[ndarray, "k m dof"]:
+    """Configurations along these rounded corners of a line, as `rounded_line` returns it."""
+    along = line[1][1 + corners, None] + line[3][corners, None] * CORNER_PLACES
+    return evaluate(line, along.ravel(), 0).reshape(len(corners), CORNER_SAMPLES, -1)
 
 
 def _can_begin(

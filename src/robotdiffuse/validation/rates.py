@@ -183,6 +183,9 @@ def _checks(
     beside = _padded(change[:1], change, change[-1:])
     low, high = np.minimum(beside[1:], beside[:-1]), np.maximum(beside[1:], beside[:-1])
     outside = np.maximum(low - a, a - high)
+    if len(a) > 1:  # at an end, no row lies beyond; accelerations that are linear have the step's mean
+        linear = np.abs((a[[0, -2]] + a[[1, -1]]) / 2 - change[[0, -1]])
+        outside[[0, -1]] = np.minimum(outside[[0, -1]], linear)
     if begins.any():
         outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
     yield _Check(

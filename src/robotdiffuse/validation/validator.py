@@ -122,14 +122,16 @@ class Verifier:
         ]
         rows = trajectory.times, trajectory.positions
         times, positions = rows if found else sample_cubics(trajectory, self.settings.chord)
-        still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
-        along = None
+        along, at_rest = None, None
+        if self.problem.waypoints:
+            still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
+            at_rest = np.isin(times, trajectory.times[still])
         if not found and self.dynamics is not None:
             found += self._torques(trajectory.times, trajectory_pieces(trajectory), ", with the payload")
         if self.constraints is not None:
             found += self._too_fast(trajectory)
             along = sample_cubics(trajectory, self.settings.constraint_chord) if not found else None
-        report = self._report(positions, times, found, np.isin(times, trajectory.times[still]), along)
+        report = self._report(positions, times, found, at_rest, along)
         if not report.valid:
             return report
         return replace(report, jerk_share=float((trajectory.peak_jerks / jerk_limits(self.robot)).max()))
@@ -162,8 +164,8 @@ class Verifier:
         """The report on waypoints, with the earliest violation; `found` are violations that are already
         known.
 
-        `times`: None for a path. `at_rest`: marks the rows at which a trajectory is at rest. `along`: times
-        and positions at which path constraints are tested, by default the waypoints.
+        `times`: None for a path. `at_rest`: marks the rows at which a trajectory through waypoints is at
+        rest. `along`: times and positions at which path constraints are tested, by default the waypoints.
         """
         bad = np.flatnonzero(~(np.abs(q) <= MAX_COORDINATE).all(axis=1))
         if len(bad):

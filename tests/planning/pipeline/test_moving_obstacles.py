@@ -11,8 +11,11 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.deadline import OutOfTimeError, deadline
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS
+from robotdiffuse.planning.pipeline.moving_obstacles import GRID_STEP
 from robotdiffuse.planning.pipeline.moving_obstacles_kernel import WAITED, earliest
 from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.trajectories.speed_limits import TimingSettings
+from robotdiffuse.trajectories.stops import StopGraph
 from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")
@@ -66,9 +69,9 @@ def test_a_start_that_is_hit_at_once_is_invalid() -> None:
 
 def test_a_wall_that_comes_cannot_be_passed() -> None:
     wall = rd.MovingObstacle(rd.Box([0, 2.0, 0.5], [4, 0.1, 4], name="wall"), velocity=[0, -2.5, 0])
-    found = rd.load_planner("rrt_connect").plan(problem(wall), 0.5)
+    found = rd.load_planner("rrt_connect").plan(problem(wall), 3.0)
     assert found.status is Status.TIMEOUT
-    assert "moving obstacles" in found.reason
+    assert "passes the moving obstacles" in found.reason
 
 
 def test_the_earliest_schedule_waits_for_a_passing_obstacle() -> None:
@@ -135,3 +138,34 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
     assert verify_trajectory(task, found.trajectory).valid
     alone = rd.load_planner("rrt_connect").plan(replace(task, moving=()), 20.0).trajectory
     assert alone is not None and found.trajectory.duration > alone.duration
+
+
+def test_corners_are_rounded_as_far_as_the_planner_certified() -> None:
+    """Where none is allowed, the motion stops at the corner; where little is, it passes slower than by the
+    default."""
+    middle = np.array([0.0, 0.9, 0, -1.8, 0, 2.1, 0.8])
+    path = rd.Path(PANDA.joint_names, np.stack([START, middle, END]))
+    shortest = {}
+    for deviation in (None, 0.0, 0.02):
+        deviations = None if deviation is None else np.full(3, deviation)
+        graph = StopGraph(
+            PANDA, path, lambda _: True, lambda _: True, TimingSettings(), GRID_STEP, deviations=deviations
+        )
+        last = len(graph.stops) - 1
+        whole = [m.ticks for m in graph.motions if (m.source, m.target) == (0, last)]
+        shortest[deviation] = min(whole, default=None)
+    assert shortest[0.0] is None
+    assert shortest[0.02] > shortest[None]
+
+
+def test_each_row_of_a_path_through_waypoints_has_its_corner_deviation() -> None:
+    """They were those of the last segment alone."""
+    tight = rd.Problem(PANDA, rd.Scene([rd.Sphere([0.55, 0.0, 0.5], 0.15)]), START, END)
+    mid = rd.load_planner("aorrtc").plan(tight, 10.0)
+    assert mid.path is not None and mid.trajectory is not None
+    task = replace(tight, waypoints=[mid.trajectory.positions[len(mid.trajectory.times) // 3]])
+    found = rd.load_planner("aorrtc").plan(task, 10.0)
+    assert found.path is not None and found.corner_deviations is not None
+    assert len(found.corner_deviations) == len(found.path.positions)
+    there = np.abs(found.path.positions - task.waypoints[0].positions[0]).max(axis=1) < 1e-6  # type: ignore[union-attr]
+    assert there.any() and not np.array(found.corner_deviations)[there].any()

@@ -60,6 +60,7 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
         return context.fail(
             Status.INVALID_START, f"the start is in collision: {first.link} touches {first.obstacle}"
         )
+    context.prepared = context.elapsed
     rng, attempts, tried = np.random.default_rng(request.seed), 0, 0
     horizon, reason = 0.0, ""
     while attempts == 0 or context.remaining > 0:
@@ -73,7 +74,7 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
         found = plan_path(solver, replace(still, scene=scene), of_path)
         attempts += 1
         if found.path is None or found.trajectory is None:
-            if scene is problem.scene:
+            if tried == 0 and scene is problem.scene:
                 return found
             continue
         tried += 1
@@ -81,18 +82,22 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
         for clearance in (context.clearance, 0.0):
             try:
                 with context.deadline():
-                    timed = _timed(context, problem, collision, found.path, clearance)
+                    timed = _timed(context, problem, collision, found, clearance)
             except OutOfTimeError as error:
-                return context.out_of_time(error)
+                if tried == 1:
+                    return context.out_of_time(error)
+                tried -= 1  # the last path was not tried in time
+                break
             if timed is None:
                 continue
             report = context.validator.trajectory(timed)
             if report.violation is None:
                 return _solved(context, found, timed, report.scene_clearance, report.self_clearance)
             reason = f"; last: {report.violation.message}"
+    paths = "one path" if tried == 1 else f"{tried} paths"
     return context.fail(
         Status.TIMEOUT,
-        f"no timing of {tried} paths, with waits and retreats, passes the moving obstacles{reason}",
+        f"no timing of {paths}, with waits and retreats, passes the moving obstacles{reason}",
     )
 
 
@@ -128,10 +133,13 @@ def _timed(
     context: PlanningContext,
     problem: Problem,
     collision: MovingCollision,
-    path: Path,
+    found: PlanResult,
     clearance: float,
 ) -> Trajectory | None:
-    """The earliest collision-free motion along the path on the grid of times; None if there is none."""
+    """The earliest collision-free motion along the path found, with its corners rounded as there, on the grid
+    of times; None if there is none."""
+    path = found.path
+    assert path is not None
     robot, validator = problem.robot, verifier(replace(problem, moving=()))
     if path.length < MIN_DISTANCE:
         return time_parameterize(robot, path, lambda _: True, validator.collision_free, context.timing)
@@ -144,6 +152,7 @@ def _timed(
         GRID_STEP,
         partial(corner_kept, validator.constraints),
         context.beside,
+        None if found.corner_deviations is None else np.array(found.corner_deviations),
         _stops(problem, path),
     )
     links = compile_links(robot)[1]
@@ -161,7 +170,7 @@ def _timed(
     for motion in rests.motions:
         check_timing("the grid of times")
         cells.append(rests.nearest_samples(motion, configurations))
-    way, found = earliest(
+    way, reached = earliest(
         clear,
         np.searchsorted(s, rests.stops),
         np.array([motion.source for motion in rests.motions]),
@@ -169,4 +178,4 @@ def _timed(
         np.cumsum([0] + [len(of_motion) for of_motion in cells]),
         np.concatenate(cells),
     )
-    return rests.trajectory([rests.motions[m] if m >= 0 else m for m in way]) if found else None
+    return rests.trajectory([rests.motions[m] if m >= 0 else m for m in way]) if reached else None

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
 
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Trajectory
@@ -101,11 +103,7 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
     left = max(context.remaining, MIN_TIME_LIMIT)
     whole = PlanningContext(context.planner_name, part, replace(context.request, time_limit=left))
     whole.timing = replace(whole.timing, line_intervals=len(segments) * whole.timing.line_intervals)
-    corners = np.cumsum([len(s.path.positions) - 1 for s in segments[:-1] if s.path is not None])
-    deviations = np.full(len(path.positions), whole.timing.corner_deviation)
-    for row, segment in zip([0, *corners], segments, strict=True):
-        if segment.corner_deviations is not None:
-            deviations[row : row + len(segment.corner_deviations)] = segment.corner_deviations
+    corners, deviations = _corners(segments, whole.timing.corner_deviation)
     for row, goal, radius in zip(corners, part.waypoints, blend, strict=True):
         deviations[row] = _deviation(part, path, int(row), goal, radius)
     clearances = [s.min_clearance for s in segments if s.min_clearance is not None]
@@ -118,6 +116,21 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
         deviations=deviations,
     )
     return None if found is None else found.trajectory
+
+
+def _corners(
+    segments: Sequence[PlanResult], default: float
+) -> tuple[Int[ndarray, "waypoints"], Float[ndarray, "n"]]:
+    """The rows of the segments' path at the waypoints, and how far the motion may leave each row [rad]; 0 at
+    the waypoints."""
+    lengths = [len(segment.path.positions) - 1 for segment in segments if segment.path is not None]
+    ends = np.cumsum(lengths)
+    deviations = np.full(ends[-1] + 1, default)
+    for row, segment in zip(ends - lengths, segments, strict=True):
+        if segment.corner_deviations is not None:
+            deviations[row : row + len(segment.corner_deviations)] = segment.corner_deviations
+    deviations[ends[:-1]] = 0.0
+    return ends[:-1], deviations
 
 
 def _deviation(problem: Problem, path: Path, row: int, goal: Goal, blend: float) -> float:
@@ -154,6 +167,7 @@ def _joined(
     itself = min(report.self_clearance for report in reports if report.self_clearance is not None)
     stages = dict.fromkeys(segment.stage for segment in segments)
     notes = dict.fromkeys(note for segment in segments for note in segment.notes)
+    deviations = _corners(segments, context.timing.corner_deviation)[1]
     return replace(
         segments[-1],
         reason=f"solved in {len(segments)} segments by {', '.join(stages)}",
@@ -162,6 +176,7 @@ def _joined(
         stage=next(iter(stages)) if len(stages) == 1 else segments[-1].planner,
         path=path,
         trajectory=trajectory,
+        corner_deviations=None if any(context.problem.blend) else tuple(deviations.tolist()),
         min_clearance=min(scene, itself),
         scene_clearance=scene,
         self_clearance=itself,
