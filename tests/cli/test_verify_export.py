@@ -106,4 +106,4 @@ def test_only_valid_motions_are_exported(planned: Path, capsys: pytest.CaptureFi
     assert run("export", planned / "r.json", "--out", "fine.csv", "--rate", "-1") == 2
     capsys.readouterr()
     assert run("export", planned / "r.json", "--out", "a.foo") == 2
-    assert "known: .mcap, .rosbag2, .rrd, .yaml" in capsys.readouterr().err
+    assert "known: .json, .csv, .mcap, .rosbag2, .rrd, .yaml" in capsys.readouterr().err

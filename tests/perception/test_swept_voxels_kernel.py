@@ -16,7 +16,7 @@ GOAL = np.array([0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:
     path = np.stack([START, GOAL]).astype(np.float32)
     swept = np.zeros(SHAPE, np.bool_)
-    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(VOXEL), swept)
+    sweep(compile_robot(PANDA), path, np.float32(0), np.array(LOW, np.float32), np.float32(VOXEL), swept)
     centres = (np.argwhere(np.ones(SHAPE)) + 0.5) * VOXEL + LOW
     moving = {link for link in PANDA.spheres if PANDA.link_frame(link) > 0}
     fixed = sum(len(spheres) for link, spheres in PANDA.spheres.items() if link not in moving)

@@ -83,7 +83,7 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*base, "--rows", "Ourz"]) == 2
     assert "known: " in capsys.readouterr().err
     assert main([*base, "--family", "ropp"]) == 2
-    assert "known: clutter, crate" in capsys.readouterr().err
+    assert "known: cabinet, clutter, crate" in capsys.readouterr().err
     assert main(base) == 2 and "no data set" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main([*base, "--samples", "0"])
