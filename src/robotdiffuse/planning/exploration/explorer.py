@@ -50,7 +50,7 @@ STRICT, CHANCE, STRICT_THEN_CHANCE = "strict", "chance", "strict_then_chance"
 POLICIES = (STRICT, CHANCE, STRICT_THEN_CHANCE)
 NOTHING = Scene(())
 QUICK_FRACTION = 0.3
-"""Part of the time limit for a search that a look, or another search, may follow."""
+"""Part of the time limit for a search within space seen free that a look, or another search, may follow."""
 TENTATIVE_MOTIONS = 6
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
 MAX_LOOKS_FOR = 2
@@ -178,11 +178,12 @@ class Explorer:
         predicted = self._predicted(problem) if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit
-        motion = self._motion(problem, policy, predicted, QUICK_FRACTION * limit if may_look else limit)
+        quick = may_look and policy == STRICT
+        motion = self._motion(problem, policy, predicted, self._quick_limit if quick else limit)
         if self._good(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
-        if look.kind == STUCK and may_look and policy == STRICT:
+        if look.kind == STUCK and quick:
             motion = self._motion(problem, policy, predicted, limit)
             if motion.solved:
                 return self._go(motion, policy)
@@ -230,7 +231,7 @@ class Explorer:
                 if policy == STRICT:
                     way = self._planned(replace(look, scene=allowed, views=()), self._quick_limit)
                 else:
-                    way = self._by_chance(look, predicted, self._quick_limit)
+                    way = self._by_chance(look, predicted, self.settings.time_limit)
                 if self._good(way, policy):
                     stated = way.confidence if policy == CHANCE else None
                     self._looked_for += wanted
@@ -267,9 +268,9 @@ class Explorer:
         best = reason = None
         for i in range(TENTATIVE_MOTIONS):
             tentative = self._planned(avoiding, self._quick_limit, self._seed + i)
-            if tentative.path is None and len(in_vain) and best is None:
-                avoiding, in_vain = as_seen, in_vain[:0]
-                tentative = self._planned(as_seen, self._quick_limit, self._seed + i)
+            if tentative.path is None and best is None:
+                avoiding = as_seen
+                tentative = self._planned(as_seen, self.settings.time_limit, self._seed + i)
             if tentative.path is None:
                 reason = tentative.reason
                 break

@@ -32,7 +32,7 @@ FULL_COST_LENGTH = 8.0
 """A look this far away counts half [rad, joint-space L2]."""
 UNSEEN_WEIGHT = 0.05
 """Weight of a swept voxel that is surely free, by the prediction; one that is surely occupied has 1 more."""
-MIN_SEEN = 0.05
+MIN_SEEN = 0.02
 """Looks that see a smaller part of the weight are of no use."""
 
 
