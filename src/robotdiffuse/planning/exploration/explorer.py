@@ -8,7 +8,7 @@ with a camera whose poses and errors are as stated, such a motion meets nothing.
 **Chance.** The arm goes if the motion's stated `confidence` is high enough, and looks first if it is not.
 
 Looks are chosen by what a tentative motion, planned among what was seen alone, would sweep unseen. A look's
-own motion is subject to the same policy.
+own motion is subject to the same policy; by chance, a strict one will do where none is confident enough.
 """
 
 from collections.abc import Sequence
@@ -236,6 +236,10 @@ class Explorer:
                     stated = way.confidence if policy == CHANCE else None
                     self._looked_for += wanted
                     return Step(LOOK, f"{why}; look there first", policy, way, stated)
+        if self.settings.policy == CHANCE == policy:
+            strict = self._look(problem, STRICT, predicted, motion)
+            if strict.kind == LOOK:
+                return strict
         back = self._way_back(problem) if policy == STRICT else None
         if back is not None:
             return Step(LOOK, f"{why}; back on the way in, to look from there", policy, back)
