@@ -236,7 +236,7 @@ class Explorer:
                     stated = way.confidence if policy == CHANCE else None
                     self._looked_for += wanted
                     return Step(LOOK, f"{why}; look there first", policy, way, stated)
-        if self.settings.policy == CHANCE == policy:
+        if policy == self.settings.policy == CHANCE:
             strict = self._look(problem, STRICT, predicted, motion)
             if strict.kind == LOOK:
                 return strict
