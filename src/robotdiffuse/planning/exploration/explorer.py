@@ -29,8 +29,9 @@ from robotdiffuse.core.types import FIRST
 from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import Corners, MapSettings, OccupancyMap
+from robotdiffuse.perception.seen_points import point_shapes
+from robotdiffuse.perception.view_memory import ViewMemory
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
@@ -75,7 +76,8 @@ class ExplorerSettings(Settings, name="explorer"):
     look_attempts: Count = 4
     """Looks to which a motion is searched for in a step, the most useful first."""
     max_views: Count = 12
-    """The latest views give seen points and the prediction; the map holds what all views told."""
+    """The views that told most, this many, give seen points and the prediction; the map holds what all views
+    told."""
     predict: bool = True
     """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
     reach."""
@@ -98,7 +100,7 @@ class Step:
     confidence: float | None = None
     """Stated probability that a motion by chance is free."""
     seen: Scene | None = None
-    """The known scene and the points that the latest views saw; None where nothing was planned."""
+    """The known scene and the points that the kept views saw; None where nothing was planned."""
 
 
 class Explorer:
@@ -126,7 +128,7 @@ class Explorer:
             self.map.declare_free(free_zone)
         self._planner = load_planner("aorrtc")
         self._rng, self._seed = np.random.default_rng(seed), seed
-        self._views: list[DepthView] = []
+        self._views = ViewMemory(robot, settings.max_views)
         self._goal: Goal | None = None
         self._looks = 0
         self._looked_for = np.zeros(FINE_SHAPE, np.uint8)
@@ -143,8 +145,8 @@ class Explorer:
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
-        self.map.add(view, stamp)
-        self._views = [*self._views, view][-self.settings.max_views :]
+        told = self.map.add(view, stamp)
+        self._views.add(view, told)
 
     def next(self, configuration: ArrayLike) -> Step:
         """What the arm, at rest at a configuration, shall do next.
@@ -156,9 +158,12 @@ class Explorer:
         q = vector("explorer", "configuration", configuration, self.robot.dof)
         if isinstance(self._goal, JointGoal) and self._at_goal(q, self._goal.positions):
             return Step(DONE, "the arm is at the goal")
-        if not self._views:
+        if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
-        problem = Problem(self.robot, self.scene, q, self._goal, views=self._views)
+        goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
+        seen = point_shapes(self._views.points(), self.robot, self.scene, q, goals)
+        scene = self.scene.with_shapes([*self.scene.shapes, *seen])
+        problem = Problem(self.robot, scene, q, self._goal)
         policies = (STRICT, CHANCE) if self.settings.policy == STRICT_THEN_CHANCE else (self.settings.policy,)
         step = Step(STUCK, "")
         for policy in policies:
@@ -175,7 +180,7 @@ class Explorer:
 
     def _step(self, problem: Problem, policy: str) -> Step:
         """The step under one policy."""
-        predicted = self._predicted(problem) if policy == CHANCE else None
+        predicted = self._predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit
         quick = may_look and policy == STRICT
@@ -215,21 +220,20 @@ class Explorer:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
         if self._looks >= self.settings.max_looks:
             return Step(STUCK, f"{why}, after {self._looks} looks", policy)
-        as_seen = replace(problem, views=())
-        wanted = swept_unseen(self.map, motion.path) if motion.path else self._least_unseen(as_seen)
+        wanted = swept_unseen(self.map, motion.path) if motion.path else self._least_unseen(problem)
         if isinstance(wanted, str):
             return Step(STUCK, f"no motion among what was seen: {wanted}", policy)
-        predicted = self._predicted(problem) if predicted is None else predicted
-        allowed = as_seen.scene
+        predicted = self._predicted() if predicted is None else predicted
+        allowed = problem.scene
         if policy == STRICT:
             obstacles = not_seen_free(self.map, self.scene, (problem.start,))
-            allowed = as_seen.scene.with_shapes([*as_seen.scene.shapes, *obstacles])
+            allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         for camera in self.cameras:
             looks = best_looks(self.map, allowed, camera, wanted, predicted, problem.start, self._rng)
             for there in islice(looks, self.settings.look_attempts):
                 look = replace(problem, goal=JointGoal(there[None]))
                 if policy == STRICT:
-                    way = self._planned(replace(look, scene=allowed, views=()), self._quick_limit)
+                    way = self._planned(replace(look, scene=allowed), self._quick_limit)
                 else:
                     way = self._by_chance(look, predicted, self.settings.time_limit)
                 if self._good(way, policy):
@@ -254,7 +258,7 @@ class Explorer:
             waypoints = _first_part(way[::-1], share)
             obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
             scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-            leaving = replace(problem, scene=scene, goal=JointGoal(waypoints[-1:]), views=())
+            leaving = replace(problem, scene=scene, goal=JointGoal(waypoints[-1:]))
             context = PlanningContext(self._planner.name, leaving, PlanRequest(self.settings.time_limit))
             found = context.finish(waypoints, "the way in", "back on the way in")
             if found is not None:
@@ -267,8 +271,10 @@ class Explorer:
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
         ends = near_ends(self.map, (as_seen.start, *goals))
         in_vain = np.argwhere((self._looked_for >= MAX_LOOKS_FOR) & self.map.unknown & ~ends)
-        avoided = cover(self.map, self.scene, in_vain, "looked for in vain")
-        avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
+        avoiding = as_seen
+        if len(in_vain):
+            avoided = cover(self.map, self.scene, in_vain, "looked for in vain")
+            avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
         best = reason = None
         for i in range(TENTATIVE_MOTIONS):
             tentative = self._planned(avoiding, self._quick_limit, self._seed + i)
@@ -304,7 +310,7 @@ class Explorer:
         goal = goals[int(np.argmin(outside))]
         obstacles = not_seen_free(self.map, self.scene, (problem.start, goal))
         scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-        result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None]), views=()), limit)
+        result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None])), limit)
         if result.solved:
             return result
         return replace(result, reason=f"no motion within space seen free: {result.reason}")
@@ -315,7 +321,7 @@ class Explorer:
         """A motion among what was seen and predicted, with its confidence."""
         asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
         request = PlanRequest(limit, self._seed, FIRST)
-        result = plan_with_unknown_space(self._planner, asked, request, predicted)
+        result = plan_with_unknown_space(self._planner, asked, request, predicted, self._views.volume())
         if result.swept_probability is not None:
             stated = confidence("predicted", result.swept_probability)
             result = replace(result, confidence=stated)
@@ -329,22 +335,22 @@ class Explorer:
         """The goal configurations, or the result that says why there is none."""
         if isinstance(problem.goal, JointGoal):
             return problem.goal.positions
-        as_seen = replace(problem, views=())
         request = PlanRequest(self.settings.time_limit, self._seed, FIRST)
-        usable = usable_start_goal(PlanningContext(self._planner.name, as_seen, request))
+        usable = usable_start_goal(PlanningContext(self._planner.name, problem, request))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 
     def _occupied_by(self, q: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
         return voxels_in(placed_spheres(self.robot, q).astype(np.float32))
 
-    def _predicted(self, problem: Problem) -> Float32[ndarray, "nx ny nz"] | None:
-        """The probability that each voxel is occupied; None without the network."""
+    def _predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
+        """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
+        network."""
         from robotdiffuse.learning.completion import predict
         from robotdiffuse.learning.completion.coverage import covers
 
         if not (self.settings.predict and covers(self.robot)):
             return None
-        return predict(observe(problem.views, self.robot, problem.start))
+        return np.where(self.map.free, np.float32(0), predict(self._views.volume()))
 
 
 def _first_part(waypoints: Float[ndarray, "n dof"], share: float) -> Float[ndarray, "m dof"]:

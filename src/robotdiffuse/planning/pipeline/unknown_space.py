@@ -69,12 +69,14 @@ def plan_with_unknown_space(
     problem: Problem,
     request: PlanRequest,
     predicted: Float32[ndarray, "nx ny nz"] | None = None,
+    volume: ObservedVolume | None = None,
 ) -> PlanResult:
     """A motion under the problem's policy for unknown space, within the time limit; see the head of this
     file.
 
     predicted: the probability that each fine voxel of the observed volume is occupied; None: as the occupancy
-    completion network predicts, if the policy needs it.
+    completion network predicts, if the policy needs it. volume: what views told, if the problem's scene holds
+    their points already; None: that of the problem's views.
 
     The result says which assumption it comes from, its confidence (how likely the motion is free in the true
     scene), and which unknown space it crosses.
@@ -87,7 +89,8 @@ def plan_with_unknown_space(
     else:
         predict = None
     context = PlanningContext(solver.name, problem, request)
-    volume = observe(problem.views, problem.robot, problem.start)
+    if volume is None:
+        volume = observe(problem.views, problem.robot, problem.start)
     if predict is not None:
         predicted = predict(volume)
     prepared = context.elapsed
