@@ -1,5 +1,7 @@
 """ViewMemory: the views that told most, with what each of them shows, computed once."""
 
+from functools import cached_property
+
 import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
@@ -10,38 +12,50 @@ from robotdiffuse.perception.seen_points import VOXEL, seen_points
 from robotdiffuse.robots.robot import Robot
 
 
+class _Kept:
+    """A view, and what it shows, computed when it is first needed."""
+
+    def __init__(self, view: DepthView, robot: Robot, told: int) -> None:
+        self._view, self._robot, self.told = view, robot, told
+
+    @cached_property
+    def volume(self) -> ObservedVolume:
+        return observe([self._view], self._robot, self._configuration)
+
+    @cached_property
+    def points(self) -> Float32[ndarray, "n 3"]:
+        return seen_points([self._view], self._robot, self._configuration)
+
+    @property
+    def _configuration(self) -> Float[ndarray, "dof"]:
+        assert self._view.configuration is not None
+        return self._view.configuration
+
+
 class ViewMemory:
     """Keeps a number of views: a new one takes the place of the kept one that told least."""
 
     def __init__(self, robot: Robot, most: int) -> None:
         self._robot, self._most = robot, most
-        self._told = list[int]()
-        self._volumes = list[ObservedVolume]()
-        self._points = list[Float32[ndarray, "n 3"]]()
+        self._kept = list[_Kept]()
 
     def __len__(self) -> int:
-        return len(self._told)
+        return len(self._kept)
 
     def add(self, view: DepthView, told: int) -> None:
-        """Keep a view. told: the number of voxels that no view before it told of."""
-        q = view.configuration
-        assert q is not None
+        """Keep a view with a configuration. told: the number of voxels that no view before it told of."""
         if len(self) >= self._most:
-            least = int(np.argmin(self._told))
-            for kept in (self._told, self._volumes, self._points):
-                del kept[least]
-        self._told.append(told)
-        self._volumes.append(observe([view], self._robot, q))
-        self._points.append(seen_points([view], self._robot, q))
+            self._kept.remove(min(self._kept, key=lambda kept: kept.told))
+        self._kept.append(_Kept(view, self._robot, told))
 
     def volume(self) -> ObservedVolume:
         """What the kept views together tell of each voxel of 4 cm."""
-        return merged(self._volumes)
+        return merged([kept.volume for kept in self._kept])
 
     def points(self) -> Float[ndarray, "n 3"]:
         """The mean of the points that the kept views observed in each cell of a grid [m]; see
         `seen_points`."""
-        every = np.concatenate(self._points).astype(np.float64)
+        every = np.concatenate([kept.points for kept in self._kept]).astype(np.float64)
         _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)
         sums = [np.bincount(cell, every[:, axis], len(counts)) for axis in range(3)]
         return np.stack(sums, axis=1) / counts[:, None]

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
+from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
@@ -31,6 +32,7 @@ from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import Corners, MapSettings, OccupancyMap
 from robotdiffuse.perception.seen_points import point_shapes
+from robotdiffuse.perception.swept_voxels_kernel import surface
 from robotdiffuse.perception.view_memory import ViewMemory
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
@@ -223,6 +225,10 @@ class Explorer:
         wanted = swept_unseen(self.map, motion.path) if motion.path else self._least_unseen(problem)
         if isinstance(wanted, str):
             return Step(STUCK, f"no motion among what was seen: {wanted}", policy)
+        if policy == STRICT and not wanted.any():
+            longer = self._motion(problem, policy, predicted, self.settings.time_limit)
+            if longer.solved:
+                return self._go(longer, policy)
         predicted = self._predicted() if predicted is None else predicted
         allowed = problem.scene
         if policy == STRICT:
@@ -266,15 +272,15 @@ class Explorer:
         return None
 
     def _least_unseen(self, as_seen: Problem) -> Bool[ndarray, "nx ny nz"] | str:
-        """What a motion among what was seen sweeps unseen: the least of several motions, which avoid voxels
-        that looks were made for in vain if they can; or why there is none."""
+        """What a motion among what was seen sweeps unknown, the least of several, or why there is none.
+
+        They avoid occupied voxels, and those that looks were made for in vain, if they can."""
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
         ends = near_ends(self.map, (as_seen.start, *goals))
-        in_vain = np.argwhere((self._looked_for >= MAX_LOOKS_FOR) & self.map.unknown & ~ends)
-        avoiding = as_seen
-        if len(in_vain):
-            avoided = cover(self.map, self.scene, in_vain, "looked for in vain")
-            avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
+        in_vain = (self._looked_for >= MAX_LOOKS_FOR) & self.map.unknown
+        blocked = surface((self.map.occupied | in_vain) & ~ends)
+        avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
+        avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
         best = reason = None
         for i in range(TENTATIVE_MOTIONS):
             tentative = self._planned(avoiding, self._quick_limit, self._seed + i)
@@ -329,6 +335,7 @@ class Explorer:
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
         """A first motion in the problem's scene as it is, found within a time limit [s]."""
+        compile_scene_for(self.robot, problem.scene)  # now, outside the time limit
         return self._planner.plan(problem, limit, self._seed if seed is None else seed, FIRST)
 
     def _goals(self, problem: Problem) -> Float[ndarray, "n dof"] | PlanResult:

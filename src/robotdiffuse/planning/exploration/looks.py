@@ -32,18 +32,23 @@ FULL_COST_LENGTH = 8.0
 """A look this far away counts half [rad, joint-space L2]."""
 UNSEEN_WEIGHT = 0.05
 """Weight of a swept voxel that is surely free, by the prediction; one that is surely occupied has 1 more."""
+DIRECT_LOOKS, DIRECT_SCORE = 40, 0.7
+"""Of this many best looks, the first one that a straight line leads to is preferred, if its score is at least
+this fraction of the best one's."""
+DIRECT_STEP = 0.1
+"""Largest motion of a joint between configurations that such a line is checked at [rad]."""
 MIN_SEEN = 0.02
 """Looks that see a smaller part of the weight are of no use."""
 
 
 def swept_unseen(known: OccupancyMap, path: Path) -> Bool[ndarray, "nx ny nz"]:
-    """The voxels that the map does not know to be free and whose covering balls a path touches, without
-    those near its ends, which count as free."""
+    """The voxels that the map does not know and whose covering balls a path touches, without those near its
+    ends, which count as free."""
     swept = np.zeros(FINE_SHAPE, np.bool_)
     positions, voxel = path.positions.astype(np.float32), np.float32(FINE_VOXEL_SIZE)
     low, margin = np.array(LOW, np.float32), np.float32(COVER_RADIUS)
     sweep(compile_robot(known.robot), positions, margin, low, voxel, swept)
-    return swept & ~known.free & ~near_ends(known, (path.positions[0], path.positions[-1]))
+    return swept & known.unknown & ~near_ends(known, (path.positions[0], path.positions[-1]))
 
 
 def best_looks(
@@ -104,4 +109,14 @@ def best_looks(
         best = q[np.argsort(-score, kind="stable")[:REFINED]].repeat(NEIGHBOURS, axis=0)
         more, scores = scored(best + spread * rng.standard_normal(best.shape))
         q, score = np.concatenate([q, more]), np.concatenate([score, scores])
-    yield from q[np.argsort(-score, kind="stable")]
+    order = np.argsort(-score, kind="stable")
+    direct = [i for i in order[:DIRECT_LOOKS] if checker.free(_between(start, q[i])).all()]
+    first = [i for i in direct if score[i] >= DIRECT_SCORE * score[order[0]]][:1]
+    yield from q[first]
+    yield from q[[i for i in order if i not in first]]
+
+
+def _between(start: Float[ndarray, "dof"], end: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+    """Configurations on the straight line to an end, close to each other."""
+    count = int(np.ceil(np.abs(end - start).max() / DIRECT_STEP)) + 1
+    return start + np.linspace(0, 1, count)[:, None] * (end - start)
