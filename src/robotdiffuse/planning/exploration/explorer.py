@@ -26,7 +26,7 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
-from robotdiffuse.core.types import FIRST
+from robotdiffuse.core.types import FIRST, Path
 from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
@@ -52,9 +52,9 @@ GO, LOOK, DONE, STUCK = "go", "look", "done", "stuck"
 STRICT, CHANCE, STRICT_THEN_CHANCE = "strict", "chance", "strict_then_chance"
 POLICIES = (STRICT, CHANCE, STRICT_THEN_CHANCE)
 NOTHING = Scene(())
-QUICK_FRACTION = 0.3
+QUICK_FRACTION = 0.2
 """Part of the time limit for a search within space seen free that a look, or another search, may follow."""
-TENTATIVE_MOTIONS = 6
+TENTATIVE_MOTIONS = 2
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
 MAX_LOOKS_FOR = 2
 """Voxels that this many looks did not show are avoided by the motions that looks are made for."""
@@ -166,6 +166,7 @@ class Explorer:
         seen = point_shapes(self._views.points(), self.robot, self.scene, q, goals)
         scene = self.scene.with_shapes([*self.scene.shapes, *seen])
         problem = Problem(self.robot, scene, q, self._goal)
+        self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
         policies = (STRICT, CHANCE) if self.settings.policy == STRICT_THEN_CHANCE else (self.settings.policy,)
         step = Step(STUCK, "")
         for policy in policies:
@@ -222,13 +223,17 @@ class Explorer:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
         if self._looks >= self.settings.max_looks:
             return Step(STUCK, f"{why}, after {self._looks} looks", policy)
-        wanted = swept_unseen(self.map, motion.path) if motion.path else self._least_unseen(problem)
-        if isinstance(wanted, str):
-            return Step(STUCK, f"no motion among what was seen: {wanted}", policy)
-        if policy == STRICT and not wanted.any():
-            longer = self._motion(problem, policy, predicted, self.settings.time_limit)
-            if longer.solved:
-                return self._go(longer, policy)
+        if motion.path is not None:
+            wanted = swept_unseen(self.map, motion.path)
+        else:
+            tentative = self._least_unseen(problem)
+            if isinstance(tentative, PlanResult):
+                return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
+            path, wanted = tentative
+            if policy == STRICT and not wanted.any():
+                kept = self._within_seen_free(problem, path.positions, "as seen")
+                if kept is not None:
+                    return self._go(kept, policy)
         predicted = self._predicted() if predicted is None else predicted
         allowed = problem.scene
         if policy == STRICT:
@@ -248,7 +253,7 @@ class Explorer:
                     return Step(LOOK, f"{why}; look there first", policy, way, stated)
         if policy == self.settings.policy == CHANCE:
             strict = self._look(problem, STRICT, predicted, motion)
-            if strict.kind == LOOK:
+            if strict.kind != STUCK:
                 return strict
         back = self._way_back(problem) if policy == STRICT else None
         if back is not None:
@@ -262,17 +267,25 @@ class Explorer:
             return None
         for share in WAY_BACK_SHARES:
             waypoints = _first_part(way[::-1], share)
-            obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
-            scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-            leaving = replace(problem, scene=scene, goal=JointGoal(waypoints[-1:]))
-            context = PlanningContext(self._planner.name, leaving, PlanRequest(self.settings.time_limit))
-            found = context.finish(waypoints, "the way in", "back on the way in")
+            found = self._within_seen_free(problem, waypoints, "back on the way in")
             if found is not None:
-                return replace(found, problem=leaving)
+                return found
         return None
 
-    def _least_unseen(self, as_seen: Problem) -> Bool[ndarray, "nx ny nz"] | str:
-        """What a motion among what was seen sweeps unknown, the least of several, or why there is none.
+    def _within_seen_free(
+        self, problem: Problem, waypoints: Float[ndarray, "n dof"], name: str
+    ) -> PlanResult | None:
+        """The motion along waypoints, if the validator accepts it within space seen free; else None."""
+        obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
+        scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
+        within = replace(problem, scene=scene, goal=JointGoal(waypoints[-1:]))
+        context = PlanningContext(self._planner.name, within, PlanRequest(self.settings.time_limit))
+        found = context.finish(waypoints, name, name)
+        return None if found is None else replace(found, problem=within)
+
+    def _least_unseen(self, as_seen: Problem) -> tuple[Path, Bool[ndarray, "nx ny nz"]] | PlanResult:
+        """A path among what was seen, and what it sweeps unknown: the least of several. Without any, the
+        result that says why.
 
         They avoid occupied voxels, and those that looks were made for in vain, if they can."""
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
@@ -281,19 +294,19 @@ class Explorer:
         blocked = surface((self.map.occupied | in_vain) & ~ends)
         avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
-        best = reason = None
+        best: tuple[Path, Bool[ndarray, "nx ny nz"]] | None = None
         for i in range(TENTATIVE_MOTIONS):
             tentative = self._planned(avoiding, self._quick_limit, self._seed + i)
             if tentative.path is None and best is None:
                 avoiding = as_seen
                 tentative = self._planned(as_seen, self.settings.time_limit, self._seed + i)
             if tentative.path is None:
-                reason = tentative.reason
-                break
+                return tentative if best is None else best
             wanted = swept_unseen(self.map, tentative.path)
-            if best is None or wanted.sum() < best.sum():
-                best = wanted
-        return best if best is not None else str(reason)
+            if best is None or wanted.sum() < best[1].sum():
+                best = tentative.path, wanted
+        assert best is not None
+        return best
 
     @property
     def _quick_limit(self) -> float:

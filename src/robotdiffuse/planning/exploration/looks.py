@@ -32,11 +32,6 @@ FULL_COST_LENGTH = 8.0
 """A look this far away counts half [rad, joint-space L2]."""
 UNSEEN_WEIGHT = 0.05
 """Weight of a swept voxel that is surely free, by the prediction; one that is surely occupied has 1 more."""
-DIRECT_LOOKS, DIRECT_SCORE = 40, 0.7
-"""Of this many best looks, the first one that a straight line leads to is preferred, if its score is at least
-this fraction of the best one's."""
-DIRECT_STEP = 0.1
-"""Largest motion of a joint between configurations that such a line is checked at [rad]."""
 MIN_SEEN = 0.02
 """Looks that see a smaller part of the weight are of no use."""
 
@@ -109,14 +104,4 @@ def best_looks(
         best = q[np.argsort(-score, kind="stable")[:REFINED]].repeat(NEIGHBOURS, axis=0)
         more, scores = scored(best + spread * rng.standard_normal(best.shape))
         q, score = np.concatenate([q, more]), np.concatenate([score, scores])
-    order = np.argsort(-score, kind="stable")
-    direct = [i for i in order[:DIRECT_LOOKS] if checker.free(_between(start, q[i])).all()]
-    first = [i for i in direct if score[i] >= DIRECT_SCORE * score[order[0]]][:1]
-    yield from q[first]
-    yield from q[[i for i in order if i not in first]]
-
-
-def _between(start: Float[ndarray, "dof"], end: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
-    """Configurations on the straight line to an end, close to each other."""
-    count = int(np.ceil(np.abs(end - start).max() / DIRECT_STEP)) + 1
-    return start + np.linspace(0, 1, count)[:, None] * (end - start)
+    yield from q[np.argsort(-score, kind="stable")]
