@@ -44,7 +44,7 @@ def test_a_warm_start_or_a_single_core_starts_none(
 
 
 def test_it_compiles_what_a_plan_calls() -> None:
-    problem = rd.load_problem(files("robotdiffuse") / "examples" / "shelf.yaml")
+    problem = rd.load_problem(str(files("robotdiffuse") / "examples" / "shelf.yaml"))
     assert rd.plan(problem, time_limit=5.0).solved
     of_a_plan = set(rounds.signatures), set(fastest_speeds.signatures)
     for step in steps(problem.robot, picture=True):
