@@ -12,9 +12,8 @@ own motion is subject to the same policy; by chance, a strict one will do where 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from itertools import islice
-from typing import Annotated, Literal
+from dataclasses import replace
+from itertools import chain, islice
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -25,20 +24,32 @@ from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
 from robotdiffuse.core.types import FIRST, Path
-from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in
+from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, voxels_in
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.occupancy_map import Corners, MapSettings, OccupancyMap
+from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.swept_voxels_kernel import surface
+from robotdiffuse.perception.unknown_space import UnknownSpace
 from robotdiffuse.perception.view_memory import ViewMemory
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
 from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free
+from robotdiffuse.planning.exploration.steps import (
+    CHANCE,
+    DONE,
+    GO,
+    LOOK,
+    STRICT,
+    STRICT_THEN_CHANCE,
+    STUCK,
+    ExplorerSettings,
+    Step,
+)
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.goals import Goal
@@ -47,11 +58,7 @@ from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-GO, LOOK, DONE, STUCK = "go", "look", "done", "stuck"
-"""What a step asks for."""
-STRICT, CHANCE, STRICT_THEN_CHANCE = "strict", "chance", "strict_then_chance"
-POLICIES = (STRICT, CHANCE, STRICT_THEN_CHANCE)
-NOTHING = Scene(())
+NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2
 """Part of the time limit for a search within space seen free that a look, or another search, may follow."""
 TENTATIVE_MOTIONS = 2
@@ -67,47 +74,6 @@ AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
 
 
-@dataclass(frozen=True)
-class ExplorerSettings(Settings, name="explorer"):
-    policy: Annotated[str, OneOf(POLICIES)] = STRICT
-    """strict: only through space seen free; chance: where the stated confidence is high enough;
-    strict_then_chance: the latter where the former leads nowhere."""
-    confidence: Annotated[float, Bound(least=0.0, most=1.0)] = 0.98
-    """Least stated confidence of motions by chance."""
-    time_limit: Positive = 1.0
-    """Time limit of each search [s]."""
-    max_looks: Natural = 8
-    """Most looks on the way to a goal."""
-    look_attempts: Count = 4
-    """Looks to which a motion is searched for in a step, the most useful first."""
-    max_views: Count = 12
-    """The views that told most, this many, give seen points and the prediction; the map holds what all views
-    told."""
-    predict: bool = True
-    """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
-    reach."""
-    map: MapSettings = field(default_factory=MapSettings)
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """What the arm shall do next."""
-
-    kind: Literal["go", "look", "done", "stuck"]
-    """go: execute the motion, which ends at the goal; look: execute the motion, if there is one, then
-    observe; done: the arm is at the goal; stuck: see `reason`."""
-    reason: str
-    policy: str = ""
-    """The policy that the motion keeps, "strict" or "chance"."""
-    motion: PlanResult | None = None
-    """Solved. A strict motion is certified against all that was not seen free; `motion.problem` holds these
-    obstacles."""
-    confidence: float | None = None
-    """Stated probability that a motion by chance is free."""
-    seen: Scene | None = None
-    """The known scene and the points that the kept views saw; None where nothing was planned."""
-
-
 class Explorer:
     """Takes an arm to goals through space that cameras see on the way; see the head of this file."""
 
@@ -117,7 +83,7 @@ class Explorer:
         cameras: Sequence[ArmCamera] = (),
         scene: Scene = NOTHING,
         free_zone: Corners | None = None,
-        settings: ExplorerSettings = ExplorerSettings(),
+        settings: ExplorerSettings = DEFAULTS,
         seed: int = 0,
     ) -> None:
         """
@@ -131,7 +97,7 @@ class Explorer:
         self.map = OccupancyMap(robot, settings.map)
         if free_zone is not None:
             self.map.declare_free(free_zone)
-        self._planner = load_planner("aorrtc")
+        self._planner = load_planner("robotdiffuse")
         self._rng, self._seed = np.random.default_rng(seed), seed
         self._views = ViewMemory(robot, settings.max_views)
         self._goal: Goal | None = None
@@ -166,7 +132,7 @@ class Explorer:
         if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
-        seen = point_shapes(self._views.points(), self.robot, self.scene, q, goals, END_RADII)
+        seen = point_shapes(self._seen_points(), self.robot, self.scene, q, goals, END_RADII)
         scene = self.scene.with_shapes([*self.scene.shapes, *seen])
         problem = Problem(self.robot, scene, q, self._goal)
         self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
@@ -180,6 +146,15 @@ class Explorer:
         if step.motion is not None and step.motion.path is not None:
             self._way_in = step.motion.path.positions
         return replace(step, seen=problem.scene)
+
+    def _seen_points(self) -> Float[ndarray, "n 3"]:
+        """The points that kept views observed, without those where more views see through: stray pixels."""
+        points = self._views.points()
+        at = np.floor((points - LOW) / FINE_VOXEL_SIZE).astype(np.int64)
+        inside = ((at >= 0) & (at < FINE_SHAPE)).all(axis=1)
+        stray = inside.copy()
+        stray[inside] = self.map.free[tuple(at[inside].T)]
+        return points[~stray]
 
     def _at_goal(self, q: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> bool:
         return bool((np.abs(goals - q).max(axis=1) < AT_GOAL).any())
@@ -243,8 +218,10 @@ class Explorer:
             obstacles = not_seen_free(self.map, self.scene, (problem.start,))
             allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         for camera in self.cameras:
-            looks = best_looks(self.map, allowed, camera, wanted, predicted, problem.start, self._rng)
-            for there in islice(looks, self.settings.look_attempts):
+            attempts = self.settings.look_attempts
+            about = self.map, allowed, camera, wanted, predicted, problem.start, self._rng
+            near = (best_looks(*about, straight) for straight in (False, True))
+            for there in chain.from_iterable(islice(looks, attempts) for looks in near):
                 look = replace(problem, goal=JointGoal(there[None]))
                 if policy == STRICT:
                     way = self._planned(replace(look, scene=allowed), self._quick_limit)
@@ -303,6 +280,8 @@ class Explorer:
             if tentative.path is None and best is None:
                 avoiding = as_seen
                 tentative = self._planned(as_seen, self.settings.time_limit, self._seed + i)
+            if tentative.path is None and best is None and i + 1 < TENTATIVE_MOTIONS:
+                continue  # another seed may find one
             if tentative.path is None:
                 return tentative if best is None else best
             wanted = swept_unseen(self.map, tentative.path)
@@ -343,9 +322,12 @@ class Explorer:
         """A motion among what was seen and predicted, with its confidence."""
         asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
         request = PlanRequest(limit, self._seed, FIRST)
-        result = plan_with_unknown_space(self._planner, asked, request, predicted, self._views.volume())
+        goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
+        ends = np.stack([problem.start, *goals])
+        unknown = UnknownSpace(self.robot, ends, self.map.unknown, predicted, margin=0.0)
+        result = plan_with_unknown_space(self._planner, asked, request, predicted, unknown)
         if result.swept_probability is not None:
-            stated = confidence("predicted", result.swept_probability)
+            stated = confidence("explored", result.swept_probability)
             result = replace(result, confidence=stated)
         return replace(result, problem=asked)
 
