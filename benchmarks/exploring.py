@@ -1,6 +1,7 @@
 """Explorer: an arm with a camera at its tip goes to goals through simulated scenes.
 
     python benchmarks/exploring.py [--problems 28] [--noise] [--methods strict ...] --records FILE
+    python benchmarks/exploring.py --families FOLDER ... --records FILE
     python benchmarks/exploring.py --report --records FILE
 
 Prints benchmarks/results/exploring.txt. Problems are those of benchmarks/cameras.py whose scene leaves the
@@ -10,26 +11,31 @@ pixels, 70 x 55 degrees, 0.15 to 2 m) one every 0.25 s of a motion, up to eight.
 checked by the validator in the true scene, and the loop ends at a collision. Looks and times are those of a
 leg; times are the Explorer's own.
 
-The first two methods are controls: motions as planned once with unknown space taken as free, and once with
-the prediction, from the first images and one at the start of each leg.
+Controls: motions as planned once with unknown space taken as free, and once with the prediction, from the
+first images and one at the start of each leg; an Explorer without the network, without the box that is
+declared free, without the camera beside the arm, and one whose looks show the border of what is known.
 """
 
 import argparse
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
+from numpy import ndarray
 from numpy.typing import ArrayLike
+from scipy.ndimage import binary_dilation
 
-from cameras import PLANNER, is_free, problems, views
+from cameras import PLANNER, is_free, known_scene, problems, unknown_scene, views
 from common import header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.types import FIRST
+from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.statistics import wilson_interval
 from robotdiffuse.learning.completion.samples import FINE_VOXEL_SIZE, true_voxels
 from robotdiffuse.perception.depth_noise import DepthNoise
@@ -42,6 +48,7 @@ from robotdiffuse.planning.exploration.explorer import (
     DONE,
     LOOK,
     STRICT,
+    STRICT_THEN_CHANCE,
     Explorer,
     ExplorerSettings,
     Step,
@@ -50,7 +57,6 @@ from robotdiffuse.planning.exploration.simulated import explore, measured, taken
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import OPTIMISTIC, PREDICTED, JointGoal, Problem
-from robotdiffuse.scenes.scene import Scene
 
 Row = dict[str, Any]
 TIME_LIMIT = 0.5
@@ -59,16 +65,36 @@ ZONE_SIDES = np.arange(0.12, 0.37, 0.04)
 """Distances of the sides of the box that is declared free from the base's axis [m]."""
 ZONE_HEIGHT = 0.7
 ONCE = {"unknown is free, once": OPTIMISTIC, "predicted, once": PREDICTED}
+
+
+@dataclass(frozen=True)
+class Method:
+    """An Explorer and what it is given."""
+
+    policy: str
+    predict: bool = True
+    free_zone: bool = True
+    standing: bool = True
+    """Whether a camera stands beside the arm."""
+    frontier: bool = False
+    """Whether looks are to show the border of what is known, whatever a motion sweeps."""
+
+
 METHODS = {
-    "strict": ExplorerSettings(policy=STRICT, time_limit=TIME_LIMIT),
-    "strict, no network": ExplorerSettings(policy=STRICT, time_limit=TIME_LIMIT, predict=False),
-    "strict, no free zone": ExplorerSettings(policy=STRICT, time_limit=TIME_LIMIT),
-    "chance": ExplorerSettings(policy=CHANCE, time_limit=TIME_LIMIT),
-    "strict, then chance": ExplorerSettings(policy="strict_then_chance", time_limit=TIME_LIMIT),
+    "strict": Method(STRICT),
+    "chance": Method(CHANCE),
+    "strict, then chance": Method(STRICT_THEN_CHANCE),
+    "strict, no network": Method(STRICT, predict=False),
+    "chance, no network": Method(CHANCE, predict=False),
+    "strict, frontier looks": Method(STRICT, frontier=True),
+    "chance, frontier looks": Method(CHANCE, frontier=True),
+    "strict, no free zone": Method(STRICT, free_zone=False),
+    "chance, no free zone": Method(CHANCE, free_zone=False),
+    "strict, no standing camera": Method(STRICT, standing=False),
+    "chance, no standing camera": Method(CHANCE, standing=False),
 }
 MAX_PROBLEMS = 10_000
 """Of a family."""
-NO_ZONE = "strict, no free zone"
 HOME = "ready"
 """Name of the pose that the arm begins in."""
 
@@ -91,19 +117,28 @@ class TimedExplorer(Explorer):
         return step
 
 
+class FrontierExplorer(TimedExplorer):
+    """Looks at unknown voxels beside free ones, whatever a motion sweeps."""
+
+    def wanted(self, path: JointPath) -> Bool[ndarray, "nx ny nz"]:
+        return self.map.unknown & binary_dilation(self.map.free)
+
+
 def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -> Row:
     """A record of one problem and method: from the arm's pose "ready" to the start, and on to the goal."""
     noise, rng = DepthNoise() if noisy else None, np.random.default_rng([number, 16])
-    camera, known = wrist_camera(problem.robot), Scene(problem.scene.shapes[:1])
+    camera, known = wrist_camera(problem.robot), known_scene(problem)
     legs = [replace(problem, start=HOME, goal=JointGoal(problem.start[None])), problem]
     [beside] = views(legs[0], family, number, 1, False)
     seen, reason = [measured(beside, np.inf, noise, rng)], ""
     reached = collided = False
-    zone = None if method == NO_ZONE else free_zone(problem.scene)
-    settings = METHODS.get(method, ExplorerSettings())
-    explorer = TimedExplorer(problem.robot, [camera], known, zone, settings)
+    about = METHODS.get(method, METHODS["strict"])
+    settings = ExplorerSettings(policy=about.policy, time_limit=TIME_LIMIT, predict=about.predict)
+    zone = free_zone(problem) if about.free_zone else None
+    kind = FrontierExplorer if about.frontier else TimedExplorer
+    explorer = kind(problem.robot, [camera], known, zone, settings)
     spent, looks = list[float](), list[int]()
-    if method not in ONCE:
+    if method not in ONCE and about.standing:
         explorer.observe(seen[0])
     for leg in legs:
         explorer.spent = 0.0
@@ -117,7 +152,7 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
             collided = result.solved and not reached
             looks.append(0)
         else:
-            events = list(explore(leg, explorer, noise, number, seen[0]))
+            events = list(explore(leg, explorer, noise, number, seen[0] if about.standing else None))
             reached, collided = events[-1].step.kind == DONE, not all(event.free for event in events)
             looks.append(sum(event.step.kind == LOOK for event in events))
             reason = events[-1].step.reason
@@ -127,9 +162,9 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
     return {"reached": reached, "collided": collided, "looks": looks, "reason": reason, "times": spent}
 
 
-def free_zone(scene: Scene) -> Corners | None:
+def free_zone(problem: Problem) -> Corners | None:
     """The largest box around the base without obstacles, as a person who knows the cell would declare it."""
-    filled = true_voxels(Scene(scene.shapes[1:]))[:, :, : round((ZONE_HEIGHT - LOW[2]) / FINE_VOXEL_SIZE)]
+    filled = true_voxels(unknown_scene(problem))[:, :, : round((ZONE_HEIGHT - LOW[2]) / FINE_VOXEL_SIZE)]
     columns = np.asarray(filled.any(axis=2))
 
     def has_obstacle(low: tuple[float, float], high: tuple[float, float]) -> bool:
@@ -171,31 +206,37 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def report(rows: list[Row]) -> None:
-    """Print reached goals, collisions, looks and times of the methods, without noise and with."""
-    for noisy in (False, True):
+    """Print reached goals, collisions, looks and times of the methods, by where problems come from and with
+    noise or without."""
+    for own, noisy in product((True, False), (False, True)):
         lines = []
+        some = [row for row in rows if (row["family"] in FAMILIES, row["noise"]) == (own, noisy)]
         for method in (*ONCE, *METHODS):
-            mine = [row for row in rows if (row["method"], row["noise"]) == (method, noisy)]
-            if not mine:
-                continue
-            reached, collided = (sum(row[name] for row in mine) for name in ("reached", "collided"))
-            low, high = wilson_interval(reached, len(mine))
-            looks, spent = (np.concatenate([row[name] for row in mine]) for name in ("looks", "times"))
-            lines.append(
-                (
-                    method,
-                    len(mine),
-                    f"{100 * reached / len(mine):.0f} ({100 * low:.0f} to {100 * high:.0f})",
-                    collided,
-                    f"{looks.mean():.2f} / {np.percentile(looks, 90):.0f}",
-                    f"{np.median(spent):.2f} / {np.percentile(spent, 90):.2f}",
-                )
-            )
+            mine = [row for row in some if row["method"] == method]
+            if mine:
+                lines.append(line(method, mine))
         if lines:
             columns = ["method", "problems", "reached, %", "collisions", "looks a leg, mean / p90"]
-            title = "With the noise of sensors" if noisy else "Ideal depth"
+            title = (
+                f"{'Families' if own else 'Other problems'}, {'noise of sensors' if noisy else 'ideal depth'}"
+            )
             print_table(title, [*columns, "CPU s a leg, median / p90"], lines)
     print("CPU time is the Explorer's (observe and next), without simulated images and the validation.")
+
+
+def line(method: str, rows: list[Row]) -> tuple[str | int, ...]:
+    """A method's line of the table."""
+    reached, collided = (sum(row[name] for row in rows) for name in ("reached", "collided"))
+    low, high = wilson_interval(reached, len(rows))
+    looks, spent = (np.concatenate([row[name] for row in rows]) for name in ("looks", "times"))
+    return (
+        method,
+        len(rows),
+        f"{100 * reached / len(rows):.0f} ({100 * low:.0f} to {100 * high:.0f})",
+        collided,
+        f"{looks.mean():.2f} / {np.percentile(looks, 90):.0f}",
+        f"{np.median(spent):.2f} / {np.percentile(spent, 90):.2f}",
+    )
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ own motion is subject to the same policy; by chance, a strict one will do where 
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import islice
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -147,12 +147,16 @@ class Explorer:
             self._way_in = step.motion.path.positions
         return replace(step, seen=problem.scene)
 
+    def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
+        """The voxels that looks are to show: unknown ones that a tentative motion sweeps."""
+        return swept_unseen(self.map, path)
+
     def _seen_points(self) -> Float[ndarray, "n 3"]:
         """The points that kept views observed, without those where more views see through: stray pixels."""
         points = self._views.points()
         at = np.floor((points - LOW) / FINE_VOXEL_SIZE).astype(np.int64)
         inside = ((at >= 0) & (at < FINE_SHAPE)).all(axis=1)
-        stray = inside.copy()
+        stray = np.zeros(len(points), np.bool_)
         stray[inside] = self.map.free[tuple(at[inside].T)]
         return points[~stray]
 
@@ -202,26 +206,26 @@ class Explorer:
         if self._looks >= self.settings.max_looks:
             return Step(STUCK, f"{why}, after {self._looks} looks", policy)
         if motion.path is not None:
-            wanted = swept_unseen(self.map, motion.path)
+            wanted = self.wanted(motion.path)
         else:
-            tentative = self._least_unseen(problem)
-            if isinstance(tentative, PlanResult):
+            tentative, wanted = self._least_unseen(problem)
+            if tentative.path is None:
                 return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
-            path, wanted = tentative
-            if policy == STRICT and not wanted.any():
-                kept = self._within_seen_free(problem, path.positions, "as seen")
-                if kept is not None:
-                    return self._go(kept, policy)
+            kept = None
+            if policy == CHANCE:
+                kept = self._with_confidence(tentative, predicted)
+            elif not wanted.any():
+                kept = self._within_seen_free(problem, tentative.path.positions, "as seen")
+            if kept is not None and self._good(kept, policy):
+                return self._go(kept, policy)
         predicted = self._predicted() if predicted is None else predicted
         allowed = problem.scene
         if policy == STRICT:
             obstacles = not_seen_free(self.map, self.scene, (problem.start,))
             allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         for camera in self.cameras:
-            attempts = self.settings.look_attempts
-            about = self.map, allowed, camera, wanted, predicted, problem.start, self._rng
-            near = (best_looks(*about, straight) for straight in (False, True))
-            for there in chain.from_iterable(islice(looks, attempts) for looks in near):
+            looks = best_looks(self.map, allowed, camera, wanted, predicted, problem.start, self._rng)
+            for there in islice(looks, self.settings.look_attempts):
                 look = replace(problem, goal=JointGoal(there[None]))
                 if policy == STRICT:
                     way = self._planned(replace(look, scene=allowed), self._quick_limit)
@@ -263,9 +267,9 @@ class Explorer:
         found = context.finish(waypoints, name, name)
         return None if found is None else replace(found, problem=within)
 
-    def _least_unseen(self, as_seen: Problem) -> tuple[Path, Bool[ndarray, "nx ny nz"]] | PlanResult:
-        """A path among what was seen, and what it sweeps unknown: the least of several. Without any, the
-        result that says why.
+    def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Bool[ndarray, "nx ny nz"]]:
+        """A motion among what was seen, and what looks are to show of it: the least of several. Without any,
+        the result that says why.
 
         They avoid occupied voxels, and those that looks were made for in vain, if they can."""
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
@@ -274,21 +278,15 @@ class Explorer:
         blocked = surface((self.map.occupied | in_vain) & ~ends)
         avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
-        best: tuple[Path, Bool[ndarray, "nx ny nz"]] | None = None
-        for i in range(TENTATIVE_MOTIONS):
-            tentative = self._planned(avoiding, self._quick_limit, self._seed + i)
-            if tentative.path is None and best is None:
+        results = list[PlanResult]()
+        for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):
+            result = self._planned(avoiding, self._quick_limit, seed)
+            if result.path is None and not any(one.solved for one in results):
                 avoiding = as_seen
-                tentative = self._planned(as_seen, self.settings.time_limit, self._seed + i)
-            if tentative.path is None and best is None and i + 1 < TENTATIVE_MOTIONS:
-                continue  # another seed may find one
-            if tentative.path is None:
-                return tentative if best is None else best
-            wanted = swept_unseen(self.map, tentative.path)
-            if best is None or wanted.sum() < best[1].sum():
-                best = tentative.path, wanted
-        assert best is not None
-        return best
+                result = self._planned(as_seen, self.settings.time_limit, seed)
+            results.append(result)
+        found = [(one, self.wanted(one.path)) for one in results if one.path is not None]
+        return min(found, key=lambda one: int(one[1].sum()), default=(results[-1], ends))
 
     @property
     def _quick_limit(self) -> float:
@@ -323,13 +321,25 @@ class Explorer:
         asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
         request = PlanRequest(limit, self._seed, FIRST)
         goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
-        ends = np.stack([problem.start, *goals])
-        unknown = UnknownSpace(self.robot, ends, self.map.unknown, predicted, margin=0.0)
+        unknown = self._unknown(np.stack([problem.start, *goals]), predicted)
         result = plan_with_unknown_space(self._planner, asked, request, predicted, unknown)
-        if result.swept_probability is not None:
-            stated = confidence("explored", result.swept_probability)
-            result = replace(result, confidence=stated)
-        return replace(result, problem=asked)
+        return replace(self._with_confidence(result, predicted), problem=asked)
+
+    def _with_confidence(
+        self, motion: PlanResult, predicted: Float32[ndarray, "nx ny nz"] | None
+    ) -> PlanResult:
+        """The motion with the confidence that follows from the probability that it sweeps."""
+        if motion.path is None or predicted is None:
+            return motion
+        unknown = self._unknown(motion.path.positions[[0, -1]], predicted)
+        swept = unknown.crossed(motion.path).risk
+        return replace(motion, swept_probability=swept, confidence=confidence("explored", swept))
+
+    def _unknown(
+        self, ends: Float[ndarray, "n dof"], predicted: Float32[ndarray, "nx ny nz"] | None
+    ) -> UnknownSpace:
+        """What the map does not know, without the voxels that the arm fills at these configurations."""
+        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, margin=0.0)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
         """A first motion in the problem's scene as it is, found within a time limit [s]."""

@@ -32,8 +32,6 @@ FULL_COST_LENGTH = 8.0
 """A look this far away counts half [rad, joint-space L2]."""
 UNSEEN_WEIGHT = 0.05
 """Weight of a swept voxel that is surely free, by the prediction; one that is surely occupied has 1 more."""
-LINE_STEPS = 16
-"""Parts of a straight line that are checked."""
 MIN_SEEN = 0.02
 """Looks that see a smaller part of the weight are of no use."""
 
@@ -56,13 +54,11 @@ def best_looks(
     probability: Float32[ndarray, "nx ny nz"] | None,
     start: Float[ndarray, "dof"],
     rng: np.random.Generator,
-    straight: bool = False,
 ) -> Iterator[Float[ndarray, "dof"]]:
     """Configurations from which the camera sees wanted voxels, the best first: weighted by the prediction if
     there is one, against the way to get there.
 
-    scene: the arm does not collide with it at the configurations. straight: only configurations to which a
-    straight line leads through it, for an arm that is hemmed in. A voxel counts by the chance that nothing
+    scene: the arm does not collide with it at the configurations. A voxel counts by the chance that nothing
     hides it: neither the arm, nor what is occupied or predicted.
     """
     robot = known.robot
@@ -82,7 +78,7 @@ def best_looks(
     def scored(q: Float[ndarray, "n dof"]) -> tuple[Float[ndarray, "m dof"], Float[ndarray, "m"]]:
         """The configurations without collision that see enough, and their scores."""
         q = np.clip(q, robot.lower, robot.upper)
-        q = _toward(checker, start, q) if straight else q[checker.free(q)]
+        q = q[checker.free(q)]
         seen = (
             seen_weights(
                 compile_robot(robot),
@@ -109,15 +105,3 @@ def best_looks(
         more, scores = scored(best + spread * rng.standard_normal(best.shape))
         q, score = np.concatenate([q, more]), np.concatenate([score, scores])
     yield from q[np.argsort(-score, kind="stable")]
-
-
-def _toward(
-    checker: CollisionChecker, start: Float[ndarray, "dof"], q: Float[ndarray, "n dof"]
-) -> Float[ndarray, "m dof"]:
-    """The configurations one step short of the first collision on straight lines; those that get anywhere."""
-    shares = np.arange(1, LINE_STEPS + 1) / LINE_STEPS
-    along = start + shares[:, None] * (q - start)[:, None]
-    free = checker.free(along.reshape(-1, len(start))).reshape(len(q), LINE_STEPS)
-    steps = np.logical_and.accumulate(free, axis=1).sum(axis=1)
-    steps[steps < LINE_STEPS] -= 1
-    return along[steps > 0, steps[steps > 0] - 1]
