@@ -101,7 +101,7 @@ def seen_shapes(
 
 
 def point_shapes(
-    points: Float[ndarray, "n 3"],
+    points: Float[ndarray, "points 3"],
     robot: Robot,
     known: Scene,
     start: Float[ndarray, "dof"],
