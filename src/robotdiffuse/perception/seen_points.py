@@ -106,25 +106,17 @@ def point_shapes(
     known: Scene,
     start: Float[ndarray, "dof"],
     goals: Float[ndarray, "n dof"],
-    end_radii: Sequence[float] = (MIN_POINT_RADIUS,),
 ) -> tuple[SeenPoints, ...]:
     """Observed points as obstacles, without those of known shapes.
 
-    Points get POINT_RADIUS, but those that the arm's spheres at start or goals would then touch get the first
-    of the `end_radii`, from large to small, that the arm does not touch, or else the last: this safety margin
-    must not make a free start or goal invalid. Points within KNOWN_DISTANCE of a known shape are left out.
+    Points get POINT_RADIUS, but those that the arm's spheres at start or goals would then touch get
+    MIN_POINT_RADIUS: this safety margin must not make a free start or goal invalid. Points within
+    KNOWN_DISTANCE of a known shape are left out.
     """
     points = points.astype(np.float32)
     if known.shapes:
         points = points[~near_scene(compile_scene_for(robot, known), points, np.float32(KNOWN_DISTANCE))]
     ends = np.concatenate([placed_spheres(robot, q) for q in (start, *goals)]).astype(np.float32)
-    radii = np.array([POINT_RADIUS, *end_radii])
-    fits = sphere_distances(points, ends)[:, None] >= radii + MIN_POINT_RADIUS
-    fits[:, -1] = True
-    chosen = fits.argmax(axis=1)
-    names = ("seen", *(f"seen_at_ends{i or ''}" for i in range(len(end_radii))))
-    return tuple(
-        SeenPoints(points[chosen == i], float(radius), name=name)
-        for i, (radius, name) in enumerate(zip(radii, names, strict=True))
-        if (chosen == i).any()
-    )
+    close = sphere_distances(points, ends) < POINT_RADIUS + MIN_POINT_RADIUS
+    parts = (~close, POINT_RADIUS, "seen"), (close, MIN_POINT_RADIUS, "seen_at_ends")
+    return tuple(SeenPoints(points[part], radius, name=name) for part, radius, name in parts if part.any())

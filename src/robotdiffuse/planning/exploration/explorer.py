@@ -65,9 +65,6 @@ TENTATIVE_MOTIONS = 2
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
 MAX_LOOKS_FOR = 2
 """Voxels that this many looks did not show are avoided by the motions that looks are made for."""
-END_RADII = (0.0075, 0.005, 0.0025, 0.001)
-"""Radii of seen points that would otherwise touch the arm where a motion begins or ends, as large as fits
-[m]."""
 WAY_BACK_SHARES = (0.25, 0.5, 1.0)
 """Parts of the way in that the arm may go back."""
 AT_GOAL = 1e-3
@@ -132,7 +129,7 @@ class Explorer:
         if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
-        seen = point_shapes(self._seen_points(), self.robot, self.scene, q, goals, END_RADII)
+        seen = point_shapes(self._seen_points(), self.robot, self.scene, q, goals)
         scene = self.scene.with_shapes([*self.scene.shapes, *seen])
         problem = Problem(self.robot, scene, q, self._goal)
         self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
