@@ -5,7 +5,9 @@ that cover all other space (`seen_free.py`). Exempt is the space within 2 cm of 
 and ends; seen points count there too. So the promise is as good as the map: in a scene that does not change,
 with a camera whose poses and errors are as stated, such a motion meets nothing.
 
-**Chance.** The arm goes if the motion's stated `confidence` is high enough, and looks first if it is not.
+**Chance.** The arm goes if the motion's stated `confidence` is high enough, and looks first if it is not. It
+follows from the predicted probability of all voxels that the map does not know and the motion sweeps, but for
+those that the arm fills where it begins and ends.
 
 Looks are chosen by what a tentative motion, planned among what was seen alone, would sweep unseen. A look's
 own motion is subject to the same policy; by chance, a strict one will do where none is confident enough.
