@@ -194,12 +194,9 @@ def run(arguments: argparse.Namespace) -> None:
     done = {(row["family"], row["number"], row["method"], row["noise"]) for row in kept.rows}
     warm = False
     for family in arguments.families:
-        first, count = arguments.skip, arguments.problems // len(arguments.families)
-        some = list(
-            islice(
-                (one for one in problems(family, MAX_PROBLEMS, set()) if usable(one[1])), first, first + count
-            )
-        )
+        some = (one for one in problems(family, MAX_PROBLEMS, set()) if usable(one[1]))
+        end = arguments.skip + arguments.problems // len(arguments.families)
+        some = list(islice(some, arguments.skip, end))
         for number, problem in progress(some, family):
             for method in arguments.methods:
                 if (family, number, method, arguments.noise) in done:
