@@ -204,19 +204,17 @@ class Explorer:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
         if self._looks >= self.settings.max_looks:
             return Step(STUCK, f"{why}, after {self._looks} looks", policy)
-        if motion.path is not None:
-            wanted = self.wanted(motion.path)
-        else:
-            tentative, wanted = self._least_unseen(problem)
-            if tentative.path is None:
-                return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
-            kept = None
-            if policy == CHANCE:
-                kept = self._with_confidence(tentative, predicted)
-            elif not wanted.any():
-                kept = self._within_seen_free(problem, tentative.path.positions, "as seen")
-            if kept is not None and self._good(kept, policy):
-                return self._go(kept, policy)
+        path = motion.path
+        tentative, wanted = self._least_unseen(problem) if path is None else (motion, self.wanted(path))
+        if tentative.path is None:
+            return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
+        kept, under = None, policy
+        if policy == CHANCE and predicted is not None:
+            kept = self._with_confidence(tentative, predicted)
+        elif not wanted.any():
+            kept, under = self._within_seen_free(problem, tentative.path.positions, "as seen"), STRICT
+        if kept is not None and self._good(kept, under):
+            return self._go(kept, under)
         predicted = self._predicted() if predicted is None else predicted
         allowed = problem.scene
         if policy == STRICT:
