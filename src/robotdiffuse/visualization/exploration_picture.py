@@ -1,0 +1,119 @@
+"""Draws an exploration as a picture: its moments beside each other, each with what was known then."""
+
+import io
+from pathlib import Path as FilePath
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import Image
+
+from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.types import Path
+from robotdiffuse.planning.exploration.recorded import RecordedExplorer
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.visualization import style
+from robotdiffuse.visualization.camera import Camera, view_of_motion
+from robotdiffuse.visualization.exploration import (
+    UNKNOWN,
+    Moment,
+    frustum,
+    in_known_scene,
+    moments,
+    shown_voxels,
+)
+from robotdiffuse.visualization.picture import (
+    MARGINS,
+    ClearSurface,
+    PictureSettings,
+    caption,
+    faded_below,
+    linear,
+    render,
+    tube,
+)
+from robotdiffuse.visualization.voxel_faces import faces_surface
+
+MAX_MOMENTS = 6
+TILE = PictureSettings(width=720, height=450, ghosts=2)
+GAP = 6
+"""Between moments [pixels]."""
+GAP_COLOR = (0xFF, 0xFF, 0xFF)
+UNKNOWN_ALPHA, PREDICTED_ALPHA = 0.27, 0.55
+LOOK_COLOR = (0xD9, 0x8A, 0x12)
+"""sRGB colour of the pyramid that shows where the camera looks."""
+LABEL_COLORS = ((0x8A, 0x93, 0xA0), UNKNOWN, style.OBSERVED, style.ASSUMED, LOOK_COLOR)
+CAPTION_SIZE = 1.7
+WHITE = (0xFF, 0xFF, 0xFF)
+
+
+def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: str | FilePath) -> None:
+    """Write the moments of an exploration as one .png: at most MAX_MOMENTS, the first and the last included.
+
+    Each shows the arm's motion among what was known when it was chosen: voxels seen occupied (blue),
+    predicted ones (violet), the boundary of unknown space (grey, see-through), and at the end of a look what
+    the camera will see (a pyramid). scene: the true one, from which the view is chosen. Raises InputError for
+    another ending or a file that cannot be written.
+    """
+    path = check_output(file, (".png",))
+    found = moments(explorer)
+    chosen = np.unique(np.linspace(0, len(found) - 1, min(MAX_MOMENTS, len(found))).round().astype(int))
+    whole = np.concatenate([_positions(moment) for moment in found])
+    surfaces = style.robot_surfaces(explorer.robot)
+    tool = style.tool_point(explorer.robot, surfaces)
+    size = TILE.width, TILE.height
+    camera = view_of_motion(explorer.robot, scene, surfaces, tool, whole, *size, MARGINS)
+    known = in_known_scene(explorer)
+    tiles = [_tile(explorer, found[i], known, camera) for i in chosen]
+    buffer = io.BytesIO()
+    _joined(tiles).save(buffer, "PNG", optimize=False)
+    write_atomically(path, buffer.getvalue())
+
+
+def _positions(moment: Moment) -> Float[ndarray, "n dof"]:
+    motion = moment.act.step.motion
+    if motion is None or motion.path is None:
+        return moment.act.configuration[None]
+    return motion.path.positions
+
+
+def _tile(explorer: RecordedExplorer, moment: Moment, known: ndarray, camera: Camera) -> Image.Image:
+    robot, act = explorer.robot, moment.act
+    shown = shown_voxels(moment.known, act, known)
+    occupied = faces_surface(shown.occupied, ~shown.occupied, style.OBSERVED)
+    predicted = faces_surface(shown.predicted, ~shown.predicted, WHITE)
+    unknown = faces_surface(shown.unknown, shown.free, WHITE)
+    clear = [
+        ClearSurface(unknown, linear(UNKNOWN), UNKNOWN_ALPHA),
+        ClearSurface(predicted, linear(style.ASSUMED), PREDICTED_ALPHA),
+    ]
+    look = [tube(edge, LOOK_COLOR, LOOK_COLOR) for edge in frustum(explorer, act)]
+    motion = act.trajectory or Path(robot.joint_names, _positions(moment))
+    pixels, _ = render(robot, explorer.scene, motion, TILE, camera, added=(occupied, *look), clear=clear)
+    image = Image.fromarray(faded_below(pixels))
+    facts = [*moment.shares, *((name, "") for name in ("occupied", "predicted", "next look"))]
+    caption(image, f"{moment.number}  {title(moment)}", facts, LABEL_COLORS, CAPTION_SIZE)
+    return image
+
+
+def title(moment: Moment) -> str:
+    """What the arm does in an act."""
+    step = moment.act.step
+    if step.kind == "look":
+        return "look" if step.motion is None else f"look ({moment.act.duration:.1f} s)"
+    return (
+        f"go ({moment.act.duration:.1f} s)"
+        if step.kind == "go"
+        else {"done": "at the goal"}.get(step.kind, step.kind)
+    )
+
+
+def _joined(tiles: list[Image.Image]) -> Image.Image:
+    """The pictures in rows of two or three."""
+    columns = min(len(tiles), 3 if len(tiles) > 4 else 2)
+    rows = -(-len(tiles) // columns)
+    width, height = TILE.width + GAP, TILE.height + GAP
+    sheet = Image.new("RGB", (columns * width - GAP, rows * height - GAP), GAP_COLOR)
+    for i, tile in enumerate(tiles):
+        sheet.paste(tile, (i % columns * width, i // columns * height))
+    return sheet
