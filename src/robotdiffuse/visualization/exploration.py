@@ -10,12 +10,15 @@ from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
 from robotdiffuse.perception.observed_volume import LOW
 from robotdiffuse.perception.seen_points_kernel import near_scene
+from robotdiffuse.planning.exploration.explorer import DONE
 from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
 
 LIKELY = 0.5
 """Voxels of unknown space that are occupied with a larger probability are shown as predicted."""
 UNKNOWN = (0x6E, 0x7B, 0x8C)
 """sRGB colour of the boundary of unknown space."""
+LOOK_COLOR = (0xD9, 0x8A, 0x12)
+"""sRGB colour of the pyramid that shows where a camera looks."""
 FRUSTUM_DEPTH = 0.25
 """Length of the pyramid that shows where a camera looks [m]."""
 
@@ -44,6 +47,13 @@ def moments(explorer: RecordedExplorer) -> list[Moment]:
         if before:
             found.append(Moment(number + 1, act, before[-1]))
     return found
+
+
+def title(moment: Moment) -> str:
+    """What the arm does in an act."""
+    step, duration = moment.act.step, moment.act.duration
+    name = {DONE: "at the goal"}.get(step.kind, step.kind)
+    return f"{name} ({duration:.1f} s)" if duration else name
 
 
 @dataclass(frozen=True, eq=False)

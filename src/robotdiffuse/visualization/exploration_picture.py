@@ -15,12 +15,14 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.camera import Camera, view_of_motion
 from robotdiffuse.visualization.exploration import (
+    LOOK_COLOR,
     UNKNOWN,
     Moment,
     frustum,
     in_known_scene,
     moments,
     shown_voxels,
+    title,
 )
 from robotdiffuse.visualization.picture import (
     MARGINS,
@@ -40,8 +42,6 @@ GAP = 6
 """Between moments [pixels]."""
 GAP_COLOR = (0xFF, 0xFF, 0xFF)
 UNKNOWN_ALPHA, PREDICTED_ALPHA = 0.27, 0.55
-LOOK_COLOR = (0xD9, 0x8A, 0x12)
-"""sRGB colour of the pyramid that shows where the camera looks."""
 LABEL_COLORS = ((0x8A, 0x93, 0xA0), UNKNOWN, style.OBSERVED, style.ASSUMED, LOOK_COLOR)
 CAPTION_SIZE = 1.7
 WHITE = (0xFF, 0xFF, 0xFF)
@@ -94,18 +94,6 @@ def _tile(explorer: RecordedExplorer, moment: Moment, known: ndarray, camera: Ca
     facts = [*moment.shares, *((name, "") for name in ("occupied", "predicted", "next look"))]
     caption(image, f"{moment.number}  {title(moment)}", facts, LABEL_COLORS, CAPTION_SIZE)
     return image
-
-
-def title(moment: Moment) -> str:
-    """What the arm does in an act."""
-    step = moment.act.step
-    if step.kind == "look":
-        return "look" if step.motion is None else f"look ({moment.act.duration:.1f} s)"
-    return (
-        f"go ({moment.act.duration:.1f} s)"
-        if step.kind == "go"
-        else {"done": "at the goal"}.get(step.kind, step.kind)
-    )
 
 
 def _joined(tiles: list[Image.Image]) -> Image.Image:

@@ -20,6 +20,7 @@ from robotdiffuse.planning.exploration.explorer import LOOK, NOTHING, Explorer, 
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
+DEFAULT = ExplorerSettings()
 SAME_POSE = 1e-9
 """Largest difference of an entry of two poses that are the same."""
 
@@ -79,7 +80,7 @@ class RecordedExplorer(Explorer):
         cameras: Sequence[ArmCamera] = (),
         scene: Scene = NOTHING,
         free_zone: Corners | None = None,
-        settings: ExplorerSettings = ExplorerSettings(),
+        settings: ExplorerSettings = DEFAULT,
         seed: int = 0,
     ) -> None:
         """See `Explorer`."""
