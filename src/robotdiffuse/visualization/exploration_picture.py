@@ -4,7 +4,7 @@ import io
 from pathlib import Path as FilePath
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from PIL import Image
 
@@ -47,13 +47,15 @@ CAPTION_SIZE = 1.7
 WHITE = (0xFF, 0xFF, 0xFF)
 
 
-def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: str | FilePath) -> None:
+def write_exploration_picture(
+    explorer: RecordedExplorer, scene: Scene, file: str | FilePath, settings: PictureSettings = TILE
+) -> None:
     """Write the moments of an exploration as one .png: at most MAX_MOMENTS, the first and the last included.
 
     Each shows the arm's motion among what was known when it was chosen: voxels seen occupied (blue),
     predicted ones (violet), the boundary of unknown space (grey, see-through), and at the end of a look what
-    the camera will see (a pyramid). scene: the true one, from which the view is chosen. Raises InputError for
-    another ending or a file that cannot be written.
+    the camera will see (a pyramid). scene: the true one, from which the view is chosen. settings: of each
+    moment. Raises InputError for another ending or a file that cannot be written.
     """
     path = check_output(file, (".png",))
     found = moments(explorer)
@@ -61,10 +63,10 @@ def write_exploration_picture(explorer: RecordedExplorer, scene: Scene, file: st
     whole = np.concatenate([_positions(moment) for moment in found])
     surfaces = style.robot_surfaces(explorer.robot)
     tool = style.tool_point(explorer.robot, surfaces)
-    size = TILE.width, TILE.height
+    size = settings.width, settings.height
     camera = view_of_motion(explorer.robot, scene, surfaces, tool, whole, *size, MARGINS)
     known = in_known_scene(explorer)
-    tiles = [_tile(explorer, found[i], known, camera) for i in chosen]
+    tiles = [_tile(explorer, found[i], known, camera, settings) for i in chosen]
     buffer = io.BytesIO()
     _joined(tiles).save(buffer, "PNG", optimize=False)
     write_atomically(path, buffer.getvalue())
@@ -77,7 +79,13 @@ def _positions(moment: Moment) -> Float[ndarray, "n dof"]:
     return motion.path.positions
 
 
-def _tile(explorer: RecordedExplorer, moment: Moment, known: ndarray, camera: Camera) -> Image.Image:
+def _tile(
+    explorer: RecordedExplorer,
+    moment: Moment,
+    known: Bool[ndarray, "nx ny nz"],
+    camera: Camera,
+    settings: PictureSettings,
+) -> Image.Image:
     robot, act = explorer.robot, moment.act
     shown = shown_voxels(moment.known, act, known)
     occupied = faces_surface(shown.occupied, ~shown.occupied, style.OBSERVED)
@@ -89,7 +97,7 @@ def _tile(explorer: RecordedExplorer, moment: Moment, known: ndarray, camera: Ca
     ]
     look = [tube(edge, LOOK_COLOR, LOOK_COLOR) for edge in frustum(explorer, act)]
     motion = act.trajectory or Path(robot.joint_names, _positions(moment))
-    pixels, _ = render(robot, explorer.scene, motion, TILE, camera, added=(occupied, *look), clear=clear)
+    pixels, _ = render(robot, explorer.scene, motion, settings, camera, added=(occupied, *look), clear=clear)
     image = Image.fromarray(faded_below(pixels))
     facts = [*moment.shares, *((name, "") for name in ("occupied", "predicted", "next look"))]
     caption(image, f"{moment.number}  {title(moment)}", facts, LABEL_COLORS, CAPTION_SIZE)
@@ -100,7 +108,7 @@ def _joined(tiles: list[Image.Image]) -> Image.Image:
     """The pictures in rows of two or three."""
     columns = min(len(tiles), 3 if len(tiles) > 4 else 2)
     rows = -(-len(tiles) // columns)
-    width, height = TILE.width + GAP, TILE.height + GAP
+    width, height = tiles[0].width + GAP, tiles[0].height + GAP
     sheet = Image.new("RGB", (columns * width - GAP, rows * height - GAP), GAP_COLOR)
     for i, tile in enumerate(tiles):
         sheet.paste(tile, (i % columns * width, i // columns * height))

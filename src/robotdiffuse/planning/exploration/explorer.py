@@ -25,7 +25,7 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
-from robotdiffuse.core.types import FIRST
+from robotdiffuse.core.types import FIRST, Trajectory
 from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
@@ -36,6 +36,7 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
 from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free
+from robotdiffuse.planning.exploration.stopping import Stop, stop_before
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.goals import Goal
@@ -127,6 +128,8 @@ class Explorer:
         self._planner = load_planner("aorrtc")
         self._rng, self._seed = np.random.default_rng(seed), seed
         self._views: list[DepthView] = []
+        self._news: list[DepthView] = []
+        """Views since the latest step."""
         self._goal: Goal | None = None
         self._looks = 0
         self._looked_for = np.zeros(FINE_SHAPE, np.uint8)
@@ -145,6 +148,14 @@ class Explorer:
         """Take a view into account; see `OccupancyMap.add`."""
         self.map.add(view, stamp)
         self._views = [*self._views, view][-self.settings.max_views :]
+        self._news.append(view)
+
+    def stop(self, motion: Trajectory, time: float) -> Stop | None:
+        """How a motion under way ends early, if what was observed since `next` returned it is in its way;
+        None if it is not. time: when a new command takes effect, on the motion's clock [s]. After the stop,
+        ask `next` again. See `stopping.stop_before`.
+        """
+        return stop_before(self.robot, self.scene, self._news, motion, time)
 
     def next(self, configuration: ArrayLike) -> Step:
         """What the arm, at rest at a configuration, shall do next.
@@ -154,6 +165,7 @@ class Explorer:
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
+        self._news = []
         if isinstance(self._goal, JointGoal) and self._at_goal(q, self._goal.positions):
             return Step(DONE, "the arm is at the goal")
         if not self._views:
