@@ -7,8 +7,8 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.planning.exploration.explorer import ExplorerSettings
-from robotdiffuse.planning.exploration.simulated import camera_beside
 from robotdiffuse.planning.exploration.stopping import braked
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.validator import verify
@@ -32,9 +32,10 @@ def motion() -> rd.Trajectory:
 
 
 def explorer_with_view(problem: rd.Problem, q: np.ndarray) -> rd.Explorer:
-    """An explorer that sees the problem's scene from beside, with the arm at a configuration."""
+    """An explorer that sees the problem's scene from in front, with the arm at a configuration."""
     explorer = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), settings=ExplorerSettings(time_limit=1.0))
-    explorer.observe(camera_beside(replace(problem, start=q), None, 0))
+    T = looking_at(np.array([1.3, -0.8, 1.1]), np.array([0.3, 0.0, 0.4]))
+    explorer.observe(ray_cast(problem.scene, T, (300.0, 300.0, 159.5, 119.5), (320, 240), PANDA, q))
     return explorer
 
 
