@@ -1,5 +1,7 @@
 """RecordedExplorer: times, cameras, and what was known after each view."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from helpers.explorations import FLOOR, ZONE, recorded
@@ -12,7 +14,7 @@ def test_steps_and_views_are_kept_with_their_times() -> None:
     acts, views = explorer.acts, explorer.views
     assert len(acts) >= 2 and acts[-1].step.motion is None
     np.testing.assert_array_equal(acts[0].configuration, problem.start)
-    for before, after in zip(acts, acts[1:], strict=False):
+    for before, after in pairwise(acts):
         assert after.begins == before.begins + before.duration
         assert before.trajectory is not None
         np.testing.assert_allclose(before.trajectory.positions[-1], after.configuration, atol=1e-9)
@@ -25,7 +27,7 @@ def test_steps_and_views_are_kept_with_their_times() -> None:
             assert act.begins < view.time <= act.begins + act.duration
     assert [view.camera for view in views[:2]] == [None, 0], "the camera beside the arm, then that on it"
     looks = [act for act in acts if act.step.kind == "look"]
-    assert all(act.T_base_camera is not None for act in looks)
+    assert looks and all(act.T_base_camera is not None for act in looks)
     assert all(act.T_base_camera is None for act in acts if act.step.kind != "look")
 
 

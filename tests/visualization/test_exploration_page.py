@@ -42,7 +42,7 @@ def numbers(text: str) -> list[int]:
 
 
 def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
-    problem, explorer = recorded()
+    _, explorer = recorded()
     found = re.search(r'id="data">(.*?)</script>', page.read_text("utf-8"), re.S)
     assert found is not None
     data = json.loads(found[1])
