@@ -71,7 +71,7 @@ PROBLEM_ATTACHMENT = "problem.json"
 class McapWriter:
     """Writes Protobuf and ROS 2 messages to one MCAP file."""
 
-    def __init__(self, stream: io.BufferedIOBase) -> None:
+    def __init__(self, stream: io.BytesIO | io.BufferedWriter) -> None:
         self.writer = Writer(stream)
         self.writer.start(profile="", library="robotdiffuse")
         self._channels: dict[str, int] = {}
