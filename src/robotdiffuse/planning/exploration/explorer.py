@@ -128,14 +128,14 @@ class Explorer:
         self._planner = load_planner("aorrtc")
         self._rng, self._seed = np.random.default_rng(seed), seed
         self._views: list[DepthView] = []
-        self._news: list[DepthView] = []
-        """Views since the latest step."""
         self._goal: Goal | None = None
         self._looks = 0
         self._looked_for = np.zeros(FINE_SHAPE, np.uint8)
         """How many looks were made for each voxel."""
         self._way_in: Float[ndarray, "n dof"] | None = None
         """Waypoints of the latest motion that was returned."""
+        self._news: list[DepthView] = []
+        """Views since the latest step."""
 
     def set_goal(self, goal: ArrayLike | Goal) -> None:
         """The next goal: configurations, or poses as `rd.Problem` takes them. What was seen is kept."""
@@ -149,13 +149,6 @@ class Explorer:
         self.map.add(view, stamp)
         self._views = [*self._views, view][-self.settings.max_views :]
         self._news.append(view)
-
-    def stop(self, motion: Trajectory, time: float) -> Stop | None:
-        """How a motion under way ends early, if what was observed since `next` returned it is in its way;
-        None if it is not. time: when a new command takes effect, on the motion's clock [s]. After the stop,
-        ask `next` again. See `stopping.stop_before`.
-        """
-        return stop_before(self.robot, self.scene, self._news, motion, time)
 
     def next(self, configuration: ArrayLike) -> Step:
         """What the arm, at rest at a configuration, shall do next.
@@ -181,6 +174,13 @@ class Explorer:
         if step.motion is not None and step.motion.path is not None:
             self._way_in = step.motion.path.positions
         return replace(step, seen=problem.scene)
+
+    def stop(self, motion: Trajectory, time: float) -> Stop | None:
+        """How a motion under way ends early, if what was observed since `next` returned it is in its way;
+        None if it is not. time: when a new command takes effect, on the motion's clock [s]. After the stop,
+        ask `next` again. See `stopping.stop_before`.
+        """
+        return stop_before(self.robot, self.scene, self._news, motion, time)
 
     def _at_goal(self, q: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> bool:
         return bool((np.abs(goals - q).max(axis=1) < AT_GOAL).any())
