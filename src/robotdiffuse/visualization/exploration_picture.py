@@ -42,8 +42,11 @@ GAP = 6
 """Between moments [pixels]."""
 GAP_COLOR = (0xFF, 0xFF, 0xFF)
 UNKNOWN_ALPHA, PREDICTED_ALPHA = 0.27, 0.55
-LABEL_COLORS = ((0x8A, 0x93, 0xA0), UNKNOWN, style.OBSERVED, style.ASSUMED, LOOK_COLOR)
+SHARE_COLORS = ((0x8A, 0x93, 0xA0), UNKNOWN)
+"""Of the labels of the shares that were seen free, and unknown."""
 CAPTION_SIZE = 1.7
+FADE = (0.7, 0.95)
+"""Where moments fade behind their caption, and how much; see `faded_below`."""
 WHITE = (0xFF, 0xFF, 0xFF)
 
 
@@ -59,7 +62,7 @@ def write_exploration_picture(
     """
     path = check_output(file, (".png",))
     found = moments(explorer)
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(MAX_MOMENTS, len(found))).round().astype(int))
+    chosen = _chosen(len(found))
     whole = np.concatenate([_positions(moment) for moment in found])
     surfaces = style.robot_surfaces(explorer.robot)
     tool = style.tool_point(explorer.robot, surfaces)
@@ -70,6 +73,13 @@ def write_exploration_picture(
     buffer = io.BytesIO()
     _joined(tiles).save(buffer, "PNG", optimize=False)
     write_atomically(path, buffer.getvalue())
+
+
+def _chosen(count: int) -> list[int]:
+    """The first moment, the last two, and others between them."""
+    if count <= MAX_MOMENTS:
+        return list(range(count))
+    return [*np.linspace(0, count - 3, MAX_MOMENTS - 2).round().astype(int), count - 2, count - 1]
 
 
 def _positions(moment: Moment) -> Float[ndarray, "n dof"]:
@@ -98,9 +108,15 @@ def _tile(
     look = [tube(edge, LOOK_COLOR, LOOK_COLOR) for edge in frustum(explorer, act)]
     motion = act.trajectory or Path(robot.joint_names, _positions(moment))
     pixels, _ = render(robot, explorer.scene, motion, settings, camera, added=(occupied, *look), clear=clear)
-    image = Image.fromarray(faded_below(pixels))
-    facts = [*moment.shares, *((name, "") for name in ("occupied", "predicted", "next look"))]
-    caption(image, f"{moment.number}  {title(moment)}", facts, LABEL_COLORS, CAPTION_SIZE)
+    image = Image.fromarray(faded_below(pixels, *FADE))
+    drawn = {
+        "occupied": style.OBSERVED,
+        **({} if act.predicted is None else {"predicted": style.ASSUMED}),
+        **({"next look": LOOK_COLOR} if look else {}),
+    }
+    facts = [*moment.shares, *((name, "") for name in drawn)]
+    colors = (*SHARE_COLORS, *drawn.values())
+    caption(image, f"{moment.number}  {title(moment)}", facts, colors, CAPTION_SIZE)
     return image
 
 

@@ -349,10 +349,13 @@ def _to_srgb(image: Float[ndarray, "h w 3"]) -> np.ndarray:
     return np.round(255 * srgb.clip(0, 1)).astype(np.uint8)
 
 
-def faded_below(pixels: np.ndarray) -> np.ndarray:
-    """The picture faded at its lower edge, so that the caption is readable."""
-    rise = (np.linspace(0, 1, len(pixels)) - 0.84).clip(0, None)[:, None, None] / 0.16
-    cover = 0.8 * rise * rise * (3 - 2 * rise)
+def faded_below(pixels: np.ndarray, begin: float = 0.84, most: float = 0.8) -> np.ndarray:
+    """The picture faded at its lower edge, so that the caption is readable.
+
+    begin: where it begins to fade, as a share of the height. most: how much it is faded at the edge.
+    """
+    rise = (np.linspace(0, 1, len(pixels)) - begin).clip(0, None)[:, None, None] / (1 - begin)
+    cover = most * rise * rise * (3 - 2 * rise)
     return (pixels + cover * (np.array(CAPTION_COLOR) - pixels)).round().astype(np.uint8)
 
 
