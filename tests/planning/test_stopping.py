@@ -32,10 +32,15 @@ def motion() -> rd.Trajectory:
 
 
 def explorer_with_view(problem: rd.Problem, q: np.ndarray) -> rd.Explorer:
-    """An explorer that sees the problem's scene from in front, with the arm at a configuration."""
+    """An explorer that saw an empty scene when it chose the motion, and the problem's with the arm at a
+    configuration on it, from in front."""
     explorer = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), settings=ExplorerSettings(time_limit=1.0))
     T = looking_at(np.array([1.3, -0.8, 1.1]), np.array([0.3, 0.0, 0.4]))
-    explorer.observe(ray_cast(problem.scene, T, (300.0, 300.0, 159.5, 119.5), (320, 240), PANDA, q))
+    camera = (300.0, 300.0, 159.5, 119.5), (320, 240), PANDA
+    explorer.observe(ray_cast(EMPTY.scene, T, *camera, LEFT))
+    explorer.set_goal(RIGHT)
+    explorer.next(LEFT)
+    explorer.observe(ray_cast(problem.scene, T, *camera, q))
     return explorer
 
 
@@ -47,14 +52,13 @@ def test_the_arm_stops_before_a_ball_that_appears(motion: rd.Trajectory) -> None
     explorer = explorer_with_view(true, motion.at(seen_at).positions)
     stop = explorer.stop(motion, seen_at + LATENCY)
     assert stop is not None and stop.certified and stop.begins == seen_at + LATENCY
-    assert "seen" in stop.reason
+    assert "appeared" in stop.reason
     rest = stop.motion.positions[-1]
     way = np.concatenate([motion.positions[motion.times < stop.begins], stop.motion.positions])
     reached = replace(true, goal=rest)
     report = verify(reached, rd.Path(PANDA.joint_names, way))
     assert report.valid, report.violation
     assert np.abs(motion.positions - rest).max(axis=1).min() < 0.02, "it stays on the path"
-    explorer.set_goal(RIGHT)
     assert explorer.next(rest).kind in ("go", "look", "stuck")
     assert explorer.stop(motion, seen_at) is None, "what was seen before the step is in its motion"
 
@@ -76,6 +80,20 @@ def test_too_late_a_stop_is_not_certified(motion: rd.Trajectory) -> None:
     explorer = explorer_with_view(true, motion.at(0.2).positions)
     stop = explorer.stop(motion, contact - 0.03)
     assert stop is not None and not stop.certified
+
+
+def test_certified_stops_are_free_in_the_true_scene(motion: rd.Trajectory) -> None:
+    true = replace(EMPTY, scene=rd.Scene([FLOOR, BALL]))
+    explorer = explorer_with_view(true, motion.at(0.05).positions)
+    said = []
+    for time in np.linspace(0.1, 0.5 * motion.duration, 9):
+        stop = explorer.stop(motion, float(time))
+        assert stop is not None
+        said.append(stop.certified)
+        way = np.concatenate([motion.positions[motion.times < time], stop.motion.positions])
+        valid = verify(replace(true, goal=way[-1]), rd.Path(PANDA.joint_names, way)).valid
+        assert valid or not stop.certified
+    assert said[0] and not said[-1], "the later, the harder"
 
 
 @pytest.mark.parametrize("share", np.linspace(0.0, 0.95, 8))

@@ -136,6 +136,8 @@ class Explorer:
         """Waypoints of the latest motion that was returned."""
         self._news: list[DepthView] = []
         """Views since the latest step."""
+        self._free = self.map.free
+        """Voxels that were free then."""
 
     def set_goal(self, goal: ArrayLike | Goal) -> None:
         """The next goal: configurations, or poses as `rd.Problem` takes them. What was seen is kept."""
@@ -158,7 +160,7 @@ class Explorer:
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
-        self._news = []
+        self._news, self._free = [], self.map.free
         if isinstance(self._goal, JointGoal) and self._at_goal(q, self._goal.positions):
             return Step(DONE, "the arm is at the goal")
         if not self._views:
@@ -180,7 +182,7 @@ class Explorer:
         None if it is not. time: when a new command takes effect, on the motion's clock [s]. After the stop,
         ask `next` again. See `stopping.stop_before`.
         """
-        return stop_before(self.robot, self.scene, self._news, motion, time)
+        return stop_before(self.robot, self.scene, self._news, self._free, motion, time)
 
     def _at_goal(self, q: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> bool:
         return bool((np.abs(goals - q).max(axis=1) < AT_GOAL).any())
