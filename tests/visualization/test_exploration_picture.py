@@ -8,14 +8,7 @@ from PIL import Image
 
 from helpers.explorations import recorded
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.visualization.exploration import (
-    UNKNOWN,
-    frustum,
-    in_known_scene,
-    moments,
-    shown_voxels,
-    title,
-)
+from robotdiffuse.visualization.exploration import moments
 from robotdiffuse.visualization.exploration_picture import GAP, write_exploration_picture
 from robotdiffuse.visualization.picture import PictureSettings
 
@@ -35,19 +28,3 @@ def test_each_moment_has_a_picture(tmp_path: Path) -> None:
     assert blue > 50, "the wall was seen"
     with pytest.raises(InputError):
         write_exploration_picture(explorer, problem.scene, tmp_path / "explore.html", SMALL)
-
-
-def test_moments_show_what_was_known_before_them() -> None:
-    _, explorer = recorded()
-    known = in_known_scene(explorer)
-    found = moments(explorer)
-    assert [moment.number for moment in found] == list(range(1, len(explorer.acts) + 1))
-    for moment in found:
-        assert moment.known.act < moment.number - 1 or moment.known.act == -1
-        shown = shown_voxels(moment.known, moment.act, known)
-        assert not (shown.occupied & known).any() and not (shown.predicted & ~shown.unknown).any()
-        assert title(moment).startswith(
-            {"done": "at the goal"}.get(moment.act.step.kind, moment.act.step.kind)
-        )
-        assert len(frustum(explorer, moment.act)) == (5 if moment.act.T_base_camera is not None else 0)
-    assert len(UNKNOWN) == 3
