@@ -26,6 +26,7 @@ FLOOR = rd.Box((0, 0, -0.06), (6, 6, 0.1), name="floor")
 WALL = rd.Box((0.45, -0.2, 0.3), (0.5, 0.02, 0.6), name="wall")
 ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
 LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (0.5, -1.7))
+OUTSIDE = np.array([-1.7, 0.3, 0.0, -1.8, 0.0, 2.0, 0.785])
 PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), LEFT, RIGHT)
 """From one side of a wall to the other."""
 
@@ -134,14 +135,16 @@ def test_stray_points_that_other_views_see_through_are_no_obstacles() -> None:
 
 def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> None:
     camera = replace(wrist_camera(PANDA), range=0.01)  # no look of it shows anything
-    one = rd.Explorer(PANDA, [camera], rd.Scene([FLOOR]), ZONE, ExplorerSettings(time_limit=1.0))
-    one.observe(camera_beside(PROBLEM, None, 0))
+    zone = ((-0.36, -0.36, 0.0), (0.9, 0.9, 1.1))  # all that is known; OUTSIDE reaches out of it
+    one = rd.Explorer(PANDA, [camera], rd.Scene([FLOOR]), zone, ExplorerSettings(time_limit=1.0))
+    view = camera_beside(PROBLEM, None, 0)
+    one.observe(replace(view, depth=np.zeros_like(view.depth)))
     inner = PROBLEM.start + np.array([0.1, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0])
     one.set_goal(inner)
     step = one.next(PROBLEM.start)
     assert step.kind == "go" and step.motion is not None and step.motion.path is not None
     way_in = step.motion.path.positions
-    one.set_goal(PROBLEM.goal)
+    one.set_goal(OUTSIDE)
     step = one.next(way_in[-1])
     assert (step.kind, step.policy) == ("look", "strict") and "back on the way in" in step.reason
     assert step.motion is not None and step.motion.solved and step.motion.path is not None
