@@ -1,6 +1,7 @@
 """Explorer: what its motions promise, against scenes that it sees by simulated cameras alone."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ FLOOR = rd.Box((0, 0, -0.06), (6, 6, 0.1), name="floor")
 WALL = rd.Box((0.45, -0.2, 0.3), (0.5, 0.02, 0.6), name="wall")
 ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
 LEFT, RIGHT = (np.array([turn, *HOME[1:]]) for turn in (0.5, -1.7))
+OUTSIDE = np.array([-1.7, 0.3, 0.0, -1.8, 0.0, 2.0, 0.785])
 PROBLEM = rd.Problem(PANDA, rd.Scene([FLOOR, WALL]), LEFT, RIGHT)
 """From one side of a wall to the other."""
 
@@ -111,3 +113,53 @@ def test_what_keeps_the_arm_from_going_is_said() -> None:
     assert step.kind == "stuck" and "no camera is on the arm" in step.reason
     with pytest.raises(InputError, match=r"unknown explorer\.policy"):
         replace(ExplorerSettings(), policy="bold")
+
+
+def test_stray_points_that_other_views_see_through_are_no_obstacles() -> None:
+    one, view = explorer(seen=False), camera_beside(PROBLEM, None, 0)
+    depth, (v, u) = view.depth.copy(), (200, 150)
+    depth[v - 8 : v + 8, u - 8 : u + 8] = 1.0
+    fx, fy, cx, cy = view.intrinsics
+    stray = view.T_base_camera @ [(u - cx) / fx, (v - cy) / fy, 1.0, 1.0]
+    one.set_goal(PROBLEM.start + 0.05)
+    gaps = []
+    for observed in (replace(view, depth=depth), view, view):
+        one.observe(observed)
+        seen = one.next(PROBLEM.start).seen
+        assert seen is not None
+        points = np.concatenate([shape.points for shape in seen.shapes if isinstance(shape, rd.PointCloud)])
+        gaps.append(np.linalg.norm(points - stray[:3], axis=1).min())
+    assert view.depth[v, u] > 1.1 and gaps[0] < 0.02
+    assert gaps[-1] > 0.05
+
+
+def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> None:
+    camera = replace(wrist_camera(PANDA), range=0.01)  # no look of it shows anything
+    zone = ((-0.36, -0.36, 0.0), (0.9, 0.9, 1.1))  # all that is known; OUTSIDE reaches out of it
+    one = rd.Explorer(PANDA, [camera], rd.Scene([FLOOR]), zone, ExplorerSettings(time_limit=1.0))
+    view = camera_beside(PROBLEM, None, 0)
+    one.observe(replace(view, depth=np.zeros_like(view.depth)))
+    inner = PROBLEM.start + np.array([0.1, 0.0, 0.0, -0.1, 0.0, 0.0, 0.0])
+    one.set_goal(inner)
+    step = one.next(PROBLEM.start)
+    assert step.kind == "go" and step.motion is not None and step.motion.path is not None
+    way_in = step.motion.path.positions
+    one.set_goal(OUTSIDE)
+    step = one.next(way_in[-1])
+    assert (step.kind, step.policy) == ("look", "strict") and "back on the way in" in step.reason
+    assert step.motion is not None and step.motion.solved and step.motion.path is not None
+    back = step.motion.path.positions
+    line = np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(way_in)])
+    assert np.allclose(back[0], way_in[-1])
+    assert all(np.linalg.norm(line - q, axis=1).min() < 0.01 for q in back)
+    assert np.linalg.norm(back[-1] - back[0]) > 0.01
+
+
+def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough() -> None:
+    """By chance, the arm looked on, whatever it saw: a rate of 0.82 was the highest confidence."""
+    settings = ExplorerSettings(policy="chance", predict=False, time_limit=1.0)
+    one = rd.Explorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
+    one.observe(camera_beside(PROBLEM, None, 0))
+    one.set_goal(PROBLEM.start + 0.02)
+    step = one.next(PROBLEM.start)
+    assert (step.kind, step.policy, step.confidence) == ("go", "strict", None)

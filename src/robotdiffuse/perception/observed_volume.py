@@ -57,25 +57,37 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof
     """
     if not len(views):
         raise InputError("views is empty; at least one depth view is needed")
+    return merged([_observed(view, robot, start) for view in views])
+
+
+def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
+    """What several volumes tell together: a voxel is occupied, or else free, if any of them says so."""
     occupied, free, shadow = (np.zeros(SHAPE, np.bool_) for _ in range(3))
     out, behind = np.ones(SHAPE, np.bool_), np.full(SHAPE, np.inf, np.float32)
-    state, depth, counts = np.empty(SHAPE, np.uint8), np.empty(SHAPE, np.float32), np.empty(SHAPE, np.int32)
-    for view in views:
-        q = start if view.configuration is None else view.configuration
-        if len(q) != robot.dof:
-            raise InputError(
-                f"view.configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints"
-            )
-        carve_view(view, robot, q, ARM_MARGIN, VOXEL, state, depth, counts)
-        occupied |= counts > 0
-        free |= state == FREE
-        shadow |= state == SHADOW
-        out &= state == OUT
-        np.copyto(behind, depth, where=(state == BEHIND) & (depth < behind))
+    for volume in volumes:
+        occupied |= volume.occupied
+        free |= volume.free
+        shadow |= volume.shadow
+        out &= volume.out_of_view
+        np.copyto(behind, volume.behind, where=(volume.behind > 0) & (volume.behind < behind))
     free &= ~occupied
     known = free | occupied
     behind[~np.isfinite(behind) | known] = 0.0
     return ObservedVolume(occupied, free, shadow & ~known, out, behind)
+
+
+def _observed(view: DepthView, robot: Robot, start: Float[ndarray, "dof"]) -> ObservedVolume:
+    """The volume observed by one view."""
+    q = start if view.configuration is None else view.configuration
+    if len(q) != robot.dof:
+        raise InputError(f"view.configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints")
+    state, depth, counts = np.empty(SHAPE, np.uint8), np.empty(SHAPE, np.float32), np.empty(SHAPE, np.int32)
+    carve_view(view, robot, q, ARM_MARGIN, VOXEL, state, depth, counts)
+    occupied = counts > 0
+    depth[(state != BEHIND) | occupied] = 0.0
+    return ObservedVolume(
+        occupied, (state == FREE) & ~occupied, (state == SHADOW) & ~occupied, state == OUT, depth
+    )
 
 
 def carve_view(

@@ -53,8 +53,8 @@ class OccupancyMap:
         self._state, self._behind = np.empty(FINE_SHAPE, np.uint8), np.empty(FINE_SHAPE, np.float32)
         self._counts = np.empty(FINE_SHAPE, np.int32)
 
-    def add(self, view: DepthView, stamp: float = 0.0) -> None:
-        """Take a view into account.
+    def add(self, view: DepthView, stamp: float = 0.0) -> int:
+        """Take a view into account; returns the number of voxels that nothing was known of before.
 
         stamp: when it was taken [s]; `view.configuration` is the arm's at that time. Raises InputError for a
         view without a configuration, or with one of the wrong length.
@@ -67,7 +67,10 @@ class OccupancyMap:
             )
         margin = self.settings.arm_margin
         carve_view(view, self.robot, q, margin, FINE_VOXEL_SIZE, self._state, self._behind, self._counts)
-        self._update(self._counts > 0, self._state == FREE, stamp)
+        hit, free = self._counts > 0, self._state == FREE
+        told = int(np.count_nonzero((hit | free) & (self._evidence == 0)))
+        self._update(hit, free, stamp)
+        return told
 
     def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], such as those of a cloud without a camera

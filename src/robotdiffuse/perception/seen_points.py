@@ -96,13 +96,24 @@ def seen_shapes(
     start: Float[ndarray, "dof"],
     goals: Float[ndarray, "n dof"],
 ) -> tuple[SeenPoints, ...]:
-    """The observed points as obstacles, without those of known shapes.
+    """The points that views observed as obstacles; see `point_shapes`."""
+    return point_shapes(seen_points(views, robot, start), robot, known, start, goals)
+
+
+def point_shapes(
+    points: Float[ndarray, "points 3"],
+    robot: Robot,
+    known: Scene,
+    start: Float[ndarray, "dof"],
+    goals: Float[ndarray, "n dof"],
+) -> tuple[SeenPoints, ...]:
+    """Observed points as obstacles, without those of known shapes.
 
     Points get POINT_RADIUS, but those that the arm's spheres at start or goals would then touch get
     MIN_POINT_RADIUS: this safety margin must not make a free start or goal invalid. Points within
     KNOWN_DISTANCE of a known shape are left out.
     """
-    points = seen_points(views, robot, start)
+    points = points.astype(np.float32)
     if known.shapes:
         points = points[~near_scene(compile_scene_for(robot, known), points, np.float32(KNOWN_DISTANCE))]
     ends = np.concatenate([placed_spheres(robot, q) for q in (start, *goals)]).astype(np.float32)

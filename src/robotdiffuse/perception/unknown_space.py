@@ -13,10 +13,9 @@ from robotdiffuse.perception.assumptions import (
     CARVING_MARGIN,
     FINE_SHAPE,
     FINE_VOXEL_SIZE,
-    refined,
     voxels_in,
 )
-from robotdiffuse.perception.observed_volume import LOW, ObservedVolume
+from robotdiffuse.perception.observed_volume import LOW
 from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, sweep
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
@@ -33,17 +32,19 @@ class UnknownSpace:
         self,
         robot: Robot,
         occupied_by_arm: Float[ndarray, "n dof"],
-        volume: ObservedVolume,
+        unknown: Bool[ndarray, "nx ny nz"],
         predicted: Float32[ndarray, "nx ny nz"] | None,
+        margin: float = CARVING_MARGIN,
     ) -> None:
         """
+        unknown: the fine voxels that no view saw.
         occupied_by_arm: configurations at which the arm is known to be free: the start and the goals.
         predicted: the probability that each fine voxel is occupied; None without a prediction.
+        margin: voxels nearer than this to the arm at those configurations count as occupied by it [m].
         """
         self._robot = compile_robot(robot)
         spheres = [placed_spheres(robot, q).astype(np.float32) for q in occupied_by_arm]
-        self.unknown = refined(volume.unknown)
-        self.unknown &= ~voxels_in(np.concatenate(spheres), CARVING_MARGIN)
+        self.unknown = unknown & ~voxels_in(np.concatenate(spheres), margin)
         self.probability = None if predicted is None else np.where(self.unknown, predicted, np.float32(0))
 
     def crossed(self, path: Path) -> "CrossedSpace":

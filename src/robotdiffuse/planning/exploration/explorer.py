@@ -5,37 +5,53 @@ that cover all other space (`seen_free.py`). Exempt is the space within 2 cm of 
 and ends; seen points count there too. So the promise is as good as the map: in a scene that does not change,
 with a camera whose poses and errors are as stated, such a motion meets nothing.
 
-**Chance.** The arm goes if the motion's stated `confidence` is high enough, and looks first if it is not.
+**Chance.** The arm goes if the motion's stated `confidence` is high enough, and looks first if it is not. It
+follows from the predicted probability of all voxels that the map does not know and the motion sweeps, but for
+those that the arm fills where it begins and ends.
 
 Looks are chosen by what a tentative motion, planned among what was seen alone, would sweep unseen. A look's
 own motion is subject to the same policy; by chance, a strict one will do where none is confident enough.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import islice
-from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
+from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
-from robotdiffuse.core.types import FIRST, Trajectory
-from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in
+from robotdiffuse.core.types import FIRST, Path, Trajectory
+from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, voxels_in
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.perception.occupancy_map import Corners, MapSettings, OccupancyMap
+from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap
+from robotdiffuse.perception.seen_points import point_shapes
+from robotdiffuse.perception.swept_voxels_kernel import surface
+from robotdiffuse.perception.unknown_space import UnknownSpace
+from robotdiffuse.perception.view_memory import ViewMemory
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
 from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free
+from robotdiffuse.planning.exploration.steps import (
+    CHANCE,
+    DONE,
+    GO,
+    LOOK,
+    STRICT,
+    STRICT_THEN_CHANCE,
+    STUCK,
+    ExplorerSettings,
+    Step,
+)
 from robotdiffuse.planning.exploration.stopping import Stop, stop_before
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
@@ -45,14 +61,10 @@ from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-GO, LOOK, DONE, STUCK = "go", "look", "done", "stuck"
-"""What a step asks for."""
-STRICT, CHANCE, STRICT_THEN_CHANCE = "strict", "chance", "strict_then_chance"
-POLICIES = (STRICT, CHANCE, STRICT_THEN_CHANCE)
-NOTHING = Scene(())
-QUICK_FRACTION = 0.3
+NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
+QUICK_FRACTION = 0.2
 """Part of the time limit for a search within space seen free that a look, or another search, may follow."""
-TENTATIVE_MOTIONS = 6
+TENTATIVE_MOTIONS = 2
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
 MAX_LOOKS_FOR = 2
 """Voxels that this many looks did not show are avoided by the motions that looks are made for."""
@@ -60,46 +72,6 @@ WAY_BACK_SHARES = (0.25, 0.5, 1.0)
 """Parts of the way in that the arm may go back."""
 AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
-
-
-@dataclass(frozen=True)
-class ExplorerSettings(Settings, name="explorer"):
-    policy: Annotated[str, OneOf(POLICIES)] = STRICT
-    """strict: only through space seen free; chance: where the stated confidence is high enough;
-    strict_then_chance: the latter where the former leads nowhere."""
-    confidence: Annotated[float, Bound(least=0.0, most=1.0)] = 0.98
-    """Least stated confidence of motions by chance."""
-    time_limit: Positive = 1.0
-    """Time limit of each search [s]."""
-    max_looks: Natural = 8
-    """Most looks on the way to a goal."""
-    look_attempts: Count = 4
-    """Looks to which a motion is searched for in a step, the most useful first."""
-    max_views: Count = 12
-    """The latest views give seen points and the prediction; the map holds what all views told."""
-    predict: bool = True
-    """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
-    reach."""
-    map: MapSettings = field(default_factory=MapSettings)
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """What the arm shall do next."""
-
-    kind: Literal["go", "look", "done", "stuck"]
-    """go: execute the motion, which ends at the goal; look: execute the motion, if there is one, then
-    observe; done: the arm is at the goal; stuck: see `reason`."""
-    reason: str
-    policy: str = ""
-    """The policy that the motion keeps, "strict" or "chance"."""
-    motion: PlanResult | None = None
-    """Solved. A strict motion is certified against all that was not seen free; `motion.problem` holds these
-    obstacles."""
-    confidence: float | None = None
-    """Stated probability that a motion by chance is free."""
-    seen: Scene | None = None
-    """The known scene and the points that the latest views saw; None where nothing was planned."""
 
 
 class Explorer:
@@ -111,7 +83,7 @@ class Explorer:
         cameras: Sequence[ArmCamera] = (),
         scene: Scene = NOTHING,
         free_zone: Corners | None = None,
-        settings: ExplorerSettings = ExplorerSettings(),
+        settings: ExplorerSettings = DEFAULTS,
         seed: int = 0,
     ) -> None:
         """
@@ -125,9 +97,9 @@ class Explorer:
         self.map = OccupancyMap(robot, settings.map)
         if free_zone is not None:
             self.map.declare_free(free_zone)
-        self._planner = load_planner("aorrtc")
+        self._planner = load_planner("robotdiffuse")
         self._rng, self._seed = np.random.default_rng(seed), seed
-        self._views: list[DepthView] = []
+        self._views = ViewMemory(robot, settings.max_views)
         self._goal: Goal | None = None
         self._looks = 0
         self._looked_for = np.zeros(FINE_SHAPE, np.uint8)
@@ -148,8 +120,8 @@ class Explorer:
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
-        self.map.add(view, stamp)
-        self._views = [*self._views, view][-self.settings.max_views :]
+        told = self.map.add(view, stamp)
+        self._views.add(view, told)
         self._news.append(view)
 
     def next(self, configuration: ArrayLike) -> Step:
@@ -163,9 +135,13 @@ class Explorer:
         self._news, self._free = [], self.map.free
         if isinstance(self._goal, JointGoal) and self._at_goal(q, self._goal.positions):
             return Step(DONE, "the arm is at the goal")
-        if not self._views:
+        if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
-        problem = Problem(self.robot, self.scene, q, self._goal, views=self._views)
+        goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
+        seen = point_shapes(self._seen_points(), self.robot, self.scene, q, goals)
+        scene = self.scene.with_shapes([*self.scene.shapes, *seen])
+        problem = Problem(self.robot, scene, q, self._goal)
+        self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
         policies = (STRICT, CHANCE) if self.settings.policy == STRICT_THEN_CHANCE else (self.settings.policy,)
         step = Step(STUCK, "")
         for policy in policies:
@@ -176,6 +152,19 @@ class Explorer:
         if step.motion is not None and step.motion.path is not None:
             self._way_in = step.motion.path.positions
         return replace(step, seen=problem.scene)
+
+    def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
+        """The voxels that looks are to show: unknown ones that a tentative motion sweeps."""
+        return swept_unseen(self.map, path)
+
+    def _seen_points(self) -> Float[ndarray, "n 3"]:
+        """The points that kept views observed, without those where more views see through: stray pixels."""
+        points = self._views.points()
+        at = np.floor((points - LOW) / FINE_VOXEL_SIZE).astype(np.int64)
+        inside = ((at >= 0) & (at < FINE_SHAPE)).all(axis=1)
+        stray = np.zeros(len(points), np.bool_)
+        stray[inside] = self.map.free[tuple(at[inside].T)]
+        return points[~stray]
 
     def stop(self, motion: Trajectory, time: float) -> Stop | None:
         """How a motion under way ends early, if what was observed since `next` returned it is in its way;
@@ -189,7 +178,7 @@ class Explorer:
 
     def _step(self, problem: Problem, policy: str) -> Step:
         """The step under one policy."""
-        predicted = self._predicted(problem) if policy == CHANCE else None
+        predicted = self._predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit
         quick = may_look and policy == STRICT
@@ -229,21 +218,28 @@ class Explorer:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
         if self._looks >= self.settings.max_looks:
             return Step(STUCK, f"{why}, after {self._looks} looks", policy)
-        as_seen = replace(problem, views=())
-        wanted = swept_unseen(self.map, motion.path) if motion.path else self._least_unseen(as_seen)
-        if isinstance(wanted, str):
-            return Step(STUCK, f"no motion among what was seen: {wanted}", policy)
-        predicted = self._predicted(problem) if predicted is None else predicted
-        allowed = as_seen.scene
+        path = motion.path
+        tentative, wanted = self._least_unseen(problem) if path is None else (motion, self.wanted(path))
+        if tentative.path is None:
+            return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
+        kept, under = None, policy
+        if policy == CHANCE and predicted is not None:
+            kept = self._with_confidence(tentative, predicted)
+        elif not wanted.any():
+            kept, under = self._within_seen_free(problem, tentative.path.positions, "as seen"), STRICT
+        if kept is not None and self._good(kept, under):
+            return self._go(kept, under)
+        predicted = self._predicted() if predicted is None else predicted
+        allowed = problem.scene
         if policy == STRICT:
             obstacles = not_seen_free(self.map, self.scene, (problem.start,))
-            allowed = as_seen.scene.with_shapes([*as_seen.scene.shapes, *obstacles])
+            allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         for camera in self.cameras:
             looks = best_looks(self.map, allowed, camera, wanted, predicted, problem.start, self._rng)
             for there in islice(looks, self.settings.look_attempts):
                 look = replace(problem, goal=JointGoal(there[None]))
                 if policy == STRICT:
-                    way = self._planned(replace(look, scene=allowed, views=()), self._quick_limit)
+                    way = self._planned(replace(look, scene=allowed), self._quick_limit)
                 else:
                     way = self._by_chance(look, predicted, self.settings.time_limit)
                 if self._good(way, policy):
@@ -252,7 +248,7 @@ class Explorer:
                     return Step(LOOK, f"{why}; look there first", policy, way, stated)
         if policy == self.settings.policy == CHANCE:
             strict = self._look(problem, STRICT, predicted, motion)
-            if strict.kind == LOOK:
+            if strict.kind != STUCK:
                 return strict
         back = self._way_back(problem) if policy == STRICT else None
         if back is not None:
@@ -266,36 +262,42 @@ class Explorer:
             return None
         for share in WAY_BACK_SHARES:
             waypoints = _first_part(way[::-1], share)
-            obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
-            scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-            leaving = replace(problem, scene=scene, goal=JointGoal(waypoints[-1:]), views=())
-            context = PlanningContext(self._planner.name, leaving, PlanRequest(self.settings.time_limit))
-            found = context.finish(waypoints, "the way in", "back on the way in")
+            found = self._within_seen_free(problem, waypoints, "back on the way in")
             if found is not None:
-                return replace(found, problem=leaving)
+                return found
         return None
 
-    def _least_unseen(self, as_seen: Problem) -> Bool[ndarray, "nx ny nz"] | str:
-        """What a motion among what was seen sweeps unseen: the least of several motions, which avoid voxels
-        that looks were made for in vain if they can; or why there is none."""
+    def _within_seen_free(
+        self, problem: Problem, waypoints: Float[ndarray, "n dof"], name: str
+    ) -> PlanResult | None:
+        """The motion along waypoints, if the validator accepts it within space seen free; else None."""
+        obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
+        scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
+        within = replace(problem, scene=scene, goal=JointGoal(waypoints[-1:]))
+        context = PlanningContext(self._planner.name, within, PlanRequest(self.settings.time_limit))
+        found = context.finish(waypoints, name, name)
+        return None if found is None else replace(found, problem=within)
+
+    def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Bool[ndarray, "nx ny nz"]]:
+        """A motion among what was seen, and what looks are to show of it: the least of several. Without any,
+        the result that says why.
+
+        They avoid occupied voxels, and those that looks were made for in vain, if they can."""
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
         ends = near_ends(self.map, (as_seen.start, *goals))
-        in_vain = np.argwhere((self._looked_for >= MAX_LOOKS_FOR) & self.map.unknown & ~ends)
-        avoided = cover(self.map, self.scene, in_vain, "looked for in vain")
+        in_vain = (self._looked_for >= MAX_LOOKS_FOR) & self.map.unknown
+        blocked = surface((self.map.occupied | in_vain) & ~ends)
+        avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
-        best = reason = None
-        for i in range(TENTATIVE_MOTIONS):
-            tentative = self._planned(avoiding, self._quick_limit, self._seed + i)
-            if tentative.path is None and best is None:
+        results = list[PlanResult]()
+        for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):
+            result = self._planned(avoiding, self._quick_limit, seed)
+            if result.path is None and not any(one.solved for one in results):
                 avoiding = as_seen
-                tentative = self._planned(as_seen, self.settings.time_limit, self._seed + i)
-            if tentative.path is None:
-                reason = tentative.reason
-                break
-            wanted = swept_unseen(self.map, tentative.path)
-            if best is None or wanted.sum() < best.sum():
-                best = wanted
-        return best if best is not None else str(reason)
+                result = self._planned(as_seen, self.settings.time_limit, seed)
+            results.append(result)
+        found = [(one, self.wanted(one.path)) for one in results if one.path is not None]
+        return min(found, key=lambda one: int(one[1].sum()), default=(results[-1], ends))
 
     @property
     def _quick_limit(self) -> float:
@@ -318,7 +320,7 @@ class Explorer:
         goal = goals[int(np.argmin(outside))]
         obstacles = not_seen_free(self.map, self.scene, (problem.start, goal))
         scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-        result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None]), views=()), limit)
+        result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None])), limit)
         if result.solved:
             return result
         return replace(result, reason=f"no motion within space seen free: {result.reason}")
@@ -329,36 +331,52 @@ class Explorer:
         """A motion among what was seen and predicted, with its confidence."""
         asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
         request = PlanRequest(limit, self._seed, FIRST)
-        result = plan_with_unknown_space(self._planner, asked, request, predicted)
-        if result.swept_probability is not None:
-            stated = confidence("predicted", result.swept_probability)
-            result = replace(result, confidence=stated)
-        return replace(result, problem=asked)
+        goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
+        unknown = self._unknown(np.stack([problem.start, *goals]), predicted)
+        result = plan_with_unknown_space(self._planner, asked, request, predicted, unknown)
+        return replace(self._with_confidence(result, predicted), problem=asked)
+
+    def _with_confidence(
+        self, motion: PlanResult, predicted: Float32[ndarray, "nx ny nz"] | None
+    ) -> PlanResult:
+        """The motion with the confidence that follows from the probability that it sweeps."""
+        if motion.path is None or predicted is None:
+            return motion
+        unknown = self._unknown(motion.path.positions[[0, -1]], predicted)
+        swept = unknown.crossed(motion.path).risk
+        return replace(motion, swept_probability=swept, confidence=confidence("explored", swept))
+
+    def _unknown(
+        self, ends: Float[ndarray, "n dof"], predicted: Float32[ndarray, "nx ny nz"] | None
+    ) -> UnknownSpace:
+        """What the map does not know, without the voxels that the arm fills at these configurations."""
+        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, margin=0.0)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
         """A first motion in the problem's scene as it is, found within a time limit [s]."""
+        compile_scene_for(self.robot, problem.scene)  # now, outside the time limit
         return self._planner.plan(problem, limit, self._seed if seed is None else seed, FIRST)
 
     def _goals(self, problem: Problem) -> Float[ndarray, "n dof"] | PlanResult:
         """The goal configurations, or the result that says why there is none."""
         if isinstance(problem.goal, JointGoal):
             return problem.goal.positions
-        as_seen = replace(problem, views=())
         request = PlanRequest(self.settings.time_limit, self._seed, FIRST)
-        usable = usable_start_goal(PlanningContext(self._planner.name, as_seen, request))
+        usable = usable_start_goal(PlanningContext(self._planner.name, problem, request))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 
     def _occupied_by(self, q: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
         return voxels_in(placed_spheres(self.robot, q).astype(np.float32))
 
-    def _predicted(self, problem: Problem) -> Float32[ndarray, "nx ny nz"] | None:
-        """The probability that each voxel is occupied; None without the network."""
+    def _predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
+        """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
+        network."""
         from robotdiffuse.learning.completion import predict
         from robotdiffuse.learning.completion.coverage import covers
 
         if not (self.settings.predict and covers(self.robot)):
             return None
-        return predict(observe(problem.views, self.robot, problem.start))
+        return np.where(self.map.free, np.float32(0), predict(self._views.volume()))
 
 
 def _first_part(waypoints: Float[ndarray, "n dof"], share: float) -> Float[ndarray, "m dof"]:

@@ -37,13 +37,13 @@ MIN_SEEN = 0.02
 
 
 def swept_unseen(known: OccupancyMap, path: Path) -> Bool[ndarray, "nx ny nz"]:
-    """The voxels that the map does not know to be free and whose covering balls a path touches, without
-    those near its ends, which count as free."""
+    """The voxels that the map does not know and whose covering balls a path touches, without those near its
+    ends, which count as free."""
     swept = np.zeros(FINE_SHAPE, np.bool_)
     positions, voxel = path.positions.astype(np.float32), np.float32(FINE_VOXEL_SIZE)
     low, margin = np.array(LOW, np.float32), np.float32(COVER_RADIUS)
     sweep(compile_robot(known.robot), positions, margin, low, voxel, swept)
-    return swept & ~known.free & ~near_ends(known, (path.positions[0], path.positions[-1]))
+    return swept & known.unknown & ~near_ends(known, (path.positions[0], path.positions[-1]))
 
 
 def best_looks(

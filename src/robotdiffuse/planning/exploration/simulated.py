@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
@@ -30,8 +31,8 @@ BESIDE_POSITION, BESIDE_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
 """Of the camera beside the arm [m]."""
 BESIDE_SIZE, BESIDE_FOCAL_LENGTH = (640, 480), 460.0
 """Width, height and focal length of its images [pixels]."""
-VIEWS_ON_THE_WAY = 2
-"""Images that are taken during a motion, apart from that at its end."""
+IMAGE_PERIOD, MAX_IMAGES = 0.25, 8
+"""Time between images during a motion [s], and the most images of a motion, that at its end included."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +95,14 @@ def explore(
     explorer: Explorer,
     noise: DepthNoise | None = None,
     seed: int = 0,
+    beside: DepthView | None = None,
 ) -> Iterator[Event]:
     """The loop from the problem's start to its goal, in the problem's scene; ends with a step without a
-    motion, and after a collision."""
+    motion, and after a collision.
+
+    The cameras on the arm take images during each motion. beside: an image of a camera that stands; it takes
+    another one after each motion, of what the arm hid before.
+    """
     rng, q = np.random.default_rng(seed), problem.start
     explorer.set_goal(problem.goal)
     for camera in explorer.cameras:
@@ -112,12 +118,38 @@ def explore(
         found = verify(true, path).violation
         if found is None and trajectory is not None:
             found = verify_trajectory(true, trajectory).violation
-        waypoints = path.positions
         for camera in explorer.cameras:
-            on_the_way = waypoints[1:-1][:: max(1, len(waypoints) // (VIEWS_ON_THE_WAY + 1))]
-            for at in (*on_the_way[:VIEWS_ON_THE_WAY], waypoints[-1]):
+            for at in _during(step.motion):
                 explorer.observe(taken(problem, camera, at, noise, rng))
-        q = waypoints[-1]
+        q = path.positions[-1]
+        if beside is not None:
+            explorer.observe(_again(problem, beside, q, noise, rng))
         yield Event(step, q, "" if found is None else found.message)
         if found is not None:
             return
+
+
+def _during(motion: PlanResult) -> Float[ndarray, "n dof"]:
+    """The configurations of a motion in which images are taken, its end the last."""
+    assert motion.path is not None
+    end = motion.path.positions[-1:]
+    if motion.trajectory is None:
+        return end
+    duration = motion.trajectory.duration
+    count = int(np.clip(duration / IMAGE_PERIOD, 1, MAX_IMAGES))
+    times = duration * np.arange(1, count) / count
+    return np.concatenate([motion.trajectory.at(times).positions, end]) if count > 1 else end
+
+
+def _again(
+    problem: Problem,
+    beside: DepthView,
+    q: Float[ndarray, "dof"],
+    noise: DepthNoise | None,
+    rng: np.random.Generator,
+) -> DepthView:
+    """Another image of a camera that stands."""
+    height, width = beside.depth.shape
+    T, size = beside.T_base_camera, (width, height)
+    view = ray_cast(problem.scene, T, beside.intrinsics, size, problem.robot, q)
+    return measured(view, np.inf, noise, rng)

@@ -33,6 +33,7 @@ from robotdiffuse.perception.assumptions import (
     occupied_assumption,
     padded_assumptions,
     predicted_assumptions,
+    refined,
 )
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
@@ -69,12 +70,15 @@ def plan_with_unknown_space(
     problem: Problem,
     request: PlanRequest,
     predicted: Float32[ndarray, "nx ny nz"] | None = None,
+    unknown: UnknownSpace | None = None,
 ) -> PlanResult:
     """A motion under the problem's policy for unknown space, within the time limit; see the head of this
     file.
 
     predicted: the probability that each fine voxel of the observed volume is occupied; None: as the occupancy
-    completion network predicts, if the policy needs it.
+    completion network predicts, if the policy needs it. unknown: the space that no view saw, if the problem's
+    scene holds the points of views already; None: that of the problem's views. With it, the policy is padded
+    or predicted.
 
     The result says which assumption it comes from, its confidence (how likely the motion is free in the true
     scene), and which unknown space it crosses.
@@ -87,11 +91,13 @@ def plan_with_unknown_space(
     else:
         predict = None
     context = PlanningContext(solver.name, problem, request)
-    volume = observe(problem.views, problem.robot, problem.start)
-    if predict is not None:
-        predicted = predict(volume)
+    volume = None
+    if unknown is None:
+        volume = observe(problem.views, problem.robot, problem.start)
+        predicted = predict(volume) if predict is not None else predicted
+        unknown = unknown_space_of(problem, volume, predicted)
     prepared = context.elapsed
-    attempts = _Attempts(solver, context, unknown_space_of(problem, volume, predicted))
+    attempts = _Attempts(solver, context, unknown)
     as_seen, limit = replace(problem, views=()), request.time_limit
     failed = list[str]()
     if policy != OPTIMISTIC:
@@ -152,7 +158,7 @@ def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> Pl
 
 
 def assumptions_of(
-    problem: Problem, volume: ObservedVolume, predicted: Float32[ndarray, "nx ny nz"] | None
+    problem: Problem, volume: ObservedVolume | None, predicted: Float32[ndarray, "nx ny nz"] | None
 ) -> Iterator[Assumption]:
     """The assumptions of the problem's policy, the most careful first.
 
@@ -167,6 +173,7 @@ def assumptions_of(
         assert predicted is not None
         yield from predicted_assumptions(predicted, robot, known)
     elif policy == OCCUPIED:
+        assert volume is not None
         yield occupied_assumption(volume, robot, known)
 
 
@@ -175,7 +182,7 @@ def unknown_space_of(
 ) -> UnknownSpace:
     """The space that no view of the problem saw, with its start and given goal configurations free."""
     goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
-    return UnknownSpace(problem.robot, np.stack([problem.start, *goals]), volume, predicted)
+    return UnknownSpace(problem.robot, np.stack([problem.start, *goals]), refined(volume.unknown), predicted)
 
 
 def predicted_obstacles(problem: Problem) -> AssumedPoints:

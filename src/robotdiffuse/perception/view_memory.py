@@ -1,0 +1,69 @@
+"""ViewMemory: the views that told most, with what each of them shows, computed once."""
+
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float32
+from numpy import ndarray
+
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.observed_volume import ObservedVolume, merged, observe
+from robotdiffuse.perception.seen_points import VOXEL, seen_points
+from robotdiffuse.robots.robot import Robot
+
+
+class _Kept:
+    """A view, and what it shows, computed when it is first needed."""
+
+    def __init__(self, view: DepthView, robot: Robot, told: int) -> None:
+        self._view, self._robot, self.told = view, robot, told
+
+    @cached_property
+    def volume(self) -> ObservedVolume:
+        return observe([self._view], self._robot, self._configuration)
+
+    @cached_property
+    def points(self) -> Float32[ndarray, "n 3"]:
+        return seen_points([self._view], self._robot, self._configuration)
+
+    @property
+    def _configuration(self) -> Float[ndarray, "dof"]:
+        assert self._view.configuration is not None
+        return self._view.configuration
+
+
+class ViewMemory:
+    """Keeps a number of views: a new one takes the place of the kept one that told least."""
+
+    def __init__(self, robot: Robot, most: int) -> None:
+        self._robot, self._most = robot, most
+        self._kept = list[_Kept]()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def add(self, view: DepthView, told: int) -> None:
+        """Keep a view with a configuration. told: the number of voxels that no view before it told of."""
+        if len(self) >= self._most:
+            self._kept.remove(min(self._kept, key=lambda kept: kept.told))
+        self._kept.append(_Kept(view, self._robot, told))
+
+    def volume(self) -> ObservedVolume:
+        """What the kept views together tell of each voxel of 4 cm."""
+        return merged([kept.volume for kept in self._kept])
+
+    def points(self) -> Float[ndarray, "n 3"]:
+        """The mean of the points that the kept views observed in each cell of a grid [m]; see
+        `seen_points`."""
+        every = np.concatenate([kept.points for kept in self._kept]).astype(np.float64)
+        _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)
+        sums = [np.bincount(cell, every[:, axis], len(counts)) for axis in range(3)]
+        return np.stack(sums, axis=1) / counts[:, None]
+
+
+def _cells(points: Float[ndarray, "n 3"]) -> ndarray:
+    """A number for the cell of each point."""
+    at = np.floor(points / VOXEL).astype(np.int64)
+    at -= at.min(axis=0, initial=0)
+    _, ny, nz = at.max(axis=0, initial=0) + 1
+    return (at[:, 0] * ny + at[:, 1]) * nz + at[:, 2]

@@ -1,0 +1,55 @@
+"""Settings of an Explorer, and the steps that it asks for."""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
+from robotdiffuse.perception.occupancy_map import MapSettings
+from robotdiffuse.scenes.scene import Scene
+
+GO, LOOK, DONE, STUCK = "go", "look", "done", "stuck"
+"""What a step asks for."""
+STRICT, CHANCE, STRICT_THEN_CHANCE = "strict", "chance", "strict_then_chance"
+POLICIES = (STRICT, CHANCE, STRICT_THEN_CHANCE)
+
+
+@dataclass(frozen=True)
+class ExplorerSettings(Settings, name="explorer"):
+    policy: Annotated[str, OneOf(POLICIES)] = STRICT
+    """strict: only through space seen free; chance: where the stated confidence is high enough;
+    strict_then_chance: the latter where the former leads nowhere."""
+    confidence: Annotated[float, Bound(least=0.0, most=1.0)] = 0.98
+    """Least stated confidence of motions by chance."""
+    time_limit: Positive = 1.0
+    """Time limit of each search [s]."""
+    max_looks: Natural = 8
+    """Most looks on the way to a goal."""
+    look_attempts: Count = 4
+    """Looks to which a motion is searched for in a step, the most useful first."""
+    max_views: Count = 12
+    """The views that told most, this many, give seen points and the prediction; the map holds what all views
+    told."""
+    predict: bool = True
+    """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
+    reach."""
+    map: MapSettings = field(default_factory=MapSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What the arm shall do next."""
+
+    kind: Literal["go", "look", "done", "stuck"]
+    """go: execute the motion, which ends at the goal; look: execute the motion, if there is one, then
+    observe; done: the arm is at the goal; stuck: see `reason`."""
+    reason: str
+    policy: str = ""
+    """The policy that the motion keeps, "strict" or "chance"."""
+    motion: PlanResult | None = None
+    """Solved. A strict motion is certified against all that was not seen free; `motion.problem` holds these
+    obstacles."""
+    confidence: float | None = None
+    """Stated probability that a motion by chance is free."""
+    seen: Scene | None = None
+    """The known scene and the points that the kept views saw; None where nothing was planned."""
