@@ -36,7 +36,8 @@ from robotdiffuse.robots import Robot, load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
-from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Sphere
+from robotdiffuse.scenes.mesh import Mesh
+from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Sphere
 
 FOLDER = Path(__file__).parents[2] / "files" / "motion_bench_maker"
 Z = np.array([0.0, 0.0, 1.0])

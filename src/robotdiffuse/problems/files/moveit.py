@@ -28,9 +28,10 @@ from robotdiffuse.problems.files.moveit_shapes import cone, plane
 from robotdiffuse.robots.bodies import AttachedBody
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
+from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.octomap import cover_radius, occupied_voxels
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
 
 PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shape]]] = {
     "box": (3, lambda size, xyz, wxyz, name: Box(xyz, size, wxyz, name)),
