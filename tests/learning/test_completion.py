@@ -115,6 +115,7 @@ def test_the_network_s_inputs() -> None:
     np.testing.assert_allclose(planes[6], np.hypot(*np.moveaxis(voxel_centers()[..., :2], -1, 0)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A small network that has memorised one sample predicts the true voxels."""
     settings = replace(TINY, learning_rate=1e-2)

@@ -256,6 +256,7 @@ def test_a_full_queue_says_when_to_try_again(server: httpx.Client) -> None:
     assert server.post("/plan", json=asked(3)).status_code == 200
 
 
+@pytest.mark.slow
 def test_a_worker_that_holds_too_much_memory_is_replaced_between_requests() -> None:
     with serving("--workers", "1", "--max-worker-memory", "1") as (client, _):
         for _ in range(2):

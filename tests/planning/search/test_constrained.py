@@ -64,7 +64,11 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(
-    ("name", "stage"), [("rrt_connect", "constrained_rrt_connect"), ("diffusion", "network")]
+    ("name", "stage"),
+    [
+        ("rrt_connect", "constrained_rrt_connect"),
+        pytest.param("diffusion", "network", marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize(("constraints", "scene"), CASES, ids=[case[0][0].kind for case in CASES])
 def test_motions_keep_constraints_at_every_millimetre(

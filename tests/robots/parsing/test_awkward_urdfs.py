@@ -129,6 +129,7 @@ def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
     assert refused[1] < 0.5 * refused[0]
 
 
+@pytest.mark.slow
 def test_an_arm_four_times_as_large_takes_no_more_spheres(tmp_path: Path) -> None:
     """A model of an ABB IRB140 with a reach of 3 m took over 400 s, with spheres that stick out 15 mm of 2 m
     links."""

@@ -283,6 +283,7 @@ def test_velocity_limits_that_make_motions_endless_are_refused(tmp_path: Path) -
         read_urdf(file)
 
 
+@pytest.mark.slow
 def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     # balls, because they are fitted quickly
