@@ -18,8 +18,12 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
+# uv takes a tenth of pip's time; where it cannot install, as from a mirror that only pip knows, pip does. Extras are left to
+# pip: many machines configure for it where PyTorch without CUDA comes from.
 .venv/core.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(BIN)/python -m pip install -q -c constraints.txt -e .
+	$(BIN)/python -m pip install -q -c constraints.txt uv && \
+		$(BIN)/uv pip install -q --python $(BIN)/python -c constraints.txt -e . || \
+		{ echo "uv could not install; now pip"; $(BIN)/python -m pip install -q -c constraints.txt -e .; }
 	touch $@
 
 .venv/dev.stamp: pyproject.toml constraints.txt | .venv/bin/python

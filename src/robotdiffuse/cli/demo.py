@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.camera:
         outputs.append(check_output("demo_true.png", ENDINGS))
         problem = seen_by_camera(true)
-    result = load_and_plan(problem, DEFAULT_PLANNER, time_limit=TIME_LIMIT)
+    result = load_and_plan(problem, DEFAULT_PLANNER, picture=True, time_limit=TIME_LIMIT)
     print_result(result, asked_clearance(problem, DEFAULT_PLANNER))
     if result.trajectory is None or result.path is None:
         return NO_PLAN

@@ -146,7 +146,8 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = _outputs(arguments)
     problem = _problem(arguments)
     request = {option: getattr(arguments, option) for option in REQUEST}
-    result = load_and_plan(problem, name, settings, arguments.weights, **request)
+    picture = any(file.suffix.lower() == ".png" for file in outputs)
+    result = load_and_plan(problem, name, settings, arguments.weights, picture, **request)
     print_result(result, asked_clearance(problem, name, arguments.clearance))
     if arguments.next_view and result.path is not None:
         print_next_view(problem, result)
@@ -237,13 +238,17 @@ def load_and_plan(
     planner: str,
     settings: "Settings | None" = None,
     weights: str | None = None,
+    picture: bool = False,
     **request: Any,
 ) -> "PlanResult":
-    """Load a planner and plan, with a spinner that names what is compiled; `request` holds arguments of
-    `Planner.plan`."""
+    """Load a planner and plan, with a spinner that names what is compiled.
+
+    picture: whether a picture follows. `request` holds arguments of `Planner.plan`.
+    """
     from robotdiffuse.core.processes import exit_on_interrupt
     from robotdiffuse.planning import load_planner
+    from robotdiffuse.planning.compile_ahead import compiling_ahead
 
     spinner = Spinner(f"planning with {planner}")
-    with exit_on_interrupt(spinner.stop), spinner:
+    with exit_on_interrupt(spinner.stop), spinner, compiling_ahead(picture):
         return load_planner(planner, settings, weights).plan(problem, **request)

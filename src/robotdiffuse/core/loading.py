@@ -3,7 +3,7 @@ needs once. No call of a planner counts it as its time."""
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
@@ -22,6 +22,8 @@ class _Clock(threading.local):
 _clock = _Clock()
 compiled: list[str] = []
 """Names of the functions that this process has compiled, or has begun to; for progress."""
+on_first_compilation: Callable[[], None] | None = None
+"""Called once, when a function is compiled."""
 
 
 @contextmanager
@@ -52,8 +54,12 @@ def end() -> None:
 
 def compiles(name: str) -> None:
     """Note that this thread compiles a function: the whole block of `loading` around it is compile time."""
+    global on_first_compilation
     _clock.compiles = True
     compiled.append(name)
+    if on_first_compilation is not None:
+        call, on_first_compilation = on_first_compilation, None
+        call()
 
 
 def loading_seconds() -> float:

@@ -1,0 +1,97 @@
+"""Compiles a part of what a first plan needs in a second process.
+
+Numba compiles one function at a time. On a new machine, a second process about halves the wait: it compiles
+what a plan needs last while the plan itself compiles what it needs first. Both share Numba's cache.
+
+    python -m robotdiffuse.planning.compile_ahead [picture]
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from robotdiffuse.core import loading
+from robotdiffuse.core.types import Path
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+
+PICTURE = "picture"
+"""Argument that asks for the code that draws pictures, too."""
+BALL = Sphere([0.0, 0.0, -5.0], 0.1)
+"""Out of reach of any arm that ships."""
+
+
+@contextmanager
+def compiling_ahead(picture: bool) -> Iterator[None]:
+    """While the block runs, the first compilation in this process starts the second one.
+
+    picture: whether it compiles the code that draws pictures, too.
+    """
+
+    def start() -> None:
+        command = [sys.executable, "-m", __name__, *([PICTURE] if picture else [])]
+        nothing = subprocess.DEVNULL
+        subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing)
+
+    alone = (os.cpu_count() or 1) < 2
+    loading.on_first_compilation = None if alone else start
+    try:
+        yield
+    finally:
+        loading.on_first_compilation = None
+
+
+def steps(robot: Robot, picture: bool) -> Iterator[Callable[[], object]]:
+    """Calls that compile the end of a plan, for any robot, what takes longest first."""
+    middle = 0.5 * (robot.lower + robot.upper)
+    rows = np.stack([middle, middle + 0.01, middle])
+    path, scene = Path(robot.joint_names, rows), Scene([BALL])
+    yield lambda: _measure(robot, scene, rows)
+    yield lambda: _certify(robot, scene, rows)
+    yield lambda: _time(robot, path)
+    if picture:
+        yield lambda: _draw(robot, scene, path)
+
+
+def _measure(robot: Robot, scene: Scene, rows: np.ndarray) -> None:
+    from robotdiffuse.collision import CollisionChecker
+
+    CollisionChecker(robot, scene).link_clearances(rows)
+
+
+def _certify(robot: Robot, scene: Scene, rows: np.ndarray) -> None:
+    from robotdiffuse.collision.motions import ContinuousCollision
+    from robotdiffuse.validation.validator import VerifySettings
+
+    settings = VerifySettings()
+    ContinuousCollision(robot, scene, settings.contact, settings.tightness).sweep(rows)
+
+
+def _time(robot: Robot, path: Path) -> None:
+    from robotdiffuse.trajectories.timing import time_parameterize
+
+    time_parameterize(robot, path, lambda _: True, lambda _: True)
+
+
+def _draw(robot: Robot, scene: Scene, path: Path) -> None:
+    from robotdiffuse.visualization.picture import PictureSettings, render
+
+    render(robot, scene, path, PictureSettings(width=16, height=16))
+
+
+def main(arguments: list[str]) -> None:
+    parent = os.getppid()
+    for step in steps(load_robot("panda"), PICTURE in arguments):
+        if os.getppid() != parent:  # the plan is done
+            return
+        step()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
