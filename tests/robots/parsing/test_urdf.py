@@ -93,17 +93,6 @@ def test_base_and_tip_are_selectable(tmp_path: Path) -> None:
     assert "rail" not in part.link_names
 
 
-def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
-    package = tmp_path / "my_arm"
-    (package / "meshes").mkdir(parents=True)
-    (package / "urdf").mkdir()
-    trimesh.creation.annulus(0.02, 0.03, 0.1).export(package / "meshes" / "ring.stl")
-    for name in ("package://my_arm/meshes/ring.stl", "../meshes/ring.stl"):
-        text = ARM.replace(BOX, f'<mesh filename="{name}" scale="2 2 1"/>')
-        robot = read_urdf(urdf(package / "urdf", text))
-        assert np.linalg.norm(robot.meshes["upper"][0].vertices[:, :2], axis=1).max() == pytest.approx(0.06)
-
-
 @pytest.mark.parametrize(
     "corners, thin",
     [
