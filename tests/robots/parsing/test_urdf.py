@@ -10,6 +10,7 @@ import trimesh
 
 import robotdiffuse.robots as robots
 from helpers.example_robots import AWKWARD
+from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_from_rpy
 from robotdiffuse.robots import ROBOTS, load_robot
@@ -20,7 +21,7 @@ from robotdiffuse.robots.fitting.preparation import PreparationSettings
 from robotdiffuse.robots.fitting.sphere_fitting import covered
 from robotdiffuse.robots.joints import CONTINUOUS_LIMIT
 from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
-from robotdiffuse.robots.parsing.urdf import UrdfTree, read_urdf
+from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, read_source, write_robot_folder
 

@@ -39,22 +39,6 @@ JERK_PER_ACCELERATION = 10.0
 """Ratio of jerk and acceleration limits: full acceleration after 0.1 s [1/s]."""
 
 
-def read_urdf(
-    path: str | Path,
-    base: str | None = None,
-    tip: str | None = None,
-    locked: dict[str, float] | None = None,
-    group: str | None = None,
-    srdf: Srdf | None = None,
-    packages: dict[str, str | Path] | None = None,
-) -> Robot:
-    """Read a robot from a URDF or xacro file.
-
-    See `UrdfTree.robot` for the other arguments; `packages` are folders of ROS packages by name.
-    """
-    return UrdfTree(Path(path), packages or {}).robot(base, tip, locked, group, srdf)
-
-
 @dataclass
 class UrdfTree:
     """The links and joints of one URDF file, checked as they are read."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.moveit_files import MOUNTED, QUARTER, ball, scene_data
+from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import (
     rotation_about,
@@ -14,7 +15,6 @@ from robotdiffuse.core.transforms import (
 from robotdiffuse.problems.files.moveit.frames import moveit_frames
 from robotdiffuse.problems.files.moveit.scene import moveit_scene
 from robotdiffuse.robots import Robot, load_robot
-from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.shapes import Sphere
 

@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from helpers.moveit_files import MOUNTED, change
+from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.problems.files import (
@@ -14,7 +15,6 @@ from robotdiffuse.problems.files import (
 )
 from robotdiffuse.problems.files.moveit.scene import read_moveit_scene
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.parsing.urdf import read_urdf
 
 UR5_JOINTS = [
     *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
