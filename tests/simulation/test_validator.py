@@ -135,7 +135,7 @@ def test_a_single_waypoint_is_checked() -> None:
 def test_frames_give_what_single_configurations_give() -> None:
     robot, scene = far_pairs_only(example_robot("panda")), every_shape()
     rng = np.random.default_rng(3)
-    ends = rng.uniform(robot.lower, robot.upper, (24, robot.dof))
+    ends = rng.uniform(robot.lower, robot.upper, (12, robot.dof))
     hits = 0
     with PyBulletOracle(robot, scene) as oracle:
         for a, b in zip(ends[::2], ends[1::2], strict=True):
@@ -147,7 +147,7 @@ def test_frames_give_what_single_configurations_give() -> None:
                 if found is not None:
                     assert found.at == single.index(True)
                     hits += 1
-    assert 10 < hits < 36
+    assert 4 < hits < 18
 
 
 def test_scenes_are_replaced_and_the_robot_stays() -> None:
