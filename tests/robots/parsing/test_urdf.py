@@ -10,6 +10,7 @@ import trimesh
 
 import robotdiffuse.robots as robots
 from helpers.example_robots import AWKWARD
+from helpers.quick_preparation import coarse_grids
 from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_from_rpy
@@ -273,17 +274,17 @@ def test_velocity_limits_that_make_motions_endless_are_refused(tmp_path: Path) -
         read_urdf(file)
 
 
-@pytest.mark.slow
 def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     # balls, because they are fitted quickly
     balls = ARM.replace(BOX, '<sphere radius="0.15"/>').replace(TUBE, '<sphere radius="0.1"/>')
     file, steps = urdf(tmp_path, balls), []
-    report = add_robot(
-        file,
-        settings=PreparationSettings(sampling=SamplingSettings(samples=200), samples=200, rounds=0),
-        progress=lambda what, step, count: steps.append((step, count)),
-    )
+    with coarse_grids():
+        report = add_robot(
+            file,
+            settings=PreparationSettings(sampling=SamplingSettings(samples=200), samples=200, rounds=0),
+            progress=lambda what, step, count: steps.append((step, count)),
+        )
     assert report.folder == tmp_path / "robots" / "tiny"
     assert steps[0] == (0, 7) and steps[-1] == (7, 7)
     for link in report.links:
@@ -297,7 +298,8 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
 
     # a changed URDF is another robot, prepared and stored anew
     larger = urdf(tmp_path, balls.replace('radius="0.15"', 'radius="0.16"'))
-    changed = load_robot(larger)
+    with coarse_grids():
+        changed = load_robot(larger)
     assert any("spheres were fitted" in note for note in changed.notes)
     assert np.ptp(changed.meshes["upper"][0].vertices[:, 2]) == pytest.approx(0.32, rel=0.05)
     kept = tmp_path / "robots" / f"tiny-{UrdfTree(larger, {}).digest[:8]}"
