@@ -34,7 +34,6 @@ SHAPES: dict[str, Shape] = {
     "mesh": Mesh(*TETRAHEDRON, xyz=[0.1, 0.2, 0.3], wxyz=TURN),
     "point_cloud": PointCloud(np.random.default_rng(0).uniform(0.2, 0.6, (500, 3))),
 }
-EVERYWHERE = VisibleRegion(floor=-10.0, reach=100.0)
 
 
 def surface_distance(shape: Shape, points: ndarray) -> ndarray:
