@@ -134,7 +134,7 @@ def test_a_single_waypoint_is_checked() -> None:
 
 def test_frames_give_what_single_configurations_give() -> None:
     robot, scene = far_pairs_only(example_robot("panda")), every_shape()
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(1)
     ends = rng.uniform(robot.lower, robot.upper, (12, robot.dof))
     hits = 0
     with PyBulletOracle(robot, scene) as oracle:
