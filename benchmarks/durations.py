@@ -47,6 +47,8 @@ ROWS = (
     ("robotdiffuse", TIME, CONVERGED),
     ("aorrtc", TIME, TIME_LIMIT),
     ("diffusion", TIME, CONVERGED),
+    ("ompl_rrt_connect", LENGTH, CONVERGED),
+    ("ompl_aorrtc", LENGTH, TIME_LIMIT),
 )
 """Planner, objective and `until`."""
 

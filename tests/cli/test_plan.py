@@ -1,6 +1,7 @@
 """The commands `plan` and `demo`: exit status, one line for bad input, and written files."""
 
 import json
+import os
 import runpy
 from pathlib import Path
 
@@ -49,6 +50,19 @@ def test_plan_writes_files_that_view_and_verify_read(
     assert capsys.readouterr().out.count("valid") == 2
     assert run("view", "r.json", "--out", "again.html") == 0
     assert (tmp_path / "again.html").stat().st_size > 10_000
+
+
+def test_files_are_written_though_nobody_reads_what_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`plan problem.yaml --out r.json | head -1` wrote nothing."""
+    problem = write_problem(tmp_path)
+    read, write = os.pipe()
+    os.close(read)
+    with monkeypatch.context() as patch, os.fdopen(write, "w", buffering=1) as nobody:
+        patch.setattr("sys.stdout", nobody)
+        run("plan", problem, "--planner", "rrt_connect", "--time-limit", 5, "--out", "r.json")
+    assert load_result("r.json").result.solved
 
 
 def test_verify_finds_a_motion_that_was_tampered_with(

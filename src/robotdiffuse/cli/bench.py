@@ -178,13 +178,13 @@ def run_report(arguments: argparse.Namespace) -> int:
     bench = read_bench(Path(arguments.folder), planners)
     parts = sections(bench, limits)
     out = Path(arguments.out or arguments.folder)
-    print_bench(bench, parts)
     write_atomically(out / "report.md", report.markdown(bench, parts), make_folder=True)
     write_atomically(out / "report.tex", report.latex(bench, parts))
     replays = None if arguments.no_replays else _write_replays(bench, parts, out / "replays.html")
     write_page(bench, parts, out / "index.html", replays)
     files = ["index.html", *([replays] if replays else []), "report.md", "report.tex"]
     curves = write_plots(bench, parts, out)
+    print_bench(bench, parts)
     print(f"wrote {', '.join(str(out / name) for name in files)} and {len(curves)} plots as .svg")
     return 0
 

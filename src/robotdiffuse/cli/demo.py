@@ -3,11 +3,12 @@
 import argparse
 from dataclasses import replace
 from importlib.resources import as_file, files
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.console import Spinner, print_result
 from robotdiffuse.cli.drawing import ENDINGS, draw
-from robotdiffuse.cli.exit_status import NO_PLAN
+from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
 from robotdiffuse.cli.plan import asked_clearance, load_and_plan
 from robotdiffuse.core.types import FIRST
 
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
 PROBLEM_FILE, FAMILY = "shelf.yaml", "shelf"
 TIME_LIMIT = 10.0
 """Time limit for planning [s]."""
+READY = "ready"
+"""Where the arm of `demo --explore` starts, if it has such a pose."""
+EXPLORE_TIME_LIMIT = 2.0
+"""Time limit of each of its searches [s]."""
 MAX_DRAWS, DRAW_TIME_LIMIT = 50, 1.0
 """Problems that are drawn for another arm, and the time limit of the search that tries each [s]."""
 CAMERA_POSITION, CAMERA_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
@@ -30,13 +35,20 @@ def add(commands: argparse._SubParsersAction) -> None:
         "demo",
         help="plan a bundled problem and draw the motion",
         description="Plan a bundled problem with obstacles, and write demo.png and demo.html to the current "
-        "folder.",
+        "folder; with --explore, see the obstacles by cameras on the way.",
     )
-    parser.add_argument(
+    seen = parser.add_mutually_exclusive_group()
+    seen.add_argument(
         "--camera",
         action="store_true",
         help="plan with the view of one depth camera instead of the scene; demo_true.png shows the motion in "
         "the true scene",
+    )
+    seen.add_argument(
+        "--explore",
+        action="store_true",
+        help="simulate an arm that sees the shelf by a camera at its tip and looks before it moves; writes "
+        "explore.png and explore.html",
     )
     parser.add_argument(
         "--robot",
@@ -51,12 +63,15 @@ def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.planning import DEFAULT_PLANNER
     from robotdiffuse.problems.files import load_problem
 
-    outputs = [check_output(file, ENDINGS) for file in ("demo.png", "demo.html")]
+    names = ("explore.png", "explore.html") if arguments.explore else ("demo.png", "demo.html")
+    outputs = [check_output(file, ENDINGS) for file in names]
     if arguments.robot is None:
         with as_file(files("robotdiffuse") / "examples" / PROBLEM_FILE) as file:
             problem = load_problem(file)
     else:
         problem = shelf_problem(arguments.robot)
+    if arguments.explore:
+        return explore(problem, outputs)
     true = problem
     if arguments.camera:
         outputs.append(check_output("demo_true.png", ENDINGS))
@@ -74,6 +89,29 @@ def run(arguments: argparse.Namespace) -> int:
         draw(true if file.name == "demo_true.png" else problem, result, file)
         print(f"wrote {file.resolve()}")
     return 0
+
+
+def explore(problem: "Problem", outputs: list[Path]) -> int:
+    """Take the arm from where it is ready to the problem's goal through space that its cameras see on the
+    way, and draw that."""
+    from robotdiffuse.cli.explore import draw_exploration, simulate
+    from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+    from robotdiffuse.problems.families.furniture import FLOOR
+    from robotdiffuse.problems.problem import Problem
+    from robotdiffuse.scenes.scene import Scene
+
+    others = [shape for shape in problem.scene.shapes if shape.name != FLOOR.name]
+    start = READY if READY in problem.robot.poses else problem.start
+    problem = Problem(problem.robot, Scene([FLOOR, *others]), start, problem.goal)
+    print("The arm knows the floor, and sees the rest by a camera at its tip and one beside it.")
+    explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
+    looks = sum(act.step.kind == "look" for act in explorer.acts)
+    end = "is at the goal" if arrived else "is not at the goal"
+    print(f"The arm {end}: {looks} looks, {len(explorer.views)} images, {explorer.duration:.1f} s in motion.")
+    for file in outputs:
+        draw_exploration(explorer, problem, file)
+        print(f"wrote {file.resolve()}")
+    return SOLVED if arrived else NO_PLAN
 
 
 def shelf_problem(robot: str) -> "Problem":

@@ -4,17 +4,20 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.drawing import ENDINGS, show
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
+from robotdiffuse.interop import WRITERS
 
 if TYPE_CHECKING:
-    from robotdiffuse.planning.exploration.explorer import Explorer
+    from robotdiffuse.perception.depth_noise import DepthNoise
+    from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+    from robotdiffuse.planning.exploration.recorded import RecordedExplorer
     from robotdiffuse.planning.exploration.simulated import Event
     from robotdiffuse.problems.problem import Problem
 
 FLOOR = "floor"
 """Shapes of this name are known without being seen."""
-TITLE_LENGTH = 60
-"""Of pictures [characters]."""
+RECORDING = ".mcap"
 FREE_ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
 """The space around the base that is declared free [m]."""
 
@@ -40,36 +43,72 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--noise", action="store_true", help="simulate the noise of depth cameras")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed")
     parser.add_argument(
-        "--out", metavar="FOLDER", help="draw each motion among what was seen then: step_1.png and so on"
+        "--out",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
+        "repeatable",
+    )
+    parser.add_argument("--view", action="store_true", help="write a replay (.html) and open it")
+    parser.add_argument(
+        "--record",
+        metavar="FILE",
+        help="write the depth images with camera parameters, poses and joint states to this .mcap file",
     )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.core.output_files import check_output
     from robotdiffuse.perception.depth_noise import DepthNoise
-    from robotdiffuse.planning.exploration.explorer import DONE, Explorer, ExplorerSettings
-    from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+    from robotdiffuse.planning.exploration.explorer import ExplorerSettings
     from robotdiffuse.problems.files import load_problem
-    from robotdiffuse.scenes.scene import Scene
 
+    outputs = [check_output(file, ENDINGS) for file in arguments.out]
+    if arguments.view:
+        outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
+    recording = None
+    if arguments.record is not None:
+        recording = check_output(arguments.record, (RECORDING,))
+        WRITERS.load(RECORDING)  # its packages are installed
     problem = load_problem(arguments.problem)
     settings = ExplorerSettings(arguments.policy, arguments.confidence, arguments.time_limit)
+    noise = DepthNoise() if arguments.noise else None
+    explorer, arrived = simulate(problem, settings, noise, arguments.seed)
+    for file in outputs:
+        draw_exploration(explorer, problem, file)
+        print(f"wrote {file}")
+    if recording is not None:
+        record(explorer, recording)
+        print(f"wrote {recording}")
+    if arguments.view:
+        show(outputs[-1])
+    return SOLVED if arrived else NO_PLAN
+
+
+def simulate(
+    problem: "Problem", settings: "ExplorerSettings", noise: "DepthNoise | None", seed: int
+) -> "tuple[RecordedExplorer, bool]":
+    """Simulate the loop and print its steps; returns the explorer, and whether the arm got to the goal
+    without a collision."""
+    from robotdiffuse.planning.exploration.explorer import DONE
+    from robotdiffuse.planning.exploration.recorded import RecordedExplorer
+    from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+    from robotdiffuse.scenes.scene import Scene
+
     known = Scene([shape for shape in problem.scene.shapes if shape.name == FLOOR])
     cameras = [wrist_camera(problem.robot)]
-    explorer = Explorer(problem.robot, cameras, known, FREE_ZONE, settings, arguments.seed)
-    noise = DepthNoise() if arguments.noise else None
-    explorer.observe(camera_beside(problem, noise, arguments.seed))
-    folder = None if arguments.out is None else Path(arguments.out)
+    explorer = RecordedExplorer(problem.robot, cameras, known, FREE_ZONE, settings, seed)
+    explorer.observe(camera_beside(problem, noise, seed))
     reached, free = False, True
-    for number, event in enumerate(explore(problem, explorer, noise, arguments.seed), 1):
+    for number, event in enumerate(explore(problem, explorer, noise, seed), 1):
         print_event(number, event, explorer)
-        if folder is not None and event.step.motion is not None:
-            draw_event(problem, event, folder / f"step_{number}.png")
         reached, free = event.step.kind == DONE, free and event.free
-    return SOLVED if reached and free else NO_PLAN
+    return explorer, reached and free
 
 
-def print_event(number: int, event: "Event", explorer: "Explorer") -> None:
+def print_event(number: int, event: "Event", explorer: "RecordedExplorer") -> None:
     """Print a step, and what is known after it."""
     seen = explorer.map
     print(f"{number}. {event.step.kind}: {event.step.reason}")
@@ -79,20 +118,22 @@ def print_event(number: int, event: "Event", explorer: "Explorer") -> None:
     print("   of the map {:.0f} % seen free, {:.0f} % unknown".format(*shares))
 
 
-def draw_event(problem: "Problem", event: "Event", file: Path) -> None:
-    """Draw a step's motion among what was seen when it was planned."""
-    from robotdiffuse.core.output_files import check_output
-    from robotdiffuse.visualization.picture import write_picture
+def draw_exploration(explorer: "RecordedExplorer", problem: "Problem", file: Path) -> None:
+    """Draw an exploration as a replay or a strip of pictures, as the ending of the file says."""
+    if file.suffix.lower() == ".html":
+        from robotdiffuse.visualization.exploration_page import write_exploration as write
+    else:
+        from robotdiffuse.visualization.exploration_picture import write_exploration_picture as write
+    write(explorer, problem.scene, file)
 
-    motion = event.step.motion
-    assert motion is not None and motion.path is not None
-    assert event.step.seen is not None
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_picture(
-        problem.robot,
-        event.step.seen,
-        motion.trajectory or motion.path,
-        check_output(file, (".png",)),
-        title=f"{event.step.kind}: {event.step.reason}"[:TITLE_LENGTH],
-    )
-    print(f"   wrote {file}")
+
+def record(explorer: "RecordedExplorer", file: Path) -> None:
+    """Write all views that an explorer observed; the camera on the arm is `wrist`, others are `beside`."""
+    from robotdiffuse.interop.depth_recording import StampedView, write_depth_views
+
+    views: dict[str, list[StampedView]] = {}
+    for one in explorer.views:
+        views.setdefault("beside" if one.camera is None else "wrist", []).append(
+            StampedView(one.time, one.view)
+        )
+    write_depth_views(explorer.robot, views, file)

@@ -148,12 +148,12 @@ def run(arguments: argparse.Namespace) -> int:
     request = {option: getattr(arguments, option) for option in REQUEST}
     picture = any(file.suffix.lower() == ".png" for file in outputs)
     result = load_and_plan(problem, name, settings, arguments.weights, picture, **request)
+    written = [file for file in outputs if _write(problem, result, file)]  # first: `| head` ends what prints
     print_result(result, asked_clearance(problem, name, arguments.clearance))
     if arguments.next_view and result.path is not None:
         print_next_view(problem, result)
-    for file in outputs:
-        if _write(problem, result, file):
-            print(f"wrote {file}")
+    for file in written:
+        print(f"wrote {file}")
     if arguments.view and result.trajectory is not None:
         show(outputs[-1])
     return SOLVED if result.solved else NO_PLAN

@@ -7,7 +7,7 @@ URDF, if the robot was read from one. The URDF and the problem are attachments, 
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,8 @@ try:
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-    from mcap.reader import make_reader
+    from mcap.reader import McapReader, make_reader
+    from mcap.records import Schema
     from mcap.writer import Writer
     from mcap_protobuf.schema import register_schema
     from rosbags.typesys import get_types_from_msg
@@ -67,10 +68,10 @@ PROBLEM_ATTACHMENT = "problem.json"
 """Name of the attachment that holds the problem."""
 
 
-class _McapWriter:
+class McapWriter:
     """Writes Protobuf and ROS 2 messages to one MCAP file."""
 
-    def __init__(self, stream: io.BytesIO) -> None:
+    def __init__(self, stream: io.BytesIO | io.BufferedWriter) -> None:
         self.writer = Writer(stream)
         self.writer.start(profile="", library="robotdiffuse")
         self._channels: dict[str, int] = {}
@@ -95,7 +96,7 @@ class _McapWriter:
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     """Write the scene and the motion; see `interop.write_motion` and this module's description."""
     robot, stream = problem.robot, io.BytesIO()
-    out = _McapWriter(stream)
+    out = McapWriter(stream)
     out.protobuf("/scene", _scene(problem), 0)
     for cloud in _clouds(problem):
         out.protobuf(f"/points/{cloud[0]}", cloud[1], 0)
@@ -227,25 +228,40 @@ def read(file: Path, topic: str | None = None) -> RecordedMotion:
     try:
         with path.open("rb") as stream:
             reader = make_reader(stream)
-            summary = reader.get_summary()
-            if summary is None:
-                raise InputError(f"{file} is damaged: it ends before its summary")
-            ros = {
-                channel.topic: summary.schemas[channel.schema_id]
-                for channel in summary.channels.values()
-                if channel.message_encoding == "cdr" and channel.schema_id in summary.schemas
-            }
+            ros = topics_in(reader, str(file))
             name = choose_topic({topic: schema.name for topic, schema in ros.items()}, topic, str(file))
-            store = _typestore(ros[name])
-            messages = [
-                (found.log_time, store.deserialize_cdr(found.data, ros[name].name))
-                for _, _, found in reader.iter_messages(topics=[name])
-            ]
+            messages = [(at, message) for _, at, message in messages_in(reader, ros, [name])]
         return motion_from_messages(ros[name].name, messages, f"{file}, {name}")
     except InputError:
         raise
     except Exception as error:  # mcap, zstandard and rosbags raise many kinds of errors for a damaged file
         raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
+
+
+def topics_in(reader: McapReader, where: str) -> dict[str, Schema]:
+    """The topics with ROS 2 messages, and their types. Raises InputError, naming `where`, for a file without
+    a summary."""
+    summary = reader.get_summary()
+    if summary is None:
+        raise InputError(f"{where} is damaged: it ends before its summary")
+    return {
+        channel.topic: summary.schemas[channel.schema_id]
+        for channel in summary.channels.values()
+        if channel.message_encoding == "cdr" and channel.schema_id in summary.schemas
+    }
+
+
+def messages_in(
+    reader: McapReader, kinds: Mapping[str, Schema], topics: Sequence[str]
+) -> Iterator[tuple[str, int, Any]]:
+    """Topic, log time [ns] and message of all messages on some topics, in the order of their log times.
+    kinds: see `topics_in`."""
+    if not topics:
+        return
+    stores = {topic: _typestore(kinds[topic]) for topic in topics}
+    for _, channel, found in reader.iter_messages(topics=topics):
+        store, kind = stores[channel.topic], kinds[channel.topic].name
+        yield channel.topic, found.log_time, store.deserialize_cdr(found.data, kind)
 
 
 def _typestore(schema: Any) -> Any:

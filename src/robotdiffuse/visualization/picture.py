@@ -47,6 +47,20 @@ MARGINS = (0.05, 0.11)
 """Fractions of the height left free above the arm, and below it for the caption."""
 
 
+Color = tuple[int, int, int]
+"""sRGB."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClearSurface:
+    """A see-through surface, of which the part nearest to the camera is drawn."""
+
+    surface: Surface
+    tint: Float[ndarray, "3"]
+    """Linear colour."""
+    alpha: float
+
+
 @dataclass(frozen=True)
 class PictureSettings:
     """Size and contents of the picture."""
@@ -88,8 +102,8 @@ def write_picture(
     path = check_output(file, (".png",))
     settings = settings or PictureSettings()
     pixels, _ = render(robot, scene, motion, settings)
-    image = Image.fromarray(_faded_below(pixels))
-    _caption(image, title or robot.name, style.facts(motion, result, robot))
+    image = Image.fromarray(faded_below(pixels))
+    caption(image, title or robot.name, style.facts(motion, result, robot))
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=False)
     write_atomically(path, buffer.getvalue())
@@ -114,9 +128,9 @@ def write_comparison(
         raise InputError(f"{len(motions)} motions; a picture shows 1 to {len(COMPARED)}")
     first, *others = motions.values()
     pixels, _ = render(robot, scene, first, settings or PictureSettings(), others=others)
-    image = Image.fromarray(_faded_below(pixels))
+    image = Image.fromarray(faded_below(pixels))
     figures = [", ".join(v for k, v in style.facts(m, None) if v != "untimed") for m in motions.values()]
-    _caption(image, title or robot.name, list(zip(motions, figures, strict=True)), COMPARED)
+    caption(image, title or robot.name, list(zip(motions, figures, strict=True)), COMPARED)
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=False)
     write_atomically(path, buffer.getvalue())
@@ -129,11 +143,14 @@ def render(
     settings: PictureSettings,
     camera: Camera | None = None,
     others: Sequence[Path | Trajectory] = (),
+    added: Sequence[Surface] = (),
+    clear: Sequence[ClearSurface] = (),
 ) -> tuple[np.ndarray, Camera]:
     """The picture without its caption, uint8 [height, width, 3], and the camera that took it.
 
     camera: where to look from; without one, from where most of the motion can be seen.
     others: further motions, of which the trace is drawn; all traces then have the colours COMPARED.
+    added, clear: further surfaces in the base frame, solid and see-through.
     """
     surfaces = style.robot_surfaces(robot)
     q = style.dense(motion.positions, 240)
@@ -152,9 +169,15 @@ def render(
     tool = style.tool_point(robot, surfaces)
     traces = [trace, *(style.trace(robot, tool, style.dense(other.positions, 240)) for other in others)]
     colors = [(color, color) for color in COMPARED] if others else [(START, GOAL)]
-    tubes = [_tube(points, *of) for points, of in zip(traces, colors, strict=False)]
-    shell = _shell(robot, poses[-1], settings.shell) if settings.shell else None
-    image = _paint(big, join([goal, obstacles, *tubes]), ghosts, shell)
+    tubes = [tube(points, *of) for points, of in zip(traces, colors, strict=False)]
+    ghosts.sort(key=lambda ghost: -float(np.linalg.norm(ghost[0].vertices.mean(0) - big.eye)))
+    over = [
+        ClearSurface(ghost, _mixed(START, GOAL, share), 0.50 if share == 0 else 0.26)
+        for ghost, share in ghosts
+    ]
+    if settings.shell:
+        over.append(ClearSurface(_shell(robot, poses[-1], settings.shell), linear(SHELL_COLOR), SHELL_ALPHA))
+    image = _paint(big, join([goal, obstacles, *tubes, *added]), [*clear, *over])
     s = SUPERSAMPLING
     image = image.reshape(settings.height, s, settings.width, s, 3).mean(axis=(1, 3))
     return _to_srgb(image), camera
@@ -174,10 +197,13 @@ def _shell(robot: Robot, T_base_frame: Float[ndarray, "frames 4 4"], thickness: 
     return join(parts)
 
 
-def _paint(
-    camera: Camera, solid: Surface, ghosts: list[tuple[Surface, float]], shell: Surface | None
-) -> Float[ndarray, "h w 3"]:
-    """Linear colours of the solid surfaces with the ghosts over them, the far ones first, and the shell."""
+def _mixed(first: Color, last: Color, share: float) -> Float[ndarray, "3"]:
+    """The linear colour between two sRGB colours."""
+    return linear(first) * (1 - share) + linear(last) * share
+
+
+def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Float[ndarray, "h w 3"]:
+    """Linear colours of the solid surfaces with the see-through ones over them, in their order."""
     shape = (camera.height, camera.width)
     image = np.zeros((*shape, 3), np.float32)
     near, ident = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
@@ -185,8 +211,8 @@ def _paint(
     draw(near, ident, screen, solid.faces)
     view = (camera.eye, camera.rays())
     height = min(0.0, float(solid.vertices[:, 2].min(initial=0.0)))
-    ground = (height - 1e-4, GROUND_RADIUS, _linear((0xE9, 0xEB, 0xEE)), _linear((0xC3, 0xC9, 0xD1)))
-    background = (_linear((0xF7, 0xF8, 0xFA)), _linear((0xE6, 0xE9, 0xED)))
+    ground = (height - 1e-4, GROUND_RADIUS, linear((0xE9, 0xEB, 0xEE)), linear((0xC3, 0xC9, 0xD1)))
+    background = (linear((0xF7, 0xF8, 0xFA)), linear((0xE6, 0xE9, 0xED)))
     toward = _key_direction(camera)
     sky = _light_maps(solid, _hemisphere(SKY_LIGHTS), SKY_MAP)
     key = _light_maps(solid, _cone(toward, KEY_LIGHTS), KEY_MAP)
@@ -195,19 +221,14 @@ def _paint(
     seen = (near, ident, screen, solid.faces, solid.normals)
     lattice = light_lattice(LIGHT_SPACING, *seen, view, ground[0], sky, key)
     shade(image, lattice, LIGHT_SPACING, *seen, colors, view, ground, background, sky, key, light)
-    ghosts = sorted(ghosts, key=lambda g: -float(np.linalg.norm(g[0].vertices.mean(0) - camera.eye)))
-    clear = [
-        (ghost, _linear(START) * (1 - s) + _linear(GOAL) * s, 0.50 if s == 0 else 0.26) for ghost, s in ghosts
-    ]
-    if shell is not None:
-        clear.append((shell, _linear(SHELL_COLOR), SHELL_ALPHA))
-    for ghost, tint, alpha in clear:
+    for one in clear:
+        ghost = one.surface
         own, shown = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
         screen = camera.project(ghost.vertices)
         draw(own, shown, screen, ghost.faces)
         blend_ghost(
             image, near, own, shown, screen, ghost.faces, ghost.normals, _linear_array(ghost.colors),
-            view, toward, tint, alpha,
+            view, toward, one.tint, one.alpha,
         )  # fmt: skip
     return image
 
@@ -268,10 +289,7 @@ def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tup
     return maps, axes, scale, center, size, 2.0 / scale
 
 
-Color = tuple[int, int, int]
-
-
-def _tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
+def tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
     """A round tube along a polyline, coloured from the first to the last colour, with spheres at both
     ends."""
     import trimesh
@@ -309,11 +327,12 @@ def _tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
     quad = [i + j, i + following, i + TUBE_SIDES + j, i + TUBE_SIDES + following]
     faces = np.concatenate([np.stack(quad[:3], -1).reshape(-1, 3), np.stack(quad[1:], -1).reshape(-1, 3)])
     vertices = points[:, None] + TUBE_RADIUS * normals
-    tube = Surface(vertices.reshape(-1, 3), normals.reshape(-1, 3), colors.reshape(-1, 3), faces)
-    return join([tube, *balls])
+    pipe = Surface(vertices.reshape(-1, 3), normals.reshape(-1, 3), colors.reshape(-1, 3), faces)
+    return join([pipe, *balls])
 
 
-def _linear(rgb: tuple[int, int, int]) -> Float[ndarray, "3"]:
+def linear(rgb: Color) -> Float[ndarray, "3"]:
+    """The linear colour of an sRGB colour."""
     return _linear_array(np.array(rgb) / 255.0)
 
 
@@ -330,18 +349,26 @@ def _to_srgb(image: Float[ndarray, "h w 3"]) -> np.ndarray:
     return np.round(255 * srgb.clip(0, 1)).astype(np.uint8)
 
 
-def _faded_below(pixels: np.ndarray) -> np.ndarray:
-    """The picture faded at its lower edge, so that the caption is readable."""
-    rise = (np.linspace(0, 1, len(pixels)) - 0.84).clip(0, None)[:, None, None] / 0.16
-    cover = 0.8 * rise * rise * (3 - 2 * rise)
+def faded_below(pixels: np.ndarray, begin: float = 0.84, most: float = 0.8) -> np.ndarray:
+    """The picture faded at its lower edge, so that the caption is readable.
+
+    begin: where it begins to fade, as a share of the height. most: how much it is faded at the edge.
+    """
+    rise = (np.linspace(0, 1, len(pixels)) - begin).clip(0, None)[:, None, None] / (1 - begin)
+    cover = most * rise * rise * (3 - 2 * rise)
     return (pixels + cover * (np.array(CAPTION_COLOR) - pixels)).round().astype(np.uint8)
 
 
-def _caption(
-    image: Image.Image, title: str, facts: list[tuple[str, str]], colors: Sequence[Color] = ()
+def caption(
+    image: Image.Image,
+    title: str,
+    facts: list[tuple[str, str]],
+    colors: Sequence[Color] = (),
+    enlarged: float = 1.0,
 ) -> None:
-    """Title and figures in the lower left corner. colors: of the labels; without any, grey."""
-    scale = image.width / 1600
+    """Write title and figures in the lower left corner. colors: of the labels; without any, grey.
+    enlarged: factor of the size of the letters."""
+    scale = enlarged * image.width / 1600
     pen = ImageDraw.Draw(image)
     big, small = ImageFont.load_default(max(8, 30 * scale)), ImageFont.load_default(max(7, 19 * scale))
     left, bottom = 44 * scale, image.height - 40 * scale

@@ -52,29 +52,34 @@ def write_replay(
     """
     target = check_output(file, (".html", ".htm"))
     title = title or f"{robot.name} · {len(scene.shapes)} obstacle{'' if len(scene.shapes) == 1 else 's'}"
-    data = json.dumps(
-        _page_data(robot, scene, motion, result, candidates), separators=(",", ":"), allow_nan=False
-    )
+    write_page(target, title, page_data(robot, scene, motion, result, candidates))
+
+
+def write_page(target: FilePath, title: str, data: dict[str, Any], script: str = "") -> None:
+    """Write a replay page with this data. script: name of a file that runs after `replay.js`."""
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     page = files("robotdiffuse.visualization") / "page"
     parts = {
         "title": html.escape(title),
         "style": (page / "replay.css").read_text("utf-8"),
         # in JSON '<' occurs only in strings; escaped, it cannot end the script element
-        "data": data.replace("<", "\\u003c"),
+        "data": text.replace("<", "\\u003c"),
         "three": (page / "three.min.js").read_text("utf-8"),
         "script": (page / "replay.js").read_text("utf-8"),
+        "more": (page / script).read_text("utf-8") if script else "",
     }
     template = (page / "replay.html").read_text("utf-8")
     write_atomically(target, re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template))
 
 
-def _page_data(
+def page_data(
     robot: Robot,
     scene: Scene,
     motion: Path | Trajectory,
-    result: PlanResult | None,
-    candidates: Sequence[Path],
+    result: PlanResult | None = None,
+    candidates: Sequence[Path] = (),
 ) -> dict[str, Any]:
+    """What the page reads; see `write_replay`."""
     surfaces = style.robot_surfaces(robot)
     frame, point = tool = style.tool_point(robot, surfaces)
     times, positions = _thinned(*style.timed(motion))
@@ -90,7 +95,7 @@ def _page_data(
             "spheres": _spheres(robot),
             "tool": {"frame": frame, "point": _rounded(point, 5)},
         },
-        "scene": [_shape(shape, color) for shape, color in zip(scene.shapes, colors, strict=True)],
+        "scene": page_shapes(scene),
         "ground": _ground(scene, colors),
         "timed": isinstance(motion, Trajectory),
         "times": _rounded(times, 4),
@@ -153,6 +158,12 @@ def _ground(scene: Scene, colors: list[tuple[int, int, int]]) -> float:
         for s, c in zip(scene.shapes, colors, strict=True)
     ]
     return round(float(min([0.0, *lows])), 4)
+
+
+def page_shapes(scene: Scene) -> list[dict[str, Any]]:
+    """The obstacles for the page."""
+    colors = style.obstacle_colors(scene)
+    return [_shape(shape, color) for shape, color in zip(scene.shapes, colors, strict=True)]
 
 
 def _shape(shape: Shape, color: tuple[int, int, int]) -> dict[str, Any]:

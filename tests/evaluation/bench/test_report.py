@@ -273,7 +273,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     assert list(bench.records)[:2] == ["robotdiffuse", "robotdiffuse+restarts"]
     section = figures.sections(bench)[-1]
     table = report.main_table(section, section.main, bench.reference)
-    assert cells(table, "ratio to robotdiffuse: hybrid, restarted") == {
+    assert cells(table, "joint length / robotdiffuse: hybrid, restarted") == {
         "robotdiffuse: hybrid": "–",
         "robotdiffuse: hybrid, restarted": "1",
         "rrt_connect": "–",
@@ -282,7 +282,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     }
     assert cells(table, "ComScore")["rrt_connect, restarted"] == "–"
     tenth = report.main_table(section, section.comparisons[0], bench.reference)
-    assert cells(tenth, "ratio to robotdiffuse: hybrid, restarted")["rrt_connect, restarted"] == "1.200"
+    assert cells(tenth, "joint length / robotdiffuse: hybrid, restarted")["rrt_connect, restarted"] == "1.200"
     plain = read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
     assert len(plain.records) == 4
     alone = Bench(
@@ -290,7 +290,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     )
     section = figures.sections(alone)[-1]
     table = report.main_table(section, section.main, alone.reference)
-    assert cells(table, "ratio to robotdiffuse: hybrid") == {
+    assert cells(table, "joint length / robotdiffuse: hybrid") == {
         "robotdiffuse: hybrid": "1",
         "rrt_connect": "1.200 †",
     }

@@ -65,7 +65,9 @@ def test_motions_take_less_time_and_keep_their_certificate(planner: str) -> None
     assert result.duration is not None and by_length.duration is not None and by_length.path is not None
     assert verify_trajectory(AROUND, result.trajectory).valid
     assert result.duration < 0.99 * by_length.duration
-    assert result.path is not None and by_length.path.length < result.path.length
+    assert result.path is not None
+    if planner != "rrt_connect":  # which returns the shorter of two paths, not the shortest
+        assert by_length.path.length < result.path.length
 
 
 def test_the_same_seed_gives_the_same_motion() -> None:

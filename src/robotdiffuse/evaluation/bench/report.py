@@ -157,7 +157,7 @@ def _ratio(comparison: Comparison, reference: str) -> Spec:
         pair = None if mark(row) is None else row.paired
         return pair and pair.ratio_interval and interval(*pair.ratio_interval, 3)
 
-    return (Column(f"ratio to {named(reference)}"), ratio), (Column("95 % ", dim=True), of_ratio)
+    return (Column(f"joint length / {named(reference)}"), ratio), (Column("95 % ", dim=True), of_ratio)
 
 
 def _metric(metric: Metric) -> tuple[Column, Callable[[Row], Cell]]:

@@ -25,7 +25,7 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
-from robotdiffuse.core.types import FIRST
+from robotdiffuse.core.types import FIRST, Trajectory
 from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
@@ -36,6 +36,7 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
 from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free
+from robotdiffuse.planning.exploration.stopping import Stop, stop_before
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.goals import Goal
@@ -133,6 +134,10 @@ class Explorer:
         """How many looks were made for each voxel."""
         self._way_in: Float[ndarray, "n dof"] | None = None
         """Waypoints of the latest motion that was returned."""
+        self._news: list[DepthView] = []
+        """Views since the latest step."""
+        self._free = self.map.free
+        """Voxels that were free then."""
 
     def set_goal(self, goal: ArrayLike | Goal) -> None:
         """The next goal: configurations, or poses as `rd.Problem` takes them. What was seen is kept."""
@@ -145,6 +150,7 @@ class Explorer:
         """Take a view into account; see `OccupancyMap.add`."""
         self.map.add(view, stamp)
         self._views = [*self._views, view][-self.settings.max_views :]
+        self._news.append(view)
 
     def next(self, configuration: ArrayLike) -> Step:
         """What the arm, at rest at a configuration, shall do next.
@@ -154,6 +160,7 @@ class Explorer:
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
+        self._news, self._free = [], self.map.free
         if isinstance(self._goal, JointGoal) and self._at_goal(q, self._goal.positions):
             return Step(DONE, "the arm is at the goal")
         if not self._views:
@@ -169,6 +176,13 @@ class Explorer:
         if step.motion is not None and step.motion.path is not None:
             self._way_in = step.motion.path.positions
         return replace(step, seen=problem.scene)
+
+    def stop(self, motion: Trajectory, time: float) -> Stop | None:
+        """How a motion under way ends early, if what was observed since `next` returned it is in its way;
+        None if it is not. time: when a new command takes effect, on the motion's clock [s]. After the stop,
+        ask `next` again. See `stopping.stop_before`.
+        """
+        return stop_before(self.robot, self.scene, self._news, self._free, motion, time)
 
     def _at_goal(self, q: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> bool:
         return bool((np.abs(goals - q).max(axis=1) < AT_GOAL).any())

@@ -23,7 +23,7 @@ ATTEMPTS_PER_ITERATION = 0.2
 """Attempts to make a motion faster per iteration of the search; both then take about the same time."""
 ATTEMPTS_AFTER_SEARCH = 200
 """Attempts between two checks whether to go on, once the search has ended."""
-TIME_GAIN, TIME_PATIENCE = 0.005, 800
+TIME_GAIN, TIME_PATIENCE = 0.0025, 1_600
 """With until "converged", attempts end when doubling them reduced the time by less than this part, but not
 before this many."""
 MIN_TIME_GAIN = 0.01

@@ -22,10 +22,10 @@ IMPROVEMENT_STEP = 1_000
 
 @dataclass(frozen=True)
 class AORRTCSettings(SearchSettings, name="aorrtc"):
-    gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.005
+    gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.0025
     """With until "converged", the search ends when doubling its work shortened the path by less than this
     part ..."""
-    patience: Natural = 8_000
+    patience: Natural = 16_000
     """... but not before this many iterations."""
 
 

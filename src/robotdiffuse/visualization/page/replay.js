@@ -237,16 +237,17 @@ const SOLIDS = {
   capsule: (s) => upright(new THREE.CapsuleGeometry(s.radius, s.height, 20, 56)),
   mesh: (s) => geometry(s.surface),
 };
-const obstacles = new THREE.Group();
-for (const shape of data.scene) {
-  if (shape.kind === "point_cloud") { obstacles.add(cloud(shape)); continue; }
+function obstacle(shape) {
+  if (shape.kind === "point_cloud") return cloud(shape);
   const mesh = new THREE.Mesh(SOLIDS[shape.kind](shape), new THREE.MeshStandardMaterial({
     color: color(shape.color), roughness: 0.62, side: shape.kind === "mesh" ? THREE.DoubleSide : THREE.FrontSide }));
   if (shape.center) mesh.position.set(...shape.center);
   if (shape.wxyz) mesh.quaternion.set(shape.wxyz[1], shape.wxyz[2], shape.wxyz[3], shape.wxyz[0]);
   mesh.castShadow = mesh.receiveShadow = true;
-  obstacles.add(mesh);
+  return mesh;
 }
+const obstacles = new THREE.Group();
+for (const shape of data.scene) obstacles.add(obstacle(shape));
 scene.add(obstacles);
 
 // --- Traces
@@ -406,6 +407,7 @@ function drawPlot(time) {
 
 // --- Time
 
+const followers = []; // called with the time whenever it changes
 let time = 0, playing = false, rest = 0, last = null; // rest: time spent at the end [s]
 const END_PAUSE = 0.9; // pause at the end of the motion before it repeats [s]
 const ICONS = { play: "M8 5.2v13.6L19 12z", pause: "M7 5h3.6v14H7zm6.4 0H17v14h-3.6z" };
@@ -431,6 +433,7 @@ function setTime(t) {
     : `<b>${(100 * share).toFixed(0)}</b> %`;
   q.forEach((v, j) => { values[j].textContent = v.toFixed(2); });
   drawPlot(time);
+  for (const follow of followers) follow(time);
   dirty = true;
 }
 const scrub = (share) => { setPlaying(false); setTime(share * duration); };

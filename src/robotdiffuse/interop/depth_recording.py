@@ -1,0 +1,245 @@
+"""Reads and writes depth images with camera parameters, poses and joint states in MCAP files, as ROS 2
+messages.
+
+A camera NAME has its images (sensor_msgs/Image) and parameters (sensor_msgs/CameraInfo) on topics of one
+folder, such as /NAME/depth/image_rect_raw and /NAME/depth/camera_info. Its pose is the transform from the
+arm's base to the `frame_id` of the images (tf2_msgs/TFMessage on /tf and /tf_static), and the arm's
+configuration is in sensor_msgs/JointState.
+"""
+
+import io
+from bisect import bisect
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.input_files import input_file
+from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.interop.mcap_file import McapWriter, make_reader, messages_in, topics_in
+from robotdiffuse.interop.ros_types import JOINT_STATE, header_seconds, to_plain
+from robotdiffuse.interop.transform_history import TransformHistory
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.robots.robot import Robot
+
+IMAGE = "sensor_msgs/msg/Image"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001)}
+"""Types of the pixels of depth images, and metres per unit (REP 118)."""
+MAX_SIZE = 64 * 10**9
+"""Of recordings [bytes]."""
+MAX_GAP = 0.1
+"""Joint states and transforms are interpolated between two that are at most this far from the image [s]."""
+
+
+class StampedView(NamedTuple):
+    stamp: float
+    """When the image was taken [s]."""
+    view: DepthView
+
+
+def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], file: str | Path) -> None:
+    """Write views of cameras by name as .mcap. Each view needs the arm's configuration.
+
+    Joint states and transforms are written at the stamps of images alone.
+    """
+    stream = io.BytesIO()
+    out = McapWriter(stream)
+    ordered = sorted(
+        ((one.stamp, name, one.view) for name, taken in views.items() for one in taken),
+        key=lambda one: one[0],
+    )
+    for stamp, name, view in ordered:
+        at = round(1e9 * stamp)
+        if view.configuration is None:
+            raise InputError(f"the view of {name} at {stamp:g} s has no configuration")
+        frame = f"{name}_depth_optical_frame"
+        times = {"sec": at // 10**9, "nanosec": at % 10**9}
+        header = {"stamp": times, "frame_id": frame}
+        names = [*robot.joint_names, *robot.locked]
+        positions = [*view.configuration.tolist(), *robot.locked.values()]
+        out.ros(
+            "/joint_states",
+            JOINT_STATE,
+            {"header": {"stamp": times}, "name": names, "position": positions},
+            at,
+        )
+        out.ros(
+            "/tf", TRANSFORMS, {"transforms": [_transform(robot.base, frame, times, view.T_base_camera)]}, at
+        )
+        out.ros(f"/{name}/depth/camera_info", CAMERA_INFO, _camera_info(header, view), at)
+        out.ros(f"/{name}/depth/image_rect_raw", IMAGE, _image(header, view), at)
+    out.writer.finish()
+    write_atomically(Path(file), stream.getvalue())
+
+
+def _transform(parent: str, child: str, stamp: dict[str, int], T: Float[ndarray, "4 4"]) -> dict[str, Any]:
+    w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
+    place = dict(zip("xyz", T[:3, 3].tolist(), strict=True))
+    return {
+        "header": {"stamp": stamp, "frame_id": parent},
+        "child_frame_id": child,
+        "transform": {"translation": place, "rotation": {"x": x, "y": y, "z": z, "w": w}},
+    }
+
+
+def _camera_info(header: dict[str, Any], view: DepthView) -> dict[str, Any]:
+    (height, width), (fx, fy, cx, cy) = view.depth.shape, view.intrinsics
+    return {
+        "header": header,
+        "height": height,
+        "width": width,
+        "distortion_model": "plumb_bob",
+        "d": [0.0] * 5,
+        "k": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        "r": np.eye(3).ravel(),
+        "p": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    }
+
+
+def _image(header: dict[str, Any], view: DepthView) -> dict[str, Any]:
+    height, width = view.depth.shape
+    return {
+        "header": header,
+        "height": height,
+        "width": width,
+        "encoding": "32FC1",
+        "is_bigendian": 0,
+        "step": 4 * width,
+        "data": np.frombuffer(view.depth.astype("<f4").tobytes(), np.uint8),
+    }
+
+
+def read_depth_views(
+    file: str | Path, robot: Robot, topics: Sequence[str] | None = None, base: str | None = None
+) -> Iterator[StampedView]:
+    """Read the depth images of an .mcap file, one after the other in the order of their log times, as views
+    that `Explorer.observe` takes.
+
+    topics: of the images; None: all topics with depth images (32FC1 in m, 16UC1 in mm).
+    base: the frame of the arm's base in the file; None: `robot.base`.
+
+    Images must be rectified. The camera's pose and the arm's configuration at an image's stamp are
+    interpolated. Raises InputError for a file that is damaged or holds no depth images, without joint states
+    or transforms within 0.1 s of an image, and for distorted or compressed images.
+    """
+    path = input_file(file, largest=MAX_SIZE)
+    try:
+        yield from _read(path, robot, topics, base or robot.base)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(str(file)) else f"{file}: {text}") from None
+    except Exception as error:  # mcap, zstandard and rosbags raise many kinds of errors for a damaged file
+        raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
+
+
+def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> Iterator[StampedView]:
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        kinds = topics_in(reader, str(path))
+        images = _image_topics(kinds, topics)
+        states, transforms, infos = _States(robot), TransformHistory(), {}
+        others = [
+            name for name, schema in kinds.items() if schema.name in (JOINT_STATE, TRANSFORMS, CAMERA_INFO)
+        ]
+        for topic, at, message in messages_in(reader, kinds, others):
+            kind = kinds[topic].name
+            if kind == CAMERA_INFO:
+                infos.setdefault(_folder(topic), message)
+            elif kind == JOINT_STATE:
+                states.add(_seconds(message, at), to_plain(message))
+            else:
+                for one in message.transforms:
+                    transforms.add(to_plain(one), static=topic.endswith("static"))
+        found = False
+        for topic, at, message in messages_in(reader, kinds, images):
+            if message.encoding not in ENCODINGS and topics is None:
+                continue
+            found, stamp = True, _seconds(message, at)
+            where = f"the image of {topic} at {stamp:.3f} s"
+            T = transforms.at(base, message.header.frame_id, stamp, MAX_GAP, where)
+            intrinsics = _intrinsics(topic, infos.get(_folder(topic)), message)
+            view = DepthView(_depth(where, message), intrinsics, T, states.at(stamp, where))
+            yield StampedView(stamp, view)
+    if not found:
+        listed = ", ".join(f"{topic} ({schema.name})" for topic, schema in kinds.items()) or "none"
+        raise InputError(f"{path} holds no depth images (32FC1 or 16UC1); topics: {listed}")
+
+
+def _image_topics(kinds: Mapping[str, Any], asked: Sequence[str] | None) -> list[str]:
+    found = [topic for topic, schema in kinds.items() if schema.name == IMAGE]
+    for topic in asked or ():
+        if topic not in found:
+            raise InputError(
+                f"topic {topic!r} holds no images; topics of images: {', '.join(found) or 'none'}"
+            )
+    return found if asked is None else list(asked)
+
+
+def _folder(topic: str) -> str:
+    return topic.rpartition("/")[0]
+
+
+def _seconds(message: Any, logged: int) -> float:
+    """The stamp of a message, or its log time if it has none [s]."""
+    stamp = message.header.stamp
+    return header_seconds({"sec": stamp.sec, "nanosec": stamp.nanosec}) or 1e-9 * logged
+
+
+def _intrinsics(topic: str, info: Any, image: Any) -> tuple[float, float, float, float]:
+    if info is None:
+        raise InputError(f"there is no CameraInfo on {_folder(topic)}/camera_info for {topic}")
+    if (info.width, info.height) != (image.width, image.height):
+        raise InputError(
+            f"images of {topic} have {image.width} x {image.height} pixels; their CameraInfo has "
+            f"{info.width} x {info.height}"
+        )
+    if np.any(np.asarray(info.d) != 0) and "rect" not in topic.rpartition("/")[2]:
+        raise InputError(f"images of {topic} are distorted; record the rectified ones (image_rect)")
+    p, k = np.asarray(info.p).reshape(3, 4), np.asarray(info.k).reshape(3, 3)
+    used = p if p[0, 0] else k
+    return float(used[0, 0]), float(used[1, 1]), float(used[0, 2]), float(used[1, 2])
+
+
+def _depth(where: str, image: Any) -> Float[ndarray, "h w"]:
+    """The image [m]."""
+    if image.encoding not in ENCODINGS:
+        raise InputError(f"{where} has the encoding {image.encoding!r}; it must be {' or '.join(ENCODINGS)}")
+    kind, scale = ENCODINGS[image.encoding]
+    rows = np.asarray(image.data, np.uint8).reshape(image.height, image.step)
+    size = np.dtype(kind).itemsize * image.width
+    pixels = np.ascontiguousarray(rows[:, :size]).view((">" if image.is_bigendian else "<") + kind)
+    return scale * pixels.astype(np.float32)
+
+
+class _States:
+    """The configurations of an arm over time."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._stamps: list[float] = []
+        self._positions: list[list[float]] = []
+
+    def add(self, stamp: float, state: Mapping[str, Any]) -> None:
+        """Take a message into account, if it holds the arm's joints."""
+        place = {name: i for i, name in enumerate(state["name"])}
+        if all(name in place for name in self._robot.joint_names):
+            i = bisect(self._stamps, stamp)  # messages may be logged in another order
+            self._stamps.insert(i, stamp)
+            positions = [state["position"][place[name]] for name in self._robot.joint_names]
+            self._positions.insert(i, positions)
+
+    def at(self, stamp: float, where: str) -> Float[ndarray, "dof"]:
+        """The configuration at a time. Raises InputError, naming `where`, if none is near."""
+        stamps = np.array(self._stamps)
+        if not len(stamps) or np.abs(stamps - stamp).min() > MAX_GAP:
+            names = ", ".join(self._robot.joint_names)
+            raise InputError(f"there is no joint state of {names} within {MAX_GAP:g} s of {where}")
+        positions = np.array(self._positions)
+        return np.array([np.interp(stamp, stamps, positions[:, j]) for j in range(self._robot.dof)])

@@ -1,0 +1,96 @@
+"""The page of an exploration: what it says of each time, and that a browser shows it."""
+
+import base64
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.explorations import FLOOR, recorded
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.visualization.exploration_page import PAUSE, write_exploration
+from robotdiffuse.visualization.voxel_faces import faces_between
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = ["--no-sandbox", "--disable-background-networking", "--use-angle=swiftshader"]
+FLAGS += ["--enable-unsafe-swiftshader"]
+PATIENCE = 300_000
+"""WebGL without a graphics card is slow [ms]."""
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    problem, explorer = recorded()
+    file = tmp_path_factory.mktemp("page") / "explore.html"
+    write_exploration(explorer, problem.scene, file)
+    return file
+
+
+def numbers(text: str) -> list[int]:
+    """What the page decodes: differences in groups of 7 bits, the lowest first."""
+    out, last, value, shift = [], 0, 0, 0
+    for byte in base64.b64decode(text):
+        value, shift = value + ((byte & 127) << shift), shift + 7
+        if byte < 128:
+            last += value
+            out.append(last)
+            value = shift = 0
+    return out
+
+
+def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
+    _, explorer = recorded()
+    found = re.search(r'id="data">(.*?)</script>', page.read_text("utf-8"), re.S)
+    assert found is not None
+    data = json.loads(found[1])
+    told = data["exploration"]
+    assert [shape["name"] for shape in data["scene"]] == [FLOOR.name]
+    assert [shape["name"] for shape in told["true_scene"]] == ["floor", "wall"]
+    assert len(told["acts"]) == len(explorer.acts)
+    for number, (act, one) in enumerate(zip(explorer.acts, told["acts"], strict=True)):
+        assert one["time"] == pytest.approx(act.begins + number * PAUSE, abs=1e-3)
+        assert one["title"].startswith(f"{number + 1}  ") and one["reason"] == act.step.reason
+        assert bool(one["look"]) == (act.T_base_camera is not None) == (one["end"] is not None)
+    assert data["times"][-1] == pytest.approx(explorer.duration + PAUSE * (len(explorer.acts) - 1), abs=1e-3)
+    times = [known["time"] for known in told["known"]]
+    assert times == sorted(times) and times[0] == 0.0
+    unknown: set[int] = set()
+    for known in told["known"]:
+        unknown ^= set(numbers(known["layers"][2]))
+    last = explorer.views[-1]
+    assert unknown <= set(faces_between(last.unknown, last.free)[0].tolist())
+    assert len(unknown) > 1000, "the boundary of unknown space, without that at the known floor"
+
+
+def test_another_ending_is_refused(tmp_path: Path) -> None:
+    problem, explorer = recorded()
+    with pytest.raises(InputError):
+        write_exploration(explorer, problem.scene, tmp_path / "explore.png")
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_a_browser_shows_the_steps(page: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
+    _, explorer = recorded()
+    errors: list[str] = []
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
+        shown = browser.new_page(viewport={"width": 480, "height": 300})
+        shown.set_default_timeout(PATIENCE)
+        shown.on("pageerror", lambda error: errors.append(str(error)))
+        shown.goto(f"{page.as_uri()}#at=1")
+        rows = shown.evaluate("[...document.querySelectorAll('#steps li')].map((row) => row.ariaCurrent)")
+        toggles = shown.evaluate(
+            "[...document.querySelectorAll('#toggles button')].map((b) => b.textContent)"
+        )
+        pixels = shown.evaluate("layers.map((layer) => layer.meshes[0].geometry.index.count)")
+        browser.close()
+    assert not errors
+    assert rows == ["false"] * (len(explorer.acts) - 1) + ["true"]
+    assert toggles[:5] == ["Occupied", "Predicted", "Unknown", "Next look", "True scene"]
+    assert np.array(pixels)[[0, 2]].min() > 6000
