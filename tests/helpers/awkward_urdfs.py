@@ -83,7 +83,7 @@ WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
         arm(chain("base", ["rail"], kind="prismatic"), chain("rail_link", row("j", 4), kind="continuous")),
         5,
     ),
-    "a branch along the arm": (arm(ARM, chain("j2_link", ["lid"])), 4),
+    "a branch along the arm": (arm(chain("base", row("j", 6)), chain("j2_link", ["lid"])), 6),
     "names in other scripts": (
         arm(chain("base", ["Gelenk_ß", "关节二", "сустав", "مفصل"]), name="机器人 Ä"),
         4,
