@@ -53,6 +53,7 @@ from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.projection_kernel import project
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -190,7 +191,7 @@ class _Set:
 
     def project(self, q_previous: ndarray, q_proposed: ndarray) -> ndarray | None:
         q = q_proposed.copy()
-        return q if kernel.project(self.rows, self.kept, q, self.work) else None
+        return q if project(self.rows, self.kept, q, self.work) else None
 
 
 def peer(problem: Problem, seed: int) -> Answer:

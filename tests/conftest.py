@@ -11,8 +11,8 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
-APART = ("learning", "robots", "scenes", "viewer")
-"""Rooms whose tests need little of the compiled code of searches."""
+APART = ("learning", "robots", "scenes")
+"""Packages whose tests need little of the compiled code of searches."""
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 _KERNELS = r"robotdiffuse\.(collision\.kernels\.compiled|core\.kernels)"
 COMPILED = re.compile(rf"^\s*(import numba\b|from numba\b|from {_KERNELS} import)", re.MULTILINE)

@@ -1,9 +1,11 @@
 """The direction of imports, what `import robotdiffuse` costs, and that tests use public names."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -69,14 +71,22 @@ def package(file: Path) -> str:
     return file.relative_to(SOURCE).parts[0].removesuffix(".py")
 
 
-def imported(file: Path) -> Iterator[str]:
+@cache
+def tree_of(file: Path) -> ast.Module:
+    return ast.parse(file.read_text())
+
+
+@cache
+def imported(file: Path) -> list[str]:
     """Full names of everything that a module imports, at the top or inside functions."""
-    for node in ast.walk(ast.parse(file.read_text())):
+    names: list[str] = []
+    for node in ast.walk(tree_of(file)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{file}:{node.lineno}: relative import"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            names += (f"{node.module}.{alias.name}" for alias in node.names)
+    return names
 
 
 @pytest.mark.parametrize("file", MODULES, ids=lambda file: str(file.relative_to(SOURCE)))
@@ -173,20 +183,26 @@ def used_names(tree: ast.AST) -> Iterator[str]:
             isinstance(node.value, ast.Name) and node.value.id == "self"
         ):
             yield node.attr
-        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("setattr", "patch.object")):
-            texts = (arg.value for arg in node.args if isinstance(arg, ast.Constant))
-            yield from (text.rpartition(".")[2] for text in texts if isinstance(text, str))
+        if isinstance(node, ast.Call):
+            texts = [arg.value for arg in node.args if isinstance(arg, ast.Constant)]
+            if texts and ast.unparse(node.func).endswith(("setattr", "patch.object")):
+                yield from (text.rpartition(".")[2] for text in texts if isinstance(text, str))
 
 
 def test_tests_benchmarks_and_examples_use_no_private_names() -> None:
-    trees = [ast.parse(file.read_text()) for file in MODULES]
-    private = {name for tree in trees for name in defined_names(tree) if name[0] == "_" != name[-1]}
+    private = {
+        name for file in MODULES for name in defined_names(tree_of(file)) if name[0] == "_" != name[-1]
+    }
     private -= {"_replace"}  # a public method of named tuples
     root = SOURCE.parents[1]
     folders = (root / folder for folder in ("tests", "benchmarks", "examples"))
     for file in (file for folder in folders for file in folder.rglob("*.py")):
-        own = ast.parse(file.read_text())
-        used = set(used_names(own)) & (private - set(defined_names(own)))
+        text = file.read_text()
+        if private.isdisjoint(re.findall(r"\b_\w+", text)):
+            continue
+        own = ast.parse(text)
+        used = private.intersection(used_names(own))
+        used -= set(defined_names(own)) if used else set()
         assert not used, f"{file.relative_to(root)} uses {', '.join(sorted(used))}"
 
 

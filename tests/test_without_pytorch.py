@@ -53,7 +53,7 @@ from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSet
 drawn, draw = [], RobotDiffuse.draw
 RobotDiffuse.draw = lambda *given: drawn.append(1) or draw(*given)
 RobotDiffuse(RobotDiffuseSettings(network_share=0.9)).plan(
-    problem, time_limit=3.0, until="time_limit", objective="length"
+    problem, time_limit=1.5, until="time_limit", objective="length"
 )
 print(bool(drawn))
 """

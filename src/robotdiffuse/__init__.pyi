@@ -37,12 +37,12 @@ from .problems.problem import Problem as Problem
 from .robots import load_robot as load_robot
 from .robots.inertias import Payload as Payload
 from .scenes.height_map import HeightMap as HeightMap
+from .scenes.mesh import Mesh as Mesh
 from .scenes.moving_obstacles import MovingObstacle as MovingObstacle
 from .scenes.scene import Scene as Scene
 from .scenes.shapes import Box as Box
 from .scenes.shapes import Capsule as Capsule
 from .scenes.shapes import Cylinder as Cylinder
-from .scenes.shapes import Mesh as Mesh
 from .scenes.shapes import PointCloud as PointCloud
 from .scenes.shapes import Sphere as Sphere
 from .validation.validator import verify as verify

@@ -44,8 +44,6 @@ def test_info_prints_figures_and_writes_the_page(folder, capsys):
     ):
         assert text in printed, text
     assert (folder / "report.html").read_text().startswith("<!doctype html>")
-    assert run("data", "info", folder, "--page", folder.parent / "page.html") == 0
-    assert (folder.parent / "page.html").is_file()
 
 
 def test_check_of_clean_data(folder, capsys):
@@ -135,5 +133,6 @@ def test_info_on_motions_that_are_all_straight_warns_of_nothing(
     rd.write_dataset(
         [line] * 20, [rd.Scene([rd.Sphere([-2, 0.1 * i, 1], 0.1)]) for i in range(20)], tmp_path / "d"
     )
-    assert run("data", "info", tmp_path / "d") == 0
+    assert run("data", "info", tmp_path / "d", "--page", tmp_path / "page.html") == 0
+    assert (tmp_path / "page.html").is_file() and not (tmp_path / "d" / "report.html").exists()
     assert not [str(warning.message) for warning in recwarn if warning.category is UserWarning]

@@ -6,7 +6,7 @@ import pytest
 
 from helpers.commands import run
 from helpers.made_arms import chain, row, written
-from helpers.quick_preparation import QUICK
+from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.robots import load_robot
 
 
@@ -26,7 +26,8 @@ def test_robot_add_with_srdf_and_robot_list(
     rows = (f'<disable_collisions link1="{a}" link2="{b}" reason="{why}"/>' for a, b, why in pairs)
     (tmp_path / "made.srdf").write_text(f"<robot name='made'>{''.join(rows)}</robot>")
 
-    assert run("robot", "add", str(file), "--allow", "j1_link", "j4_link") == 0
+    with coarse_grids():
+        assert run("robot", "add", str(file), "--allow", "j1_link", "j4_link") == 0
     told = capsys.readouterr()
     assert "pairs that differ from made.srdf" in told.out and "User" in told.out and "named 1" in told.out
     assert "5 of 11: spheres of base" in told.err and "11 of 11: done" in told.err
@@ -35,7 +36,8 @@ def test_robot_add_with_srdf_and_robot_list(
     assert frozenset(("base", "j4_link")) not in allowed  # found beside: compared, not taken
 
     given = ("--srdf", str(tmp_path / "made.srdf"), "--name", "by_srdf")
-    assert run("robot", "add", str(file), *given) == 0
+    with coarse_grids():
+        assert run("robot", "add", str(file), *given) == 0
     capsys.readouterr()
     assert frozenset(("base", "j4_link")) in load_robot("by_srdf").allowed_collisions
     assert run("robot", "add", str(file), "--allow", "base", "moon") == 2

@@ -8,8 +8,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
+from helpers.urdfs import read_urdf
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.robots.robot import Joint, Robot
 
 TIPS = {

@@ -1,8 +1,14 @@
 """A small model of motions for the arm of boxes, untrained: for tests of what is built around one."""
 
+import shutil
+import tempfile
+from functools import cache
+from pathlib import Path
+
 import torch
 
 from helpers.box_arm import box_arm
+from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.denoisers.settings import TransformerSettings
 from robotdiffuse.learning.encoders.settings import PointAutoencoderSettings
 from robotdiffuse.learning.motion_model import MotionModelSettings
@@ -23,3 +29,16 @@ def small_model(seed: int = 0) -> MotionNetwork:
     model = MotionNetwork(RobotIdentity.of(box_arm()), settings)
     torch.nn.init.normal_(model.denoiser.out.weight, std=0.2)
     return model
+
+
+@cache
+def _saved() -> tempfile.TemporaryDirectory[str]:
+    """The export to ONNX takes seconds, so it is done once; the folder goes with the process."""
+    folder = tempfile.TemporaryDirectory()
+    save_network("model", small_model(), folder.name, {})
+    return folder
+
+
+def save_small_model(folder: Path) -> None:
+    """Write the files of `small_model()`, as `save_network` does."""
+    shutil.copytree(_saved().name, folder, dirs_exist_ok=True)

@@ -9,7 +9,7 @@ import torch
 
 from helpers.box_arm import box_arm
 from helpers.example_robots import planar_arm
-from helpers.small_model import SMALL_ENCODER, small_model
+from helpers.small_model import SMALL_ENCODER, save_small_model, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import (
     fingerprint,
@@ -46,7 +46,7 @@ def test_checkpoint_round_trip(tmp_path):
 
 
 def test_wrong_robot_is_refused(tmp_path):
-    save_network("model", small_model(), tmp_path, {})
+    save_small_model(tmp_path)
     with pytest.raises(InputError, match=r"model\.json was trained for .* other dimensions"):
         load_model(tmp_path, planar_arm(0.5, 0.5, 0.5))
     with pytest.raises(InputError, match=r"model\.json was trained for .* with joints"):
@@ -56,7 +56,7 @@ def test_wrong_robot_is_refused(tmp_path):
 def test_other_links_with_spheres_are_refused(tmp_path):
     """A robot with the same joints and dimensions: its clearances would belong to other links."""
     arm = box_arm()
-    save_network("model", small_model(), tmp_path, {})
+    save_small_model(tmp_path)
     bare = replace(arm, spheres={link: arm.spheres[link] for link in ("l1", "l2")})
     with pytest.raises(InputError, match="has spheres on the links l1, l2, not l1, l2, l3"):
         load_model(tmp_path, bare)
@@ -111,7 +111,7 @@ def damage(folder, case):
     ],
 )
 def test_damaged_weights_give_one_line(tmp_path, case, file):
-    save_network("model", small_model(), tmp_path, {})
+    save_small_model(tmp_path)
     damage(tmp_path, case)
     with pytest.raises(InputError, match=file) as caught:
         load_model(tmp_path)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning import checkpoint
 from robotdiffuse.learning.checkpoint import load_completion, save_completion
 from robotdiffuse.learning.completion import exported_completion, predict
 from robotdiffuse.learning.completion.network import CompletionNetwork, folded, unfolded
@@ -115,6 +116,7 @@ def test_the_network_s_inputs() -> None:
     np.testing.assert_allclose(planes[6], np.hypot(*np.moveaxis(voxel_centers()[..., :2], -1, 0)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A small network that has memorised one sample predicts the true voxels."""
     settings = replace(TINY, learning_rate=1e-2)
@@ -145,6 +147,12 @@ def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch
     reach = reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
     counted = ~free & reach
     assert average_precision(p[counted], fine[counted]) > 2 * fine[counted].mean()
+
+
+def test_training_writes_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(checkpoint, "completion_exports", lambda _: {})  # it takes seconds
+    report = train_completion(replace(TINY, samples=2), str(tmp_path))
+    assert report["samples"] == 2 and load_completion(tmp_path).settings == SMALL
 
 
 @pytest.mark.slow

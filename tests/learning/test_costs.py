@@ -8,8 +8,9 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.costs import path_constraint_cost
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.problems.compiled_constraints import PathConstraints
-from robotdiffuse.problems.constraint_kernel import ANGLE_WEIGHT, DISTANCE
+from robotdiffuse.problems.constraint_kernel import DISTANCE
 from robotdiffuse.problems.constraints import Constraint
+from robotdiffuse.problems.projection_kernel import ANGLE_WEIGHT
 from robotdiffuse.robots.kinematics import link_pose
 
 PANDA, HAND = rd.load_robot("panda"), "panda_hand"

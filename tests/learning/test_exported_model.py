@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from helpers.box_arm import box_arm
-from helpers.small_model import small_model
+from helpers.small_model import save_small_model, small_model
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.checkpoint import load_completion, load_network, save_network
+from robotdiffuse.learning.checkpoint import load_completion, load_network
 from robotdiffuse.learning.completion import exported_completion
 from robotdiffuse.learning.completion.samples import BITS
 from robotdiffuse.learning.encoders.compression_autoencoder import CompressionAutoencoder
@@ -93,7 +93,7 @@ def test_units_of_joints_agree_for_arrays_and_tensors() -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("weights")
-    save_network("model", small_model(), place, {})
+    save_small_model(place)
     return place
 
 

@@ -46,7 +46,7 @@ def random_scene(rng: np.random.Generator, count: int = 6) -> Scene:
     return Scene(shapes)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000))
 def test_points_lie_on_surfaces_and_nothing_is_nearer(seed: int) -> None:
     rng = np.random.default_rng(seed)

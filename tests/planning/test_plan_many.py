@@ -89,8 +89,12 @@ NOT_MAIN = """if __name__ != "__main__":
 
 @pytest.mark.parametrize(
     "beginning",
-    ["", *map(NOT_MAIN.format, ("raise ValueError", "raise SystemExit", "import os; os._exit(0)"))],
-    ids=["unguarded", "raises", "exits", "ends"],
+    [
+        pytest.param("", id="unguarded"),
+        pytest.param(NOT_MAIN.format("raise ValueError"), id="raises"),
+        pytest.param(NOT_MAIN.format("raise SystemExit"), id="exits"),
+        pytest.param(NOT_MAIN.format("import os; os._exit(0)"), id="ends", marks=pytest.mark.slow),
+    ],
 )
 def test_a_script_that_processes_cannot_import_is_an_error(beginning: str, tmp_path: Path) -> None:
     """It hung: what a process is given as it starts, robots, does not fit a pipe that nobody reads."""

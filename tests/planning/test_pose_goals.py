@@ -12,6 +12,7 @@ from numpy import ndarray
 
 import robotdiffuse as rd
 from helpers.made_arms import chain, row, written
+from helpers.urdfs import read_urdf
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
@@ -22,7 +23,6 @@ from robotdiffuse.planning.pose_goals import pose_configurations
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
 from robotdiffuse.problems.goals import PoseGoal, PosesGoal
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verify

@@ -4,6 +4,7 @@ does not support."""
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -150,8 +151,21 @@ def problem_of(asked: str) -> Problem:
     return ASKED[asked].problem()
 
 
-@pytest.mark.parametrize("asked", ASKED)
-@pytest.mark.parametrize("name", PLANNERS)
+SEVERAL = ("blended", "waypoints", "moving", "moving and waypoints", "all of it")
+"""Requests for which planners are called several times by the pipeline that all share."""
+
+
+def marks_of(name: str, asked: str) -> list[pytest.MarkDecorator]:
+    return [pytest.mark.slow] if name in ("edmp", "mpd") and asked in SEVERAL else []
+
+
+@pytest.mark.parametrize(
+    ("name", "asked"),
+    [
+        pytest.param(name, asked, marks=marks_of(name, asked), id=f"{name}-{asked}")
+        for name, asked in product(PLANNERS, ASKED)
+    ],
+)
 def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> None:
     if name.startswith("ompl_"):
         pytest.importorskip("ompl", reason="the extra `baselines` (ompl) is not installed")

@@ -11,6 +11,7 @@ import pytest
 import robotdiffuse as rd
 from helpers.example_robots import example_robot
 from helpers.made_arms import chain, row, written
+from helpers.urdfs import read_urdf
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.constraints import constraint_bounds
 from robotdiffuse.cli import main
@@ -24,7 +25,6 @@ from robotdiffuse.robots.inertias import Payload, inertia_of
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.robots.parsing.srdf import read_srdf
-from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.robots.scaling import reach

@@ -17,9 +17,10 @@ from robotdiffuse.core.input_files import read_triangles, read_yaml
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
 from robotdiffuse.scenes.height_map import HeightMap
+from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.point_cloud import crop, distinct, read_points, voxel_thin
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 from robotdiffuse.scenes.surface_points import DRAWS, VisibleRegion, sample_surface
 
 TURN = (0.8, 0.2, -0.5, 0.3)
@@ -33,7 +34,6 @@ SHAPES: dict[str, Shape] = {
     "mesh": Mesh(*TETRAHEDRON, xyz=[0.1, 0.2, 0.3], wxyz=TURN),
     "point_cloud": PointCloud(np.random.default_rng(0).uniform(0.2, 0.6, (500, 3))),
 }
-EVERYWHERE = VisibleRegion(floor=-10.0, reach=100.0)
 
 
 def surface_distance(shape: Shape, points: ndarray) -> ndarray:

@@ -3,7 +3,6 @@
 import asyncio
 import json
 import socket
-from collections.abc import Iterator
 from typing import Any
 
 import h11
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from helpers.box_arm import box_arm
-from helpers.serving import serving
 
 pytest.importorskip("fastapi")
 
@@ -24,12 +22,6 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.server import connection, worker
 from robotdiffuse.server.connection import Connection
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[httpx.Client]:
-    with serving("--workers", "1") as (client, _):
-        yield client
 
 
 def answer(server: httpx.Client, sent: bytes) -> tuple[int, Any]:

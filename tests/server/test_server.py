@@ -6,9 +6,7 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.commands import run
 from helpers.faulty_planner import DIES, HANGS, RAISES, SEARCHES
 from helpers.serving import serving
 from robotdiffuse.cli.serve import served_robots
@@ -43,15 +42,6 @@ def problem(height: float = 0.4, **changed: Any) -> dict[str, Any]:
 
 def asked(seed: int = 0, planner: str = "rrt_connect", height: float = 0.4, **more: Any) -> dict[str, Any]:
     return {"problem": problem(height), "planner": planner, "seed": seed, "time_limit": 2.0} | more
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[httpx.Client]:
-    with serving("--workers", "1", "--queue", "2", "--max-time-limit", "5", "--max-request-size", "1") as (
-        client,
-        _,
-    ):
-        yield client
 
 
 def gauge(server: httpx.Client, name: str) -> float:
@@ -256,6 +246,7 @@ def test_a_full_queue_says_when_to_try_again(server: httpx.Client) -> None:
     assert server.post("/plan", json=asked(3)).status_code == 200
 
 
+@pytest.mark.slow
 def test_a_worker_that_holds_too_much_memory_is_replaced_between_requests() -> None:
     with serving("--workers", "1", "--max-worker-memory", "1") as (client, _):
         for _ in range(2):
@@ -280,10 +271,9 @@ def test_it_stops_gracefully_and_leaves_no_worker() -> None:
         until(lambda: not any(os.path.exists(f"/proc/{worker}") for worker in workers.split()))
 
 
-def test_a_server_for_other_machines_needs_a_token() -> None:
-    arguments = [sys.executable, "-m", "robotdiffuse", "serve", "--host", "0.0.0.0", "--port", "0"]
-    refused = subprocess.run(arguments, capture_output=True, text=True)
-    assert refused.returncode == 2 and "ROBOTDIFFUSE_TOKEN" in refused.stderr
+def test_a_server_for_other_machines_needs_a_token(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("serve", "--host", "0.0.0.0", "--port", "0") == 2
+    assert "ROBOTDIFFUSE_TOKEN" in capsys.readouterr().err
     with serving("--workers", "1", "--host", "0.0.0.0", ROBOTDIFFUSE_TOKEN="open sesame") as (client, _):
         assert client.get("/robots").status_code == 401
         told = {"Authorization": "Bearer open sesame"}
@@ -291,11 +281,9 @@ def test_a_server_for_other_machines_needs_a_token() -> None:
         assert client.get("/robots", headers={"Authorization": "Bearer open"}).status_code == 401
 
 
-def test_an_address_in_use_is_one_line(server: httpx.Client) -> None:
-    port = str(server.base_url.port)
-    arguments = [sys.executable, "-m", "robotdiffuse", "serve", "--port", port]
-    refused = subprocess.run(arguments, capture_output=True, text=True)
-    assert refused.returncode == 2 and "cannot listen on 127.0.0.1" in refused.stderr
+def test_an_address_in_use_is_one_line(server: httpx.Client, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("serve", "--port", server.base_url.port) == 2
+    assert "cannot listen on 127.0.0.1" in capsys.readouterr().err
 
 
 def test_robots_named_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,9 @@ import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status
+from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Mesh, PointCloud
+from robotdiffuse.scenes.shapes import PointCloud
 from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
 from robotdiffuse.visualization.style import decimated, robot_surfaces
 

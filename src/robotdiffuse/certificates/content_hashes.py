@@ -10,8 +10,9 @@ import numpy as np
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
+from robotdiffuse.scenes.shapes import PointCloud, Shape
 
 HASH_DECIMALS = 9
 """Decimals that are hashed: rotations from quaternions differ in the last bits between machines."""

@@ -4,7 +4,7 @@ import argparse
 import json
 from collections.abc import Iterator
 
-BASH, ZSH = SHELLS = ("bash", "zsh")
+SHELLS = ("bash", "zsh")
 SCRIPT = """_robotdiffuse() {{
   local word="${{COMP_WORDS[COMP_CWORD]}}" command="" words="" options="" i
   for ((i = 1; i < COMP_CWORD; i++)); do
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     script = SCRIPT.format(paths=paths, cases=cases)
     print(
-        script if arguments.shell == BASH else f"autoload -U +X bashcompinit && bashcompinit\n{script}",
+        script if arguments.shell == "bash" else f"autoload -U +X bashcompinit && bashcompinit\n{script}",
         end="",
     )
     return 0

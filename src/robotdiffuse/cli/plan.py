@@ -245,9 +245,9 @@ def load_and_plan(
 
     picture: whether a picture follows. `request` holds arguments of `Planner.plan`.
     """
+    from robotdiffuse.cli.compile_ahead import compiling_ahead
     from robotdiffuse.core.processes import exit_on_interrupt
     from robotdiffuse.planning import load_planner
-    from robotdiffuse.planning.compile_ahead import compiling_ahead
 
     spinner = Spinner(f"planning with {planner}")
     with exit_on_interrupt(spinner.stop), spinner, compiling_ahead(picture):

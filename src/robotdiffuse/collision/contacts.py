@@ -6,8 +6,8 @@ from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import checks_of
 from robotdiffuse.collision.exact_meshes import Distance, ExactCollision
-from robotdiffuse.collision.kernels import motion_certificate as kernel
-from robotdiffuse.collision.kernels.motion_certificate import Motion
+from robotdiffuse.collision.kernels import motion_pieces
+from robotdiffuse.collision.kernels.motion_pieces import Motion
 from robotdiffuse.collision.motions import DEPTH_SAMPLE_TRAVEL, Contact, ContinuousCollision
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.robots.robot import Robot
@@ -24,11 +24,11 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
     certificate finds the next contact; while there is one, distances are computed every 1 cm of motion.
     """
     validator, exact = ContinuousCollision(robot, scene, contact, 0.5), ExactCollision(robot, scene)
-    motion = Motion(for_kernels(q), kernel.travel_along(q, validator.checks.motion_radii))
+    motion = Motion(for_kernels(q), motion_pieces.travel_along(q, validator.checks.motion_radii))
     end, at, found = float(motion.travel[-1]), 0.0, list[Contact]()
     for _ in range(MAX_CONFIGURATIONS):
-        low = kernel.segment_at(motion.travel, at)[0]
-        here = kernel.configurations(motion, np.array([at]))
+        low = motion_pieces.segment_at(motion.travel, at)[0]
+        here = motion_pieces.configurations(motion, np.array([at]))
         rest = np.concatenate([here, q[low + 1 :]])
         first = validator.sweep(rest).contact
         if first is None:
@@ -56,7 +56,7 @@ def _follow(
     end = float(motion.travel[-1])
     while at < end:
         at = min(at + DEPTH_SAMPLE_TRAVEL, end)
-        q = kernel.configurations(motion, np.array([at]))[0]
+        q = motion_pieces.configurations(motion, np.array([at]))[0]
         near = [d for d in (*exact.link_distances(q), *exact.pair_distances(q)) if d.distance <= contact]
         now = {_key(d, checks): d for d in near}
         for key in [key for key in open_ones if key not in now]:
@@ -81,5 +81,5 @@ def _key(distance: Distance, checks: dict) -> tuple[str, str | None, str]:
 
 def _place(motion: Motion, at: float) -> float:
     """Waypoint index plus fraction of the segment."""
-    low, share = kernel.segment_at(motion.travel, at)
+    low, share = motion_pieces.segment_at(motion.travel, at)
     return low + share

@@ -14,8 +14,9 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 
 SURFACES_BELOW = 0.002
 """Distance of the convex parts of two grazing links below which their surfaces decide [m]."""

@@ -25,8 +25,9 @@ from robotdiffuse.core.deadline import check_time
 from robotdiffuse.robots.link_pair_tables import LinkPairTable
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
 FLOAT32_ROUNDING = 4e-7
 """Obstacles grow by this share of their coordinates, which is more than float32 rounding."""

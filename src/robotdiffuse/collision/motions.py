@@ -30,16 +30,16 @@ from robotdiffuse.collision.convex_geometry import (
 )
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import motion_certificate as kernel
+from robotdiffuse.collision.kernels import motion_pieces
 from robotdiffuse.collision.kernels.motion_certificate import (
     CLEARANCE_CAP,
     PAIR,
     SCENE,
     Arm,
     Checks,
-    Motion,
-    Pieces,
     Round,
 )
+from robotdiffuse.collision.kernels.motion_pieces import Motion, Pieces
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
@@ -132,8 +132,8 @@ class ContinuousCollision:
     def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
         """Certify the motion along straight lines in joint space through the waypoints (at least one)."""
         q = for_kernels(q)
-        motion = Motion(q, kernel.travel_along(q, self.checks.motion_radii))
-        todo = kernel.first_pieces(motion, self.checks, INITIAL_TRAVEL)
+        motion = Motion(q, motion_pieces.travel_along(q, self.checks.motion_radii))
+        todo = motion_pieces.first_pieces(motion, self.checks, INITIAL_TRAVEL)
         best, certified = np.full(2, CLEARANCE_CAP), np.full(2, CLEARANCE_CAP)
         hit: tuple[float, int] | None = None
         while len(todo.start):
@@ -171,7 +171,7 @@ class ContinuousCollision:
         kinds = self.checks.kind[columns]
         travel = found.travel[rows, columns]
         middle = (todo.start + todo.stop) / 2
-        at = kernel.configurations(motion, middle[rows])
+        at = motion_pieces.configurations(motion, middle[rows])
         cutoffs = np.clip(travel + best[kinds], 2 * self.contact, CLEARANCE_CAP)
         distances, _ = self._exact.nearest(at, columns, cutoffs, stop=self.contact)
         asked = int(np.isfinite(distances).sum())
@@ -206,12 +206,12 @@ class ContinuousCollision:
         steps = at + DEPTH_SAMPLE_TRAVEL * np.arange(DEPTH_SAMPLES)
         steps = steps[steps <= max(motion.travel[-1], at)]
         checks, cutoffs = np.full(len(steps), check), np.full(len(steps), 2 * self.contact)
-        distances, names = self._exact.nearest(kernel.configurations(motion, steps), checks, cutoffs)
+        distances, names = self._exact.nearest(motion_pieces.configurations(motion, steps), checks, cutoffs)
         other = names[0]
         left = [i for i, name in enumerate(names) if name != other or distances[i] > self.contact]
         episode = distances[: left[0] if left else len(steps)]
         depth = max(0.0, -float(episode.min(initial=0)))
-        low, share = kernel.segment_at(motion.travel, at)
+        low, share = motion_pieces.segment_at(motion.travel, at)
         if share == 0.0:  # the first of several equal waypoints
             low = int(np.searchsorted(motion.travel, at))
         return Contact(checks_of(self.robot)[check], str(other), low + share, depth)

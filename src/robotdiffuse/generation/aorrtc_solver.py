@@ -20,7 +20,7 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.anytime_search import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import END_MARGIN, StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots.robot import TURN
+from robotdiffuse.robots.link_pair_tables import TURN
 
 ITERATIONS_PER_STEP = 500
 """Between two checks whether to stop."""

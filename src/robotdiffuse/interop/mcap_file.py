@@ -46,7 +46,7 @@ from robotdiffuse.interop.scene_primitives import (
 )
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.kinematics import link_poses
 
 try:
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
@@ -113,9 +113,11 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     except InputError:
         pass  # a robot that was made in Python has no problem file
     names = [*trajectory.joint_names, *robot.locked]
+    links = [link for link in robot.link_names if link != robot.base]
+    poses = {link: link_poses(robot, trajectory.positions, link) for link in links}
     for i, t in enumerate(trajectory.times.tolist()):
         at = round(1e9 * t)
-        out.protobuf("/tf", _transforms(problem, trajectory.positions[i], at), at)
+        out.protobuf("/tf", _transforms(problem, {link: T[i] for link, T in poses.items()}, at), at)
         stamp = {"sec": at // 10**9, "nanosec": at % 10**9}
         values = [*trajectory.positions[i].tolist(), *robot.locked.values()]
         rates = [*trajectory.velocities[i].tolist(), *(0.0 for _ in robot.locked)]
@@ -188,11 +190,10 @@ def _clouds(problem: Problem) -> Iterator[tuple[str, PointCloud]]:
             yield name, cloud
 
 
-def _transforms(problem: Problem, q: Float[ndarray, "dof"], at: int) -> FrameTransforms:
+def _transforms(problem: Problem, poses: dict[str, Float[ndarray, "4 4"]], at: int) -> FrameTransforms:
+    """poses: T_base_link of all links but the base."""
     update, robot = FrameTransforms(), problem.robot
-    frames = {
-        link: (robot.base, link_pose(robot, q, link)) for link in robot.link_names if link != robot.base
-    }
+    frames = {link: (robot.base, T) for link, T in poses.items()}
     if problem.T_world_base is not None:
         frames[robot.base] = ("world", problem.T_world_base)
     for link, (parent, T) in frames.items():

@@ -11,7 +11,8 @@ from robotdiffuse.core.transforms import transform
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
-from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere, Triangulated
+from robotdiffuse.scenes.mesh import Triangulated
+from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
 
 Color = tuple[int, int, int]
 OBSTACLE_COLOR: Color = (0xD9, 0x7B, 0x5C)

@@ -13,8 +13,9 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.registry import Registry
-from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.compiled_constraints import PathConstraints
+from robotdiffuse.problems.constraint_kernel import make_work
+from robotdiffuse.problems.projection_kernel import step
 
 CostStep = Callable[
     [CollisionChecker, Float[ndarray, "count waypoints dof"], float], Float[ndarray, "count waypoints dof"]
@@ -30,7 +31,7 @@ def path_constraint_cost(constraints: PathConstraints, share: float) -> CostStep
     """The cost of a problem's path constraints: the sum of h^2 / 2 over their rows.
 
     h is how far a row's value exceeds `share` of its tolerance [m]; a radian counts as
-    `constraint_kernel.ANGLE_WEIGHT` metres. The strength is the longest step of a waypoint [rad].
+    `projection_kernel.ANGLE_WEIGHT` metres. The strength is the longest step of a waypoint [rad].
     """
     rows, limits = constraints.rows, constraints.limits(share)
 
@@ -47,6 +48,6 @@ def path_constraint_cost(constraints: PathConstraints, share: float) -> CostStep
 @njit(cache=True, nogil=True)
 def _steps(rows, limits, q, max_step):
     """Moves each configuration of q [n, dof] by a Gauss-Newton step down the cost, in place."""
-    work = kernel.make_work(rows)
+    work = make_work(rows)
     for i in range(len(q)):
-        kernel.step(rows, limits, q[i], max_step, work)
+        step(rows, limits, q[i], max_step, work)

@@ -18,8 +18,9 @@ from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem, check_problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import PointCloud, Shape, Sphere
 
 PlannerSettings = TypeVar("PlannerSettings", bound=Settings)
 EASY_TIME_LIMIT, SHORT_TIME_LIMIT = 1.0, 0.02

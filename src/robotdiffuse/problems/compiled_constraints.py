@@ -1,7 +1,8 @@
 """PathConstraints: the constraints of a problem as arrays; evaluates, proves and projects with the Numba
 kernel.
 
-The compiled functions are in `constraint_kernel.py`; this file builds their arrays and interprets results.
+The compiled functions are in `constraint_kernel.py` and `projection_kernel.py`; this file builds their arrays
+and interprets results.
 """
 
 from collections.abc import Sequence
@@ -27,6 +28,7 @@ from robotdiffuse.problems.constraints import (
 )
 from robotdiffuse.problems.goals import JointGoal, PoseGoal, poses_of
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.projection_kernel import project
 from robotdiffuse.robots.inverse_kinematics import KINDS
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -127,7 +129,7 @@ class PathConstraints:
     def projected(self, q: Float[ndarray, "n dof"], tolerance_fraction: float) -> Float[ndarray, "k dof"]:
         """The configurations projected onto a fraction of the tolerances; failed projections are left out."""
         limits, work = self.limits(tolerance_fraction), kernel.make_work(self.rows)
-        rows = [row for row in q.astype(np.float64) if kernel.project(self.rows, limits, row, work)]
+        rows = [row for row in q.astype(np.float64) if project(self.rows, limits, row, work)]
         return np.stack(rows) if rows else np.zeros((0, self.robot.dof))
 
     def worst_violation(self, q: Float[ndarray, "dof"]) -> ConstraintViolation | None:

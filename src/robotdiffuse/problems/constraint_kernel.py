@@ -1,5 +1,4 @@
-"""Numba kernel of path constraints: evaluates them, proves them along straight motions, and projects onto
-them.
+"""Numba kernel of path constraints: evaluates them, and proves them along straight motions.
 
 `compiled_constraints.py` builds the arrays that this file reads (`Rows`) from the constraints of a problem. A
 row is a scalar function of the pose of a link, its frame, whose value must not exceed a limit:
@@ -23,14 +22,9 @@ from typing import NamedTuple
 import numpy as np
 
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step, forward, pose_error
+from robotdiffuse.robots.ik_kernel import PRISMATIC, forward, pose_error
 
 DISTANCE, CONE, TURN = 0, 1, 2
-ANGLE_WEIGHT = 0.3
-"""Metres that correspond to one radian in projection."""
-DAMPING, MAX_STEP, MAX_ITERATIONS = 1e-5, 1.0, 30
-"""For projection: damping (squared singular values well above it are inverted), longest step [rad], and
-number of steps."""
 
 
 class Rows(NamedTuple):
@@ -125,7 +119,7 @@ def make_work(rows):
 
 
 @inner_kernel()
-def _pose(rows, m, q, work):
+def pose_frame(rows, m, q, work):
     """Writes the pose of the frame of row m to work.T, and the joint axes and origins of its chain."""
     for k in range(rows.chain_length[m]):
         work.q[k] = q[rows.chain[m, k]]
@@ -142,7 +136,7 @@ def _pose(rows, m, q, work):
 
 
 @inner_kernel()
-def _in_box(rows, m, T, r):
+def in_box(rows, m, T, r):
     """Coordinate r of the frame's origin in the frame of the box."""
     place, out = rows.reference_pose[m], 0.0
     for i in range(3):
@@ -186,7 +180,7 @@ def _turn(rows, m, T, target, error):
 
 
 @inner_kernel()
-def _value(rows, m, work):
+def row_value(rows, m, work):
     """The value of row m at the pose in work.T."""
     if rows.row_kind[m] == CONE:
         return _cone(rows, m, work.T, work.error)
@@ -194,7 +188,7 @@ def _value(rows, m, work):
         return _turn(rows, m, work.T, work.target, work.error)
     outside, deepest = 0.0, -np.inf
     for r in range(3):
-        d = abs(_in_box(rows, m, work.T, r)) - rows.half_size[m, r]
+        d = abs(in_box(rows, m, work.T, r)) - rows.half_size[m, r]
         outside += max(d, 0.0) ** 2
         deepest = max(deepest, d)
     return np.sqrt(outside) + min(deepest, 0.0)
@@ -206,13 +200,13 @@ def evaluate(rows, q, end, work):
     frame's origin to work.levers[end]."""
     for m in range(len(rows.row_kind)):
         if not rows.same_frame[m]:
-            _pose(rows, m, q, work)
-        work.values[end, m] = _value(rows, m, work)
+            pose_frame(rows, m, q, work)
+        work.values[end, m] = row_value(rows, m, work)
         if rows.row_kind[m] != CONE:
             for k in range(rows.chain_length[m]):
                 velocity = work.y
                 velocity[0] = velocity[1] = velocity[2] = 0.0
-                _add_velocity(rows, m, k, 1.0, work, velocity)
+                add_velocity(rows, m, k, 1.0, work, velocity)
                 work.levers[end, m, k] = np.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
 
 
@@ -233,16 +227,16 @@ def speeds(rows, m, q, rates):
     work = make_work(rows)
     out = np.empty(len(q))
     for i in range(len(q)):
-        _pose(rows, m, q[i], work)
+        pose_frame(rows, m, q[i], work)
         total = np.zeros(3)
         for k in range(rows.chain_length[m]):
-            _add_velocity(rows, m, k, rates[i, rows.chain[m, k]], work, total)
+            add_velocity(rows, m, k, rates[i, rows.chain[m, k]], work, total)
         out[i] = np.sqrt((total * total).sum())
     return out
 
 
 @inner_kernel()
-def _add_velocity(rows, m, k, rate, work, total):
+def add_velocity(rows, m, k, rate, work, total):
     """Adds to `total` the velocity of the frame's origin of row m that joint k of its chain causes."""
     a, b, c = work.axes[k, 0], work.axes[k, 1], work.axes[k, 2]
     if rows.joint_kinds[m, k] == PRISMATIC:
@@ -333,98 +327,3 @@ def first_unproved(rows, limits, q, min_fraction):
         if row >= 0:
             return i, fraction, row
     return len(q) - 1, 0.0, -1
-
-
-@inner_kernel()
-def _residuals(rows, limits, q, work):
-    """The number of residuals of the rows that exceed their limits.
-
-    Writes to work.e the residuals to the values that projection aims for, and to work.J their Jacobian.
-    """
-    count, dof = 0, len(q)
-    for m in range(len(rows.row_kind)):
-        if not rows.same_frame[m]:
-            _pose(rows, m, q, work)
-        value = _value(rows, m, work)
-        if value <= limits[m]:
-            continue
-        lines = 1 if rows.row_kind[m] == CONE else 3
-        keep = 1.0 - rows.inner_limit[m] / value if value > 0 else 1.0
-        sine = np.sqrt(work.error[0] ** 2 + work.error[1] ** 2 + work.error[2] ** 2)
-        for r in range(lines):
-            if rows.row_kind[m] == DISTANCE:
-                x = _in_box(rows, m, work.T, r)
-                off = min(max(x, -rows.inner_half_size[m, r]), rows.inner_half_size[m, r]) - x
-                if off == 0.0:
-                    continue
-                work.e[count] = off * keep
-            elif rows.row_kind[m] == CONE:
-                work.e[count] = ANGLE_WEIGHT * (value - rows.inner_limit[m])
-            else:
-                work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * keep
-            for j in range(dof):
-                work.J[count, j] = 0.0
-            for k in range(rows.chain_length[m]):
-                entry = 0.0
-                if rows.row_kind[m] == DISTANCE:
-                    moved = work.y
-                    moved[0] = moved[1] = moved[2] = 0.0
-                    _add_velocity(rows, m, k, 1.0, work, moved)
-                    for i in range(3):
-                        entry += rows.reference_pose[m, i, r] * moved[i]
-                elif rows.joint_kinds[m, k] != PRISMATIC and rows.row_kind[m] == TURN:
-                    entry = ANGLE_WEIGHT * work.axes[k, r]
-                elif rows.joint_kinds[m, k] != PRISMATIC and sine > 1e-9:
-                    for i in range(3):
-                        entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
-                elif (
-                    rows.joint_kinds[m, k] != PRISMATIC
-                ):  # axis and direction are opposite: any rotation axis serves
-                    entry = ANGLE_WEIGHT * work.axes[k, 0]
-                work.J[count, rows.chain[m, k]] = entry
-            count += 1
-    return count
-
-
-@inner_kernel()
-def step(rows, limits, q, most, work):
-    """Moves q by one damped Newton step towards the limits, within the joint limits.
-
-    most: longest step [rad]. Returns the number of residuals before the step: 0 if q satisfied all limits and
-    was not moved, -1 if no step helps.
-    """
-    dof = len(q)
-    count = _residuals(rows, limits, q, work)
-    if count == 0:
-        return 0
-    work.held[:] = False
-    damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
-    again = False
-    for k in range(dof):
-        low, high = q[k] <= rows.lower[k], q[k] >= rows.upper[k]
-        if not rows.continuous[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
-            work.held[k] = again = True
-    if again:
-        damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
-    length = np.sqrt((work.step * work.step).sum())
-    scale = min(1.0, most / max(length, 1e-12))
-    if length < 1e-9:
-        return -1
-    for k in range(dof):
-        q[k] += scale * work.step[k]
-        if not rows.continuous[k]:
-            q[k] = min(max(q[k], rows.lower[k]), rows.upper[k])
-    return count
-
-
-@kernel()
-def project(rows, limits, q, work):
-    """Projects q in place onto the limits by damped Newton steps, within the joint limits.
-
-    Returns whether q satisfies the limits.
-    """
-    for _ in range(MAX_ITERATIONS):
-        left = step(rows, limits, q, MAX_STEP, work)
-        if left <= 0:
-            return left == 0
-    return _residuals(rows, limits, q, work) == 0

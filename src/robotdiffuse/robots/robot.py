@@ -2,23 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, lru_cache, reduce, wraps
+from functools import lru_cache, reduce, wraps
 from numbers import Real
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, Value, read_only
+from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.transforms import inverse, rotation_z_to, transform
 from robotdiffuse.robots.bodies import TOOL, AttachedBody, BodyContent, ConvexMesh, RigidShape, Surface
 from robotdiffuse.robots.inertias import Inertia
 from robotdiffuse.robots.joints import MIMIC_SLACK, MOVING_KINDS, Joint, with_mimics
-from robotdiffuse.robots.link_pair_tables import TURN, LinkPairTable
+from robotdiffuse.robots.kinematic_tree import KinematicTree
+from robotdiffuse.robots.link_pair_tables import LinkPairTable
 
 LOCKED_CACHE = 256
 """Number of robots with locked joints in the cache, least recently used out first: about 0.1 MB each."""
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot(Value):
+class Robot(KinematicTree):
     """A serial arm, or several arms on one body, such as two arms on a torso.
 
     Planned joints are the movable, unlocked joints between the base and the tips.
@@ -96,216 +96,6 @@ class Robot(Value):
             near: ArrayLike | None = None,
             seed: int = 0,
         ) -> ndarray: ...
-
-    @cached_property
-    def link_names(self) -> tuple[str, ...]:
-        return (self.base, *(joint.child for joint in self.joints))
-
-    @property
-    def T_base_root(self) -> Float[ndarray, "4 4"] | None:
-        """Pose of the URDF's root in the base frame; None if a movable joint lies between them."""
-        return np.eye(4) if self.root in ("", self.base) else self.above.get(self.root)
-
-    @cached_property
-    def links_fixed_to_base(self) -> dict[str, Float[ndarray, "4 4"]]:
-        """T_base_link of the base and of the links that only fixed joints connect to it."""
-        found = {self.base: np.eye(4)}
-        for joint in self.joints:
-            if joint.kind == "fixed" and joint.parent in found:
-                found[joint.child] = found[joint.parent] @ joint.T_parent_joint
-        return read_only(found)
-
-    @property
-    def tips(self) -> tuple[str, ...]:
-        return (self.tip, *self.other_tips)
-
-    @cached_property
-    def planned_joints(self) -> tuple[Joint, ...]:
-        """Movable, unlocked joints between the base and the tips, in depth-first order."""
-        by_child = {joint.child: joint for joint in self.joints}
-        chains: list[list[Joint]] = []
-        for link in self.tips:
-            chain: list[Joint] = []
-            while link != self.base:
-                chain.append(by_child[link])
-                link = by_child[link].parent
-            chains.append(chain[::-1])
-        first: dict[str, int] = {}
-        for i, chain in enumerate(chains):
-            for joint in chain:
-                first.setdefault(joint.name, i)
-        chains.sort(key=lambda chain: [first[joint.name] for joint in chain])
-        ordered = {joint.name: joint for chain in chains for joint in chain}.values()
-        return tuple(j for j in ordered if j.kind in MOVING_KINDS and j.name not in self.locked)
-
-    @cached_property
-    def joint_names(self) -> tuple[str, ...]:
-        return tuple(joint.name for joint in self.planned_joints)
-
-    @property
-    def dof(self) -> int:
-        return len(self.planned_joints)
-
-    def _limit(self, what: str) -> Float[ndarray, "dof"]:
-        return read_only(np.array([getattr(joint, what) for joint in self.planned_joints]))
-
-    @cached_property
-    def lower(self) -> Float[ndarray, "dof"]:
-        return self._limit("lower")
-
-    @cached_property
-    def upper(self) -> Float[ndarray, "dof"]:
-        return self._limit("upper")
-
-    @cached_property
-    def velocity(self) -> Float[ndarray, "dof"]:
-        return self._limit("velocity")
-
-    @cached_property
-    def acceleration(self) -> Float[ndarray, "dof"]:
-        return self._limit("acceleration")
-
-    @cached_property
-    def jerk(self) -> Float[ndarray, "dof"]:
-        return self._limit("jerk")
-
-    @cached_property
-    def effort(self) -> Float[ndarray, "dof"]:
-        """Largest torques [N m] or forces [N]; 0 where the URDF gives none."""
-        return self._limit("effort")
-
-    @cached_property
-    def prismatic(self) -> tuple[bool, ...]:
-        return tuple(joint.kind == "prismatic" for joint in self.planned_joints)
-
-    @cached_property
-    def continuous(self) -> Bool[ndarray, "dof"]:
-        """Which planned joints rotate without limits, so that values one turn apart are equivalent."""
-        return read_only(np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool))
-
-    def whole_turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
-        """The multiples of 2 pi to subtract so that continuous joints are within [-pi, pi]; 0 for others."""
-        if not self._any_continuous:
-            return np.zeros_like(q)
-        return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
-
-    @cached_property
-    def _any_continuous(self) -> bool:
-        return bool(self.continuous.any())
-
-    def unwound(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
-        """Equivalent configurations in which joints with a range above one turn are within half a turn of the
-        middle of their limits."""
-        middle = 0.5 * (self.lower + self.upper)
-        return np.where(self._turns_twice, q - TURN * np.round((q - middle) / TURN), q)
-
-    def equivalent_configurations(
-        self, q: Float[ndarray, "dof"], start: Float[ndarray, "dof"]
-    ) -> Float[ndarray, "k dof"]:
-        """Configurations within the limits that differ from `q` by whole turns of joints that have limits and
-        a range above one turn.
-
-        In the first one, all of these joints are as close to `start` as possible. In each further one, one
-        joint turns the other way, since obstacles may block the short way.
-        """
-        many = self._turns_twice & ~self.continuous
-        nearest = np.where(many, q - TURN * np.round((q - start) / TURN), q)
-        nearest = np.where(many & (nearest > self.upper), nearest - TURN, nearest)
-        nearest = np.where(many & (nearest < self.lower), nearest + TURN, nearest)
-        rows = [nearest]
-        for j in np.flatnonzero(many):
-            other = nearest.copy()
-            other[j] -= np.copysign(TURN, nearest[j] - start[j])
-            if self.lower[j] <= other[j] <= self.upper[j]:
-                rows.append(other)
-        return np.stack(rows)
-
-    @cached_property
-    def _turns_twice(self) -> Bool[ndarray, "dof"]:
-        return read_only((self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool))
-
-    @cached_property
-    def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], ndarray, ndarray]:
-        links: dict[str, tuple[int, ndarray]] = {self.base: (0, np.eye(4))}
-        offsets, parents = np.zeros((self.dof, 4, 4)), np.zeros(self.dof, np.int64)
-        planned = {joint.name: j for j, joint in enumerate(self.planned_joints)}
-        for joint in self.joints:
-            frame, T_frame_parent = links[joint.parent]
-            if joint.name in planned:
-                j = planned[joint.name]
-                T_joint_frame = transform(np.zeros(3), rotation_z_to(joint.axis))
-                offsets[j] = T_frame_parent @ joint.T_parent_joint @ T_joint_frame
-                parents[j] = frame
-                links[joint.child] = (j + 1, inverse(T_joint_frame))
-            else:
-                T_joint_child = joint.motion(self.locked.get(joint.name, 0.0))
-                links[joint.child] = (frame, T_frame_parent @ joint.T_parent_joint @ T_joint_child)
-        return read_only((links, offsets, parents))
-
-    @cached_property
-    def frame_offsets(self) -> Float[ndarray, "dof 4 4"]:
-        return self._frames[1]
-
-    @cached_property
-    def parents(self) -> Int[ndarray, "dof"]:
-        """Index of the frame that each planned joint is mounted on: j for joint j of a serial arm."""
-        return self._frames[2]
-
-    @cached_property
-    def kernel_parents(self) -> Int[ndarray, "dof"] | None:
-        """`parents` for compiled code, as a writable array; None for a serial arm.
-
-        Kernels are compiled for writable arrays, and skip the look-up for serial arms.
-        """
-        return None if (self.parents == np.arange(self.dof)).all() else self.parents.copy()
-
-    @cached_property
-    def moved_by(self) -> Bool[ndarray, "frames dof"]:
-        """Which planned joints move which frames."""
-        rows = np.zeros((self.dof + 1, self.dof), dtype=bool)
-        for j, parent in enumerate(self.parents):
-            rows[j + 1] = rows[parent]
-            rows[j + 1, j] = True
-        return read_only(rows)
-
-    def at_end(self, link: str) -> bool:
-        """Whether planned joints move a link, and none comes after it."""
-        frame = self.link_frame(link)
-        return frame > 0 and not self.moved_by[frame + 1 :, frame - 1].any()
-
-    def chain(self, link: str) -> tuple[int, ...]:
-        """Indices of the planned joints that move a link, from the base on."""
-        return tuple(np.flatnonzero(self.moved_by[self.link_frame(link)]).tolist())
-
-    def joints_between(self, a: str, b: str) -> tuple[int, ...]:
-        """Indices of the planned joints between two links of which one carries the other.
-
-        Empty if neither carries the other, or if a movable joint between them is not planned.
-        """
-        by_child = {joint.child: joint for joint in self.joints}
-
-        def above(link: str) -> tuple[str, ...]:
-            if link not in by_child:
-                return ()
-            joint = by_child[link]
-            return (*above(joint.parent), *((joint.name,) if joint.kind in MOVING_KINDS else ()))
-
-        near, far = sorted((above(a), above(b)), key=len)
-        between = far[len(near) :] if far[: len(near)] == near else ()
-        return tuple(map(self.joint_names.index, between)) if {*between} <= {*self.joint_names} else ()
-
-    def link_frame(self, link: str) -> int:
-        """Index of the frame that the link is fixed to: 0 for the base, j + 1 after planned joint j."""
-        return self._link(link)[0]
-
-    def T_frame_link(self, link: str) -> Float[ndarray, "4 4"]:
-        """Constant pose of the link in its frame (see `link_frame`); InputError for an unknown link."""
-        return self._link(link)[1]
-
-    def _link(self, link: str) -> tuple[int, ndarray]:
-        if link not in self._frames[0]:
-            raise unknown_name("link", link, self.link_names)
-        return self._frames[0][link]
 
     def checked_pairs(self) -> tuple[tuple[str, str], ...]:
         """Pairs of links that are checked against each other: with geometry, on different frames, not

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, form, numbers, positive, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.scenes.shapes import IDENTITY, Mesh, PosedTriangles, set_fields
+from robotdiffuse.scenes.mesh import Mesh, PosedTriangles
+from robotdiffuse.scenes.shapes import IDENTITY, set_fields
 
 
 @no_type_check

@@ -9,18 +9,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.scenes.mesh import Mesh, Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import (
-    IDENTITY,
-    Box,
-    Capsule,
-    Cylinder,
-    Mesh,
-    PointCloud,
-    Shape,
-    Sphere,
-    Triangulated,
-)
+from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 from robotdiffuse.simulation.model import write_obj, write_points_urdf, write_shaded, write_urdf
 
 COLLISION_MARGIN = 0.001

@@ -17,8 +17,9 @@ from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
+from robotdiffuse.scenes.shapes import PointCloud, Shape
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.camera import TRACE_POINTS, VERTICAL_FIELD, view_of_motion
 from robotdiffuse.visualization.style import GOAL, START, Surface

@@ -13,8 +13,9 @@ from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import has_visual, load_visual
+from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 
 START, GOAL = (0x4F, 0x7F, 0xD9), (0x10, 0xA3, 0x7F)
 """sRGB colours of the start and goal of a motion; the trace fades from one to the other."""

@@ -15,8 +15,8 @@ from helpers.example_robots import example_robot
 from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.convex_geometry import checks_of, hulls_of, solid_arrays
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.collision.kernels import convex_bounds, motion_certificate
-from robotdiffuse.collision.kernels.motion_certificate import Motion, Pieces
+from robotdiffuse.collision.kernels import convex_bounds, motion_certificate, motion_pieces
+from robotdiffuse.collision.kernels.motion_pieces import Motion, Pieces
 from robotdiffuse.collision.kernels.swept_spheres import make_swept_spheres
 from robotdiffuse.collision.motions import ContinuousCollision
 from robotdiffuse.robots.robot import Robot
@@ -96,7 +96,7 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
         CollisionChecker(robot, scene),
         ExactCollision(robot, scene),
     )
-    motion = Motion(q, motion_certificate.travel_along(q, validator.checks.motion_radii))
+    motion = Motion(q, motion_pieces.travel_along(q, validator.checks.motion_radii))
     whole = Pieces(
         np.zeros(1), np.full(1, motion.travel[-1]), np.ones((1, len(checks_of(robot))), dtype=np.bool_)
     )
@@ -111,7 +111,7 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
         make_swept_spheres(validator.arm.spheres, validator.scene_arrays),
     )
     places = np.linspace(0, motion.travel[-1], 41)
-    dense = motion_certificate.configurations(motion, places)
+    dense = motion_pieces.configurations(motion, places)
     apart = np.hstack([checker.link_clearances(dense), checker.pair_clearances(dense)])
     # towards points the checker's clearances are themselves bounds, up to the size of a voxel
     slack = 0.02 if cloud else 1e-6

@@ -27,6 +27,7 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.objectives import OBJECTIVES
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.sampling import SamplingSettings
+from robotdiffuse.learning.training import encoder as encoder_training
 from robotdiffuse.learning.training import loop as training_run
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.batches import (
@@ -207,6 +208,8 @@ def test_training_without_accelerate_names_the_extra(monkeypatch):
 @pytest.mark.parametrize("kind", ["encoder", "planner"])
 @pytest.mark.usefixtures("no_export")
 def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
+    monkeypatch.setattr(encoder_training, "READOUT_SCENES", 256)
+
     def train(out):
         if kind == "encoder":
             settings = EncoderTraining(minutes=None, samples=96, batch=8, points=32, encoder=SMALL_ENCODER)

@@ -4,7 +4,7 @@ import gc
 import runpy
 import sys
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -46,9 +46,11 @@ def problem(*goals: np.ndarray, scene: Scene = WALL) -> Problem:
     return Problem(PANDA, scene, LEFT, JointGoal(np.stack(goals)))
 
 
-def plan(planner: type[planners.OmplPlanner], problem: Problem, seed: int = 1) -> PlanResult:
+def plan(
+    planner: type[planners.OmplPlanner], problem: Problem, seed: int = 1, limit: float = 0.5
+) -> PlanResult:
     """Plan with a short time limit for anytime planners, which use all of it."""
-    return planner().plan(problem, time_limit=1.5 if planner.anytime else 120.0, seed=seed)
+    return planner().plan(problem, time_limit=limit if planner.anytime else 120.0, seed=seed)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -70,7 +72,7 @@ def test_around_a_wall(planner):
 
 
 def test_an_anytime_planner_improves():
-    result = plan(planners.OmplInformedRRTStar, problem(RIGHT))
+    result = plan(planners.OmplInformedRRTStar, problem(RIGHT), limit=1.5)
     assert len(result.progress) > 2
     assert result.progress[-1][1] < 0.9 * result.progress[0][1]
 
@@ -216,9 +218,8 @@ class UncheckedStartGoal(planners.StartGoal):
 OMPL_CHECKS = planners.ob.MotionValidator, planners.ob.StateValidityChecker
 
 
-@every
-def test_nothing_stays_in_memory(planner):
-    for seed in range(3):
+def test_nothing_stays_in_memory():
+    for planner, seed in product(FIRST + ANYTIME, range(3)):
         planner().plan(problem(RIGHT), time_limit=0.05, seed=seed)
     gc.collect()
     kept = [each for each in gc.get_objects() if issubclass(type(each), OMPL_CHECKS)]

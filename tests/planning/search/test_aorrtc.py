@@ -188,7 +188,7 @@ def test_a_limit_of_jerk_is_kept_by_a_certified_motion() -> None:
 
 def test_gain_zero_does_not_end_the_search() -> None:
     """Regression: with `gain` 0 the search stopped at once if there was no path at half the work."""
-    result = AORRTC(AORRTCSettings(gain=0.0, patience=0)).plan(AROUND, 0.5)
+    result = AORRTC(AORRTCSettings(gain=0.0, patience=0)).plan(AROUND, 1.0)
     assert result.solved and len(result.progress) > 1
 
 

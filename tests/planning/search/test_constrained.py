@@ -64,11 +64,19 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(
-    ("name", "stage"), [("rrt_connect", "constrained_rrt_connect"), ("diffusion", "network")]
+    ("name", "stage", "constraints", "scene"),
+    [
+        pytest.param(
+            *(*planner, *case),
+            id=f"{case[0][0].kind}-{planner[0]}",
+            marks=[pytest.mark.slow] if planner[0] == "diffusion" and LINE in case[0] else [],
+        )
+        for planner in (("rrt_connect", "constrained_rrt_connect"), ("diffusion", "network"))
+        for case in CASES
+    ],
 )
-@pytest.mark.parametrize(("constraints", "scene"), CASES, ids=[case[0][0].kind for case in CASES])
 def test_motions_keep_constraints_at_every_millimetre(
-    constraints: list[Constraint], scene: rd.Scene, name: str, stage: str
+    name: str, stage: str, constraints: list[Constraint], scene: rd.Scene
 ) -> None:
     made = problem(constraints, scene)
     result = load_planner(name).plan(made, time_limit=20.0)

@@ -44,7 +44,7 @@ RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 @pytest.mark.parametrize("index", range(6))
 def test_solved_means_verified(family, index):
     problem = family.draw(PANDA, np.random.default_rng([11, index])).problem(PANDA)
-    result = RRTConnect().plan(problem, time_limit=5.0)
+    result = RRTConnect().plan(problem, time_limit=2.0)
     assert result.status in (Status.SOLVED, Status.TIMEOUT)
     if result.solved:
         assert result.path is not None and verify(problem, result.path).valid

@@ -131,9 +131,9 @@ def test_the_tree_stays_a_tree() -> None:
     """With goals reached, rewired, grafted, and room made anew."""
     checker = CollisionChecker(PANDA, WALL)
     goals = RIGHT + np.pad([[0.0, 0.0, 0.0], [0.2, 0.2, 0.0], [0.1, -0.3, 0.3]], ((0, 0), (0, 4)))
-    settings = replace(TOUCHING, capacity=64, growth=400)
+    settings = replace(TOUCHING, capacity=64, growth=200)
     search = SharedTreeSearch(checker, LEFT, goals, settings, random_state(2))
-    for _ in range(5):
+    for _ in range(4):
         search.round()
     assert search.nodes > 64
     consistent(search.tree)

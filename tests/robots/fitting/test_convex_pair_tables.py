@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from helpers.quick_preparation import coarse_grids
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.transforms import transform
@@ -60,7 +61,8 @@ def made() -> Prepared:
         "flange": (disc(0.047, 0.14),),
     }
     robot = Robot("fork", "fork", "flange", joints, meshes=dict.fromkeys(surfaces, ()))
-    return prepare(robot, surfaces, QUICK)
+    with coarse_grids():
+        return prepare(robot, surfaces, QUICK)
 
 
 def shares(robot: Robot) -> tuple[float, int]:

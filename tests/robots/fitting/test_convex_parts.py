@@ -1,10 +1,13 @@
 """Convex parts contain their mesh, follow it closely, and are few and simple."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import trimesh
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_hulls import convex_hull, planes_of
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_parts, simplified
 
@@ -46,6 +49,11 @@ MESHES = {"L": L, "frame": FRAME, "tube": TUBE, "bowl": BOWL}
 SLOW_MESHES = ("bowl", "tube")
 
 
+@cache
+def parts_of(name: str) -> tuple[ConvexMesh, ...]:
+    return convex_parts((surface(MESHES[name]),))
+
+
 def beyond(parts: tuple, points: np.ndarray) -> np.ndarray:
     """Largest distance of points from the nearest part."""
     return np.min([(points @ n.T - o).max(1) for n, o in map(planes_of, parts)], axis=0)
@@ -55,7 +63,7 @@ def beyond(parts: tuple, points: np.ndarray) -> np.ndarray:
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_MESHES else []) for name in MESHES]
 )
 def test_parts_hold_all_of_the_mesh(name: str) -> None:
-    parts = convex_parts((surface(MESHES[name]),))
+    parts = parts_of(name)
     points = trimesh.sample.sample_surface(MESHES[name], 20_000, seed=1)[0]
     assert beyond(parts, points).max() < 1e-9
     for part in parts:
@@ -64,7 +72,7 @@ def test_parts_hold_all_of_the_mesh(name: str) -> None:
 
 
 def test_an_l_is_two_parts_of_its_own_volume() -> None:
-    parts = convex_parts((surface(L),))
+    parts = parts_of("L")
     assert len(parts) <= 4
     volume = sum(trimesh.Trimesh(part.vertices, part.faces).volume for part in parts)
     assert volume == pytest.approx(0.1 * 0.1 * 0.6, rel=0.1)
@@ -72,7 +80,7 @@ def test_an_l_is_two_parts_of_its_own_volume() -> None:
 
 def test_a_frame_stays_open() -> None:
     """No single cut reduces the volume of the hull; cutting must continue nevertheless."""
-    parts = convex_parts((surface(FRAME),))
+    parts = parts_of("frame")
     assert 4 <= len(parts) <= 6
     assert beyond(parts, np.array([[0.2, 0.05, 0.2]]))[0] > 0.1
 

@@ -129,6 +129,7 @@ def test_parts_are_finer_where_they_touch_in_vain(tmp_path: Path) -> None:
     assert refused[1] < 0.5 * refused[0]
 
 
+@pytest.mark.slow
 def test_an_arm_four_times_as_large_takes_no_more_spheres(tmp_path: Path) -> None:
     """A model of an ABB IRB140 with a reach of 3 m took over 400 s, with spheres that stick out 15 mm of 2 m
     links."""
@@ -150,7 +151,8 @@ def test_an_arm_on_a_long_rail_is_no_larger(tmp_path: Path) -> None:
     rail = chain("base", ["rail"], kind="prismatic", limits='lower="-9" upper="9"')
     counts = []
     for parts in (rail + chain("rail_link", row("j", 4)), chain("base", ["rail", *row("j", 4)])):
-        report = add_robot(written(tmp_path, parts), out=tmp_path / "robot", settings=QUICK)
+        with coarse_grids():
+            report = add_robot(written(tmp_path, parts), out=tmp_path / "robot", settings=QUICK)
         counts.append(report.sphere_count)
     assert counts[0] == counts[1]
 

@@ -8,8 +8,9 @@ import pytest
 import trimesh
 
 from helpers.made_arms import BALL, chain, joint, link, row, written
+from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.parsing.urdf import UrdfTree, read_urdf
+from robotdiffuse.robots.parsing.urdf import UrdfTree
 
 NAME = "package://some_arm/meshes/box.stl"
 MESH = f'<collision><geometry><mesh filename="{NAME}"/></geometry></collision>'

@@ -10,6 +10,8 @@ import trimesh
 
 import robotdiffuse.robots as robots
 from helpers.example_robots import AWKWARD
+from helpers.quick_preparation import coarse_grids
+from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_from_rpy
 from robotdiffuse.robots import ROBOTS, load_robot
@@ -20,7 +22,7 @@ from robotdiffuse.robots.fitting.preparation import PreparationSettings
 from robotdiffuse.robots.fitting.sphere_fitting import covered
 from robotdiffuse.robots.joints import CONTINUOUS_LIMIT
 from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
-from robotdiffuse.robots.parsing.urdf import UrdfTree, read_urdf
+from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, read_source, write_robot_folder
 
@@ -91,17 +93,6 @@ def test_base_and_tip_are_selectable(tmp_path: Path) -> None:
     assert whole.locked == {"lid_joint": 0.0}
     assert part.joint_names == ("arm_joint", "wrist_joint")
     assert "rail" not in part.link_names
-
-
-def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
-    package = tmp_path / "my_arm"
-    (package / "meshes").mkdir(parents=True)
-    (package / "urdf").mkdir()
-    trimesh.creation.annulus(0.02, 0.03, 0.1).export(package / "meshes" / "ring.stl")
-    for name in ("package://my_arm/meshes/ring.stl", "../meshes/ring.stl"):
-        text = ARM.replace(BOX, f'<mesh filename="{name}" scale="2 2 1"/>')
-        robot = read_urdf(urdf(package / "urdf", text))
-        assert np.linalg.norm(robot.meshes["upper"][0].vertices[:, :2], axis=1).max() == pytest.approx(0.06)
 
 
 @pytest.mark.parametrize(
@@ -288,11 +279,12 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     # balls, because they are fitted quickly
     balls = ARM.replace(BOX, '<sphere radius="0.15"/>').replace(TUBE, '<sphere radius="0.1"/>')
     file, steps = urdf(tmp_path, balls), []
-    report = add_robot(
-        file,
-        settings=PreparationSettings(sampling=SamplingSettings(samples=200), samples=200, rounds=0),
-        progress=lambda what, step, count: steps.append((step, count)),
-    )
+    with coarse_grids():
+        report = add_robot(
+            file,
+            settings=PreparationSettings(sampling=SamplingSettings(samples=200), samples=200, rounds=0),
+            progress=lambda what, step, count: steps.append((step, count)),
+        )
     assert report.folder == tmp_path / "robots" / "tiny"
     assert steps[0] == (0, 7) and steps[-1] == (7, 7)
     for link in report.links:
@@ -306,7 +298,8 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
 
     # a changed URDF is another robot, prepared and stored anew
     larger = urdf(tmp_path, balls.replace('radius="0.15"', 'radius="0.16"'))
-    changed = load_robot(larger)
+    with coarse_grids():
+        changed = load_robot(larger)
     assert any("spheres were fitted" in note for note in changed.notes)
     assert np.ptp(changed.meshes["upper"][0].vertices[:, 2]) == pytest.approx(0.32, rel=0.05)
     kept = tmp_path / "robots" / f"tiny-{UrdfTree(larger, {}).digest[:8]}"

@@ -203,11 +203,8 @@ def _least_along(hulls, p, base, sign, posture):
     twist, seen = posture.twists[hulls.frame[p]], posture.twists[base]
     at_start, at_stop = np.inf, np.inf
     for i in range(hulls.first[p], hulls.first[p + 1]):
-        x, y, z = (
-            placed(T, hulls.vertices[:, i], 0),
-            placed(T, hulls.vertices[:, i], 1),
-            placed(T, hulls.vertices[:, i], 2),
-        )
+        vertex = hulls.vertices[:, i]
+        x, y, z = placed(T, vertex, 0), placed(T, vertex, 1), placed(T, vertex, 2)
         a, b, c = twist[0] - seen[0], twist[1] - seen[1], twist[2] - seen[2]
         u = b * z - c * y + twist[3] - seen[3]
         v = c * x - a * z + twist[4] - seen[4]

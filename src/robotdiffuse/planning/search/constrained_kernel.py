@@ -14,7 +14,8 @@ from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.problems.constraint_kernel import evaluate, make_work, project, proved
+from robotdiffuse.problems.constraint_kernel import evaluate, make_work, proved
+from robotdiffuse.problems.projection_kernel import project
 
 MAX_DEPTH = 9
 """A motion is halved at most this many times."""

@@ -20,18 +20,15 @@ from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
 from robotdiffuse.problems.files.constraints import constraint_entry, read_constraints
 from robotdiffuse.problems.files.goals import goal_entry, read_goal, read_waypoints
-from robotdiffuse.problems.files.moveit import (
-    MoveItRequest,
-    holding_at,
-    linkable,
+from robotdiffuse.problems.files.moveit.frames import moveit_frames
+from robotdiffuse.problems.files.moveit.joints import (
     mimic_notes,
-    moveit_frames,
     moveit_model,
-    moveit_request,
-    moveit_scene,
     request_robot_notes,
     scene_robot_notes,
 )
+from robotdiffuse.problems.files.moveit.request import MoveItRequest, holding_at, linkable, moveit_request
+from robotdiffuse.problems.files.moveit.scene import moveit_scene
 from robotdiffuse.problems.files.moving_obstacles import moving_entry, read_moving
 from robotdiffuse.problems.files.robot_setup import (
     equipment_entries,

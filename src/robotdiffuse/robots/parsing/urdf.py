@@ -6,14 +6,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, MIN_RATE, MIN_SIZE, points, within
+from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, MIN_RATE
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.input_files import parse_xml, read_triangles
-from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
+from robotdiffuse.core.input_files import parse_xml
+from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_hulls import convex_hull
 from robotdiffuse.robots.fitting.convex_parts import Surface
@@ -23,6 +22,8 @@ from robotdiffuse.robots.parsing.joint_groups import passive_notes, planned_join
 from robotdiffuse.robots.parsing.mobile_bases import moves_in_a_plane
 from robotdiffuse.robots.parsing.packages import Packages, urdf_text
 from robotdiffuse.robots.parsing.srdf import Srdf
+from robotdiffuse.robots.parsing.urdf_geometry import link_surfaces
+from robotdiffuse.robots.parsing.urdf_values import numbers_of, origin_of
 from robotdiffuse.robots.robot import Robot
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -36,22 +37,6 @@ ACCELERATION_PER_VELOCITY = 4.0
 [1/s]."""
 JERK_PER_ACCELERATION = 10.0
 """Ratio of jerk and acceleration limits: full acceleration after 0.1 s [1/s]."""
-
-
-def read_urdf(
-    path: str | Path,
-    base: str | None = None,
-    tip: str | None = None,
-    locked: dict[str, float] | None = None,
-    group: str | None = None,
-    srdf: Srdf | None = None,
-    packages: dict[str, str | Path] | None = None,
-) -> Robot:
-    """Read a robot from a URDF or xacro file.
-
-    See `UrdfTree.robot` for the other arguments; `packages` are folders of ROS packages by name.
-    """
-    return UrdfTree(Path(path), packages or {}).robot(base, tip, locked, group, srdf)
 
 
 @dataclass
@@ -193,25 +178,6 @@ class UrdfTree:
             raise InputError(f"{self.path}: joint {name}: its {what} link {shown(link)} is not in the file")
         return link
 
-    def _numbers(self, text: str, count: int, what: str, most: float = MAX_COORDINATE) -> Float[ndarray, "n"]:
-        try:
-            values = np.array([float(word) for word in text.split()])
-        except ValueError:
-            values = np.zeros(0)
-        if len(values) != count or not np.isfinite(values).all():
-            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be {count} finite number(s)")
-        if not within(values, most):
-            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be within ±{most:g}")
-        return values
-
-    def _origin(self, element: ET.Element, what: str) -> Float[ndarray, "4 4"]:
-        origin = element.find("origin")
-        if origin is None:
-            return np.eye(4)
-        rpy = self._numbers(origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
-        xyz = self._numbers(origin.get("xyz", "0 0 0"), 3, f"{what}: origin xyz")
-        return transform(xyz, rotation_from_rpy(*map(float, rpy)))
-
     def below(self, link: str) -> list[Joint]:
         """Joints below a link, parents before children."""
         joints: list[Joint] = []
@@ -230,7 +196,7 @@ class UrdfTree:
             if element.get("type") != "fixed":
                 break
             link = self._end(name, element, "parent")
-            T_link_ancestor = T_link_ancestor @ inverse(self._origin(element, f"joint {name}"))
+            T_link_ancestor = T_link_ancestor @ inverse(origin_of(self.path, element, f"joint {name}"))
             found[link] = T_link_ancestor
         return found
 
@@ -269,7 +235,7 @@ class UrdfTree:
         axis_element = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0])
         if axis_element is not None and kind != "fixed":
-            axis = self._numbers(axis_element.get("xyz", "1 0 0"), 3, f"{what}: axis")
+            axis = numbers_of(self.path, axis_element.get("xyz", "1 0 0"), 3, f"{what}: axis")
             if np.linalg.norm(axis) < 1e-6:
                 raise InputError(f"{self.path}: {what}: its axis is zero; give it a direction")
             axis = axis / np.linalg.norm(axis)
@@ -278,7 +244,7 @@ class UrdfTree:
             kind=kind,
             parent=self._end(name, element, "parent"),
             child=self._end(name, element, "child"),
-            T_parent_joint=self._origin(element, what),
+            T_parent_joint=origin_of(self.path, element, what),
             axis=axis,
             mimic=None if kind == "fixed" else self._mimic(name, element),
         )
@@ -301,8 +267,8 @@ class UrdfTree:
             self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
             return None
         what = f"joint {name}: mimic"
-        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{what} multiplier")
-        offset = self._numbers(followed.get("offset", "0"), 1, f"{what} offset")
+        multiplier = numbers_of(self.path, followed.get("multiplier", "1"), 1, f"{what} multiplier")
+        offset = numbers_of(self.path, followed.get("offset", "0"), 1, f"{what} offset")
         return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
 
     def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
@@ -310,7 +276,9 @@ class UrdfTree:
         for what in ("lower", "upper", "velocity"):
             if limit is not None and limit.get(what) is not None:
                 text, most = limit.get(what, ""), MAX_RATE if what == "velocity" else MAX_COORDINATE
-                given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit", most)[0])
+                given[what] = float(
+                    numbers_of(self.path, text, 1, f"joint {joint.name}: {what} limit", most)[0]
+                )
         if joint.kind == "continuous":
             given["lower"], given["upper"] = -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT
         if "lower" not in given and "upper" not in given:
@@ -346,7 +314,7 @@ class UrdfTree:
         if limit is None or limit.get("effort") is None:
             return 0.0
         try:
-            effort = self._numbers(limit.get("effort", ""), 1, f"joint {name}: effort limit")[0]
+            effort = numbers_of(self.path, limit.get("effort", ""), 1, f"joint {name}: effort limit")[0]
         except InputError:
             return 0.0
         return max(float(effort), 0.0)
@@ -368,10 +336,10 @@ class UrdfTree:
     def _inertia(self, element: ET.Element, what: str) -> Inertia:
         mass, inertia = element.find("mass"), element.find("inertia")
         value = "" if mass is None else mass.get("value", "")
-        mass = self._numbers(value, 1, what)[0]
+        mass = numbers_of(self.path, value, 1, what)[0]
         of = {} if inertia is None else inertia.attrib
-        xx, xy, xz, yy, yz, zz = (self._numbers(of.get(name, ""), 1, what)[0] for name in MOMENTS)
-        T = self._origin(element, what)
+        xx, xy, xz, yy, yz, zz = (numbers_of(self.path, of.get(name, ""), 1, what)[0] for name in MOMENTS)
+        T = origin_of(self.path, element, what)
         R = T[:3, :3]
         moments = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
         return inertia_of([mass, *T[:3, 3], *moments[np.triu_indices(3)]])
@@ -397,76 +365,6 @@ class UrdfTree:
     def surfaces(self, link: str) -> tuple[Surface, ...]:
         """The link's collision elements as triangle meshes, in the link's frame."""
         if link not in self._surfaces:
-            self._surfaces[link] = self._read_surfaces(link)
+            element = self.links[link]
+            self._surfaces[link] = link_surfaces(self.path, element, self.kind, self.packages)
         return self._surfaces[link]
-
-    def _read_surfaces(self, link: str) -> tuple[Surface, ...]:
-        parts = []
-        for element in self.links[link].findall(self.kind):
-            geometry = element.find("geometry")
-            shape = next(iter(geometry), None) if geometry is not None else None
-            if shape is None:
-                raise InputError(f"{self.path}: link {link}: a <{self.kind}> has no geometry")
-            surface = self._surface(shape, link)
-            T = self._origin(element, f"link {link}: {self.kind}")
-            parts.append(Surface(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces))
-        return tuple(parts)
-
-    def _surface(self, shape: ET.Element, link: str) -> Surface:
-        def positive(name: str, count: int) -> Float[ndarray, "n"]:
-            what = f"link {link}: {shape.tag} {name}"
-            values = self._numbers(shape.get(name, ""), count, what)
-            if (values < MIN_SIZE).any():
-                raise InputError(f"{self.path}: {what} is {shown(shape.get(name))}; it must be positive")
-            return values
-
-        if shape.tag == "mesh":
-            return self._mesh(shape, link)
-        if shape.tag == "box":
-            points = np.array(trimesh.creation.box(positive("size", 3)).vertices)
-        elif shape.tag == "sphere":
-            points = _ball() * positive("radius", 1)
-        elif shape.tag == "capsule":
-            ball, half = _ball() * positive("radius", 1), float(positive("length", 1)[0]) / 2
-            points = np.concatenate([ball + np.array([0, 0, z]) for z in (-half, half)])
-        elif shape.tag == "cylinder":
-            angle = np.arange(32) * np.pi / 16
-            ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            ring = ring * positive("radius", 1) / np.cos(np.pi / 32)
-            half = float(positive("length", 1)[0]) / 2
-            points = np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
-        else:
-            raise InputError(
-                f"{self.path}: link {link}: {self.kind} shape <{shape.tag}> is not supported; known: box, "
-                f"capsule, cylinder, mesh, sphere"
-            )
-        hull = convex_hull(points)
-        return Surface(hull.vertices, hull.faces)
-
-    def _mesh(self, shape: ET.Element, link: str) -> Surface:
-        file = self.packages.file(shape.get("filename", ""))
-        where = f"link {link}: mesh"
-        try:
-            vertices, faces = read_triangles(file, merge=True)
-            vertices = points(where, "vertices", vertices * self._scale(shape, where))
-        except InputError as error:
-            raise InputError(f"{self.path}: {error}") from None
-        if len(vertices) < 4:
-            raise InputError(
-                f"{self.path}: link {link}: {file} has no triangle mesh with at least four vertices; "
-                f"repair it or remove its element"
-            )
-        return Surface(vertices, faces)
-
-    def _scale(self, shape: ET.Element, where: str) -> Float[ndarray, "3"]:
-        scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"{where} scale")
-        if (np.abs(scale) < MIN_SIZE).any():
-            raise InputError(f"{where} scale is {shown(shape.get('scale'))}; its numbers must not be 0")
-        return scale
-
-
-def _ball() -> Float[ndarray, "n 3"]:
-    """Vertices of a polyhedron around the unit ball."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-    inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
-    return np.array(ball.vertices) / inner

@@ -14,8 +14,9 @@ from robotdiffuse.core.types import Trajectory, Tree
 from robotdiffuse.planning.diffusion.candidates import Candidates
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
+from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
+from robotdiffuse.scenes.shapes import PointCloud, Shape
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, moved_to
 from robotdiffuse.visualization.style import GOAL, START, Surface

@@ -9,7 +9,8 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.transforms import inverse, rotation_from_quaternion, transform
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
+from robotdiffuse.scenes.mesh import Mesh
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
 
 NEW_OBSTACLES: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
     "sphere": lambda center, size: Sphere(center, size),

@@ -7,9 +7,9 @@ from importlib.resources import files
 import pytest
 
 import robotdiffuse as rd
+from robotdiffuse.cli.compile_ahead import compiling_ahead, steps
 from robotdiffuse.collision.kernels.motion_certificate import rounds
 from robotdiffuse.core import loading
-from robotdiffuse.planning.compile_ahead import compiling_ahead, steps
 from robotdiffuse.trajectories.timing_kernel import fastest_speeds
 
 
@@ -28,7 +28,7 @@ def test_the_first_compilation_starts_one_process(started: list[list[str]]) -> N
         loading.compiles("one")
         loading.compiles("two")
     loading.compiles("three")
-    assert started == [[sys.executable, "-m", "robotdiffuse.planning.compile_ahead", "picture"]]
+    assert started == [[sys.executable, "-m", "robotdiffuse.cli.compile_ahead", "picture"]]
 
 
 def test_a_warm_start_or_a_single_core_starts_none(

@@ -3,7 +3,7 @@
 Numba compiles one function at a time. On a new machine, a second process about halves the wait: it compiles
 what a plan needs last while the plan itself compiles what it needs first. Both share Numba's cache.
 
-    python -m robotdiffuse.planning.compile_ahead [picture]
+    python -m robotdiffuse.cli.compile_ahead [picture]
 """
 
 import os

@@ -6,7 +6,8 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_z_to
-from robotdiffuse.scenes.shapes import Box, Mesh
+from robotdiffuse.scenes.mesh import Mesh
+from robotdiffuse.scenes.shapes import Box
 
 CONE_SIDES = 32
 """Sides of the pyramid around a cone, which is 0.5 % wider than the cone."""

@@ -6,7 +6,8 @@ Message: https://docs.ros.org/en/noetic/api/moveit_msgs/html/msg/AllowedCollisio
 from collections.abc import Collection, Iterable
 from typing import Any
 
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.files.moveit.values import list_of, mapping_of
 
 MATRIX, OCTOMAP = "allowed_collision_matrix", "<octomap>"
 """Names in planning scenes: of the matrix, and in it of the octomap."""
@@ -54,17 +55,3 @@ def _enabled(row: object) -> list[bool]:
     if isinstance(row, dict):
         row = row.get("enabled")
     return [bool(value) for value in list_of(f"{MATRIX}.entry_values", row)]
-
-
-def mapping_of(where: str, value: object) -> dict[str, Any]:
-    """The mapping; None counts as empty, as in the messages."""
-    if value is not None and not isinstance(value, dict):
-        raise InputError(f"{where} is {shown(value)}; it must be a mapping")
-    return value or {}
-
-
-def list_of(where: str, value: object) -> list[Any]:
-    """The list; None counts as empty."""
-    if value is not None and not isinstance(value, list):
-        raise InputError(f"{where} is {shown(value)}; it must be a list")
-    return value or []

@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 import yaml
 
+from helpers.moveit_files import MOTION_BENCH_MAKER
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.problems.files import load_problem
-from robotdiffuse.problems.files.moveit import read_moveit_scene
-from robotdiffuse.problems.files.moveit_contacts import matrix_contacts
+from robotdiffuse.problems.files.moveit.contacts import matrix_contacts
+from robotdiffuse.problems.files.moveit.scene import read_moveit_scene
 from robotdiffuse.robots import load_robot
 
-FOLDER = Path(__file__).parents[2] / "files" / "motion_bench_maker"
 LINKS = ("hand", "finger")
 
 
@@ -67,7 +67,7 @@ def test_a_damaged_matrix_is_an_error(data: object) -> None:
 
 
 def test_a_scene_and_a_problem_file_allow_contacts(tmp_path: Path) -> None:
-    shutil.copytree(FOLDER, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(MOTION_BENCH_MAKER, tmp_path, dirs_exist_ok=True)
     file = tmp_path / "scene0001.yaml"
     data = read_yaml(file)
     names = [entry["id"] for entry in data["world"]["collision_objects"]]

@@ -1,0 +1,119 @@
+"""Numba kernel that projects configurations onto path constraints by damped Newton steps.
+
+The rows, their values and their working memory are those of `constraint_kernel.py`.
+"""
+
+import numpy as np
+
+from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.problems.constraint_kernel import (
+    CONE,
+    DISTANCE,
+    TURN,
+    add_velocity,
+    in_box,
+    pose_frame,
+    row_value,
+)
+from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step
+
+ANGLE_WEIGHT = 0.3
+"""Metres that correspond to one radian in projection."""
+DAMPING, MAX_STEP, MAX_ITERATIONS = 1e-5, 1.0, 30
+"""For projection: damping (squared singular values well above it are inverted), longest step [rad], and
+number of steps."""
+
+
+@inner_kernel()
+def _residuals(rows, limits, q, work):
+    """The number of residuals of the rows that exceed their limits.
+
+    Writes to work.e the residuals to the values that projection aims for, and to work.J their Jacobian.
+    """
+    count, dof = 0, len(q)
+    for m in range(len(rows.row_kind)):
+        if not rows.same_frame[m]:
+            pose_frame(rows, m, q, work)
+        value = row_value(rows, m, work)
+        if value <= limits[m]:
+            continue
+        lines = 1 if rows.row_kind[m] == CONE else 3
+        keep = 1.0 - rows.inner_limit[m] / value if value > 0 else 1.0
+        sine = np.sqrt(work.error[0] ** 2 + work.error[1] ** 2 + work.error[2] ** 2)
+        for r in range(lines):
+            if rows.row_kind[m] == DISTANCE:
+                x = in_box(rows, m, work.T, r)
+                off = min(max(x, -rows.inner_half_size[m, r]), rows.inner_half_size[m, r]) - x
+                if off == 0.0:
+                    continue
+                work.e[count] = off * keep
+            elif rows.row_kind[m] == CONE:
+                work.e[count] = ANGLE_WEIGHT * (value - rows.inner_limit[m])
+            else:
+                work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * keep
+            for j in range(dof):
+                work.J[count, j] = 0.0
+            for k in range(rows.chain_length[m]):
+                entry = 0.0
+                if rows.row_kind[m] == DISTANCE:
+                    moved = work.y
+                    moved[0] = moved[1] = moved[2] = 0.0
+                    add_velocity(rows, m, k, 1.0, work, moved)
+                    for i in range(3):
+                        entry += rows.reference_pose[m, i, r] * moved[i]
+                elif rows.joint_kinds[m, k] != PRISMATIC and rows.row_kind[m] == TURN:
+                    entry = ANGLE_WEIGHT * work.axes[k, r]
+                elif rows.joint_kinds[m, k] != PRISMATIC and sine > 1e-9:
+                    for i in range(3):
+                        entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
+                elif (
+                    rows.joint_kinds[m, k] != PRISMATIC
+                ):  # axis and direction are opposite: any rotation axis serves
+                    entry = ANGLE_WEIGHT * work.axes[k, 0]
+                work.J[count, rows.chain[m, k]] = entry
+            count += 1
+    return count
+
+
+@inner_kernel()
+def step(rows, limits, q, most, work):
+    """Moves q by one damped Newton step towards the limits, within the joint limits.
+
+    most: longest step [rad]. Returns the number of residuals before the step: 0 if q satisfied all limits and
+    was not moved, -1 if no step helps.
+    """
+    dof = len(q)
+    count = _residuals(rows, limits, q, work)
+    if count == 0:
+        return 0
+    work.held[:] = False
+    damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
+    again = False
+    for k in range(dof):
+        low, high = q[k] <= rows.lower[k], q[k] >= rows.upper[k]
+        if not rows.continuous[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
+            work.held[k] = again = True
+    if again:
+        damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
+    length = np.sqrt((work.step * work.step).sum())
+    scale = min(1.0, most / max(length, 1e-12))
+    if length < 1e-9:
+        return -1
+    for k in range(dof):
+        q[k] += scale * work.step[k]
+        if not rows.continuous[k]:
+            q[k] = min(max(q[k], rows.lower[k]), rows.upper[k])
+    return count
+
+
+@kernel()
+def project(rows, limits, q, work):
+    """Projects q in place onto the limits by damped Newton steps, within the joint limits.
+
+    Returns whether q satisfies the limits.
+    """
+    for _ in range(MAX_ITERATIONS):
+        left = step(rows, limits, q, MAX_STEP, work)
+        if left <= 0:
+            return left == 0
+    return _residuals(rows, limits, q, work) == 0

@@ -1,0 +1,17 @@
+"""One server for all tests that do not stop it."""
+
+from collections.abc import Iterator
+
+import httpx
+import pytest
+
+from helpers.serving import serving
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[httpx.Client]:
+    with serving("--workers", "1", "--queue", "2", "--max-time-limit", "5", "--max-request-size", "1") as (
+        client,
+        _,
+    ):
+        yield client
