@@ -115,6 +115,18 @@ def test_what_keeps_the_arm_from_going_is_said() -> None:
         replace(ExplorerSettings(), policy="bold")
 
 
+def test_a_strict_arm_does_not_look_for_a_goal_outside_of_the_map() -> None:
+    """It used up its looks on goals of MotionBenchMaker below the base."""
+    below = np.array([0.0, 1.7, 0.0, -1.0, 0.0, 2.2, 0.785])
+    one = rd.Explorer(PANDA, [wrist_camera(PANDA)], free_zone=ZONE)
+    one.observe(camera_beside(PROBLEM, None, 0))
+    one.set_goal(below)
+    step = one.next(PROBLEM.start)
+    assert (step.kind, step.reason) == ("stuck", "at the goal the arm reaches out of the map")
+    one.set_goal(np.stack([below, PROBLEM.start + 0.05]))
+    assert one.next(PROBLEM.start).kind in ("go", "look")
+
+
 def test_stray_points_that_other_views_see_through_are_no_obstacles() -> None:
     one, view = explorer(seen=False), camera_beside(PROBLEM, None, 0)
     depth, (v, u) = view.depth.copy(), (200, 150)

@@ -40,7 +40,7 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
-from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free
+from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free, reaches_outside
 from robotdiffuse.planning.exploration.steps import (
     CHANCE,
     DONE,
@@ -178,6 +178,11 @@ class Explorer:
 
     def _step(self, problem: Problem, policy: str) -> Step:
         """The step under one policy."""
+        if policy == STRICT and isinstance(problem.goal, JointGoal):
+            goals = [q for q in problem.goal.positions if not reaches_outside(self.robot, q)]
+            if not goals:
+                return Step(STUCK, "at the goal the arm reaches out of the map", policy)
+            problem = replace(problem, goal=JointGoal(np.stack(goals)))
         predicted = self._predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit

@@ -14,6 +14,7 @@ from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.perception.swept_voxels_kernel import surface
 from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape
 
@@ -51,10 +52,21 @@ def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], 
     return AssumedPoints(points, COVER_RADIUS, name=name)
 
 
+def reaches_outside(robot: Robot, q: Float[ndarray, "dof"]) -> bool:
+    """Whether the arm reaches out of the map: centres of its covering spheres lie outside."""
+    low, high = _ends_of_map()
+    centers = placed_spheres(robot, q)[:, :3]
+    return bool(((centers < low) | (centers > high)).any())
+
+
+def _ends_of_map() -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
+    low = np.array(LOW)
+    return low, low + np.array(FINE_SHAPE) * FINE_VOXEL_SIZE
+
+
 def _walls() -> list[Box]:
     """Boxes around the map."""
-    low = np.array(LOW)
-    high = low + np.array(FINE_SHAPE) * FINE_VOXEL_SIZE
+    low, high = _ends_of_map()
     walls = []
     for axis in range(3):
         for at, name in ((low[axis] - WALL / 2, "before"), (high[axis] + WALL / 2, "beyond")):
