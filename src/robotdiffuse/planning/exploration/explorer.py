@@ -26,7 +26,7 @@ from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import FIRST, Path, Trajectory
+from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
 from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, voxels_in
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
@@ -250,14 +250,14 @@ class Explorer:
                 if self._good(way, policy):
                     stated = way.confidence if policy == CHANCE else None
                     self._looked_for += wanted
-                    return Step(LOOK, f"{why}; look there first", policy, way, stated)
+                    return Step(LOOK, f"{why}; look at unseen space on the way", policy, way, stated)
         if policy == self.settings.policy == CHANCE:
             strict = self._look(problem, STRICT, predicted, motion)
             if strict.kind != STUCK:
                 return strict
         back = self._way_back(problem) if policy == STRICT else None
         if back is not None:
-            return Step(LOOK, f"{why}; back on the way in, to look from there", policy, back)
+            return Step(LOOK, f"{why}; go back on the way in and look from there", policy, back)
         return Step(STUCK, f"{why}; no look that would help can be reached", policy)
 
     def _way_back(self, problem: Problem) -> PlanResult | None:
@@ -328,7 +328,8 @@ class Explorer:
         result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None])), limit)
         if result.solved:
             return result
-        return replace(result, reason=f"no motion within space seen free: {result.reason}")
+        why = "" if result.status is Status.TIMEOUT else f": {result.reason}"
+        return replace(result, reason=f"no motion through space seen free alone was found{why}")
 
     def _by_chance(
         self, problem: Problem, predicted: Float32[ndarray, "nx ny nz"] | None, limit: float
