@@ -80,7 +80,7 @@ class Method:
     standing: bool = True
     """Whether a camera stands beside the arm."""
     frontier: bool = False
-    """Whether looks are to show the border of what is known, whatever a motion sweeps."""
+    """Whether looks are to show the frontier of known space, not what a motion sweeps."""
 
 
 METHODS = {
@@ -121,7 +121,7 @@ class TimedExplorer(Explorer):
 
 
 class FrontierExplorer(TimedExplorer):
-    """Looks at unknown voxels beside free ones, whatever a motion sweeps."""
+    """Looks at unknown voxels beside free ones, not at what a motion sweeps."""
 
     def wanted(self, path: JointPath) -> Bool[ndarray, "nx ny nz"]:
         return self.map.unknown & binary_dilation(self.map.free)

@@ -168,7 +168,7 @@ def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> N
 
 
 def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough() -> None:
-    """By chance, the arm looked on, whatever it saw: a rate of 0.82 was the highest confidence."""
+    """Under `chance` the arm never stopped looking: the highest confidence was a rate of 0.82."""
     settings = ExplorerSettings(policy="chance", predict=False, time_limit=1.0)
     one = rd.Explorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
     one.observe(camera_beside(PROBLEM, None, 0))

@@ -95,7 +95,7 @@ def explore(problem: "Problem", outputs: list[Path]) -> int:
     """Take the arm from where it is ready to the problem's goal through space that its cameras see on the
     way, and draw that."""
     from robotdiffuse.cli.explore import draw_exploration, simulate
-    from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+    from robotdiffuse.planning.exploration.steps import LOOK, ExplorerSettings
     from robotdiffuse.problems.families.furniture import FLOOR
     from robotdiffuse.problems.problem import Problem
     from robotdiffuse.scenes.scene import Scene
@@ -105,7 +105,7 @@ def explore(problem: "Problem", outputs: list[Path]) -> int:
     problem = Problem(problem.robot, Scene([FLOOR, *others]), start, problem.goal)
     print("The arm knows the floor, and sees the rest by a camera at its tip and one beside it.")
     explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
-    looks = sum(act.step.kind == "look" for act in explorer.acts)
+    looks = sum(act.step.kind == LOOK for act in explorer.acts)
     end = "is at the goal" if arrived else "is not at the goal"
     print(f"The arm {end}: {looks} looks, {len(explorer.views)} images, {explorer.duration:.1f} s in motion.")
     for file in outputs:

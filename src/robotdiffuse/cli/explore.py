@@ -10,9 +10,9 @@ from robotdiffuse.interop import WRITERS
 
 if TYPE_CHECKING:
     from robotdiffuse.perception.depth_noise import DepthNoise
-    from robotdiffuse.planning.exploration.explorer import ExplorerSettings
     from robotdiffuse.planning.exploration.recorded import RecordedExplorer
     from robotdiffuse.planning.exploration.simulated import Event
+    from robotdiffuse.planning.exploration.steps import ExplorerSettings
     from robotdiffuse.problems.problem import Problem
 
 FLOOR = "floor"
@@ -62,7 +62,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.perception.depth_noise import DepthNoise
-    from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+    from robotdiffuse.planning.exploration.steps import ExplorerSettings
     from robotdiffuse.problems.files import load_problem
 
     outputs = [check_output(file, ENDINGS) for file in arguments.out]
@@ -92,9 +92,9 @@ def simulate(
 ) -> "tuple[RecordedExplorer, bool]":
     """Simulate the loop and print its steps; returns the explorer, and whether the arm got to the goal
     without a collision."""
-    from robotdiffuse.planning.exploration.explorer import DONE
     from robotdiffuse.planning.exploration.recorded import RecordedExplorer
     from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+    from robotdiffuse.planning.exploration.steps import DONE
     from robotdiffuse.scenes.scene import Scene
 
     known = Scene([shape for shape in problem.scene.shapes if shape.name == FLOOR])

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
@@ -106,6 +106,11 @@ class Voxels(Assumption):
 def refined(voxels: Bool[ndarray, "mx my mz"]) -> Bool[ndarray, "nx ny nz"]:
     """Coarse voxels of the observed volume as fine ones, of half the edge."""
     return voxels.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+
+
+def voxels_of(points: Float[ndarray, "n 3"]) -> Int[ndarray, "n 3"]:
+    """The indices of the fine voxels that points in the base frame lie in; they may be outside the volume."""
+    return np.floor((points - LOW) / FINE_VOXEL_SIZE).astype(np.int64)
 
 
 def voxels_in(

@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
-from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
+from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, voxels_of
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.free_space_kernel import FREE
 from robotdiffuse.perception.observed_volume import LOW, carve_view
@@ -75,7 +75,7 @@ class OccupancyMap:
     def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
         or of `rd.PointCloud.from_file`. They say nothing about free space."""
-        at = np.floor((np.asarray(points) - LOW) / FINE_VOXEL_SIZE).astype(np.int64)
+        at = voxels_of(np.asarray(points))
         at = at[((at >= 0) & (at < FINE_SHAPE)).all(axis=1)]
         hit = np.zeros(FINE_SHAPE, np.bool_)
         hit[tuple(at.T)] = True

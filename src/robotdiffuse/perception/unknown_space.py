@@ -37,8 +37,8 @@ class UnknownSpace:
         margin: float = CARVING_MARGIN,
     ) -> None:
         """
-        unknown: the fine voxels that no view saw.
         occupied_by_arm: configurations at which the arm is known to be free: the start and the goals.
+        unknown: the fine voxels that no view saw.
         predicted: the probability that each fine voxel is occupied; None without a prediction.
         margin: voxels nearer than this to the arm at those configurations count as occupied by it [m].
         """

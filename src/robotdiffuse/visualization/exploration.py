@@ -10,8 +10,8 @@ from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
 from robotdiffuse.perception.observed_volume import LOW
 from robotdiffuse.perception.seen_points_kernel import near_scene
-from robotdiffuse.planning.exploration.explorer import DONE
 from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
+from robotdiffuse.planning.exploration.steps import DONE
 
 LIKELY = 0.5
 """Voxels of unknown space that are occupied with a larger probability are shown as predicted."""

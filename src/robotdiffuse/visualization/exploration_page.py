@@ -13,8 +13,8 @@ from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
 from robotdiffuse.perception.observed_volume import LOW
-from robotdiffuse.planning.exploration.explorer import DONE, LOOK
 from robotdiffuse.planning.exploration.recorded import RecordedExplorer
+from robotdiffuse.planning.exploration.steps import DONE, LOOK
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.exploration import (

@@ -1,14 +1,13 @@
 """Draws an exploration as a picture: its moments beside each other, each with what was known then."""
 
-import io
 from pathlib import Path as FilePath
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from numpy import ndarray
 from PIL import Image
 
-from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.types import Path
 from robotdiffuse.planning.exploration.recorded import RecordedExplorer
 from robotdiffuse.scenes.scene import Scene
@@ -32,6 +31,7 @@ from robotdiffuse.visualization.picture import (
     faded_below,
     linear,
     render,
+    save_png,
     tube,
 )
 from robotdiffuse.visualization.voxel_faces import faces_surface
@@ -63,16 +63,14 @@ def write_exploration_picture(
     path = check_output(file, (".png",))
     found = moments(explorer)
     chosen = _chosen(len(found))
-    whole = np.concatenate([_positions(moment) for moment in found])
+    whole = np.concatenate([moment.act.waypoints for moment in found])
     surfaces = style.robot_surfaces(explorer.robot)
     tool = style.tool_point(explorer.robot, surfaces)
     size = settings.width, settings.height
     camera = view_of_motion(explorer.robot, scene, surfaces, tool, whole, *size, MARGINS)
     known = in_known_scene(explorer)
     tiles = [_tile(explorer, found[i], known, camera, settings) for i in chosen]
-    buffer = io.BytesIO()
-    _joined(tiles).save(buffer, "PNG", optimize=False)
-    write_atomically(path, buffer.getvalue())
+    save_png(_joined(tiles), path)
 
 
 def _chosen(count: int) -> list[int]:
@@ -80,13 +78,6 @@ def _chosen(count: int) -> list[int]:
     if count <= MAX_MOMENTS:
         return list(range(count))
     return [*np.linspace(0, count - 3, MAX_MOMENTS - 2).round().astype(int), count - 2, count - 1]
-
-
-def _positions(moment: Moment) -> Float[ndarray, "n dof"]:
-    motion = moment.act.step.motion
-    if motion is None or motion.path is None:
-        return moment.act.configuration[None]
-    return motion.path.positions
 
 
 def _tile(
@@ -106,7 +97,7 @@ def _tile(
         ClearSurface(predicted, linear(style.ASSUMED), PREDICTED_ALPHA),
     ]
     look = [tube(edge, LOOK_COLOR, LOOK_COLOR) for edge in frustum(explorer, act)]
-    motion = act.trajectory or Path(robot.joint_names, _positions(moment))
+    motion = act.trajectory or Path(robot.joint_names, act.waypoints)
     pixels, _ = render(robot, explorer.scene, motion, settings, camera, added=(occupied, *look), clear=clear)
     image = Image.fromarray(faded_below(pixels, *FADE))
     drawn = {

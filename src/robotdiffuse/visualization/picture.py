@@ -104,9 +104,7 @@ def write_picture(
     pixels, _ = render(robot, scene, motion, settings)
     image = Image.fromarray(faded_below(pixels))
     caption(image, title or robot.name, style.facts(motion, result, robot))
-    buffer = io.BytesIO()
-    image.save(buffer, "PNG", optimize=False)
-    write_atomically(path, buffer.getvalue())
+    save_png(image, path)
 
 
 def write_comparison(
@@ -131,6 +129,11 @@ def write_comparison(
     image = Image.fromarray(faded_below(pixels))
     figures = [", ".join(v for k, v in style.facts(m, None) if v != "untimed") for m in motions.values()]
     caption(image, title or robot.name, list(zip(motions, figures, strict=True)), COMPARED)
+    save_png(image, path)
+
+
+def save_png(image: Image.Image, path: FilePath) -> None:
+    """Write an image at once."""
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=False)
     write_atomically(path, buffer.getvalue())

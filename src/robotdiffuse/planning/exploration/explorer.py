@@ -27,10 +27,9 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
-from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, voxels_in
+from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in, voxels_of
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import LOW
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.swept_voxels_kernel import surface
@@ -160,7 +159,7 @@ class Explorer:
     def _seen_points(self) -> Float[ndarray, "n 3"]:
         """The points that kept views observed, without those where more views see through: stray pixels."""
         points = self._views.points()
-        at = np.floor((points - LOW) / FINE_VOXEL_SIZE).astype(np.int64)
+        at = voxels_of(points)
         inside = ((at >= 0) & (at < FINE_SHAPE)).all(axis=1)
         stray = np.zeros(len(points), np.bool_)
         stray[inside] = self.map.free[tuple(at[inside].T)]
@@ -183,7 +182,7 @@ class Explorer:
             if not goals:
                 return Step(STUCK, "at the goal the arm reaches out of the map", policy)
             problem = replace(problem, goal=JointGoal(np.stack(goals)))
-        predicted = self._predicted() if policy == CHANCE else None
+        predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit
         quick = may_look and policy == STRICT
@@ -234,7 +233,7 @@ class Explorer:
             kept, under = self._within_seen_free(problem, tentative.path.positions, "as seen"), STRICT
         if kept is not None and self._good(kept, under):
             return self._go(kept, under)
-        predicted = self._predicted() if predicted is None else predicted
+        predicted = self.predicted() if predicted is None else predicted
         allowed = problem.scene
         if policy == STRICT:
             obstacles = not_seen_free(self.map, self.scene, (problem.start,))
@@ -374,13 +373,13 @@ class Explorer:
     def _occupied_by(self, q: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
         return voxels_in(placed_spheres(self.robot, q).astype(np.float32))
 
-    def _predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
+    def predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
         """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
-        network."""
+        network, and before the first view."""
         from robotdiffuse.learning.completion import predict
         from robotdiffuse.learning.completion.coverage import covers
 
-        if not (self.settings.predict and covers(self.robot)):
+        if not (len(self._views) and self.settings.predict and covers(self.robot)):
             return None
         return np.where(self.map.free, np.float32(0), predict(self._views.volume()))
 

@@ -10,17 +10,14 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.learning.completion import predict
-from robotdiffuse.learning.completion.coverage import covers
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import Corners
 from robotdiffuse.planning.exploration.cameras import ArmCamera
-from robotdiffuse.planning.exploration.explorer import LOOK, NOTHING, Explorer, ExplorerSettings, Step
+from robotdiffuse.planning.exploration.explorer import DEFAULTS, NOTHING, Explorer
+from robotdiffuse.planning.exploration.steps import LOOK, ExplorerSettings, Step
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-DEFAULT = ExplorerSettings()
 SAME_POSE = 1e-9
 """Largest difference of an entry of two poses that are the same."""
 
@@ -63,6 +60,11 @@ class RecordedAct:
         return None if self.step.motion is None else self.step.motion.trajectory
 
     @property
+    def waypoints(self) -> Float[ndarray, "n dof"]:
+        """Of the motion; without one, the configuration."""
+        return _waypoints(self.step, self.configuration)
+
+    @property
     def duration(self) -> float:
         """[s]; 0 for a step without a motion."""
         return 0.0 if self.trajectory is None else self.trajectory.duration
@@ -80,7 +82,7 @@ class RecordedExplorer(Explorer):
         cameras: Sequence[ArmCamera] = (),
         scene: Scene = NOTHING,
         free_zone: Corners | None = None,
-        settings: ExplorerSettings = DEFAULT,
+        settings: ExplorerSettings = DEFAULTS,
         seed: int = 0,
     ) -> None:
         """See `Explorer`."""
@@ -106,9 +108,8 @@ class RecordedExplorer(Explorer):
         begins, step = self.duration, super().next(q)
         T = None
         if step.kind == LOOK and self.cameras:
-            end = q if step.motion is None or step.motion.path is None else step.motion.path.positions[-1]
-            T = self.cameras[0].poses(self.robot, end[None])[0]
-        self.acts.append(RecordedAct(begins, step, q, self._predicted_from(q), T))
+            T = self.cameras[0].poses(self.robot, _waypoints(step, q)[-1:])[0]
+        self.acts.append(RecordedAct(begins, step, q, self.predicted(), T))
         return step
 
     def _time_of(self, view: DepthView) -> float:
@@ -127,8 +128,7 @@ class RecordedExplorer(Explorer):
                     return number
         return None
 
-    def _predicted_from(self, q: Float[ndarray, "dof"]) -> Float32[ndarray, "nx ny nz"] | None:
-        if not (self.views and self.settings.predict and covers(self.robot)):
-            return None
-        latest = [one.view for one in self.views[-self.settings.max_views :]]
-        return predict(observe(latest, self.robot, q))
+
+def _waypoints(step: Step, q: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+    motion = step.motion
+    return q[None] if motion is None or motion.path is None else motion.path.positions
