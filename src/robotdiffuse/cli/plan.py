@@ -75,7 +75,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--until",
         choices=UNTIL,
         default=CONVERGED,
-        help="stop at the first motion, when paths stop getting shorter (default), or at the time limit",
+        help="stop at the first motion, when more time hardly improves it (default), or at the time limit",
     )
     parser.add_argument(
         "--clearance",

@@ -77,7 +77,11 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _add_planning(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems, results, page")
     parser.add_argument(
-        "--problems", type=count, default=300, metavar="N", help="of each kind of goal (default: 300)"
+        "--problems",
+        type=count,
+        default=300,
+        metavar="N",
+        help="problems of each kind of goal (default: 300)",
     )
     parser.add_argument(
         "--time-limit", type=positive, default=10.0, metavar="S", help="of a call [s] (default: 10)"
