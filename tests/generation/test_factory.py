@@ -47,6 +47,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def test_a_folder_called_like_a_robot_does_not_hide_it_from_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nodes got the path of any folder of this name in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "panda").mkdir()
+    assert factory._as_absolute(SETTINGS) == SETTINGS
+
+
 @pytest.fixture
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(factory, "on_this_machine", in_this_process)

@@ -14,8 +14,9 @@ from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.datasets.motion_rows import motion_of, problem_of
 from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
-from robotdiffuse.evaluation.datasets.check import KINDS, check_data
+from robotdiffuse.evaluation.datasets.check import KINDS, _limits, check_data
 from robotdiffuse.problems.problem import JointGoal
+from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
@@ -88,6 +89,12 @@ def test_limit_violation_is_found(tmp_path, pybullet):
     assert {kind: n for kind, n in check.counts.items() if n} == {"limits": 1}
     (example,) = check.examples
     assert example.where == "shard 0, row 1" and "j0 is 2.801 at waypoint 7" in example.message
+
+
+def test_continuous_joints_have_no_limits() -> None:
+    robot = load_robot("gen3")
+    q = np.where(robot.continuous, 9.6, (robot.lower + robot.upper) / 2)[None]
+    assert any(robot.continuous) and not list(_limits(robot, q))
 
 
 @pytest.mark.sim

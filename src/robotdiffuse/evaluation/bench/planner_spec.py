@@ -11,7 +11,7 @@ from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 
 CALL_ARGUMENTS = [field.name for field in fields(PlanRequest) if field.name not in ("time_limit", "seed")]
-"""Arguments of a planner's calls that a contestant may set; the bench sets the others."""
+"""Arguments of a planner's calls that a planner under test may set; the bench sets the others."""
 
 
 @dataclass(frozen=True)
