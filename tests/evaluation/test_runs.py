@@ -59,6 +59,16 @@ def test_what_is_kept_is_not_made_again(tmp_path: Path) -> None:
     assert len(calls) == 4 and [record.name for record in backwards["x"]] == ["b", "a"]
 
 
+def test_another_time_limit_is_another_run(tmp_path: Path) -> None:
+    """Records of any time limit were returned."""
+    calls: list[tuple[str, str, int]] = []
+    case = Case("x#1", "free", FREE, True, LENGTH_OF_LINE, "mine")
+    for limit in (1.0, 2.0, 2.0):
+        found = run_all([case], quick(1.0, calls), limit=limit, folder=tmp_path, bar=False)
+        assert [(r.name, r.time_limit) for r in found["x"]] == [("x#1", limit)]
+    assert len(calls) == 4
+
+
 def test_interrupted_runs_continue(tmp_path: Path) -> None:
     calls: list[tuple[str, str, int]] = []
 

@@ -4,12 +4,15 @@ verdict.
 The validator's time counts only where it is part of a planner's call.
 """
 
+import hashlib
+import json
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import lru_cache
 from math import ceil
+from pathlib import Path as FilePath
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -193,6 +196,14 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
         }
 
     return call
+
+
+def sampling_digest(settings: RobotDiffuseSettings, folder: FilePath | None) -> str:
+    """Identifies in the names of methods what samples depend on: the settings, and the network's weights in a
+    folder, if there is a network."""
+    weights = None if folder is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
+    about = json.dumps(asdict(settings) | {"weights": weights}, sort_keys=True)
+    return hashlib.sha256(about.encode()).hexdigest()[:12]
 
 
 def from_network(

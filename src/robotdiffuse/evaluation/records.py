@@ -82,8 +82,8 @@ class Record:
 
     @property
     def case(self) -> tuple[str, str, int]:
-        """Problem set, problem and seed. A name may end with # and the part of the answer."""
-        return self.problem_set, self.name.partition("#")[0], self.seed
+        """Problem set, problem and seed."""
+        return self.problem_set, self.name, self.seed
 
     @property
     def joint_length(self) -> float | None:
