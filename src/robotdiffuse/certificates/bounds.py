@@ -93,11 +93,11 @@ class Prover:
     def __init__(self, robot: Robot, scene: Scene, q: Float[ndarray, "rows dof"]) -> None:
         self.robot, self.q = robot, q
         self.linkage, self.obstacles = Linkage(robot), Obstacles(scene)
-        if SCENE in self.linkage.links:
+        self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
+        if SCENE in self.links:
             raise InputError(
                 f"the robot has a link called {SCENE!r}; rename it: certificates use this name for the scene"
             )
-        self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
         self._of = {link: k for k, link in enumerate(self.linkage.links)}
         self._moved = self.linkage.moved
         self.may_touch = np.array(
