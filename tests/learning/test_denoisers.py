@@ -16,6 +16,7 @@ from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import Denoiser
 from robotdiffuse.learning.denoisers.layers import MAX_UNFUSED_TOKENS, attend
 from robotdiffuse.learning.denoisers.settings import (
+    CrossAttentionSettings,
     DecoderOnlySettings,
     EncoderDecoderSettings,
     TransformerSettings,
@@ -28,12 +29,13 @@ from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 
-DOF, FEATURES, CODE = 3, 9, 8
+DOF, FEATURES, CODE = 3, 9, 9
 CONDITION = CODE + 2 * DOF
 SMALL = {
     "transformer": TransformerSettings(32, 2, 2, 48, 1),
     "encoder_decoder": EncoderDecoderSettings(32, 2, 2, 48, 1, encoder_layers=1),
     "decoder_only": DecoderOnlySettings(32, 2, 2, 48, 1),
+    "cross_attention": CrossAttentionSettings(32, 2, 2, 48, 1),
     "unet": UNetSettings(16, (1, 2, 2), 3, 32),
 }
 LENGTHS = (12, 48, 254)

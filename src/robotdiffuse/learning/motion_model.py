@@ -110,6 +110,11 @@ class MotionModelSettings(ModelParts, name="model"):
             )
         if self.encoder is None and self.denoiser == "encoder_decoder":
             raise InputError("model.denoiser is encoder_decoder and encoder is None; it needs a condition")
+        if (self.encoder == "points") != (self.denoiser == "cross_attention"):
+            raise InputError(
+                f"model.encoder is {self.encoder} and denoiser is {self.denoiser}; "
+                "points and cross_attention need each other"
+            )
 
     @property
     def network(self) -> str:

@@ -35,6 +35,11 @@ DENOISERS = Registry(
             "decoder-only transformer",
             _SETTINGS + "DecoderOnlySettings",
         ),
+        "cross_attention": Entry(
+            _PACKAGE + "cross_attention:CrossAttention",
+            "transformer whose waypoints attend to points of the scene, of the encoder points",
+            _SETTINGS + "CrossAttentionSettings",
+        ),
         "unet": Entry(_PACKAGE + "unet:UNet", "temporal U-Net", _SETTINGS + "UNetSettings"),
     },
 )

@@ -92,6 +92,12 @@ class DecoderOnlySettings(AttentionSettings, name="decoder_only"):
 
 
 @dataclass(frozen=True)
+class CrossAttentionSettings(AttentionSettings, name="cross_attention"):
+    patch: Count = 8
+    """Waypoints per token; a divisor of the number of waypoints."""
+
+
+@dataclass(frozen=True)
 class UNetSettings(DenoiserSettings, name="unet"):
     width: Count = 48
     """Channels at the full resolution; even."""

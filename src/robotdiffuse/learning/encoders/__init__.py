@@ -30,6 +30,12 @@ ENCODERS = Registry(
             _PACKAGE + "pointnet:PointNet", "PointNet", _SETTINGS + "PointNetSettings", "jointly"
         ),
         "dgcnn": Entry(_PACKAGE + "dgcnn:DGCNN", "DGCNN", _SETTINGS + "DGCNNSettings", "jointly"),
+        "points": Entry(
+            _PACKAGE + "points:Points",
+            "the points themselves, for the denoiser cross_attention",
+            _SETTINGS + "PointsSettings",
+            "jointly",
+        ),
     },
 )
 """By the name in settings and checkpoints. Two kinds: "alone" is trained with a loss of its own and then

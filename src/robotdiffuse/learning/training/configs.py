@@ -59,6 +59,17 @@ CONFIGS: dict[str, Config] = {
             **_TABLE2_ROW,
         },
     ),
+    "points": Config(
+        "no clearances: waypoints attend to 32 points of the obstacles, the best of the codes of the scene",
+        {
+            **_TABLE2_ROW,
+            "minutes": None,
+            "samples": 1_600_000,
+            "encoder": "points",
+            "denoiser": "cross_attention",
+            "turned_copies": 15,
+        },
+    ),
     "table2_pointnet": Config("encoder PointNet, trained jointly", {**_TABLE2_ROW, "encoder": "pointnet"}),
     "table2_dgcnn": Config("encoder DGCNN, trained jointly", {**_TABLE2_ROW, "encoder": "dgcnn"}),
     "table2_unet": Config("temporal U-Net", {**_TABLE2_ROW, "denoiser": "unet"}),
