@@ -96,6 +96,10 @@ class CrossAttentionSettings(AttentionSettings, name="cross_attention"):
     patch: Count = 8
     """Waypoints per token; a divisor of the number of waypoints."""
 
+    @classmethod
+    def paper_size(cls) -> "CrossAttentionSettings":
+        return cls(512, 5, 4, 1024, patch=1)
+
 
 @dataclass(frozen=True)
 class UNetSettings(DenoiserSettings, name="unet"):

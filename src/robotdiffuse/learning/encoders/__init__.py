@@ -39,7 +39,8 @@ ENCODERS = Registry(
     },
 )
 """By the name in settings and checkpoints. Two kinds: "alone" is trained with a loss of its own and then
-frozen; "jointly" is trained with the planner, by the planner's loss."""
+frozen; "jointly" is a part of the planner's network, whose loss trains what weights it has, on fresh clouds
+for every batch."""
 
 
 def make_encoder(name: str, settings: "EncoderSettings | None" = None) -> "Encoder":

@@ -8,7 +8,6 @@ activation is PReLU, as in MPNet (Qureshi et al. 2019), whose encoder has the sa
 from collections.abc import Iterable
 from itertools import pairwise
 
-import torch
 from jaxtyping import Float
 from numpy.random import Generator
 from torch import Tensor, nn

@@ -50,7 +50,7 @@ def in_order(points: Float32[ndarray, "n 3"], count: int) -> Float32[ndarray, "{
     """`count` of the points, sorted by x, then y, then z: thinned evenly, or repeated if there are fewer.
 
     Coordinates are rounded to a millionth of the largest one. Zeros without any point. See also
-    `CompressionAutoencoder.arrange`, for batches of tensors.
+    `Encoder.arrange`, for batches of tensors.
     """
     if not len(points):
         return np.zeros((count, 3), np.float32)

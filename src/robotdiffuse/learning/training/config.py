@@ -19,7 +19,7 @@ from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.settings import DenoiserSettings
 from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.encoders.settings import EncoderSettings
-from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts
+from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts, check_points
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.training.losses import LossSettings
 
@@ -152,6 +152,7 @@ class PlannerTraining(MotionTraining, ModelParts):
             raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
         if self.encoder_settings is not None:
             ENCODERS.entry(self.encoder)  # a folder holds a trained encoder with its own settings
+        check_points("encoder", self.encoder, self.denoiser)
 
     @property
     def jointly(self) -> bool:
