@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -334,11 +335,10 @@ def data(tmp_path, monkeypatch):
     return folder
 
 
-def denoiser_for(encoder):
-    sizes = {"width": 32, "layers": 2, "heads": 2, "hidden": 48, "patch": 8}
+def denoiser_for(encoder: str) -> dict[str, Any]:
     if encoder == "points":
-        return {"denoiser": "cross_attention", "denoiser_settings": CrossAttentionSettings(**sizes)}
-    return {"denoiser_settings": TransformerSettings(**sizes)}
+        return {"denoiser": "cross_attention", "denoiser_settings": CrossAttentionSettings(32, 2, 2, 48, 8)}
+    return {"denoiser_settings": TransformerSettings(32, 2, 2, 48, 8)}
 
 
 def planner(data, encoder, **changes) -> PlannerTraining:

@@ -240,8 +240,8 @@ def notes(settings: Table1Settings) -> list[str]:
         "success: the motion passes the validator and ends within 1 cm and 15° of the pose, with the 95 % "
         "interval by Wilson. collision: share of problems on which the validator refused the planner's last "
         "path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion as it ships try again until time "
-        "runs out; the rows of a single sample have one motion a problem, as in the paper, whose training saw "
-        "1.6 M samples.",
+        "runs out; the rows of a single sample have one motion a problem, as in the paper, whose training "
+        "saw 1.6 M samples.",
         "Means are over the problems that a row solves, with 95 % intervals: rows that solve only easy "
         "problems seem short. length of links 1 to 7: path lengths of the origins of the links that joints "
         "move, which the paper calls path length (its arm has no hand; it names no unit). log jerk: "
