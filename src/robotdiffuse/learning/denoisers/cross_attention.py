@@ -52,9 +52,8 @@ class CrossAttention(Denoiser):
         """The output for noisy trajectories; level is t / T in [0, 1]."""
         batch = features.shape[0]
         points = condition[:, : -2 * self.dof].reshape(batch, -1, 3)
-        with torch.autocast(points.device.type, enabled=False):  # bf16 would round coordinates to 4 mm
-            angles = torch.cat([points * (np.pi / 2 * 2**k) for k in range(OCTAVES)], -1)
-            known = torch.cat([points, angles.sin(), angles.cos()], -1)
+        angles = torch.cat([points * (np.pi / 2 * 2**k) for k in range(OCTAVES)], -1)
+        known = torch.cat([points, angles.sin(), angles.cos()], -1)
         memory = self.norm_points(self.points(known))
         z_tk = self.ends(condition[:, -2 * self.dof :]) + self.level(level)
         tokens = self.embed(features.reshape(batch, len(self.positions), -1)) + self.positions
