@@ -82,14 +82,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--config",
         default="compact",
         metavar="NAME",
-        help="compact (default), paper, trajectory_prior (for MPD and EDMP), or a row of the paper's Table "
-        "2: table2_jpc, table2_unet, ...",
+        help="compact (default), paper, points (no clearances as inputs), trajectory_prior (for MPD and "
+        "EDMP), or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
     )
     planner.add_argument(
         "--encoder",
         metavar="FOLDER",
-        help="folder of a trained encoder; or pointnet or dgcnn, which are trained with the planner "
-        "(default: that of the config, or the bundled one)",
+        help="folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
+        "for the denoiser cross_attention (default: that of the config, or the bundled one)",
     )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (default: panda)")
     planner.add_argument(
@@ -105,7 +105,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     _add_device(planner)
     parts = planner.add_argument_group("parts of the model that replace those of the config")
     parts.add_argument(
-        "--denoiser", metavar="NAME", help="transformer, encoder_decoder, decoder_only or unet"
+        "--denoiser",
+        metavar="NAME",
+        help="transformer, encoder_decoder, decoder_only, unet, or cross_attention for the encoder points",
     )
     parts.add_argument("--sampler", metavar="NAME", help="sampler for planning: ddim or ddpm")
     parts.add_argument("--objective", metavar="NAME", help="what the denoiser predicts: clean or noise")

@@ -118,8 +118,9 @@ class PlannerTraining(MotionTraining, ModelParts):
 
     encoder: str | None
     """Folder with a trained encoder, which stays frozen; or the name of an encoder, for example pointnet or
-    dgcnn, that is trained jointly, by the planner's loss, on fresh clouds for every batch. None for a prior,
-    whose inputs do not include the scene."""
+    dgcnn, that is trained jointly, by the planner's loss, on fresh clouds for every batch; points, for the
+    denoiser cross_attention, has nothing to train. None for a prior, whose inputs do not include the
+    scene."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
     """Peak learning rate of AdamW (paper: 3e-4)."""
