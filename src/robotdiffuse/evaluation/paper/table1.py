@@ -17,6 +17,7 @@ from robotdiffuse.evaluation.statistics import wilson_interval
 from robotdiffuse.evaluation.tables import Column, Figure, Table
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.weight_files import read_description
+from robotdiffuse.learning.weights_registry import POINTS
 
 AS_IN_PAPER = "diffusion, as the paper says"
 WITHOUT_CLEARANCES = "diffusion, no clearances, one unguided sample"
@@ -27,9 +28,8 @@ PAPER_SAMPLES = 1_600_000
 ONE_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
 """One sample, no guidance by distances, no further batches where the validator refuses it."""
 NO_WEIGHTS = (
-    f"{AS_IN_PAPER}: no weights. The bundled ones have clearances as inputs; train others with `robotdiffuse "
-    "train planner --config paper --data FOLDER --encoder FOLDER --out FOLDER`, or `--config points` without "
-    "an encoder, and name them by --paper-weights."
+    f"{AS_IN_PAPER}: no weights of its size and with its encoder. Train them with `robotdiffuse train "
+    "planner --config paper --data FOLDER --encoder FOLDER --out FOLDER` and name them by --paper-weights."
 )
 OURS = "RobotDiffuse"
 """The paper's name of its own row."""
@@ -51,6 +51,7 @@ ROWS = (
     Row("diffusion, as it ships: clearances as inputs", "diffusion", OURS),
     Row("diffusion, a single sample", "diffusion:samples=1:repeat=false"),
     Row("diffusion, a single sample, no guidance", ":".join(["diffusion", *ONE_SAMPLE])),
+    Row("the same, no clearances: 32 points of the scene", ":".join([f"diffusion@{POINTS}", *ONE_SAMPLE])),
     Row("robotdiffuse (hybrid)", "robotdiffuse"),
     Row("aorrtc", "aorrtc"),
     Row("no planner: line to the nearest goal", "straight_line:goals=nearest"),
