@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from robotdiffuse.perception.assumptions import FINE_SHAPE
-from robotdiffuse.perception.confidence import RATES, confidence, explored_confidence
+from robotdiffuse.perception.confidence import MAX_CONFIDENCE, RATES, confidence, explored_confidence
 from robotdiffuse.perception.unknown_space import CrossedSpace
 
 VOXELS = np.zeros(FINE_SHAPE, np.bool_)
@@ -15,7 +15,7 @@ VOXELS[40:60, 50:52, 20:22] = True
 def test_confidence_falls_with_the_predicted_probability() -> None:
     crossed = [CrossedSpace(VOXELS, np.full(FINE_SHAPE, p, np.float32)) for p in (0, 0.01, 0.1, 0.5, 1)]
     stated = [confidence("predicted, p > 0.1", one) for one in crossed]
-    assert stated[0] == 1 and stated[-1] == 0 and all(b < a for a, b in pairwise(stated))
+    assert stated[0] == MAX_CONFIDENCE and stated[-1] == 0 and all(b < a for a, b in pairwise(stated))
 
 
 def test_an_explorers_confidence_falls_with_the_probability_that_is_swept() -> None:

@@ -14,6 +14,9 @@ RATES: dict[str, float] = {
 """Part of the motions under an assumption that were free in the true scene, without a prediction, as
 `python benchmarks/cameras.py --fit` prints it for the calibration half of its problems."""
 
+MAX_CONFIDENCE = 0.995
+"""Of a motion that is free in every sampled world: the network and 256 worlds cannot tell more."""
+
 
 def confidence(assumption: str, crossed: CrossedSpace) -> float:
     """The probability that a motion under an assumption is free in the true scene.
@@ -22,7 +25,7 @@ def confidence(assumption: str, crossed: CrossedSpace) -> float:
     it is the assumption's rate.
     """
     share = crossed.free_share
-    return RATES[assumption] if share is None else share
+    return RATES[assumption] if share is None else min(share, MAX_CONFIDENCE)
 
 
 EXPLORED = (4.05, -1.15)
