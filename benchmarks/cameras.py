@@ -18,7 +18,7 @@ made again; --report prints their tables.
 
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; methods are named by the folder. Those of a training that left families out are tried on
-these families. --fit prints the constants of perception/confidence.py, from problems with even numbers;
+these families. --fit prints the rates of perception/confidence.py, from problems with even numbers;
 settings were chosen on these too, and --odd leaves them out of the report. --times prints the CPU time of the
 network.
 
@@ -225,7 +225,7 @@ def table(rows: list[Row], title: str) -> None:
             )
         )
     columns = ["%", "problems", "free in truth", "plans", "of them free"]
-    columns += ["first assumption", "of it free", "ms", *families]
+    columns += ["first assumption", "of it free", "ms", *(Path(family).name for family in families)]
     print_table(title, columns, lines)
     base = {name: _free(rows, name) for name in [*METHODS, *others, TRUE]}
     pairs = [("padded", "as seen"), ("predicted", "as seen"), ("predicted", "padded"), (TRUE, "predicted")]
@@ -249,8 +249,8 @@ def _free(rows: list[Row], method: str) -> dict[tuple[str, int], bool]:
     return {(row["family"], row["number"]): row["free"] for row in rows if row["method"] == method}
 
 
-def calibration(rows: list[Row]) -> None:
-    """Print the stated confidence against the share that is free."""
+def calibration(rows: list[Row], of: str) -> None:
+    """Print the stated confidence against the share that is free; `of`: where the problems come from."""
     for method in METHODS:
         mine = [row for row in rows if row["method"] == method and row["solved"]]
         if not mine:
@@ -270,7 +270,7 @@ def calibration(rows: list[Row]) -> None:
                     )
                 )
                 error += part.mean() * abs(stated[part].mean() - free[part].mean())
-        print_table(f"Confidence of {method}", ["stated", "motions", "mean", "free"], lines)
+        print_table(f"Confidence of {method}, {of}", ["stated", "motions", "mean", "free"], lines)
         whole = f"{len(mine)} motions, {stated.mean():.2f} stated, {free.mean():.2f} free"
         print(f"{whole}, expected error {error:.3f}\n")
 
@@ -284,8 +284,8 @@ def report(rows: list[Row]) -> None:
             row for row in rows if (row["views"], row["noise"], row["cameras"]) == (count, noisy, cameras)
         ]
         table(some, f"{count} {'noisy ' if noisy else ''}view{'s' if count > 1 else ''}, cameras: {cameras}")
-        for own in (True, False):
-            calibration([row for row in some if (row["family"] in FAMILIES) == own])
+        calibration([row for row in some if row["family"] in FAMILIES], "families")
+        calibration([row for row in some if row["family"] not in FAMILIES], "other problems")
     spent = [row["view_time"] for row in rows]
     print(f"From views to the problem's scene: {1e3 * np.median(spent):.0f} ms of CPU time (median)")
 
