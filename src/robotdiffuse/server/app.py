@@ -228,7 +228,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
         return StreamedResponse(write)
 
     @app.delete(
-        "/requests/{name}",
+        "/requests/{name:path}",
         summary="Cancel a running request",
         response_model=Cancelled,
         responses=_errors(401, 404, 421),
@@ -326,12 +326,12 @@ async def _read(request: Request, max_size: int, kind: str) -> bytes:
     length = request.headers.get("content-length", "0")
     if not length.isdecimal() or int(length) > max_size:
         raise too_large
-    parts: list[bytes] = []
+    body = bytearray()
     try:
         async with asyncio.timeout(READ_TIMEOUT):
             async for part in request.stream():
-                parts.append(part)
-                if sum(map(len, parts)) > max_size:
+                body += part
+                if len(body) > max_size:
                     raise too_large
     except TimeoutError:
         raise RequestError(
@@ -339,7 +339,7 @@ async def _read(request: Request, max_size: int, kind: str) -> bytes:
         ) from None
     except ClientDisconnect:
         raise RequestError(CLIENT_GONE, "the client closed the connection") from None
-    return b"".join(parts)
+    return bytes(body)
 
 
 def robot_info(name: str, robot: Robot) -> RobotInfo:
