@@ -10,7 +10,7 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.interop.depth_recording import StampedView, read_depth_views, write_depth_views
+from robotdiffuse.interop.depth_recording import StampedView, _States, read_depth_views, write_depth_views
 from robotdiffuse.interop.mcap_file import McapWriter
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.planning.exploration.explorer import ExplorerSettings
@@ -109,6 +109,37 @@ def remove(topic: str) -> Callable[[dict[str, Any]], None]:
 def late(messages: dict[str, Any]) -> None:
     messages["/joint_states"] = messages["/joint_states"][:1]
     messages["/joint_states"][0]["header"]["stamp"]["sec"] = 3
+
+
+def far_apart(messages: dict[str, Any]) -> None:
+    messages["/joint_states"][1]["header"]["stamp"]["sec"] = 100
+
+
+def with_velocities_alone(messages: dict[str, Any]) -> None:
+    header = {"stamp": {"sec": 1, "nanosec": 5 * 10**7}}
+    rates = {"header": header, "name": list(PANDA.joint_names), "velocity": [0.0] * 7}
+    messages["/joint_states"].append(rates)
+
+
+@pytest.mark.parametrize(("change", "at"), [(far_apart, 1.0), (with_velocities_alone, 1.05)])
+def test_only_joint_states_near_in_time_and_with_positions_count(
+    change: Callable[[dict[str, Any]], None], at: float, tmp_path: Path
+) -> None:
+    """One far away was interpolated with, and one without positions was reported as damage."""
+    [(_, view)] = read_depth_views(recording(tmp_path / "r.mcap", change), PANDA)
+    assert view.configuration is not None
+    np.testing.assert_allclose(view.configuration, HOME + at, atol=1e-9)
+
+
+def test_continuous_joints_are_interpolated_the_short_way() -> None:
+    """Between 3.13 and -3.13 rad a joint was taken to be at 0."""
+    gen3 = rd.load_robot("gen3")
+    states = _States(gen3)
+    for stamp, angle in ((0.0, 3.13), (0.1, -3.13)):
+        q = np.where(gen3.continuous, angle, 0.5)
+        states.add(stamp, {"name": gen3.joint_names, "position": q.tolist()})
+    q = states.at(0.05, "the image")
+    np.testing.assert_allclose(np.cos(q), np.where(gen3.continuous, -1.0, np.cos(0.5)), atol=1e-9)
 
 
 def in_colour(messages: dict[str, Any]) -> None:

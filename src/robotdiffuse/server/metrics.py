@@ -16,8 +16,8 @@ class Metrics:
         self.registry = CollectorRegistry()
         self._requests = Counter(
             "requests",
-            "Answers of the worker pool by endpoint and HTTP status code; each line of a batch counts, refused "
-            "and cancelled requests do not.",
+            "Answers of the worker pool by endpoint and HTTP status code; each line of a batch counts, "
+            "refused and cancelled requests do not.",
             ("endpoint", "code"),
             namespace=PREFIX,
             registry=self.registry,
