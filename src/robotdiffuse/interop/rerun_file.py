@@ -42,7 +42,7 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     content = recording.memory_recording()
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if problem.T_world_base is not None:
-        T, turn = problem.T_world_base, _xyzw(problem.T_world_base)
+        T, turn = problem.T_world_base, _quaternion(problem.T_world_base)
         for part in ("scene", "robot"):
             recording.log(part, rr.Transform3D(translation=T[:3, 3], quaternion=turn), static=True)
     for name, _, drawn in obstacles(problem):
@@ -72,7 +72,7 @@ def _motion(recording: rr.RecordingStream, problem: Problem, trajectory: Traject
 def _send_poses(
     recording: rr.RecordingStream, entity: str, at: rr.TimeColumn, poses: Iterable[Float[ndarray, "4 4"]]
 ) -> None:
-    places, turns = zip(*((T[:3, 3], _xyzw(T)) for T in poses), strict=True)
+    places, turns = zip(*((T[:3, 3], _quaternion(T)) for T in poses), strict=True)
     recording.send_columns(entity, [at], rr.Transform3D.columns(translation=places, quaternion=turns))
 
 
@@ -80,16 +80,15 @@ def _entity(obstacle: str) -> str:
     return f"scene/{rr.escape_entity_path_part(obstacle)}"
 
 
-def _xyzw(T: Float[ndarray, "4 4"]) -> Float[ndarray, "4"]:
-    return quaternion_from_rotation(T[:3, :3])[[1, 2, 3, 0]]
+def _quaternion(T: Float[ndarray, "4 4"]) -> rr.Quaternion:
+    return rr.Quaternion(xyzw=quaternion_from_rotation(T[:3, :3])[[1, 2, 3, 0]])
 
 
 def _archetypes(drawn: Primitive) -> tuple[rr.AsComponents, ...]:
     if isinstance(drawn, PointsPrimitive):
         return (rr.Points3D(drawn.points, radii=drawn.radius, colors=[drawn.color]),)
     x, y, z = drawn.T[:3, 3].tolist()
-    turn = rr.Quaternion(xyzw=_xyzw(drawn.T))
-    placed = {"centers": [[x, y, z]], "quaternions": [turn], "colors": [drawn.color]}
+    placed = {"centers": [[x, y, z]], "quaternions": [_quaternion(drawn.T)], "colors": [drawn.color]}
     solid = rr.components.FillMode.Solid
     match drawn:
         case BoxPrimitive(_, size, _):
