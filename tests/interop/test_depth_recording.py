@@ -10,7 +10,7 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.interop.depth_recording import StampedView, _States, read_depth_views, write_depth_views
+from robotdiffuse.interop.depth_recording import StampedView, read_depth_views, write_depth_views
 from robotdiffuse.interop.mcap_file import McapWriter
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.planning.exploration.explorer import ExplorerSettings
@@ -131,15 +131,19 @@ def test_only_joint_states_near_in_time_and_with_positions_count(
     np.testing.assert_allclose(view.configuration, HOME + at, atol=1e-9)
 
 
-def test_continuous_joints_are_interpolated_the_short_way() -> None:
-    """Between 3.13 and -3.13 rad a joint was taken to be at 0."""
+def test_continuous_joints_are_interpolated_the_short_way(tmp_path: Path) -> None:
+    """Halfway between 3.13 and -3.13 rad a joint was taken to be at 0."""
     gen3 = rd.load_robot("gen3")
-    states = _States(gen3)
-    for stamp, angle in ((0.0, 3.13), (0.1, -3.13)):
-        q = np.where(gen3.continuous, angle, 0.5)
-        states.add(stamp, {"name": gen3.joint_names, "position": q.tolist()})
-    q = states.at(0.05, "the image")
-    np.testing.assert_allclose(np.cos(q), np.where(gen3.continuous, -1.0, np.cos(0.5)), atol=1e-9)
+
+    def of_gen3(messages: dict[str, Any]) -> None:
+        for state, angle in zip(messages["/joint_states"], (3.13, -3.13), strict=True):
+            positions = np.where(gen3.continuous, angle, 0.5).tolist()
+            state |= {"name": list(gen3.joint_names), "position": positions}
+
+    [(_, view)] = read_depth_views(recording(tmp_path / "r.mcap", of_gen3), gen3, base="panda_link0")
+    assert view.configuration is not None
+    halfway = np.where(gen3.continuous, -1.0, np.cos(0.5))
+    np.testing.assert_allclose(np.cos(view.configuration), halfway, atol=1e-9)
 
 
 def in_colour(messages: dict[str, Any]) -> None:

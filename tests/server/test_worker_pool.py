@@ -11,9 +11,9 @@ pytest.importorskip("fastapi")
 from fastapi import Request
 
 from robotdiffuse.server import worker_pool
-from robotdiffuse.server.app import JSON, _read
+from robotdiffuse.server.app import JSON, read_body
 from robotdiffuse.server.settings import ServeSettings
-from robotdiffuse.server.worker import PLAN
+from robotdiffuse.server.worker import PLAN, Answer
 from robotdiffuse.server.worker_pool import WorkerPool
 
 
@@ -41,27 +41,28 @@ class Process:
 
 def pool_of(monkeypatch: pytest.MonkeyPatch, *futures: "Future[Any]") -> WorkerPool:
     monkeypatch.setattr(worker_pool, "RESTART_DELAY", 0.0)
-    pool = WorkerPool({}, ServeSettings(workers=1))
-    pool._slots[0].process = Process(*futures)  # type: ignore[assignment]
-    return pool
+    monkeypatch.setattr(worker_pool, "SingleWorker", lambda *_: Process(*futures))
+    return WorkerPool({}, ServeSettings(workers=1))
 
 
 NO_REPLY = TypeError("cannot pickle this reply")
 COMPILED = False
+ANSWER = Answer(200, b"{}", "solved")
 
 
 def test_a_worker_that_lacks_memory_to_start_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only a dead one was; after another error the server had one worker less for good."""
-    pool = pool_of(monkeypatch, done(COMPILED), done(NO_REPLY), done(MemoryError()), done(COMPILED))
+    starts = done(COMPILED), done(NO_REPLY), done(MemoryError()), done(COMPILED)
+    pool = pool_of(monkeypatch, *starts, done(ANSWER))
 
     async def talk() -> None:
         await pool.start()
         answer = await pool.run(PLAN, b"{}")
         assert answer.code == 500 and b"TypeError: cannot pickle this reply" in answer.body
-        await asyncio.gather(*pool._tasks)
+        assert await asyncio.wait_for(pool.run(PLAN, b"{}"), 10.0) is ANSWER
 
     asyncio.run(talk())
-    assert pool.ready == len(pool._idle) == 1
+    assert pool.ready == 1
 
 
 def test_a_cancelled_call_whose_reply_fails_does_not_keep_its_worker(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,7 +71,7 @@ def test_a_cancelled_call_whose_reply_fails_does_not_keep_its_worker(monkeypatch
             return False
 
     running = Running()
-    pool = pool_of(monkeypatch, done(COMPILED), running, done(COMPILED))
+    pool = pool_of(monkeypatch, done(COMPILED), running, done(COMPILED), done(ANSWER))
 
     async def talk() -> None:
         await pool.start()
@@ -79,10 +80,10 @@ def test_a_cancelled_call_whose_reply_fails_does_not_keep_its_worker(monkeypatch
         task.cancel()
         await asyncio.sleep(0.01)
         running.set_exception(NO_REPLY)
-        await asyncio.gather(*pool._tasks)
+        assert await asyncio.wait_for(pool.run(PLAN, b"{}"), 10.0) is ANSWER
 
     asyncio.run(talk())
-    assert pool.ready == len(pool._idle) == 1
+    assert pool.ready == 1
 
 
 class Piece(bytes):
@@ -104,5 +105,5 @@ def test_the_work_for_a_body_in_pieces_grows_with_their_number() -> None:
         return {"type": "http.request", "body": body, "more_body": bool(pieces)}
 
     scope = {"type": "http", "method": "POST", "headers": [(b"content-type", JSON.encode())]}
-    assert asyncio.run(_read(Request(scope, receive), 300, JSON)) == b"x" * 300
+    assert asyncio.run(read_body(Request(scope, receive), 300, JSON)) == b"x" * 300
     assert Piece.asked < 3000

@@ -171,7 +171,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
 
     async def single(request: Request, endpoint: str, name: str) -> Response:
         with pool.admit(1):
-            body = await _read(request, settings.max_request_size, JSON)
+            body = await read_body(request, settings.max_request_size, JSON)
             task = asyncio.ensure_future(pool.run(endpoint, body))
             with _cancellable(name, running, [task]):
                 answer = await answer_of(task, asyncio.ensure_future(wait_for_disconnect(request)))
@@ -213,7 +213,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
 
         async def write(send: Send) -> None:
             with pool.admit(1):
-                body = await _read(request, settings.max_request_size, LINES)
+                body = await read_body(request, settings.max_request_size, LINES)
                 lines = [line for line in body.split(b"\n") if line.strip()]
                 if not 1 <= len(lines) <= settings.max_batch:
                     raise RequestError(
@@ -314,7 +314,7 @@ def _cancellable(
         cancel()
 
 
-async def _read(request: Request, max_size: int, kind: str) -> bytes:
+async def read_body(request: Request, max_size: int, kind: str) -> bytes:
     """The body of a request. Raises RequestError if it is too large, too slow or not of Content-Type
     `kind`."""
     given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
