@@ -111,6 +111,41 @@ def late(messages: dict[str, Any]) -> None:
     messages["/joint_states"][0]["header"]["stamp"]["sec"] = 3
 
 
+def far_apart(messages: dict[str, Any]) -> None:
+    messages["/joint_states"][1]["header"]["stamp"]["sec"] = 100
+
+
+def with_velocities_alone(messages: dict[str, Any]) -> None:
+    header = {"stamp": {"sec": 1, "nanosec": 5 * 10**7}}
+    rates = {"header": header, "name": list(PANDA.joint_names), "velocity": [0.0] * 7}
+    messages["/joint_states"].append(rates)
+
+
+@pytest.mark.parametrize(("change", "at"), [(far_apart, 1.0), (with_velocities_alone, 1.05)])
+def test_only_joint_states_near_in_time_and_with_positions_count(
+    change: Callable[[dict[str, Any]], None], at: float, tmp_path: Path
+) -> None:
+    """One far away was interpolated with, and one without positions was reported as damage."""
+    [(_, view)] = read_depth_views(recording(tmp_path / "r.mcap", change), PANDA)
+    assert view.configuration is not None
+    np.testing.assert_allclose(view.configuration, HOME + at, atol=1e-9)
+
+
+def test_continuous_joints_are_interpolated_the_short_way(tmp_path: Path) -> None:
+    """Halfway between 3.13 and -3.13 rad a joint was taken to be at 0."""
+    gen3 = rd.load_robot("gen3")
+
+    def of_gen3(messages: dict[str, Any]) -> None:
+        for state, angle in zip(messages["/joint_states"], (3.13, -3.13), strict=True):
+            positions = np.where(gen3.continuous, angle, 0.5).tolist()
+            state |= {"name": list(gen3.joint_names), "position": positions}
+
+    [(_, view)] = read_depth_views(recording(tmp_path / "r.mcap", of_gen3), gen3, base="panda_link0")
+    assert view.configuration is not None
+    halfway = np.where(gen3.continuous, -1.0, np.cos(0.5))
+    np.testing.assert_allclose(np.cos(view.configuration), halfway, atol=1e-9)
+
+
 def in_colour(messages: dict[str, Any]) -> None:
     messages["/camera/image_rect"][0]["encoding"] = "rgb8"
 

@@ -439,17 +439,27 @@ def rosbridge() -> Iterator[tuple[int, list[dict[str, Any]]]]:
         server.shutdown()
 
 
-def test_motions_are_published_to_a_rosbridge(planned: tuple[Problem, Trajectory]) -> None:
+def test_motions_are_published_to_a_rosbridge(
+    planned: tuple[Problem, Trajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Subscribers had no time to match the publisher, which sent and ended at once."""
     import time
 
-    from robotdiffuse.interop.rosbridge import publish
+    from robotdiffuse.interop import rosbridge as module
 
     _, trajectory = planned
+    waited: list[str] = []
     with rosbridge() as (port, heard):
-        publish(trajectory, "127.0.0.1", port, "/arm/joint_trajectory")
-        end = time.monotonic() + 10
-        while len(heard) < 2 and time.monotonic() < end:
-            time.sleep(0.01)
+
+        def wait(_: float) -> None:
+            end = time.monotonic() + 10
+            while len(heard) <= len(waited) and time.monotonic() < end:
+                time.sleep(0.01)
+            waited.append(heard[-1]["op"])
+
+        monkeypatch.setattr(module, "sleep", wait)
+        module.publish(trajectory, "127.0.0.1", port, "/arm/joint_trajectory")
+    assert waited == ["advertise", "publish"]
     advertised, published = heard[:2]
     assert (advertised["op"], advertised["type"]) == ("advertise", "trajectory_msgs/msg/JointTrajectory")
     assert (published["op"], published["topic"]) == ("publish", "/arm/joint_trajectory")

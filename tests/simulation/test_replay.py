@@ -1,5 +1,6 @@
 """Replay of motions in PyBullet, and the command `simulate`."""
 
+import subprocess
 import sys
 from pathlib import Path as FilePath
 
@@ -27,8 +28,8 @@ from robotdiffuse.simulation import (
     PyBulletOracle,
     ReplaySettings,
     replay,
+    world,
 )
-from robotdiffuse.simulation.replay import sample
 from robotdiffuse.trajectories.timing import time_parameterize
 
 pytestmark = pytest.mark.sim
@@ -42,15 +43,12 @@ def motion(robot: Robot, *waypoints: np.ndarray) -> Trajectory:
     return time_parameterize(robot, path, lambda _: True, lambda _: True)
 
 
-def test_samples_follow_positions_and_velocities() -> None:
+def test_a_motion_of_one_row_holds_still() -> None:
+    """The simulated arm was NaN."""
     robot = box_arm()
-    trajectory = motion(robot, np.zeros(3), np.array([1.0, -0.5, 0.3]), np.array([0.2, 0.6, 0.0]))
-    assert np.allclose(sample(trajectory, trajectory.times), trajectory.positions, atol=1e-12)
-    step = 1e-6
-    inner = trajectory.times[1:-1]
-    slopes = (sample(trajectory, inner + step) - sample(trajectory, inner - step)) / (2 * step)
-    assert np.allclose(slopes, trajectory.velocities[1:-1], atol=1e-4)
-    assert np.array_equal(sample(trajectory, np.array([99.0]))[0], trajectory.positions[-1])
+    stay = np.full((1, 3), 0.1)
+    run = replay(robot, Scene(), Trajectory(robot.joint_names, np.zeros(1), stay, 0 * stay, 0 * stay))
+    assert run.free and run.max_errors.max() < 1e-3 and (run.reference == stay).all()
 
 
 def test_a_panda_tracks_a_timed_motion_the_better_the_finer_the_step() -> None:
@@ -122,7 +120,7 @@ def test_what_cannot_be_replayed() -> None:
     trajectory = motion(robot, np.zeros(3), np.ones(3))
     with pytest.raises(InputError, match="the trajectory moves a, b, c; planar plans j0, j1, j2"):
         replay(robot, Scene(), replace(trajectory, joint_names=("a", "b", "c")))
-    for name, value in (("time_step", 0.01), ("position_gain", 0.0), ("force", -1.0), ("settle", -1.0)):
+    for name, value in (("time_step", 0.01), ("position_gain", 0.0), ("force", -1.0), ("gravity", np.nan)):
         with pytest.raises(InputError, match=f"replay.{name} is {value}"):
             ReplaySettings(**{name: value})
 
@@ -146,6 +144,24 @@ def result_file(folder: FilePath, scene: Scene) -> str:
     file = folder / "result.json"
     result.save(file, problem_record(problem))
     return str(file)
+
+
+def test_importing_pybullet_without_standard_output() -> None:
+    code = "import os; os.close(1); import robotdiffuse.simulation"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_a_world_that_fails_to_load_leaves_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object) -> None:
+        raise OSError("no space left")
+
+    clients: list[int] = []
+    connect = world.pybullet.connect
+    monkeypatch.setattr(world.pybullet, "connect", lambda mode: clients.append(connect(mode)) or clients[0])
+    monkeypatch.setattr(world, "write_urdf", failing)
+    with pytest.raises(OSError, match="no space left"):
+        world.World(box_arm(), Scene())
+    assert not world.pybullet.isConnected(clients[0])
 
 
 def test_command(tmp_path: FilePath, capsys: pytest.CaptureFixture[str]) -> None:

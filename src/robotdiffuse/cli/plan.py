@@ -58,7 +58,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--weights",
         metavar="FOLDER",
-        help="weights of `robotdiffuse train`, for a learned planner (default: the bundled ones)",
+        help="weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
+        "without clearances as inputs (default: the bundled ones)",
     )
     parser.add_argument(
         "--set",

@@ -89,8 +89,8 @@ def _add_planning(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--paper-weights",
         metavar="FOLDER",
-        help="weights of `train planner --config paper`, for the row of the paper's method as it says "
-        "(default: the row says how to train them)",
+        help="weights of `train planner --config paper`, or points, for a row of the diffusion model without "
+        "clearances, guidance and further samples (default: a note says how to train them)",
     )
     parser.add_argument(
         "--workers", type=count, metavar="N", help="planners that run at once (default: half of the cores)"

@@ -23,16 +23,17 @@ def read(file: Path, topic: str | None = None) -> RecordedMotion:
 
 def _read(text: str) -> RecordedMotion:
     try:
-        rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+        reader = csv.reader(text.splitlines())
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except csv.Error as error:
         raise InputError(f"it is not valid CSV: {error}") from None
     if not rows:
         raise InputError("it is empty; it must have a header and rows of numbers")
-    header = [cell.strip() for cell in rows[0]]
+    header = [cell.strip() for cell in rows[0][1]]
     if len(rows) == 1:
         raise InputError("it has a header and no rows")
     columns: list[list[float]] = [[] for _ in header]
-    for number, row in enumerate(rows[1:], start=2):
+    for number, row in rows[1:]:
         if len(row) != len(header):
             raise InputError(f"line {number} has {len(row)} cells; the header has {len(header)}")
         for name, column, cell in zip(header, columns, row, strict=True):

@@ -8,7 +8,6 @@ configuration is in sensor_msgs/JointState.
 """
 
 import io
-from bisect import bisect
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.interop.mcap_file import McapWriter, make_reader, messages_in, topics_in
 from robotdiffuse.interop.ros_types import JOINT_STATE, header_seconds, to_plain
-from robotdiffuse.interop.transform_history import TransformHistory
+from robotdiffuse.interop.transform_history import TransformHistory, insert_by_time, neighbours
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.robots.robot import Robot
 
@@ -223,23 +222,22 @@ class _States:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._stamps: list[float] = []
-        self._positions: list[list[float]] = []
+        self._states: list[tuple[float, Float[ndarray, "dof"]]] = []
 
     def add(self, stamp: float, state: Mapping[str, Any]) -> None:
-        """Take a message into account, if it holds the arm's joints."""
-        place = {name: i for i, name in enumerate(state["name"])}
-        if all(name in place for name in self._robot.joint_names):
-            i = bisect(self._stamps, stamp)  # messages may be logged in another order
-            self._stamps.insert(i, stamp)
-            positions = [state["position"][place[name]] for name in self._robot.joint_names]
-            self._positions.insert(i, positions)
+        """Take a message into account, if it holds positions of the arm's joints."""
+        at = dict(zip(state["name"], state["position"], strict=False))  # it may hold velocities alone
+        if all(name in at for name in self._robot.joint_names):
+            insert_by_time(self._states, (stamp, np.array([at[name] for name in self._robot.joint_names])))
 
     def at(self, stamp: float, where: str) -> Float[ndarray, "dof"]:
         """The configuration at a time. Raises InputError, naming `where`, if none is near."""
-        stamps = np.array(self._stamps)
-        if not len(stamps) or np.abs(stamps - stamp).min() > MAX_GAP:
+        near = neighbours(self._states, stamp, MAX_GAP)
+        if not near:
             names = ", ".join(self._robot.joint_names)
             raise InputError(f"there is no joint state of {names} within {MAX_GAP:g} s of {where}")
-        positions = np.array(self._positions)
-        return np.array([np.interp(stamp, stamps, positions[:, j]) for j in range(self._robot.dof)])
+        (t0, first), (t1, last) = near[0], near[-1]
+        if len(near) == 1:
+            return first
+        change = last - first
+        return first + (stamp - t0) / (t1 - t0) * (change - self._robot.whole_turns(change))

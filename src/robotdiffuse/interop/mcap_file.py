@@ -1,8 +1,8 @@
 """Reads and writes MCAP files: a scene for Foxglove, and the motion as ROS 2 messages.
 
 /scene and /tf hold Foxglove messages: the obstacles, the arm as triangles fixed to its links, and the poses
-of the links. /joint_trajectory, /joint_states and /robot_description hold ROS 2 messages; the last is the
-URDF, if the robot was read from one. The URDF and the problem are attachments, too.
+of the links and of moving obstacles. /joint_trajectory, /joint_states and /robot_description hold ROS 2
+messages; the last is the URDF, if the robot was read from one. The URDF and the problem are attachments, too.
 """
 
 import io
@@ -42,6 +42,7 @@ from robotdiffuse.interop.scene_primitives import (
     Primitive,
     SpherePrimitive,
     arm,
+    moving_frames,
     obstacles,
 )
 from robotdiffuse.problems.files import problem_from_record, problem_record
@@ -117,7 +118,8 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     poses = {link: link_poses(robot, trajectory.positions, link) for link in links}
     for i, t in enumerate(trajectory.times.tolist()):
         at = round(1e9 * t)
-        out.protobuf("/tf", _transforms(problem, {link: T[i] for link, T in poses.items()}, at), at)
+        frames = {link: T[i] for link, T in poses.items()} | moving_frames(problem, t)
+        out.protobuf("/tf", _transforms(problem, frames, at), at)
         stamp = {"sec": at // 10**9, "nanosec": at % 10**9}
         values = [*trajectory.positions[i].tolist(), *robot.locked.values()]
         rates = [*trajectory.velocities[i].tolist(), *(0.0 for _ in robot.locked)]
@@ -191,13 +193,13 @@ def _clouds(problem: Problem) -> Iterator[tuple[str, PointCloud]]:
 
 
 def _transforms(problem: Problem, poses: dict[str, Float[ndarray, "4 4"]], at: int) -> FrameTransforms:
-    """poses: T_base_link of all links but the base."""
+    """poses: in the base frame, of all links but the base and of moving obstacles."""
     update, robot = FrameTransforms(), problem.robot
-    frames = {link: (robot.base, T) for link, T in poses.items()}
+    frames = {frame: (robot.base, T) for frame, T in poses.items()}
     if problem.T_world_base is not None:
         frames[robot.base] = ("world", problem.T_world_base)
-    for link, (parent, T) in frames.items():
-        transform = update.transforms.add(parent_frame_id=parent, child_frame_id=link)
+    for frame, (parent, T) in frames.items():
+        transform = update.transforms.add(parent_frame_id=parent, child_frame_id=frame)
         transform.timestamp.FromNanoseconds(at)
         transform.translation.x, transform.translation.y, transform.translation.z = T[:3, 3].tolist()
         w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()

@@ -24,7 +24,7 @@ MAX_NAMES = 6
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion:
-    """A checked_motion motion of any joints, in any order; absent rates are None."""
+    """A checked motion of any joints, in any order; absent rates are None."""
 
     joint_names: tuple[str, ...]
     positions: Float[ndarray, "n joints"]

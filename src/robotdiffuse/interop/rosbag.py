@@ -1,9 +1,10 @@
 """Reads and writes ROS 2 bags (folders with metadata.yaml and a database) without ROS."""
 
-import shutil
 import sqlite3
 import sys
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.input_files import input_file
@@ -43,21 +44,30 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         "/joint_trajectory": (JOINT_TRAJECTORY, record),
         "/display_planned_path": (DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record)),
     }
-    part = file.with_name(f".{file.name}.part")
     try:
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir()
-        with Writer(part / file.name, version=VERSION) as writer:  # it names the database after the folder
-            for topic, (kind, content) in topics.items():
-                connection = writer.add_connection(topic, kind, typestore=typestore())
-                writer.write(connection, 0, typestore().serialize_cdr(to_message(kind, content), kind))
-        shutil.rmtree(file, ignore_errors=True)
-        (part / file.name).replace(file)
+        with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent, ignore_cleanup_errors=True) as part:
+            new, old = Path(part, file.name), Path(part, "old")
+            with Writer(new, version=VERSION) as writer:  # it names the database after the folder
+                for topic, (kind, content) in topics.items():
+                    connection = writer.add_connection(topic, kind, typestore=typestore())
+                    writer.write(connection, 0, typestore().serialize_cdr(to_message(kind, content), kind))
+            _replace(file, new, old)
     except (OSError, sqlite3.Error) as error:
         why = getattr(error, "strerror", None) or error
         raise InputError(f"{file} cannot be written: {why}") from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+
+
+def _replace(file: Path, new: Path, old: Path) -> None:
+    """Move an existing bag, or a link to one, to `old`, and `new` to its place; if that fails, move it
+    back."""
+    try:
+        with suppress(FileNotFoundError):
+            file.replace(old)
+        new.replace(file)
+    except BaseException:
+        with suppress(OSError):
+            old.replace(file)
+        raise
 
 
 def read(file: Path, topic: str | None = None) -> RecordedMotion:

@@ -1,5 +1,7 @@
 """Publishes motions to ROS through rosbridge."""
 
+from time import sleep
+
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import missing_package
@@ -12,6 +14,8 @@ except ImportError:
 
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 PORT = 9090
+MATCH_TIME = 0.5
+"""Time for subscribers to match the publisher before it sends, and to receive before it ends [s]."""
 
 
 def publish(
@@ -23,7 +27,8 @@ def publish(
 ) -> None:
     """Publish a trajectory once, as a JointTrajectory; the caller must have validated it.
 
-    Raises InputError if no rosbridge answers within `timeout` [s].
+    Whether a subscriber received it is not known: ROS does not confirm deliveries. Raises InputError if no
+    rosbridge answers within `timeout` [s].
     """
     ros = roslibpy.Ros(host, port)
     try:
@@ -34,7 +39,9 @@ def publish(
     try:
         publisher = roslibpy.Topic(ros, topic, JOINT_TRAJECTORY, latch=True)
         publisher.advertise()
+        sleep(MATCH_TIME)
         publisher.publish(roslibpy.Message(joint_trajectory(trajectory.joint_names, trajectory)))
+        sleep(MATCH_TIME)
         publisher.unadvertise()
     finally:
         ros.close()

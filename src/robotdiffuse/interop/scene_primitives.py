@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.transforms import transform
+from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
@@ -55,9 +55,17 @@ Primitive = BoxPrimitive | SpherePrimitive | CylinderPrimitive | MeshPrimitive |
 
 
 def obstacles(problem: Problem) -> Iterator[tuple[str, str, Primitive]]:
-    """Name, frame and primitive of each obstacle."""
+    """Name, frame and primitive of each obstacle; moving ones have the frames of `moving_frames`."""
     for shape in problem.scene.shapes:
         yield shape.name, problem.robot.base, _primitive(shape)
+    for moving, frame in zip(problem.moving, moving_frames(problem, 0.0), strict=True):
+        yield moving.name, frame, _primitive(moving.shape.moved(inverse(moving.shape.T_base_shape)))
+
+
+def moving_frames(problem: Problem, time: float) -> dict[str, Float[ndarray, "4 4"]]:
+    """T_base_obstacle by the frame of each moving obstacle at a time [s]; at time 0 if its motion is
+    unknown."""
+    return {f"moving/{moving.name}": moving.pose(time) for moving in problem.moving}
 
 
 def _primitive(shape: Shape) -> Primitive:

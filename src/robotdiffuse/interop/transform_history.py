@@ -3,7 +3,7 @@
 from bisect import bisect_left, insort
 from collections.abc import Mapping
 from operator import itemgetter
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +15,20 @@ from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.interop.ros_types import header_seconds
 
 _stamp = itemgetter(0)
+Stamped = TypeVar("Stamped", bound=tuple[float, Any])
+
+
+def insert_by_time(history: list[Stamped], stamped: Stamped) -> None:
+    """Add an entry to a history, which may have later ones: messages may be logged in another order."""
+    insort(history, stamped, key=_stamp)
+
+
+def neighbours(history: list[Stamped], stamp: float, gap: float) -> list[Stamped]:
+    """The entries on both sides of a time, without those more than `gap` from it [s]; one at the very time
+    counts alone."""
+    i = bisect_left(history, stamp, key=_stamp)
+    near = [history[k] for k in (i - 1, i) if 0 <= k < len(history) and abs(history[k][0] - stamp) <= gap]
+    return near[-1:] if near and near[-1][0] <= stamp else near
 
 
 class TransformHistory:
@@ -39,7 +53,7 @@ class TransformHistory:
         if static:
             self._static.add(child)
         stamped = header_seconds(message["header"]["stamp"]), T
-        insort(self._poses.setdefault(child, []), stamped, key=_stamp)
+        insert_by_time(self._poses.setdefault(child, []), stamped)
 
     def at(self, base: str, frame: str, stamp: float, gap: float, where: str) -> Float[ndarray, "4 4"]:
         """T_base_frame at a time, interpolated between two transforms at most `gap` from it [s].
@@ -65,12 +79,11 @@ class TransformHistory:
         poses = self._poses[frame]
         if frame in self._static:
             return poses[-1][1]
-        i = bisect_left(poses, stamp, key=_stamp)
-        near = [poses[k] for k in (i - 1, i) if 0 <= k < len(poses) and abs(poses[k][0] - stamp) <= gap]
+        near = neighbours(poses, stamp, gap)
         if not near:
             raise InputError(f"there is no transform of {frame} within {gap:g} s of {where}")
-        if near[-1][0] <= stamp or len(near) == 1:
-            return near[-1][1]
+        if len(near) == 1:
+            return near[0][1]
         (t0, first), (t1, last) = near
         share = (stamp - t0) / (t1 - t0)
         turn = Slerp([0, 1], Rotation.from_matrix([first[:3, :3], last[:3, :3]]))(share).as_matrix()

@@ -11,7 +11,7 @@ from robotdiffuse.server.worker_pool import WorkerPool
 
 LINES = "application/x-ndjson"
 CLIENT_GONE = 499
-"""Status code, for the metrics only, of a request whose client closed the connection."""
+"""Status code of a request whose client closed the connection; nobody reads it."""
 
 
 async def wait_for_disconnect(request: Request) -> None:

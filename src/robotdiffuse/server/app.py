@@ -171,7 +171,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
 
     async def single(request: Request, endpoint: str, name: str) -> Response:
         with pool.admit(1):
-            body = await _read(request, settings.max_request_size, JSON)
+            body = await read_body(request, settings.max_request_size, JSON)
             task = asyncio.ensure_future(pool.run(endpoint, body))
             with _cancellable(name, running, [task]):
                 answer = await answer_of(task, asyncio.ensure_future(wait_for_disconnect(request)))
@@ -213,7 +213,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
 
         async def write(send: Send) -> None:
             with pool.admit(1):
-                body = await _read(request, settings.max_request_size, LINES)
+                body = await read_body(request, settings.max_request_size, LINES)
                 lines = [line for line in body.split(b"\n") if line.strip()]
                 if not 1 <= len(lines) <= settings.max_batch:
                     raise RequestError(
@@ -228,7 +228,7 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
         return StreamedResponse(write)
 
     @app.delete(
-        "/requests/{name}",
+        "/requests/{name:path}",
         summary="Cancel a running request",
         response_model=Cancelled,
         responses=_errors(401, 404, 421),
@@ -314,7 +314,7 @@ def _cancellable(
         cancel()
 
 
-async def _read(request: Request, max_size: int, kind: str) -> bytes:
+async def read_body(request: Request, max_size: int, kind: str) -> bytes:
     """The body of a request. Raises RequestError if it is too large, too slow or not of Content-Type
     `kind`."""
     given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -326,12 +326,12 @@ async def _read(request: Request, max_size: int, kind: str) -> bytes:
     length = request.headers.get("content-length", "0")
     if not length.isdecimal() or int(length) > max_size:
         raise too_large
-    parts: list[bytes] = []
+    body = bytearray()
     try:
         async with asyncio.timeout(READ_TIMEOUT):
             async for part in request.stream():
-                parts.append(part)
-                if sum(map(len, parts)) > max_size:
+                body += part
+                if len(body) > max_size:
                     raise too_large
     except TimeoutError:
         raise RequestError(
@@ -339,7 +339,7 @@ async def _read(request: Request, max_size: int, kind: str) -> bytes:
         ) from None
     except ClientDisconnect:
         raise RequestError(CLIENT_GONE, "the client closed the connection") from None
-    return b"".join(parts)
+    return bytes(body)
 
 
 def robot_info(name: str, robot: Robot) -> RobotInfo:

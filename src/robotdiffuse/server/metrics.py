@@ -16,7 +16,8 @@ class Metrics:
         self.registry = CollectorRegistry()
         self._requests = Counter(
             "requests",
-            "Answers by endpoint and HTTP status code; each line of a batch counts.",
+            "Answers of the worker pool by endpoint and HTTP status code; each line of a batch counts, "
+            "refused and cancelled requests do not.",
             ("endpoint", "code"),
             namespace=PREFIX,
             registry=self.registry,

@@ -84,7 +84,8 @@ async def _serve(
         if task.cancelled() or task.exception() is not None:
             server.should_exit = True
         else:
-            say(f"ready, with {settings.workers} worker{'s' * (settings.workers > 1)}")
+            others = f"; {settings.workers - 1} more are starting" if settings.workers > 1 else ""
+            say(f"ready, with 1 worker{others}")
 
     say(f"listening on {_address(listener)}; loading compiled code (about a minute on a new machine)")
     starting = asyncio.ensure_future(pool.start())

@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 import orjson
 
 from robotdiffuse.core.deadline import check_left, left_by
-from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import parse_json
 from robotdiffuse.core.loading import compile_seconds
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import UNTIL
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
@@ -35,7 +34,6 @@ from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import Verifier
 
 PLAN, VERIFY = "plan", "verify"
-DEFAULT_SEED, DEFAULT_TIME_LIMIT = 0, 1.0
 MAX_SEED = 2**32 - 1
 """Largest seed that all random generators accept."""
 
@@ -155,33 +153,22 @@ def answer_plan(state: _State, body: bytes) -> Answer:
     asked = check_fields("the request", _record(body), ("problem",), ARGUMENTS)
     problem = problem_from_record(asked["problem"], state.robots)
     given = {name: value for name, value in asked.items() if name not in ("problem", "planner")}
-    time_limit, seed = given.get("time_limit", DEFAULT_TIME_LIMIT), given.get("seed", DEFAULT_SEED)
-    for name, value in given.items():
-        _check_kind(name, value)
-    if not 0 < time_limit <= state.max_time_limit:
-        most = f"it must be above 0 and at most {state.max_time_limit:g} s here"
-        raise InputError(f"time_limit is {shown(time_limit)}; {most}")
-    if not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
-        raise InputError(f"seed is {shown(seed)}; it must be an integer from 0 to {MAX_SEED}")
+    request = PlanRequest(**given)
+    if request.time_limit > state.max_time_limit:
+        most = f"it must be at most {state.max_time_limit:g} s here"
+        raise InputError(f"time_limit is {shown(request.time_limit)}; {most}")
+    if request.seed > MAX_SEED:
+        raise InputError(f"seed is {shown(request.seed)}; it must be at most {MAX_SEED}")
     planner = _planner(asked.get("planner", DEFAULT_PLANNER))
     planner.prepare(problem.robot)
-    PlanRequest(**given)
     _warm_up_once(planner, problem, asked["problem"]["robot"])
-    state.shared.due = time.monotonic() + time_limit + GRACE_TIME
+    state.shared.due = time.monotonic() + request.time_limit + GRACE_TIME
     result: PlanResult = planner.plan(problem, **given)
     return _answer(result.record(), result.status.value)
 
 
 ARGUMENTS = ("planner", *(field.name for field in fields(PlanRequest)))
 """Fields of a plan request besides its problem."""
-
-
-def _check_kind(name: str, value: object) -> None:
-    """Raises InputError unless `until` is a string and each other argument a number."""
-    if name == "until" and not isinstance(value, str):
-        raise unknown_name(name, value, UNTIL)
-    if name != "until" and (isinstance(value, bool) or not isinstance(value, int | float)):
-        raise InputError(f"{name} is {shown(value)}; it must be a number")
 
 
 def _planner(name: object) -> Planner:

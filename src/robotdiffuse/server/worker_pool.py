@@ -4,6 +4,7 @@ import asyncio
 import itertools
 import multiprocessing
 import signal
+import sys
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.processes import SingleWorker
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server import worker
@@ -134,6 +135,9 @@ class WorkerPool:
             slot.shared.cancelled = number
             self._spawn(self._cancel(slot, current))
             raise
+        except Exception as error:  # such as a reply that cannot be pickled
+            self._spawn(self._replace_lost(slot))
+            return failed(500, _described(error))
         finally:
             self.busy -= 1
         if answer.memory > self.settings.max_worker_memory:
@@ -210,11 +214,11 @@ class WorkerPool:
         try:
             if current is not None:
                 await asyncio.wait_for(asyncio.wrap_future(current), CANCEL_TIMEOUT)
-        except (TimeoutError, BrokenProcessPool):
-            await self._replace_lost(slot)
-            return
         except worker.Cancelled:
             pass
+        except Exception:  # a timeout, a dead process, or a reply that cannot be pickled
+            await self._replace_lost(slot)
+            return
         self._free(slot)
 
     async def _replace_lost(self, slot: _Slot) -> None:
@@ -233,7 +237,9 @@ class WorkerPool:
             try:
                 await self._warm_up(slot)
                 return
-            except BrokenProcessPool:
+            except Exception as error:
+                print(f"a worker could not be started: {_described(error)}", file=sys.stderr)
+                slot.process.terminate(signal.SIGKILL)
                 await asyncio.sleep(RESTART_DELAY)
 
     async def _warm_up(self, slot: _Slot) -> None:
@@ -249,6 +255,10 @@ class WorkerPool:
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {shortened(str(error))}"
 
 
 def _retrieve_error(done: "asyncio.Future[Answer]") -> None:

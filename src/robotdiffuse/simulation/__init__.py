@@ -2,18 +2,22 @@
 motions."""
 
 import os
+from contextlib import suppress
 
 
 def _import_pybullet() -> None:
     """Import PyBullet without the build time that it prints directly to the file descriptors."""
-    saved = [os.dup(stream) for stream in (1, 2)]
+    saved: dict[int, int] = {}
+    for stream in (1, 2):
+        with suppress(OSError):  # it is closed
+            saved[stream] = os.dup(stream)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
-        for stream in (1, 2):
+        for stream in saved:
             os.dup2(nowhere, stream)
         import pybullet  # noqa: F401
     finally:
-        for stream, copy in zip((1, 2), saved, strict=True):
+        for stream, copy in saved.items():
             os.dup2(copy, stream)
             os.close(copy)
         os.close(nowhere)

@@ -3,14 +3,15 @@
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pybullet
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.settings import Bound, Settings
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.camera import DepthCamera, Light, RawImage, capture, render
@@ -39,37 +40,23 @@ PICTURE_TIMES = (0.0, 0.33, 0.67, 1.0)
 
 
 @dataclass(frozen=True)
-class FilmSettings:
+class FilmSettings(Settings, name="film"):
     """Size and quality of pictures and films."""
 
-    width: int = 640
+    width: Annotated[int, Bound(least=16.0, most=1920.0)] = 640
     """[pixels]"""
-    height: int = 480
+    height: Annotated[int, Bound(least=16.0, most=1080.0)] = 480
     """[pixels]"""
-    oversampling: int = 2
+    oversampling: Annotated[int, Bound(least=1.0, most=4.0)] = 2
     """Rendered pixels per pixel of the picture along each side, against jagged edges."""
-    rate: float = 20.0
+    rate: Annotated[float, Bound(least=1.0, most=50.0)] = 20.0
     """Frame rate of a film [1/s]; films run in real time."""
-    max_frames: int = 150
+    max_frames: Annotated[int, Bound(least=2.0, most=1000.0)] = 150
     """Most frames of a film; longer films get a lower frame rate."""
-    colors: int = 128
+    colors: Annotated[int, Bound(least=2.0, most=256.0)] = 128
     """Colours of a film's palette."""
-    field_of_view: float = 0.6
+    field_of_view: Annotated[float, Bound(least=0.05, most=2.0)] = 0.6
     """Vertical angle [rad]."""
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("width", 16, 1920),
-            ("height", 16, 1080),
-            ("oversampling", 1, 4),
-            ("rate", 1, 50),
-            ("max_frames", 2, 1000),
-            ("colors", 2, 256),
-        ):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"film.{name} is {getattr(self, name)}; it must lie in [{low}, {high}]")
-        if not 0.05 <= self.field_of_view <= 2:
-            raise InputError(f"film.field_of_view is {self.field_of_view}; it must lie in [0.05, 2] rad")
 
 
 DEFAULT = FilmSettings()

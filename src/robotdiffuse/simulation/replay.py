@@ -1,8 +1,8 @@
 """Replay of a trajectory in PyBullet with position control: tracking errors and contacts.
 
 Each joint has a motor that PyBullet drives towards the position of the trajectory, with the velocity as feed
-forward. Gravity acts. Links have uniform density (`World`) and motors are strong, because the robot file has
-neither masses nor torque limits. So a replay shows that the motion is smooth enough to track and free of
+forward. Gravity acts. Links have uniform density (`World`) and motors are strong: masses and torque limits of
+the robot file are not used. So a replay shows that the motion is smooth enough to track and free of
 contacts while tracked, not that a certain motor can execute it.
 
 Bullet's meshes are 1 mm too large. A motion that passes an obstacle at less than that (2 mm between two
@@ -10,6 +10,7 @@ links) has a contact here.
 """
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import pybullet
@@ -17,6 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -25,38 +27,27 @@ from robotdiffuse.simulation.world import DENSITY, World
 SOLVER_ITERATIONS = 500
 """Iterations of Bullet's constraint solver in a time step. With its default of 50, motors miss their targets
 by up to 0.6 mm at the tip, whatever the motion; with 500 by a few micrometres."""
+Gain = Annotated[float, Bound(above=0.0, most=1.0)]
 
 
 @dataclass(frozen=True)
-class ReplaySettings:
+class ReplaySettings(Settings, name="replay"):
     """Settings of the simulation and of its motors."""
 
-    time_step: float = 1 / 240
+    time_step: Annotated[float, Bound(least=1e-5, most=1 / 240)] = 1 / 240
     """Time step of the simulation [s]; the default is PyBullet's own."""
-    position_gain: float = 0.3
+    position_gain: Gain = 0.3
     """Fraction of a position error that a motor corrects in one time step, in (0, 1]."""
-    velocity_gain: float = 1.0
+    velocity_gain: Gain = 1.0
     """Fraction of a velocity error that a motor corrects in one time step, in (0, 1]."""
-    force: float = 500.0
+    force: Positive = 500.0
     """Largest motor torque [N m], or force [N] for a prismatic joint."""
-    gravity: float = 9.81
+    gravity: Annotated[float, Bound()] = 9.81
     """Gravity along -z of the base [m/s^2]."""
-    density: float = DENSITY
+    density: Positive = DENSITY
     """Density of all links [kg/m^3]."""
-    settle: float = 0.25
+    settle: NotNegative = 0.25
     """Time for which the motors hold the last configuration after the motion [s]."""
-
-    def __post_init__(self) -> None:
-        if not 1e-5 <= self.time_step <= 1 / 240:
-            raise InputError(f"replay.time_step is {self.time_step}; it must lie in [0.00001, 1/240] s")
-        for name in ("position_gain", "velocity_gain"):
-            if not 0 < getattr(self, name) <= 1:
-                raise InputError(f"replay.{name} is {getattr(self, name)}; it must lie in (0, 1]")
-        for name in ("force", "density"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"replay.{name} is {getattr(self, name)}; it must be positive")
-        if not 0 <= self.settle < np.inf:
-            raise InputError(f"replay.settle is {self.settle}; it must not be negative [s]")
 
 
 DEFAULT = ReplaySettings()
@@ -123,23 +114,11 @@ def replay(robot: Robot, scene: Scene, trajectory: Trajectory, settings: ReplayS
         )
     count = int(np.ceil((trajectory.duration + settings.settle) / settings.time_step))
     times = settings.time_step * np.arange(count + 1)
-    reference = sample(trajectory, times)
+    reference = trajectory.at(np.minimum(times, trajectory.duration)).positions
     with World(robot, scene, density=settings.density) as world:
         positions, contacts = _simulate(world, times, reference, settings)
         tip_errors = np.linalg.norm(_tips(world, positions) - _tips(world, reference), axis=1)
     return Replay(robot.joint_names, times, positions, reference, tip_errors, contacts)
-
-
-def sample(trajectory: Trajectory, times: Float[ndarray, "n"]) -> Float[ndarray, "n dof"]:
-    """Positions at times [s], by cubic interpolation with the rows' velocities; the last row after the
-    end."""
-    t = np.clip(times, 0.0, trajectory.duration)
-    i = np.clip(np.searchsorted(trajectory.times, t, side="right") - 1, 0, len(trajectory.times) - 2)
-    h = (trajectory.times[i + 1] - trajectory.times[i])[:, None]
-    u = (t - trajectory.times[i])[:, None] / h
-    p, v = trajectory.positions, trajectory.velocities
-    a, b, va, vb = p[i], p[i + 1], h * v[i], h * v[i + 1]
-    return a + u * (va + u * (3 * (b - a) - 2 * va - vb + u * (2 * (a - b) + va + vb)))
 
 
 def _simulate(

@@ -17,8 +17,8 @@ from robotdiffuse.simulation.model import write_obj, write_points_urdf, write_sh
 COLLISION_MARGIN = 0.001
 """Margin that Bullet adds around each convex mesh [m]; Bullet's call to change it has no effect."""
 DENSITY = 1000.0
-"""Density of all links [kg/m^3], because robot files have no masses. A Panda gets 19.7 kg; a real one has
-18."""
+"""Density of all links [kg/m^3]; the masses of a robot's file are not used. A Panda gets 19.7 kg; a real one
+has 18."""
 OTHER, LINK, OTHER_LINK, DISTANCE, FORCE = 2, 3, 4, 8, 9
 """Columns of PyBullet's contact points: second body, link of each body, distance, normal force."""
 OBSTACLE_COLORS = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
@@ -40,11 +40,19 @@ class World:
         self.robot = robot
         self.visuals = visuals
         self.client = pybullet.connect(pybullet.DIRECT)
+        self._folder = TemporaryDirectory()
+        try:
+            self._load(scene, density)
+        except BaseException:
+            self.close()
+            raise
+
+    def _load(self, scene: Scene, density: float) -> None:
+        robot = self.robot
         # otherwise Bullet takes a file of the same name for the same mesh
         pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self.client)
         flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
-        self._folder = TemporaryDirectory()
-        urdf = write_urdf(robot, Path(self._folder.name), density, visuals)
+        urdf = write_urdf(robot, Path(self._folder.name), density, self.visuals)
         self.body: int = pybullet.loadURDF(
             str(urdf), useFixedBase=True, flags=flags, physicsClientId=self.client
         )
