@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
+from robotdiffuse.certificates import bounds
 from robotdiffuse.certificates.bounds import SCENE, Prover, Stretches
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.certificates.obstacles import CLEARANCE_CAP, Obstacles, Rounded, Surface
@@ -193,3 +194,10 @@ def test_unknown_shapes_are_refused_by_name() -> None:
 
     with pytest.raises(InputError, match="odd: a Strange cannot be certified"):
         Obstacles(Scene([Strange()]))
+
+
+def test_a_link_that_is_called_like_the_scene_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claims against the link were taken for claims against the scene, so the pair was not proved."""
+    monkeypatch.setattr(bounds, "SCENE", "l2")
+    with pytest.raises(InputError, match="a link called 'l2'"):
+        Prover(box_arm(), Scene(), np.zeros((2, 3)))

@@ -45,6 +45,8 @@ FAR = [1e20, 0, 0]
         (lambda: DepthView([[1.0]], (1, 1, 0, 0), transform(np.array(FAR))), "view.T_base_camera"),
         (lambda: box_arm().with_locked({"j0": 1e20}), r"locked: j0 is 1e\+20; it must be a number within"),
         (lambda: Problem(box_arm(), Scene(), [1e20, 0, 0], [0, 0, 0]), "start: j0"),
+        (lambda: Sphere([False, 0.5, 0], 1), r"sphere.center is \[False, 0.5, 0\]; it must be 3 finite"),
+        (lambda: PointCloud([[0, 0, 1], [0, True, 0]]), "points is not numbers"),
         (lambda: Problem(box_arm(), Scene(), [0, 0, 0], [0, 0, 0], clearance=1e39), "clearance"),
     ],
 )

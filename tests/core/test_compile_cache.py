@@ -23,6 +23,17 @@ def test_a_temporary_folder_is_used_if_nothing_else_is_writable(
     assert Path(os.environ["NUMBA_CACHE_DIR"]).stat().st_mode & 0o777 == 0o700
 
 
+def test_a_user_without_a_home_has_no_writable_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """pathlib raised RuntimeError for a user without HOME who is not in the password file."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    compile_cache.ensure_cache()
+    assert not compile_cache.is_writable(Path("~/.cache/numba"))
+    assert not list(tmp_path.iterdir())
+
+
 def test_numba_chooses_among_writable_folders(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     compile_cache.ensure_cache()

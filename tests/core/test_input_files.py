@@ -1,6 +1,7 @@
 """Readers of untrusted files return a value or raise one line, for any content."""
 
 import ast
+import copy
 import json
 import os
 import re
@@ -67,6 +68,7 @@ def one_line(call: Callable[[], object]) -> str:
         ('"' + "[" * DEEP, "is not valid JSON"),
         ("9" * 5000, "integer 9999"),
         ("[1, 2", "line 1, column 6"),
+        ('{"a": {"b": 1, "b": 2}}', "b appears twice"),
     ],
 )
 def test_json_that_is_no_json(text: str, message: str) -> None:
@@ -92,6 +94,8 @@ def test_brackets_in_texts_are_no_nesting() -> None:
         ("9" * 5000, "integer 9999"),
         ("a: 1\n---\nb: 2", "more than one document"),
         ("a: [1, 2", "in line 2"),
+        ("a: 0x_", "'0x_' is not a number in line 1"),
+        ("a: -0b_", "'-0b_' is not a number in line 1"),
         ("\0", "is not valid YAML"),
         ("\ud800", "surrogate"),
     ],
@@ -242,6 +246,20 @@ def test_arrays_of_python_objects_are_refused(ending: str, tmp_path: Path) -> No
         np.savez(file, points=objects)
     with pytest.raises(InputError, match="is damaged"):
         read_arrays(file)
+
+
+def test_an_archive_called_npy_is_refused(tmp_path: Path) -> None:
+    """It was returned unread and open."""
+    np.savez(tmp_path / "points.npz", points=np.zeros(3))
+    file = (tmp_path / "points.npz").rename(tmp_path / "points.npy")
+    with pytest.raises(InputError, match="is damaged"):
+        read_arrays(file)
+
+
+def test_errors_survive_pickling() -> None:
+    """The listed lines were joined into one."""
+    error = InputError("it is wrong:", ["a b", "c"])
+    assert str(copy.copy(error)) == str(error) == "it is wrong:\n  a b\n  c"
 
 
 def test_nothing_unpickles_files() -> None:

@@ -56,6 +56,8 @@ class Search(Settings, name="search"):
         ({"decay": 1.0}, "search.decay is 1.0; it must be at least 0 and below 1"),
         ({"range": -2.0}, "search.range is -2.0; it must be positive"),
         ({"levels": (0.1, 0.0)}, "search.levels is 0.0; it must be positive"),
+        ({"levels": [0.0]}, "search.levels is 0.0; it must be positive"),
+        ({"step": np.float32(-1)}, "search.step is -1.0; it must be positive"),
         ({"order": "worst"}, "unknown search.order 'worst'; known: best, first"),
         ({"grid": "round"}, "unknown search.grid 'round'; known: coarse, fine"),
         ({"grid_settings": Fine()}, "grid is coarse, but its settings are Fine; they must be Coarse"),
@@ -73,10 +75,11 @@ def test_bounds(values: dict[str, Any], message: str) -> None:
         ({"step": "1"}, "search.step is '1'; it takes float positive"),
         ({"step": None}, "search.step is None; it takes float positive"),
         ({"step": True}, "search.step is True; it takes float positive"),
-        ({"range": []}, r"search.range is \[\]; it takes float positive or none"),
+        ({"range": []}, r"search.range is \(\); it takes float positive or none"),
         ({"order": 1}, "search.order is 1; it takes first, best"),
         ({"inner": 3}, "search.inner is 3; it takes Coarse"),
         ({"levels": 0.1}, "search.levels is 0.1; it takes tuple"),
+        ({"levels": ["a"]}, "search.levels is 'a'; it takes float positive"),
     ],
 )
 def test_values_of_another_type_are_refused(values: dict[str, Any], message: str) -> None:
@@ -161,3 +164,9 @@ def test_registry() -> None:
         table.make("fine", Search())
     table["bare"] = Entry("robotdiffuse.core.transforms:transform", "no settings")
     assert table.settings("bare") is None
+
+
+def test_numbers_of_numpy_and_lists_are_kept_as_python_has_them() -> None:
+    found = Search(step=np.float32(0.5), levels=[np.float64(0.5)], inner=Coarse(np.int64(2)))  # type: ignore
+    assert found == Search(step=0.5, levels=(0.5,), inner=Coarse(2))
+    assert [type(x) for x in (found.step, found.levels, found.inner.cells)] == [float, tuple, int]

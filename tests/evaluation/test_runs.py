@@ -1,13 +1,15 @@
 """Runs: methods take turns, kept records are not made again, planners and networks are validated."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.methods import planned, sampled
+from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.evaluation.methods import planned, restarted, sampled
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.runs import Fields, Run, run_all
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
@@ -57,6 +59,16 @@ def test_what_is_kept_is_not_made_again(tmp_path: Path) -> None:
     assert len(calls) == 4 and [record.name for record in backwards["x"]] == ["b", "a"]
 
 
+def test_another_time_limit_is_another_run(tmp_path: Path) -> None:
+    """Records of any time limit were returned."""
+    calls: list[tuple[str, str, int]] = []
+    case = Case("x#1", "free", FREE, True, LENGTH_OF_LINE, "mine")
+    for limit in (1.0, 2.0, 2.0):
+        found = run_all([case], quick(1.0, calls), limit=limit, folder=tmp_path, bar=False)
+        assert [(r.name, r.time_limit) for r in found["x"]] == [("x#1", limit)]
+    assert len(calls) == 4
+
+
 def test_interrupted_runs_continue(tmp_path: Path) -> None:
     calls: list[tuple[str, str, int]] = []
 
@@ -75,12 +87,15 @@ def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measu
     def draw(run: Run, checker: CollisionChecker) -> np.ndarray:
         middle = (START + GOAL) / 2
         bent = [np.stack([START, middle + np.array([0, 0, bend, 0, 0, 0, 0.0]), GOAL]) for bend in (0.4, 0.2)]
+        bent[1][[0, -1]] += 0.01
         past = np.stack([START, START + 20.0, GOAL])
         return np.stack([bent[0], bent[1], past]).astype(np.float32)
 
     free, blocked = run_all(CASES, {"x": sampled(draw)}, bar=False)["x"]
     assert free.solved and free.passed == pytest.approx(2 / 3)
-    assert free.joint_length == pytest.approx(2 * np.hypot(LENGTH_OF_LINE / 2, 0.2), rel=1e-5)
+    assert free.joint_length == pytest.approx(2 * np.hypot(LENGTH_OF_LINE / 2, 0.2), rel=1e-5), (
+        "with exact ends"
+    )
     assert {"scene_clearance", "link_length", "turning"} <= free.measures.keys()
     assert blocked.status == "no_path" and blocked.passed == 0.0 and blocked.collided == 1.0
 
@@ -91,3 +106,12 @@ def test_a_planner_in_this_process_gives_the_bench_records() -> None:
     assert blocked.joint_length is not None and blocked.joint_length > LENGTH_OF_LINE
     assert blocked.cpu is not None and blocked.restarts is None and blocked.time_limit == 5.0
     assert np.array_equal(blocked.waypoints[0], START)
+
+
+def test_a_motion_that_stands_still_is_not_planned_again() -> None:
+    """A length of 0 counted as no path."""
+    problem = Problem(PANDA, Scene(), START, JointGoal(START[None]))
+    found = RRTConnect().plan(problem, time_limit=2.0, seed=0)
+    first = replace(found, path=Motion(PANDA.joint_names, START[None]))
+    again, best = restarted(RRTConnect(), problem, 0, 2.0, first)
+    assert (again, best.path_length) == (0, 0.0)

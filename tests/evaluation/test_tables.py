@@ -24,6 +24,8 @@ TABLE = Table.of("Title [of] it", COLUMNS, ROWS, ("note_1 < 2",))
 def test_numbers_are_formatted_and_what_is_not_known_is_a_dash() -> None:
     assert [row[1:] for row in TABLE.texts] == [["25.0", "0.0010"], ["75.0", "2"], ["–", "–"]]
     assert Table.of("", ["", ""], [("x", -3)]).texts == [["x", "−3"]]
+    in_mm = Table.of("", ["", Column("", "mm", ".1f", scale=1000.0)], [("x", 1), ("y", 0.5)])
+    assert in_mm.texts == [["x", "1000.0"], ["y", "500.0"]]
 
 
 def test_the_best_are_those_that_look_like_it_and_are_not_common() -> None:

@@ -27,7 +27,7 @@ from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.shard_maker import PROBLEMS_PER_SHARD, draw, make_shard
 from robotdiffuse.problems.families import family, rop
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots import load_robot
+from robotdiffuse.robots import load_robot, names_a_file
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.validation.validator import verify
@@ -45,6 +45,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert generate(SETTINGS, out, progress=lambda *at: seen.append(at)) == 12
     assert seen == [(0, 12), (4, 12), (8, 12), (12, 12)]
     return out
+
+
+def test_a_folder_called_like_a_robot_does_not_hide_it_from_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nodes got the path of any folder of this name in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "panda").mkdir()
+    assert not names_a_file("panda") and names_a_file("./panda") and load_robot("panda") is PANDA
 
 
 @pytest.fixture

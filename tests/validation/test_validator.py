@@ -1,5 +1,6 @@
 """The validator: motions that it must reject, motions that it must accept, and its certified clearances."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -362,9 +363,27 @@ def test_trajectories_that_jump_or_run_backwards() -> None:
     )
     rates = np.full_like(good.velocities, np.inf)
     refused(verify_trajectory(problem, replace(good, velocities=rates)), "not_finite")
-    object.__setattr__(good, "velocities", good.velocities[1:])
-    with pytest.raises(InputError, match=r"trajectory\.velocities has 100 rows; positions has 101"):
-        verify_trajectory(problem, good)
+    late = verify_trajectory(problem, replace(good, times=good.times + 5.0))
+    assert refused(late, "time").message == "times begin at 5 s, not at 0"
+
+
+@pytest.mark.parametrize(
+    ("name", "cut"),
+    [
+        ("times", lambda times: times[:, None]),
+        ("times", lambda times: times[0]),
+        ("velocities", lambda rates: rates[1:]),
+        ("velocities", lambda rates: rates[:, :1]),
+        ("velocities", lambda rates: rates[:, 0]),
+        ("accelerations", lambda rates: rates[:, :1]),
+        ("positions", lambda q: q[:, :2]),
+    ],
+)
+def test_wrong_shapes_of_a_trajectory_raise(name: str, cut: Callable[[np.ndarray], np.ndarray]) -> None:
+    good = trajectory(2.0)
+    object.__setattr__(good, name, np.asarray(cut(getattr(good, name))))
+    with pytest.raises(InputError, match=rf"trajectory\.{name} has shape .*; it must be"):
+        verify_trajectory(problem_and_path(SWING)[0], good)
 
 
 def at_the_limit() -> Trajectory:

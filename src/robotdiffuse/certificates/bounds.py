@@ -25,10 +25,12 @@ from robotdiffuse.certificates.obstacles import (
     Rounded,
     Surface,
 )
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 SCENE = "scene"
+"""Stands for the scene where a claim names the other link, so no link may have this name."""
 
 
 class Claim(NamedTuple):
@@ -92,6 +94,10 @@ class Prover:
         self.robot, self.q = robot, q
         self.linkage, self.obstacles = Linkage(robot), Obstacles(scene)
         self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
+        if SCENE in self.links:
+            raise InputError(
+                f"the robot has a link called {SCENE!r}; rename it: certificates use this name for the scene"
+            )
         self._of = {link: k for k, link in enumerate(self.linkage.links)}
         self._moved = self.linkage.moved
         self.may_touch = np.array(

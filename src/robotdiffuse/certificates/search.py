@@ -37,7 +37,7 @@ PLANES_BELOW = 0.02
 PLANES_DISPLACEMENT = 0.1
 """Largest displacement of stretches for which planes are tried [m]."""
 ROUNDING_RESERVE = 2e-6
-"""Clearance minus displacement exceeds what is proved by this, to absorb rounding [m]."""
+"""Margin added to each target clearance so that rounded bounds still prove it [m]."""
 MAX_STRETCHES = 200_000
 PLACE_DECIMALS = 7
 MAX_HALVINGS = 20
@@ -83,7 +83,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     if problem.moving and isinstance(motion, Trajectory):
         times = np.sort(np.concatenate([motion.times, between]), kind="stable")
         moving, others = _prove(MovingProver(problem.robot, problem.moving, q, times), {"": 0.0})
-        left[SCENE] = min(left[SCENE], others[""])
+        left[SCENE] = min(left[SCENE], *others.values())  # an obstacle may be called "scene"
     return Certificate(
         problem.robot.name,
         robot_parts(problem.robot),

@@ -27,7 +27,7 @@ T = TypeVar("T")
 class Value:
     """Base of the dataclasses that are values: the arrays in their fields are read-only.
 
-    What is prepared for a value, and verdicts on it, are kept by its identity. An array that can be written
+    Caches use the object's identity as the key, so its arrays must not change. An array that can be written
     to is copied, so that whoever gave it keeps it as it was. Subclasses with a `__post_init__` of their own
     call this one at its end.
     """
@@ -57,8 +57,8 @@ class Value:
 
 
 def read_only(value: T) -> T:
-    """An array, or what tuples and dictionaries hold of arrays, without anyone who can write to it: itself if
-    that is so, else a copy. Anything else is returned as it is."""
+    """Returns the value if its arrays are read-only, else a read-only copy; looks into tuples and
+    dictionaries."""
     if isinstance(value, ndarray):
         if not _writable(value):
             return value
@@ -99,7 +99,14 @@ def numbers(value: object) -> ndarray | None:
         array = np.asarray(value)
     except (TypeError, ValueError, OverflowError, RecursionError):
         return None
-    return array.astype(np.float64) if array.dtype.kind in "iuf" else None
+    return array.astype(np.float64) if array.dtype.kind in "iuf" and not _holds_boolean(value) else None
+
+
+def _holds_boolean(value: object) -> bool:
+    """Whether nested lists hold a boolean; NumPy makes 0 or 1 of it beside numbers."""
+    if isinstance(value, list | tuple):
+        return any(map(_holds_boolean, value))
+    return isinstance(value, bool) or getattr(value, "dtype", None) == np.bool_
 
 
 def within(array: ndarray, most: float = MAX_COORDINATE) -> bool:

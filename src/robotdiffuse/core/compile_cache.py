@@ -20,7 +20,8 @@ def ensure_cache() -> None:
     Numba refuses to compile without a writable cache folder, as in a container with a read-only installation
     and no home. Call this before importing compiled code. NUMBA_CACHE_DIR, if set, takes precedence.
     """
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "numba"
+    # unlike Path.expanduser, this leaves ~ as it is for a user without a home
+    user = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "numba"
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     remove_stale_indexes(PACKAGE, Path(chosen or user))
     if chosen or any(map(is_writable, (Path(__file__).parent, user))):
@@ -43,7 +44,10 @@ def ensure_cache() -> None:
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether a file can be written in the folder; permissions alone do not show that a disk is read-only."""
+    """Whether a file can be written in the folder; permissions alone do not show that a disk is read-only.
+    False for ~, a home that is not known."""
+    if folder.parts[:1] == ("~",):
+        return False
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()

@@ -23,6 +23,11 @@ class InputError(ValueError):
         line = " ".join(shortened(word) if len(word) > MAX_WORD else word for word in words)
         super().__init__("\n  ".join([line, *listed]))
 
+    def __reduce__(self) -> tuple[type, tuple[str, list[str]]]:
+        """For pickle and copies, which would otherwise join the listed lines into one."""
+        line, *listed = str(self).split("\n  ")
+        return type(self), (line, listed)
+
 
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
     """Raises InputError unless the value is of one of these types; `wanted` says what it must be."""

@@ -167,7 +167,8 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
     path = input_file(file)
     try:
         if path.suffix.lower() != ".npz":
-            return {"": np.load(path, allow_pickle=False)}
+            with path.open("rb") as stream:  # np.load would open an archive of this name
+                return {"": np.lib.format.read_array(stream, allow_pickle=False)}
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size <= MAX_FILE_SIZE:
@@ -185,8 +186,8 @@ def read_json(file: str | Path) -> Any:
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The value of a JSON text. Raises InputError, naming `where`, for invalid or too deeply nested JSON and
-    for integers of more than MAX_DIGITS digits."""
+    """The value of a JSON text. Raises InputError, naming `where`, for invalid or too deeply nested JSON, for
+    a key that appears twice and for integers of more than MAX_DIGITS digits."""
     if text.count("[") + text.count("{") > MAX_DEPTH:
         marks = np.frombuffer(_STRING.sub("", text).encode("utf-8", "replace"), np.uint8)
         opened = (marks == ord("[")) | (marks == ord("{"))
@@ -194,7 +195,11 @@ def parse_json(text: str, where: str) -> Any:
         if (np.cumsum(opened.astype(np.int64) - closed)).max(initial=0) > MAX_DEPTH:
             _too_deep(where)
     try:
-        return json.loads(text, parse_int=lambda digits: _integer(digits, where))
+        return json.loads(
+            text,
+            parse_int=lambda digits: _integer(digits, where),
+            object_pairs_hook=lambda pairs: _object(pairs, where),
+        )
     except json.JSONDecodeError as error:
         at = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{where} is not valid JSON: {error.msg} at {at}") from None
@@ -319,12 +324,15 @@ class _Composer:
             return None
         if kind == "bool":
             return self.loader.construct_yaml_bool(node)
-        if kind == "float":
-            return self.loader.construct_yaml_float(node)
+        if kind not in ("float", "int"):
+            return text
         if kind == "int":
             _check_digits(text, self.where)
-            return self.loader.construct_yaml_int(node)
-        return text
+        try:
+            construct = getattr(self.loader, f"construct_yaml_{kind}")
+            return construct(node)
+        except ValueError:  # 0x_ has no digits
+            self._refuse(event, f"{shown(text)} is not a number")
 
     def _add(self, count: int, event: Any) -> None:
         self.count += count
@@ -340,6 +348,15 @@ def _reason(error: yaml.YAMLError) -> str:
         mark = error.problem_mark
         return f"{shortened(error.problem or '')} in line {mark.line + 1}, column {mark.column + 1}"
     return shortened(str(error))
+
+
+def _object(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{where} is not valid JSON: {shortened(twice)} appears twice")
+    return found
 
 
 def _integer(digits: str, where: str) -> int:

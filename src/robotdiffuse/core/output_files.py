@@ -3,8 +3,9 @@
 import fcntl
 import json
 import os
+import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,16 @@ def write_atomically(file: Path, content: str | bytes, make_folder: bool = False
     An interruption or a full disk leaves the old file, if there was one. Raises InputError if the file cannot
     be written.
     """
-    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    temporary = file.with_name(f".{file.name}.{secrets.token_hex(8)}.tmp")
     try:
         if make_folder:
             file.parent.mkdir(parents=True, exist_ok=True)
         try:
             temporary.write_bytes(content.encode() if isinstance(content, str) else content)
             temporary.replace(file)
-        except OSError:
-            temporary.unlink(missing_ok=True)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink()
             raise
     except OSError as error:
         raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
@@ -80,19 +82,27 @@ class JsonLines:
             write_atomically(self._file, "".join(json.dumps(row) + "\n" for row in rows), make_folder=True)
 
     def append(self, row: dict[str, Any]) -> None:
-        """Add a row and flush it to the disk."""
+        """Add a row and flush it to the disk. If that fails, neither the file nor `rows` has it."""
+        if self._file is not None:
+            self._write(self._file, json.dumps(row) + "\n")
         self.rows.append(row)
-        if self._file is None:
-            return
+
+    def _write(self, file: Path, line: str) -> None:
         if self._without_cut_line is not None:
             # not earlier: another process may still have been writing that line
-            write_atomically(self._file, self._without_cut_line)
+            write_atomically(file, self._without_cut_line)
             self._without_cut_line = None
-        self._file.parent.mkdir(parents=True, exist_ok=True)
-        with self._file.open("a") as stream:
-            stream.write(json.dumps(row) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("ab", buffering=0) as stream:
+            size = stream.seek(0, os.SEEK_END)
+            left = memoryview(line.encode())
+            try:
+                while left:
+                    left = left[stream.write(left) :]
+                os.fsync(stream.fileno())
+            except BaseException:
+                stream.truncate(size)
+                raise
 
 
 @contextmanager

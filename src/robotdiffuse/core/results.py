@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robotdiffuse.core.bounds import MAX_RATE, within
+from robotdiffuse.core.bounds import MAX_RATE, numbers, within
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
@@ -271,10 +271,9 @@ def _number_or_none(record: dict[str, Any], name: str) -> float | None:
 
 def _rows(record: dict[str, Any], name: str, rows: int | None, columns: int | None) -> np.ndarray:
     """An array of finite numbers: a vector if `columns` is None; any number of rows if `rows` is None."""
-    try:
-        array = np.asarray(record.get(name), dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be {'a list' if columns is None else 'rows'} of numbers") from None
+    array = numbers(record.get(name))
+    if array is None:
+        raise InputError(f"{name} must be {'a list' if columns is None else 'rows'} of numbers")
     shape = "x".join(map(str, array.shape))
     wanted = f"{rows or 'n'}" + ("" if columns is None else f"x{columns}")
     if array.ndim != (1 if columns is None else 2) or len(array) == 0:

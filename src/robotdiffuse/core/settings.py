@@ -9,20 +9,17 @@
 Each instance checks itself on creation; error messages name the field, its value and what would be right.
 """
 
-import ast
 import dataclasses
-import inspect
 import math
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from numbers import Integral, Real
 from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.field_docstrings import field_docstrings
 from robotdiffuse.core.input_files import parse_yaml
 from robotdiffuse.core.registry import Registry
 
@@ -133,11 +130,13 @@ class Settings:
             cls.settings_name = name
 
     def __post_init__(self) -> None:
-        """Raises InputError for the first field of the wrong type or out of bounds."""
+        """Turns lists into tuples, and NumPy's numbers into Python's.
+
+        Raises InputError for the first field of the wrong type or out of bounds.
+        """
         prefix = f"{self.settings_name}." if self.settings_name else ""
         for name, hint in _hints(type(self)).items():
-            if not _fits(hint, getattr(self, name)):
-                raise InputError(f"{prefix}{name} is {shown(getattr(self, name))}; it takes {_rule(hint)}")
+            object.__setattr__(self, name, _plain(getattr(self, name)))
             _check(prefix + name, hint, getattr(self, name), self)
 
     def to_json(self) -> dict[str, Any]:
@@ -238,7 +237,7 @@ class Settings:
 
     def describe(self) -> list[Setting]:
         """All settings with their values, including nested ones."""
-        hints, documents = _hints(type(self)), _documents(type(self))
+        hints, documents = _hints(type(self)), field_docstrings(type(self))
         found: list[Setting] = []
         for name, hint in hints.items():
             value = getattr(self, name)
@@ -268,8 +267,17 @@ def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     return hint, ()
 
 
+def _plain(value: Any) -> Any:
+    """The value with lists as tuples, and other kinds of numbers, such as NumPy's, as Python's."""
+    if isinstance(value, list | tuple):
+        return tuple(_plain(entry) for entry in value)
+    if isinstance(value, Real) and not isinstance(value, bool):
+        return int(value) if isinstance(value, Integral) else float(value)
+    return value
+
+
 def _fits(hint: Any, value: Any) -> bool:
-    """Whether a value is of a type, whatever its entries are: NumPy's numbers are numbers."""
+    """Whether a value is of a type, whatever its entries are."""
     for option in _options(_split(hint)[0]):
         bare = _split(option)[0]
         kind = get_origin(bare) or bare
@@ -277,8 +285,6 @@ def _fits(hint: Any, value: Any) -> bool:
             fits = _fits(bare, value)
         elif kind in (int, float):
             fits = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
-        elif kind is tuple:
-            fits = isinstance(value, tuple | list)
         else:
             fits = kind is Any or not isinstance(kind, type) or isinstance(value, kind)
         if fits:
@@ -287,6 +293,8 @@ def _fits(hint: Any, value: Any) -> bool:
 
 
 def _check(where: str, hint: Any, value: Any, owner: object) -> None:
+    if not _fits(hint, value):
+        raise InputError(f"{where} is {shown(value)}; it takes {_rule(hint)}")
     if value is None:
         return
     for option in _options(hint):
@@ -378,23 +386,3 @@ def _rule(hint: Any) -> str:
             yield " ".join(names or [kind, *rules])
 
     return " or ".join(parts(hint))
-
-
-def _documents(kind: type) -> dict[str, str]:
-    """Docstring below each field of a class and of its base classes."""
-    found: dict[str, str] = {}
-    for cls in reversed(kind.__mro__):
-        if not dataclasses.is_dataclass(cls):
-            continue
-        [tree] = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-        body = tree.body if isinstance(tree, ast.ClassDef) else []
-        for field, text in pairwise(body):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(field.target, ast.Name)
-                and isinstance(text, ast.Expr)
-                and isinstance(text.value, ast.Constant)
-                and isinstance(text.value.value, str)
-            ):
-                found[field.target.id] = " ".join(text.value.value.split())
-    return found

@@ -4,12 +4,15 @@ verdict.
 The validator's time counts only where it is part of a planner's call.
 """
 
+import hashlib
+import json
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import lru_cache
 from math import ceil
+from pathlib import Path as FilePath
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +24,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status
 from robotdiffuse.evaluation.metrics import Measure
-from robotdiffuse.evaluation.records import ENDED_EARLY, RAISED, RESTARTABLE, SOLVED
+from robotdiffuse.evaluation.records import ENDED_EARLY, RAISED, RESTARTABLE, SHORTEST_FACTOR, SOLVED
 from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planning.diffusion.diffusion import ModelSampler, encode
@@ -40,8 +43,6 @@ NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4, guidanc
 """Settings of networks that are measured alone; the planner's own number of steps is too small without
 guidance."""
 UNSOLVED = Status.NO_PATH.value
-SHORTEST_FACTOR = 1 + 1e-6
-"""A path counts as the shortest possible if it is at most so many times as long as the straight line."""
 
 measure_of = lru_cache(maxsize=8)(Measure)
 """The Measure of a robot; made once."""
@@ -93,13 +94,13 @@ def restarted(
 ) -> tuple[int, PlanResult]:
     """Call a planner again with fresh seeds until its calls have used up the time limit together.
 
-    Returns the number of calls and the shortest path of all, with the times at which paths were found. Stops
-    early if no shorter path exists. The time for timing the other paths does not count: a single call times
-    its answer only.
+    Returns the number of further calls and the shortest path of all, with the times at which paths were
+    found. Stops early if no shorter path exists. The time for timing the other paths does not count: a single
+    call times its answer only.
     """
     best, spent, least, again = first, first.planning_time, first.planning_time, 0
     progress, straight = list(first.progress), _straight_length(problem)
-    while limit - spent > least and (best.path_length or np.inf) > SHORTEST_FACTOR * straight:
+    while limit - spent > least and _length(best) > SHORTEST_FACTOR * straight:
         again += 1
         fresh = int(np.random.SeedSequence([seed, again]).generate_state(1)[0])
         result = planner.plan(problem, time_limit=limit - spent, seed=fresh, **request)
@@ -107,9 +108,14 @@ def restarted(
             if not progress or length < progress[-1][1]:
                 progress.append((spent + at, length))
         spent, least = spent + result.planning_time, min(least, result.planning_time)
-        if result.path_length is not None and result.path_length < (best.path_length or np.inf):
+        if _length(result) < _length(best):
             best = result
     return again, replace(best, planning_time=spent, progress=tuple(progress))
+
+
+def _length(result: PlanResult) -> float:
+    """Length of the path [rad]; infinite without one."""
+    return np.inf if result.path_length is None else result.path_length
 
 
 def _straight_length(problem: Problem) -> float:
@@ -149,17 +155,18 @@ class Validated(NamedTuple):
     hit: Bool[ndarray, "n"]
     """Which trajectories are in collision."""
     reports: list[Report]
+    waypoints: Float[ndarray, "n waypoints dof"]
+    """The trajectories with exact ends."""
 
 
 def validated(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Validated:
     """Validate trajectories as they are, except that their ends are made exact."""
-    validator, reports = verifier(problem, VerifySettings()), []
-    for waypoints in q.astype(np.float64):
-        waypoints[0], waypoints[-1] = problem.start, goal_of(problem)
-        reports.append(validator.path(Path(problem.robot.joint_names, waypoints)))
+    validator, exact = verifier(problem, VerifySettings()), q.astype(np.float64)
+    exact[:, 0], exact[:, -1] = problem.start, goal_of(problem)
+    reports = [validator.path(Path(problem.robot.joint_names, waypoints)) for waypoints in exact]
     kinds = ["" if report.violation is None else report.violation.kind for report in reports]
     passed, hit = [not kind for kind in kinds], [kind.endswith("collision") for kind in kinds]
-    return Validated(np.array(passed), np.array(hit), reports)
+    return Validated(np.array(passed), np.array(hit), reports, exact)
 
 
 def path_lengths(q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
@@ -177,8 +184,8 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
             q = draw(run, checker)
         verdict, found = validated(problem, q), {}
         if verdict.passed.any():
-            best = int(np.where(verdict.passed, lengths(q), np.inf).argmin())
-            path = Path(problem.robot.joint_names, q[best].astype(np.float64))
+            best = int(np.where(verdict.passed, lengths(verdict.waypoints), np.inf).argmin())
+            path = Path(problem.robot.joint_names, verdict.waypoints[best])
             found = measure_of(problem.robot)(path, None, verdict.reports[best])
         yield {
             "status": SOLVED if found else UNSOLVED,
@@ -189,6 +196,14 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
         }
 
     return call
+
+
+def sampling_digest(settings: RobotDiffuseSettings, folder: FilePath | None) -> str:
+    """Identifies in the names of methods what samples depend on: the settings, and the network's weights in a
+    folder, if there is a network."""
+    weights = None if folder is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
+    about = json.dumps(asdict(settings) | {"weights": weights}, sort_keys=True)
+    return hashlib.sha256(about.encode()).hexdigest()[:12]
 
 
 def from_network(

@@ -201,8 +201,7 @@ class Measure:
     def __call__(
         self, path: Path, trajectory: Trajectory | None = None, verdict: Verdict | None = None
     ) -> dict[str, float]:
-        """Values of the metrics that the motion has, by name; all but the duration are 0 for one that stands
-        still."""
+        """Values of the metrics that the motion has, by name; lengths are 0 for one that stands still."""
         motion = Motion(self.kinematics, path, trajectory, verdict)
         values = {name: metric.of(motion) for name, metric in METRICS.items()}
         return {name: float(f"{x:.{DIGITS}g}") for name, x in values.items() if x is not None}

@@ -1,11 +1,15 @@
 """Problem sets by name: held-out problems of the families, and those of files and folders, checked once and
 kept."""
 
+import hashlib
 import itertools
+import json
 from dataclasses import replace
 from pathlib import Path as FilePath
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.input_files import read_bytes, read_json
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import LENGTH, Path
 from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
 from robotdiffuse.problems.families import FAMILIES
@@ -57,7 +61,10 @@ def problem_set_name(text: str) -> str:
             f"problems {text!r} are neither a file or folder nor a family; known families: "
             f"{', '.join(FAMILIES)}, each also with {NONTRIVIAL}"
         )
-    return place.resolve().stem
+    name = place.resolve().stem
+    if name.removesuffix(NONTRIVIAL) in FAMILIES:
+        raise InputError(f"problems {text!r} have the name of the family {name}; rename the file or folder")
+    return name
 
 
 def gather_cases(names: list[str], count: int | None, out: FilePath, report: Report) -> list[Case]:
@@ -87,10 +94,28 @@ def _set(text: str, count: int | None, folder: FilePath, report: Report) -> list
         finder = search if text.endswith(NONTRIVIAL) else None
         wanted = 100 if count is None else count
         return _of_set(case_file(folder, family).held_out(family, wanted, validator, finder, report), name)
-    kept = case_file(folder, name)
+    kept, place, source = case_file(folder, name), FilePath(text), folder / f"{name}.source.json"
+    about = {"source": str(place.resolve()), "sha256": _content_hash(place)}
     if not len(kept):
-        kept.fill(_read_place(FilePath(text), name, report))
+        cases = _read_place(place, name, report)
+        write_atomically(source, json.dumps(about), make_folder=True)
+        kept.fill(cases)
+    elif source.is_file() and (known := read_json(source))["sha256"] != about["sha256"]:
+        raise InputError(
+            f"{folder} has problems called {name} that were read from {known['source']}; those in {text} are "
+            "others: rename them, or use another folder"
+        )
     return _of_set(kept.cases()[:count], name)
+
+
+def _content_hash(place: FilePath) -> str:
+    """SHA-256 of the problem files of a set, without the scenes and meshes that they name."""
+    digest = hashlib.sha256()
+    for part in _parts(place):
+        for file in [part] if part.is_file() else sorted(part.glob("*.yaml")):
+            digest.update(f"{file.relative_to(place)} {file.stat().st_size}\n".encode())
+            digest.update(read_bytes(file))
+    return digest.hexdigest()
 
 
 def _of_set(cases: list[Case], problem_set: str) -> list[Case]:

@@ -19,6 +19,9 @@ SOLVED, CRASHED, OVERRAN, RAISED = "solved", "crashed", "overran", "exception"
 raised."""
 ENDED_EARLY = 0.9
 """A call that took less than this share of its time limit ended by itself: a longer limit changes nothing."""
+SHORTEST_FACTOR = 1 + 1e-6
+"""A path counts as the shortest if it is at most so many times as long as the shortest known or possible
+one."""
 RESTARTABLE = {SOLVED, Status.TIMEOUT.value, Status.NO_PATH.value}
 """Statuses that another seed can change."""
 RESTARTED = "+restarts"
@@ -79,8 +82,8 @@ class Record:
 
     @property
     def case(self) -> tuple[str, str, int]:
-        """Problem set, problem and seed. A name may end with # and the part of the answer."""
-        return self.problem_set, self.name.partition("#")[0], self.seed
+        """Problem set, problem and seed."""
+        return self.problem_set, self.name, self.seed
 
     @property
     def joint_length(self) -> float | None:
@@ -176,5 +179,5 @@ def read_records(folder: FilePath, methods: Sequence[str] | None = None) -> dict
         raise InputError(f"{folder} holds no records of a bench; `robotdiffuse bench run` makes them")
     for name in methods or ():
         if name not in files:
-            raise InputError(f"planners names {name!r}, of which {folder} has no records; {', '.join(files)}")
+            raise InputError(f"{folder} has no records of {name}; it has {', '.join(files)}")
     return {name: RecordFile(files[name]).records for name in methods or files}

@@ -39,6 +39,11 @@ class Run:
     def problem(self) -> Problem:
         return self.case.problem
 
+    @property
+    def key(self) -> tuple[str, str, int, float]:
+        """That of its record."""
+        return self.case.problem_set, self.case.name, self.seed, self.limit
+
     def rng(self) -> np.random.Generator:
         """Random numbers, the same ones for all methods."""
         return np.random.default_rng([SEED, self.seed, self.index])
@@ -143,14 +148,14 @@ def run_all(
     title: of the progress bar, which `bar` switches off.
     """
     files = {name: RecordFile(None if folder is None else record_path(folder, name)) for name in methods}
-    there = {(name, record.case) for name, file in files.items() for record in file.records}
+    there = {(name, record.key) for name, file in files.items() for record in file.records}
     runs = runs_of(cases, methods, seeds, limit)
-    todo = [t for t in runs if (t.method, (t.case.problem_set, t.case.name, t.seed)) not in there]
+    todo = [t for t in runs if (t.method, t.key) not in there]
     with Progress(transient=True, console=Console(stderr=True), disable=not bar) as shown:
         task = shown.add_task(title, total=len(runs), completed=len(runs) - len(todo))
         execute_runs(todo, in_this_process(methods), files, lambda *_: shown.advance(task))
-    order = {(t.case.problem_set, t.case.name, t.seed): i for i, t in enumerate(runs)}
+    order = {t.key: i for i, t in enumerate(runs)}
     return {
-        name: sorted((r for r in file.records if r.case in order), key=lambda record: order[record.case])
+        name: sorted((r for r in file.records if r.key in order), key=lambda record: order[record.key])
         for name, file in files.items()
     }

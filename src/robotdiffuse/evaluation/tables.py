@@ -125,7 +125,8 @@ def _text(cell: Cell, column: Column) -> str:
         return cell.text
     if cell is None or cell != cell:
         return NO_VALUE
-    text = f"{cell:,}" if isinstance(cell, int) else format(column.scale * cell, column.format or "g")
+    plain = isinstance(cell, int) and column.scale == 1 and not column.format
+    text = f"{cell:,}" if plain else format(column.scale * cell, column.format or "g")
     return text.replace("-", "−") if text.strip("-0.") else text.removeprefix("-")
 
 

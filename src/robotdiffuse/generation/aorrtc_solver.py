@@ -43,10 +43,9 @@ class AORRTCSearchSettings(Settings, name="aorrtc"):
     resolution: Positive = 0.02
     """No point of the arm moves further than this between two checks of a motion [m]."""
     gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.01
-    """The search ends when the last doubling of its iterations shortened the path by a smaller share than
-    this, ..."""
+    """The search ends when the last doubling of iterations shortened the path by less than this share."""
     patience: Natural = 4_000
-    """... but not before so many iterations."""
+    """Minimum number of iterations."""
 
 
 class AORRTCSearch:

@@ -18,7 +18,7 @@ from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, rea
 from robotdiffuse.datasets.shards import remove_leftovers, shard_indices, write_shard
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.shard_maker import Arrays, Counts, make_shard
-from robotdiffuse.robots import load_robot
+from robotdiffuse.robots import load_robot, names_a_file
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 
 PACKAGES = ("numpy", "numba", "zarr")
@@ -93,7 +93,7 @@ def _fill(
 def _as_absolute(settings: GenerationSettings) -> GenerationSettings:
     """The settings with an absolute path of the robot, for nodes with other working folders."""
     file = Path(settings.robot)
-    return replace(settings, robot=str(file.resolve())) if file.exists() else settings
+    return replace(settings, robot=str(file.resolve())) if names_a_file(settings.robot) else settings
 
 
 def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, str]) -> tuple[Arrays, Counts]:

@@ -45,11 +45,18 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
         check_type("locked", locked, dict, "a mapping of joints to values")
     if is_file(Path(name) / ROBOT_FILE):
         robot = _read(Path(name), str(Path(name).resolve()))
-    elif isinstance(name, Path) or text.endswith((".urdf", ".xacro", ".xml")) or "/" in text or "\\" in text:
+    elif names_a_file(name):
         robot = _from_urdf(Path(name))
     else:
         robot = _by_name(text)
     return robot.with_locked(locked or {})
+
+
+def names_a_file(name: str | Path) -> bool:
+    """Whether `load_robot` reads a file or folder of this name; else it looks the name up."""
+    text = str(name)
+    by_form = text.endswith((".urdf", ".xacro", ".xml")) or "/" in text or "\\" in text
+    return by_form or isinstance(name, Path) or is_file(Path(name) / ROBOT_FILE)
 
 
 def _by_name(name: str) -> Robot:

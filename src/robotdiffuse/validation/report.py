@@ -1,10 +1,6 @@
 """What a validation returns."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:  # what most problems do not need is imported where one does
-    pass
 
 
 @dataclass(frozen=True)

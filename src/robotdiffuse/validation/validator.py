@@ -82,7 +82,7 @@ class Verifier:
     def path(self, path: Path) -> Report:
         """See `verify`."""
         check_motion("path", path, (Path,))
-        self._check_shape(path.joint_names, path.positions)
+        self._check_shape("path", path)
         found = []
         if self.dynamics is not None and within(path.positions):
             clock = np.arange(len(path.positions), dtype=float)
@@ -92,13 +92,8 @@ class Verifier:
     def trajectory(self, trajectory: Trajectory) -> Report:
         """See `verify_trajectory`."""
         check_motion("trajectory", trajectory, (Trajectory,))
-        self._check_shape(trajectory.joint_names, trajectory.positions)
+        self._check_shape("trajectory", trajectory)
         rows = (trajectory.times, trajectory.velocities, trajectory.accelerations)
-        for name, values in zip(("times", "velocities", "accelerations"), rows, strict=True):
-            if len(values) != len(trajectory.positions):
-                raise InputError(
-                    f"trajectory.{name} has {len(values)} rows; positions has {len(trajectory.positions)}"
-                )
         if not all(np.isfinite(values).all() for values in rows):
             violation = Violation("not_finite", 0.0, "the trajectory holds values that are not finite")
             return Report(False, violation, None, None)
@@ -107,11 +102,14 @@ class Verifier:
             at = float(trajectory.times[backwards[0] + 1])
             message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
             return Report(False, Violation("time", at, message), None, None)
-        if trajectory.duration - trajectory.times[0] > MAX_DURATION:
+        if trajectory.times[0] != 0:
+            at = float(trajectory.times[0])
+            return Report(False, Violation("time", at, f"times begin at {at:.6g} s, not at 0"), None, None)
+        if trajectory.duration > MAX_DURATION:
             message = (
                 f"the motion takes {trajectory.duration:.6g} s; at most {MAX_DURATION:g} s can be validated"
             )
-            return Report(False, Violation("time", float(trajectory.times[0]), message), None, None)
+            return Report(False, Violation("time", 0.0, message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
         found = [
@@ -139,19 +137,26 @@ class Verifier:
     def collision_free(self, path: Path) -> bool:
         """Whether a path is certified free of collision and keeps the path constraints. Start, goal and
         limits are not checked."""
-        self._check_shape(path.joint_names, path.positions)
+        self._check_shape("path", path)
         if self.constraints is not None and self.constraints.first_violation(path.positions) is not None:
             return False
         return self._continuous.sweep(path.positions).contact is None
 
-    def _check_shape(self, joint_names: tuple[str, ...], positions: ndarray) -> None:
-        if tuple(joint_names) != self.robot.joint_names:
-            given, right = joined(joint_names), joined(self.robot.joint_names)
-            raise InputError(f"path.joint_names is {given}; the robot's planned joints are {right}")
-        if positions.ndim != 2 or positions.shape[1] != self.robot.dof or len(positions) == 0:
+    def _check_shape(self, what: str, motion: Path | Trajectory) -> None:
+        shape = motion.positions.shape
+        if tuple(motion.joint_names) != self.robot.joint_names:
+            given, right = joined(motion.joint_names), joined(self.robot.joint_names)
+            raise InputError(f"{what}.joint_names is {given}; the robot's planned joints are {right}")
+        if len(shape) != 2 or shape[1] != self.robot.dof or shape[0] == 0:
             raise InputError(
-                f"path.positions has shape {positions.shape}; it must be n x {self.robot.dof} with n >= 1"
+                f"{what}.positions has shape {shape}; it must be n x {self.robot.dof} with n >= 1"
             )
+        if isinstance(motion, Trajectory):
+            for name, wanted in (("times", shape[:1]), ("velocities", shape), ("accelerations", shape)):
+                values = getattr(motion, name)
+                if values.shape != wanted:
+                    rule = f"it must be {wanted}, as {what}.positions has shape {shape}"
+                    raise InputError(f"{what}.{name} has shape {values.shape}; {rule}")
 
     def _report(
         self,

@@ -18,7 +18,7 @@ from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.types import Path as Motion
-from robotdiffuse.evaluation.bench import planner_process
+from robotdiffuse.evaluation.bench import planner_process, runner
 from robotdiffuse.evaluation.bench.outcomes import LATE_SECONDS
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.bench.runner import BenchSettings, open_runs, run_bench
@@ -291,6 +291,36 @@ def test_problems_of_files_and_folders(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no usable problem"):
         gather_cases([str(tmp_path / "empty")], None, tmp_path / "out", quiet)
+
+
+def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
+    """Those of the first file of a name were returned for any other."""
+    lines = [json.dumps(problem_record(held_out_problem("rop", i))) for i in range(2)]
+    for folder, line in zip("ab", lines, strict=True):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.jsonl").write_text(line)
+    first, other = str(tmp_path / "a" / "mine.jsonl"), str(tmp_path / "b" / "mine.jsonl")
+    for _ in range(2):
+        assert len(gather_cases([first], None, tmp_path / "out", quiet)) == 1
+    with pytest.raises(InputError, match=r"problems called mine that were read from .*; those in .* others"):
+        gather_cases([other], None, tmp_path / "out", quiet)
+    (tmp_path / "rop.jsonl").write_text(lines[0])
+    with pytest.raises(InputError, match="have the name of the family rop"):
+        gather_cases([str(tmp_path / "rop.jsonl")], None, tmp_path / "out", quiet)
+
+
+def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their calls counted as made, or shared a row."""
+    monkeypatch.setattr(runner, "execute_runs", lambda *_: 0)
+    for parent, digest in (("a", "1"), ("b", "2")):
+        (tmp_path / parent / "best").mkdir(parents=True)
+        about = {"format": 2, "weights_sha256": digest}
+        (tmp_path / parent / "best" / "mpnet.json").write_text(json.dumps(about))
+    first, other = (settings(tmp_path / "out", f"mpnet@{tmp_path / at}/best", count=1) for at in "ab")
+    for _ in range(2):
+        run_bench(first, quiet, quiet)
+    with pytest.raises(InputError, match="has records of mpnet@best with other weights than those in"):
+        run_bench(other, quiet, quiet)
 
 
 @pytest.mark.parametrize(

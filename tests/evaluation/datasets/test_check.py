@@ -16,6 +16,7 @@ from robotdiffuse.datasets.motion_rows import motion_of, problem_of
 from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
 from robotdiffuse.evaluation.datasets.check import KINDS, check_data
 from robotdiffuse.problems.problem import JointGoal
+from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
@@ -88,6 +89,14 @@ def test_limit_violation_is_found(tmp_path, pybullet):
     assert {kind: n for kind, n in check.counts.items() if n} == {"limits": 1}
     (example,) = check.examples
     assert example.where == "shard 0, row 1" and "j0 is 2.801 at waypoint 7" in example.message
+
+
+@pytest.mark.sim
+def test_continuous_joints_have_no_limits(tmp_path, pybullet):
+    robot = load_robot("gen3")
+    q = line(np.where(robot.continuous, 9.6, 0.0), np.where(robot.continuous, 9.5, 0.1))
+    write_motions(tmp_path, robot, [record(robot, Scene([]), q)])
+    assert any(robot.continuous) and check_data(tmp_path, robot).counts["limits"] == 0
 
 
 @pytest.mark.sim

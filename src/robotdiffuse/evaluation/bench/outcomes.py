@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotdiffuse.core.types import Status
-from robotdiffuse.evaluation.records import CRASHED, ENDED_EARLY, OVERRAN, RAISED, Record
+from robotdiffuse.evaluation.records import CRASHED, ENDED_EARLY, OVERRAN, RAISED, SHORTEST_FACTOR, Record
 
 LATE_SHARE, LATE_SECONDS = 0.1, 0.05
 """A returned motion counts if it is at most this share of the limit, or this time [s], late: planners stop in
 time, and validation follows."""
-SHORTEST_FACTOR = 1 + 1e-6
-"""A path counts as the shortest if it is at most so many times as long as the shortest known one."""
 RAN_OUT, GAVE_UP, LATER = "time ran out", "gave up before", "found one later"
 FAILURES = {
     RAN_OUT: "no path by the end of the limit",

@@ -5,13 +5,16 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.input_files import is_file
 from robotdiffuse.core.settings import Settings
+from robotdiffuse.learning.networks import NETWORKS
+from robotdiffuse.learning.weight_files import read_description
 from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 
 CALL_ARGUMENTS = [field.name for field in fields(PlanRequest) if field.name not in ("time_limit", "seed")]
-"""Arguments of a planner's calls that a contestant may set; the bench sets the others."""
+"""Arguments of a planner's calls that a planner under test may set; the bench sets the others."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,15 @@ class PlannerSpec:
         """Its name in results."""
         name = self.name if self.weights is None else f"{self.name}@{FilePath(self.weights).name}"
         return ":".join([name, *self.settings])
+
+    @property
+    def weights_hashes(self) -> dict[str, Any]:
+        """SHA-256 of the weights in its folder, by network; empty for those that come with the package."""
+        if self.weights is None:
+            return {}
+        folder = FilePath(self.weights)
+        names = [name for name in NETWORKS if is_file(folder / f"{name}.json")]
+        return {name: read_description(folder, name).get("weights_sha256") for name in names}
 
     def request(self) -> dict[str, Any]:
         """Arguments of its calls: until, clearance, ..."""

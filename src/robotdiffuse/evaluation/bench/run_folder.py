@@ -1,6 +1,5 @@
 """A folder of `bench run`: its sessions, and the records of every planner."""
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,6 +7,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.evaluation.records import RESTARTED, Record, read_records, recorded
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
 
@@ -83,12 +83,8 @@ def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench
 
 
 def _read_sessions(file: FilePath) -> tuple[dict[str, Any], ...]:
-    try:
-        lines = file.read_text().splitlines() if file.is_file() else []
-        runs = tuple(json.loads(line) for line in lines)
-        for name in ("date", "versions", "planners", "problems", "time_limit", "seeds", "count"):
-            if not all(name in run for run in runs):
-                raise ValueError(f"a run without {name}")
-        return runs
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{file} is damaged: {error}; results cannot be read without it") from None
+    runs = JsonLines(file).rows
+    for name in ("date", "versions", "planners", "problems", "time_limit", "seeds", "count"):
+        if not all(name in run for run in runs):
+            raise InputError(f"{file} is damaged: a run has no {name}; results cannot be read without it")
+    return tuple(runs)

@@ -1,16 +1,16 @@
 """The bench: calls planners on problems and keeps a record of each call; kept calls are not repeated."""
 
-import json
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path as FilePath
+from typing import Any
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.output_files import JsonLines, lock_folder
 from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.bench.workers import on_cluster, on_this_machine
@@ -92,8 +92,10 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
         specs = settings.specs
         for spec in specs.values():
             spec.load()
+        sessions = JsonLines(settings.out / "runs.jsonl")
+        _check_weights(settings, sessions.rows)
         cases = gather_cases(list(settings.problems), settings.count, settings.out, report)
-        session = _note_session(settings)
+        session = _note_session(settings, sessions)
         labels = [label + of for label in specs for of in ("", RESTARTED)[: 1 + settings.equal_time]]
         files = {label: RecordFile(record_path(settings.out, label)) for label in labels}
         todo = open_runs({label: file.records for label, file in files.items()}, cases, settings)
@@ -126,7 +128,18 @@ def open_runs(
     return [t for t in runs if (t.method, t.case.problem_set, t.case.name, t.seed) not in answered]
 
 
-def _note_session(settings: BenchSettings) -> str:
+def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]]) -> None:
+    """Raise InputError if a planner of this name was run here with other weights: its records would mix."""
+    for label, spec in settings.specs.items():
+        known = [session["weights"][label] for session in sessions if label in session.get("weights", {})]
+        if any(hashes != spec.weights_hashes for hashes in known):
+            raise InputError(
+                f"{settings.out} has records of {label} with other weights than those in {spec.weights}; "
+                "rename the folder of the weights, or use another folder for the results"
+            )
+
+
+def _note_session(settings: BenchSettings, sessions: JsonLines) -> str:
     """Append machine, versions and settings of this session to runs.jsonl; its name in records."""
     now = datetime.now(UTC)
     session = now.strftime("%Y-%m-%d %H:%M:%S")
@@ -138,6 +151,7 @@ def _note_session(settings: BenchSettings) -> str:
         "python": platform.python_version(),
         "versions": {"robotdiffuse": __version__, **versions(PACKAGES)},
         "planners": list(settings.specs),
+        "weights": {label: spec.weights_hashes for label, spec in settings.specs.items() if spec.weights},
         "problems": [problem_set_name(text) for text in settings.problems],
         "time_limit": settings.time_limit,
         "seeds": settings.seeds,
@@ -146,6 +160,5 @@ def _note_session(settings: BenchSettings) -> str:
         "load": round(os.getloadavg()[0], 2),
         "equal_time": settings.equal_time,
     }
-    with (settings.out / "runs.jsonl").open("a") as stream:
-        stream.write(json.dumps(note) + "\n")
+    sessions.append(note)
     return session

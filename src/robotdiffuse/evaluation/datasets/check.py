@@ -45,9 +45,10 @@ CLEARANCE_TOLERANCE = 1e-4
 """Largest difference of the recorded clearance from the least one of the waypoints by covering spheres
 [m]."""
 COST_TOLERANCE = 0.05
-"""Waypoints, which cut corners, may be shorter than the recorded length by this share, ..."""
+"""Largest share by which waypoints, which cut corners, may be shorter than the recorded length."""
 ROUNDING = 1e-4
-"""... and longer by this one; also the tolerance of the detour."""
+"""Largest share by which waypoints may be longer than the recorded length; also the tolerance of the
+detour."""
 PYBULLET_STEP = 0.01
 """PyBullet checks every waypoint, and configurations between them at most this far apart [rad, joint-space
 L2]."""
@@ -290,6 +291,7 @@ def _ends(shard: Shard, row: int) -> Iterator[tuple[str, str]]:
 
 def _limits(robot: Robot, q: Float[ndarray, "n dof"]) -> Iterator[tuple[str, str]]:
     excess = np.maximum(robot.lower - q, q - robot.upper)
+    excess[:, robot.continuous] = 0.0
     if excess.max() > LIMIT_SLACK:
         i, j = np.unravel_index(excess.argmax(), excess.shape)
         low, high = robot.lower[j], robot.upper[j]

@@ -14,7 +14,7 @@ from robotdiffuse.core.types import Path
 from robotdiffuse.evaluation.bench import plots
 from robotdiffuse.evaluation.bench.figures import sections
 from robotdiffuse.evaluation.bench.run_folder import Bench
-from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled
+from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, sampling_digest
 from robotdiffuse.evaluation.paper.problems import JOINT, POSE
 from robotdiffuse.evaluation.problem_sets import hard_cases, read_cases
 from robotdiffuse.evaluation.records import Record
@@ -23,10 +23,12 @@ from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.style import as_svg, make_figure, percent_axis, style
 from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.learning.weights_registry import weights_for
 from robotdiffuse.planning.diffusion.diffusion import encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.held_out import Case, goal_of
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import load_robot
 
 STEPS = (1, 2, 5, 10, 50, 200)
 """Denoising steps of the plot of success."""
@@ -80,16 +82,17 @@ def _joints(q: Float[ndarray, "n dof"], problem: Problem) -> Float[ndarray, "n d
 def success_by_steps(out: FilePath, count: int) -> dict[str, dict[int, list[Record]]]:
     """Records of 16 samples of the network on `count` problems that the straight line does not solve, by
     guidance and denoising steps; the folder keeps them."""
-    cases = hard_cases("rop", count, out / "problems")
+    cases, weights = hard_cases("rop", count, out / "problems"), weights_for("model", load_robot("panda"))
     found: dict[str, dict[int, list[Record]]] = {}
     for name, guidance in (("no guidance", 0), ("guidance", RobotDiffuseSettings().guidance_steps)):
+        of_steps = {
+            steps: replace(NETWORK_ALONE, guidance_steps=guidance, sampling_steps=steps) for steps in STEPS
+        }
         methods = {
-            f"{name}, {steps} steps": sampled(
-                from_network(
-                    RobotDiffuse(replace(NETWORK_ALONE, guidance_steps=guidance, sampling_steps=steps))
-                )
+            f"{name}, {steps} steps, {sampling_digest(settings, weights)}": sampled(
+                from_network(RobotDiffuse(settings))
             )
-            for steps in STEPS
+            for steps, settings in of_steps.items()
         }
         records = run_all(cases, methods, seeds=(1,), folder=out / "figures", title=f"figure 1, {name}")
         found[name] = dict(zip(STEPS, records.values(), strict=True))

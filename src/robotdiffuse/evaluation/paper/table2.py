@@ -4,7 +4,6 @@ Collision guidance alone, without a network, solves many problems. What a row ow
 without guidance, and by a control: guidance of trajectories that do not come from a network.
 """
 
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
@@ -19,7 +18,13 @@ from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.processes import Workers
 from robotdiffuse.datasets.manifest import read_manifest
-from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, without_network
+from robotdiffuse.evaluation.methods import (
+    NETWORK_ALONE,
+    from_network,
+    sampled,
+    sampling_digest,
+    without_network,
+)
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.paper.problems import straight_line_shares
 from robotdiffuse.evaluation.problem_sets import hard_cases
@@ -246,10 +251,9 @@ def _evaluate(
 ) -> tuple[Training | None, bool, Evaluation]:
     robot = load_robot("panda")
     folder = FilePath(settings.out) / (training.folder if training else CONTROL.replace(" ", "_"))
-    weights = None if training is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
     planner = _planner_settings(settings, training, guided)
-    about = json.dumps(asdict(planner) | {"weights": weights}, sort_keys=True)
-    name = f"{'guided' if guided else 'unguided'} {hashlib.sha256(about.encode()).hexdigest()[:12]}"
+    digest = sampling_digest(planner, None if training is None else folder)
+    name = f"{'guided' if guided else 'unguided'} {digest}"
     alone = training is None
     draw = without_network(planner, CONTROL_WAYPOINTS) if alone else from_network(RobotDiffuse(planner))
     method = sampled(draw, Kinematics(robot).link_length)
