@@ -9,6 +9,7 @@ from robotdiffuse.core.input_files import is_file
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.weight_files import read_description
+from robotdiffuse.learning.weights_registry import folder_of
 from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
@@ -59,10 +60,10 @@ class PlannerSpec:
 
     @property
     def weights_hashes(self) -> dict[str, Any]:
-        """SHA-256 of the weights in its folder, by network; empty for those that come with the package."""
+        """SHA-256 of the weights in its folder, by network; empty without a folder."""
         if self.weights is None:
             return {}
-        folder = FilePath(self.weights)
+        folder = folder_of(self.weights)
         names = [name for name in NETWORKS if is_file(folder / f"{name}.json")]
         return {name: read_description(folder, name).get("weights_sha256") for name in names}
 
