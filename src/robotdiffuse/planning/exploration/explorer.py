@@ -27,10 +27,10 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
-from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in, voxels_of
+from robotdiffuse.perception.assumptions import voxels_in, voxels_of
 from robotdiffuse.perception.confidence import confidence
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap
+from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, Corners, OccupancyMap
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.swept_voxels_kernel import surface
 from robotdiffuse.perception.unknown_space import UnknownSpace
@@ -39,6 +39,7 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
+from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free, reaches_outside
 from robotdiffuse.planning.exploration.steps import (
     CHANCE,
@@ -69,6 +70,9 @@ MAX_LOOKS_FOR = 2
 """Voxels that this many looks did not show are avoided by the motions that looks are made for."""
 WAY_BACK_SHARES = (0.25, 0.5, 1.0)
 """Parts of the way in that the arm may go back."""
+PROBABILITY_BELOW = np.float32(0.1)
+"""That a voxel below the volume that the network predicts is occupied, where the map does not know it: the
+share of unknown voxels within reach that are."""
 AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
 
@@ -101,7 +105,7 @@ class Explorer:
         self._views = ViewMemory(robot, settings.max_views)
         self._goal: Goal | None = None
         self._looks = 0
-        self._looked_for = np.zeros(FINE_SHAPE, np.uint8)
+        self._looked_for = np.zeros(MAP.shape, np.uint8)
         """How many looks were made for each voxel."""
         self._way_in: Float[ndarray, "n dof"] | None = None
         """Waypoints of the latest motion that was returned."""
@@ -159,8 +163,8 @@ class Explorer:
     def _seen_points(self) -> Float[ndarray, "n 3"]:
         """The points that kept views observed, without those where more views see through: stray pixels."""
         points = self._views.points()
-        at = voxels_of(points)
-        inside = ((at >= 0) & (at < FINE_SHAPE)).all(axis=1)
+        at = voxels_of(points, MAP)
+        inside = ((at >= 0) & (at < MAP.shape)).all(axis=1)
         stray = np.zeros(len(points), np.bool_)
         stray[inside] = self.map.free[tuple(at[inside].T)]
         return points[~stray]
@@ -238,15 +242,16 @@ class Explorer:
         if policy == STRICT:
             obstacles = not_seen_free(self.map, self.scene, (problem.start,))
             allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
+        tree = ReachableTree(self.robot, allowed, problem.start)
         for camera in self.cameras:
-            looks = best_looks(self.map, allowed, camera, wanted, predicted, problem.start, self._rng)
-            for there in islice(looks, self.settings.look_attempts):
-                look = replace(problem, goal=JointGoal(there[None]))
+            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng)
+            for waypoints in islice(ways, self.settings.look_attempts):
+                look = replace(problem, goal=JointGoal(waypoints[-1:]))
                 if policy == STRICT:
-                    way = self._planned(replace(look, scene=allowed), self._quick_limit)
+                    way = self._along(replace(look, scene=allowed), waypoints, "look")
                 else:
                     way = self._by_chance(look, predicted, self.settings.time_limit)
-                if self._good(way, policy):
+                if way is not None and self._good(way, policy):
                     stated = way.confidence if policy == CHANCE else None
                     self._looked_for += wanted
                     return Step(LOOK, f"{why}; look at unseen space on the way", policy, way, stated)
@@ -277,10 +282,13 @@ class Explorer:
         """The motion along waypoints, if the validator accepts it within space seen free; else None."""
         obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
         scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-        within = replace(problem, scene=scene, goal=JointGoal(waypoints[-1:]))
-        context = PlanningContext(self._planner.name, within, PlanRequest(self.settings.time_limit))
+        return self._along(replace(problem, scene=scene, goal=JointGoal(waypoints[-1:])), waypoints, name)
+
+    def _along(self, problem: Problem, waypoints: Float[ndarray, "n dof"], name: str) -> PlanResult | None:
+        """The motion along waypoints, if the validator accepts it in the problem's scene; else None."""
+        context = PlanningContext(self._planner.name, problem, PlanRequest(self.settings.time_limit))
         found = context.finish(waypoints, name, name)
-        return None if found is None else replace(found, problem=within)
+        return None if found is None else replace(found, problem=problem)
 
     def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Bool[ndarray, "nx ny nz"]]:
         """A motion among what was seen, and what looks are to show of it: the least of several. Without any,
@@ -338,7 +346,8 @@ class Explorer:
         request = PlanRequest(limit, self._seed, FIRST)
         goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
         unknown = self._unknown(np.stack([problem.start, *goals]), predicted)
-        result = plan_with_unknown_space(self._planner, asked, request, predicted, unknown)
+        above = None if predicted is None else predicted[:, :, LAYERS_BELOW:]
+        result = plan_with_unknown_space(self._planner, asked, request, above, unknown)
         return replace(self._with_confidence(result, predicted), problem=asked)
 
     def _with_confidence(
@@ -355,7 +364,7 @@ class Explorer:
         self, ends: Float[ndarray, "n dof"], predicted: Float32[ndarray, "nx ny nz"] | None
     ) -> UnknownSpace:
         """What the map does not know, without the voxels that the arm fills at these configurations."""
-        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, margin=0.0)
+        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
         """A first motion in the problem's scene as it is, found within a time limit [s]."""
@@ -371,7 +380,7 @@ class Explorer:
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 
     def _occupied_by(self, q: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
-        return voxels_in(placed_spheres(self.robot, q).astype(np.float32))
+        return voxels_in(placed_spheres(self.robot, q).astype(np.float32), grid=MAP)
 
     def predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
         """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
@@ -381,7 +390,9 @@ class Explorer:
 
         if not (len(self._views) and self.settings.predict and covers(self.robot)):
             return None
-        return np.where(self.map.free, np.float32(0), predict(self._views.volume()))
+        below = ((0, 0), (0, 0), (LAYERS_BELOW, 0))
+        probability = np.pad(predict(self._views.volume()), below, constant_values=PROBABILITY_BELOW)
+        return np.where(self.map.free, np.float32(0), probability)
 
 
 def _first_part(waypoints: Float[ndarray, "n dof"], share: float) -> Float[ndarray, "m dof"]:
