@@ -63,7 +63,8 @@ from robotdiffuse.scenes.scene import Scene
 
 NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2
-"""Part of the time limit for a search within space seen free that a look, or another search, may follow."""
+"""Part of the time limit for a search that a look, or another search, may follow. Within space seen free it
+doubles with each look: the more was seen, the less likely a search fails for lack of it."""
 TENTATIVE_MOTIONS = 2
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
 MAX_LOOKS_FOR = 2
@@ -189,12 +190,14 @@ class Explorer:
         predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit
-        quick = may_look and policy == STRICT
-        motion = self._motion(problem, policy, predicted, self._quick_limit if quick else limit)
+        quick = limit
+        if may_look and policy == STRICT:
+            quick = min(self._quick_limit * 2**self._looks, limit)
+        motion = self._motion(problem, policy, predicted, quick)
         if self._good(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
-        if look.kind == STUCK and quick:
+        if look.kind == STUCK and quick < limit:
             motion = self._motion(problem, policy, predicted, limit)
             if motion.solved:
                 return self._go(motion, policy)
