@@ -39,7 +39,7 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
-from robotdiffuse.planning.exploration.reachable import ReachableTree
+from robotdiffuse.planning.exploration.reachable import ReachableTree, first_parts
 from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free, reaches_outside
 from robotdiffuse.planning.exploration.steps import (
     CHANCE,
@@ -67,10 +67,6 @@ QUICK_FRACTION = 0.2
 doubles with each look: the more was seen, the less likely a search fails for lack of it."""
 TENTATIVE_MOTIONS = 2
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
-MAX_LOOKS_FOR = 2
-"""Voxels that this many looks did not show are avoided by the motions that looks are made for."""
-WAY_BACK_SHARES = (0.25, 0.5, 1.0)
-"""Parts of the way in that the arm may go back."""
 PROBABILITY_BELOW = np.float32(0.1)
 """That a voxel below the volume that the network predicts is occupied, where the map does not know it: the
 share of unknown voxels within reach that are."""
@@ -106,8 +102,8 @@ class Explorer:
         self._views = ViewMemory(robot, settings.max_views)
         self._goal: Goal | None = None
         self._looks = 0
-        self._looked_for = np.zeros(MAP.shape, np.uint8)
-        """How many looks were made for each voxel."""
+        self._looked_for = np.zeros(MAP.shape, np.bool_)
+        """The voxels that looks were to show."""
         self._way_in: Float[ndarray, "n dof"] | None = None
         """Waypoints of the latest motion that was returned."""
         self._news: list[DepthView] = []
@@ -120,7 +116,7 @@ class Explorer:
         middle = 0.5 * (self.robot.lower + self.robot.upper)
         self._goal = Problem(self.robot, NOTHING, middle, goal).goal
         self._looks = 0
-        self._looked_for[:] = 0
+        self._looked_for[:] = False
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
@@ -256,7 +252,7 @@ class Explorer:
                     way = self._by_chance(look, predicted, self.settings.time_limit)
                 if way is not None and self._good(way, policy):
                     stated = way.confidence if policy == CHANCE else None
-                    self._looked_for += wanted
+                    self._looked_for |= wanted
                     return Step(LOOK, f"{why}; look at unseen space on the way", policy, way, stated)
         if policy == self.settings.policy == CHANCE:
             strict = self._look(problem, STRICT, predicted, motion)
@@ -272,8 +268,7 @@ class Explorer:
         way = self._way_in
         if way is None or np.abs(way[-1] - problem.start).max() > AT_GOAL:
             return None
-        for share in WAY_BACK_SHARES:
-            waypoints = _first_part(way[::-1], share)
+        for waypoints in first_parts(way[::-1]):
             found = self._within_seen_free(problem, waypoints, "back on the way in")
             if found is not None:
                 return found
@@ -300,7 +295,7 @@ class Explorer:
         They avoid occupied voxels, and those that looks were made for in vain, if they can."""
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
         ends = near_ends(self.map, (as_seen.start, *goals))
-        in_vain = (self._looked_for >= MAX_LOOKS_FOR) & self.map.unknown
+        in_vain = self._looked_for & self.map.unknown
         blocked = surface((self.map.occupied | in_vain) & ~ends)
         avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
@@ -396,14 +391,6 @@ class Explorer:
         below = ((0, 0), (0, 0), (LAYERS_BELOW, 0))
         probability = np.pad(predict(self._views.volume()), below, constant_values=PROBABILITY_BELOW)
         return np.where(self.map.free, np.float32(0), probability)
-
-
-def _first_part(waypoints: Float[ndarray, "n dof"], share: float) -> Float[ndarray, "m dof"]:
-    """The part of a path before a share of its length."""
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
-    end = share * at[-1]
-    last = np.array([np.interp(end, at, joint) for joint in waypoints.T])
-    return np.concatenate([waypoints[at < end], last[None]])
 
 
 def _said(stated: float | None) -> str:

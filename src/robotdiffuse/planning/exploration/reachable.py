@@ -1,5 +1,7 @@
 """Configurations that an arm can reach from where it is, and the ways there."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -15,6 +17,8 @@ RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of a motion [m]."""
 CAPACITY = 2000
 """Most configurations of a tree."""
+PARTS = (0.25, 0.5, 1.0)
+"""Parts of a way that may be gone."""
 
 
 class ReachableTree:
@@ -52,3 +56,12 @@ class ReachableTree:
         way = simplify(self._space, nodes[path[::-1]], 1).astype(np.float64)
         way[0] = self._start
         return way
+
+
+def first_parts(waypoints: Float[ndarray, "n dof"]) -> Iterator[Float[ndarray, "m dof"]]:
+    """The first parts of a way, the shortest first, and all of it."""
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
+    for part in PARTS:
+        end = part * at[-1]
+        last = np.array([np.interp(end, at, joint) for joint in waypoints.T])
+        yield np.concatenate([waypoints[at < end], last[None]])
