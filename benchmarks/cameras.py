@@ -18,7 +18,7 @@ made again; --report prints their tables.
 
 --weights adds the method 'predicted' with other weights of the occupancy completion network, folders of
 `train completion`; methods are named by the folder. Those of a training that left families out are tried on
-these families. --fit prints the constants of perception/confidence.py, from problems with even numbers;
+these families. --fit prints the rates of perception/confidence.py, from problems with even numbers;
 settings were chosen on these too, and --odd leaves them out of the report. --times prints the CPU time of the
 network.
 
@@ -38,8 +38,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_processor_time
 from robotdiffuse.core.output_files import JsonLines
@@ -47,7 +45,6 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.evaluation.statistics import compare, wilson_interval
 from robotdiffuse.learning.completion import Completion, exported_completion, predict
 from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
-from robotdiffuse.perception.confidence import MIN_RISK, confidence
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
@@ -228,7 +225,7 @@ def table(rows: list[Row], title: str) -> None:
             )
         )
     columns = ["%", "problems", "free in truth", "plans", "of them free"]
-    columns += ["first assumption", "of it free", "ms", *families]
+    columns += ["first assumption", "of it free", "ms", *(Path(family).name for family in families)]
     print_table(title, columns, lines)
     base = {name: _free(rows, name) for name in [*METHODS, *others, TRUE]}
     pairs = [("padded", "as seen"), ("predicted", "as seen"), ("predicted", "padded"), (TRUE, "predicted")]
@@ -252,13 +249,13 @@ def _free(rows: list[Row], method: str) -> dict[tuple[str, int], bool]:
     return {(row["family"], row["number"]): row["free"] for row in rows if row["method"] == method}
 
 
-def calibration(rows: list[Row]) -> None:
-    """Print the stated confidence against the share that is free, on problems that it was not fitted on."""
+def calibration(rows: list[Row], of: str) -> None:
+    """Print the stated confidence against the share that is free; `of`: where the problems come from."""
     for method in METHODS:
-        mine = [r for r in rows if r["method"] == method and r["solved"] and r["number"] % 2]
+        mine = [row for row in rows if row["method"] == method and row["solved"]]
         if not mine:
             continue
-        stated = np.array([confidence(row["assumption"], row["risk"]) for row in mine])
+        stated = np.array([row["confidence"] for row in mine])
         free = np.array([row["free"] for row in mine], float)
         lines, error = [], 0.0
         for low in np.arange(0, 1, 0.2):
@@ -273,12 +270,9 @@ def calibration(rows: list[Row]) -> None:
                     )
                 )
                 error += part.mean() * abs(stated[part].mean() - free[part].mean())
-        print_table(
-            f"Confidence of {method}, on problems with odd numbers",
-            ["stated", "motions", "mean", "free"],
-            lines,
-        )
-        print(f"expected error {error:.3f}\n")
+        print_table(f"Confidence of {method}, {of}", ["stated", "motions", "mean", "free"], lines)
+        whole = f"{len(mine)} motions, {stated.mean():.2f} stated, {free.mean():.2f} free"
+        print(f"{whole}, expected error {error:.3f}\n")
 
 
 def report(rows: list[Row]) -> None:
@@ -290,8 +284,8 @@ def report(rows: list[Row]) -> None:
             row for row in rows if (row["views"], row["noise"], row["cameras"]) == (count, noisy, cameras)
         ]
         table(some, f"{count} {'noisy ' if noisy else ''}view{'s' if count > 1 else ''}, cameras: {cameras}")
-        if (count, noisy, cameras) == (1, False, RING):
-            calibration(some)
+        calibration([row for row in some if row["family"] in FAMILIES], "families")
+        calibration([row for row in some if row["family"] not in FAMILIES], "other problems")
     spent = [row["view_time"] for row in rows]
     print(f"From views to the problem's scene: {1e3 * np.median(spent):.0f} ms of CPU time (median)")
 
@@ -313,34 +307,12 @@ def times(families: list[str]) -> None:
 
 
 def fit(rows: list[Row]) -> None:
-    """Print the constants RATES and BY_RISK of perception/confidence.py."""
+    """Print the constants RATES of perception/confidence.py."""
     rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1 and not r["noise"]]
     plain = [row for row in rows if row["risk"] is None]
     for assumption in dict.fromkeys(row["assumption"] for row in plain):
         free = [row["free"] for row in plain if row["assumption"] == assumption]
         print(f'RATES "{assumption}": {(sum(free) + 1) / (len(free) + 2):.2f} of {len(free)}')
-    for seen in (False, True):
-        some = [r for r in rows if r["method"] == "predicted" and (r["assumption"] == "as seen") == seen]
-        if some:
-            free, risk = (np.array([row[name] for row in some], float) for name in ("free", "risk"))
-            print(
-                "BY_RISK",
-                "as seen" if seen else "predicted",
-                _logistic(np.log(np.maximum(risk, MIN_RISK)), free),
-            )
-
-
-def _logistic(x: Float[ndarray, "n"], y: Float[ndarray, "n"]) -> tuple[float, float]:
-    """Log odds at 0 and their slope, at most 0, fitted with a prior of one motion of either kind."""
-    from scipy.optimize import minimize
-
-    def loss(w: ndarray) -> float:
-        odds = w[0] + w[1] * x
-        prior = np.logaddexp(0, -w[0]) + np.logaddexp(0, w[0])
-        return float(np.logaddexp(0, np.where(y > 0, -odds, odds)).sum() + prior)
-
-    found = minimize(loss, np.zeros(2), bounds=[(None, None), (None, 0.0)]).x
-    return round(float(found[0]), 2), round(float(found[1]), 2)
 
 
 def run_next_view(records: str, families: list[str], count: int) -> None:

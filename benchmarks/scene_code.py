@@ -9,7 +9,7 @@ have no clearances as inputs and are sampled without guidance, so all they know 
 
 - oracle: kind, centre, size and turn of each true obstacle, through a perceptron that sums over obstacles and
   is trained along;
-- tokens: points of the cloud, which the waypoints attend to, in place of one vector;
+- tokens: points of the cloud, which the waypoints attend to, in place of one vector (config `points`);
 - pointnet: PointNet, trained along;
 - cae: the paper's auto-encoder, trained alone first, then frozen.
 
@@ -43,18 +43,15 @@ from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.factory import generate
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.learning.checkpoint import load_encoder, read_tensors, write_tensors
-from robotdiffuse.learning.denoisers.base import Denoiser
-from robotdiffuse.learning.denoisers.layers import (
-    CrossBlock,
-    LevelEmbedding,
-    positions,
-    start_at_zero,
-    two_layers,
+from robotdiffuse.learning.denoisers.layers import two_layers
+from robotdiffuse.learning.denoisers.settings import (
+    CrossAttentionSettings,
+    DenoiserSettings,
+    TransformerSettings,
 )
-from robotdiffuse.learning.denoisers.settings import TransformerSettings
 from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.encoders.base import Encoder, fp32
-from robotdiffuse.learning.encoders.settings import EncoderSettings, PointNetSettings
+from robotdiffuse.learning.encoders.settings import EncoderSettings, PointNetSettings, PointsSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.samplers.ddim import ddim
@@ -87,8 +84,6 @@ WAYPOINTS = 48
 ERROR_LEVELS = (200, 150, 100, 50)
 """Noise levels at which predictions are compared; 200 is noise alone."""
 CODES = ("own", "another scene's", "mean", "hidden")
-TOKENS = 32
-"""Points that the waypoints attend to."""
 CHUNK = 256
 """Samples that go through a network together."""
 DECISIVE = 10.0
@@ -135,71 +130,20 @@ class ObstacleCode(Encoder):
             return self.all((self.each(known) * cloud[..., -1:]).sum(1))
 
 
-class PointTokens(Encoder):
-    """z is the cloud itself: the coordinates of its points."""
-
-    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
-        return cloud.flatten(1)
-
-
-class AttendingTransformer(Denoiser):
-    """The transformer, with attention of the waypoints to the points of the cloud after each self attention.
-    The condition is the points, start and goal."""
-
-    OCTAVES = 4
-    """Wavelengths (4 m, 2 m, ...) of the sines and cosines of coordinates that are further inputs."""
-    positions: Tensor
-
-    def __init__(
-        self, settings: TransformerSettings, waypoints: int, dof: int, features: int, condition: int
-    ) -> None:
-        super().__init__(settings, waypoints, dof, features, condition)
-        tokens, width = settings.tokens(waypoints), settings.width
-        self.embed = nn.Linear(settings.patch * features, width)
-        self.condition = two_layers(2 * dof, 2 * width, width)
-        self.points = two_layers(3 + 6 * self.OCTAVES, width, width)
-        self.level = LevelEmbedding(width)
-        self.blocks = nn.ModuleList(
-            CrossBlock(width, settings.heads, settings.hidden, settings.layers)
-            for _ in range(settings.layers)
-        )
-        self.norm_points, self.norm = nn.LayerNorm(width), nn.LayerNorm(width)
-        self.out = nn.Linear(width, settings.patch * dof)
-        start_at_zero(self.out)
-        self.register_buffer("positions", positions(tokens, width), persistent=False)
-
-    def forward(
-        self,
-        features: Float[Tensor, "batch waypoints features"],
-        level: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-    ) -> Float[Tensor, "batch waypoints dof"]:
-        batch = features.shape[0]
-        points = condition[:, : -2 * self.dof].reshape(batch, -1, 3)
-        with fp32(points):
-            angles = torch.cat([points * (np.pi / 2 * 2**k) for k in range(self.OCTAVES)], -1)
-            known = torch.cat([points, angles.sin(), angles.cos()], -1)
-        memory = self.norm_points(self.points(known))
-        z_tk = self.condition(condition[:, -2 * self.dof :]) + self.level(level)
-        tokens = self.embed(features.reshape(batch, len(self.positions), -1)) + self.positions
-        x = torch.cat([z_tk[:, None].to(tokens.dtype), tokens + z_tk[:, None]], 1)
-        for block in self.blocks:
-            x = block(x, memory)
-        return self.out(self.norm(x[:, 1:])).float().reshape(batch, self.waypoints, self.dof)
-
-
 class Row(NamedTuple):
     title: str
     encoder: str | None
     """Encoder of the package that stands in this place in settings; None: the frozen one of this study."""
     settings: EncoderSettings | None = None
     """Its settings."""
+    denoiser: str = "transformer"
+    denoiser_settings: DenoiserSettings = TransformerSettings(patch=8)
 
 
 ROWS = {
     "oracle": Row("true obstacles, one code", "pointnet", PointNetSettings()),
     "tokens": Row(
-        f"{TOKENS} points, attended to", "pointnet", PointNetSettings(code=3 * TOKENS, cloud=TOKENS)
+        "32 points, attended to", "points", PointsSettings(), "cross_attention", CrossAttentionSettings()
     ),
     "pointnet": Row("PointNet, trained along", "pointnet", PointNetSettings()),
     "cae": Row("the paper's auto-encoder, frozen", None),
@@ -207,15 +151,11 @@ ROWS = {
 
 
 def with_parts_of(row: str, model: MotionNetwork) -> MotionNetwork:
-    """The model with the parts of a row that the package does not have."""
-    settings, denoiser = model.settings.encoder_settings, model.settings.denoiser_settings
-    assert settings is not None and isinstance(denoiser, TransformerSettings)
+    """The model with the encoder of a row that the package does not have."""
+    settings = model.settings.encoder_settings
+    assert settings is not None
     if row == "oracle":
         model.encoder = ObstacleCode(settings)
-    if row == "tokens":
-        model.encoder = PointTokens(settings)
-        sizes = model.waypoints, model.dof, model.feature_count, model.condition_count
-        model.denoiser = AttendingTransformer(denoiser, *sizes)
     return model
 
 
@@ -281,7 +221,8 @@ class Study:
             condition_drop=0.1,
             losses=JOINT_POINT_COLLISION,
             turned_copies=15,
-            denoiser_settings=TransformerSettings(patch=8),
+            denoiser=of.denoiser,
+            denoiser_settings=of.denoiser_settings,
             checkpoint_seconds=300.0,
             device="cpu",
         )

@@ -2,14 +2,16 @@
 
 import os
 import re
+import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 from hypothesis import settings
-from jaxtyping import install_import_hook
+from jaxtyping import _import_hook, install_import_hook
 
 APART = ("learning", "robots", "scenes")
 """Packages whose tests need little of the compiled code of searches."""
@@ -28,7 +30,21 @@ def checked_modules() -> list[str]:
     ]
 
 
+def one_import_at_a_time() -> None:
+    """Lets the hook parse one module at a time. CPython 3.11 counts the depth of the syntax trees of all
+    threads together (gh-106905): parsing in two ended in "SystemError: AST constructor recursion depth
+    mismatch", and the live page's first plan failed."""
+    parse, parsing = _import_hook._JaxtypingLoader.source_to_code, threading.Lock()
+
+    def alone(*args: Any, **kwargs: Any) -> Any:
+        with parsing:
+            return parse(*args, **kwargs)
+
+    _import_hook._JaxtypingLoader.source_to_code = alone
+
+
 install_import_hook(checked_modules(), "beartype.beartype")
+one_import_at_a_time()
 
 # the same examples at every run: a suite that fails by chance guards nothing
 settings.register_profile("suite", deadline=None, max_examples=40, derandomize=True)

@@ -53,7 +53,7 @@ BAD_CALL = {
     ),
     "unknown sampler": ([*TRAIN, "--sampler", "heun"], "known: ddim, ddpm"),
     "unknown objective": ([*TRAIN, "--objective", "score"], "known: clean, noise"),
-    "unknown denoiser": ([*TRAIN, "--denoiser", "net"], "known: decoder_only, encoder_decoder, transformer"),
+    "unknown denoiser": ([*TRAIN, "--denoiser", "net"], "known: cross_attention, decoder_only"),
     "unknown target": ([*TRAIN, "--target", "line"], "known: absolute, limits, residual"),
     "too few waypoints": ([*TRAIN, "--waypoints", "2"], "waypoints is 2"),
     "no condition at all": ([*TRAIN, "--condition-drop", "1"], "condition_drop is 1.0"),

@@ -66,3 +66,31 @@ def test_the_bundled_encoder_is_taken_where_none_is_named(monkeypatch: pytest.Mo
     assert trained[0].encoder == str(Path("o", "encoder")) and Path("o", "encoder", "encoder.json").is_file()
     assert run("train", "planner", "--data", "d", "--out", "o", "--config", "table2_pointnet") == 0
     assert trained[1].encoder == "pointnet"
+
+
+@pytest.mark.parametrize("data", [("--data", "d"), ("--robot", "ur5e")])
+def test_cross_attention_without_points_is_refused_before_anything_is_made(
+    data: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("train", "planner", *data, "--out", "o", "--denoiser", "cross_attention") == 2
+    assert "denoiser cross_attention need each other" in capsys.readouterr().err
+    assert not Path("o").exists()
+
+
+@pytest.mark.parametrize(("config", "encoder"), [("points", "points"), ("trajectory_prior", None)])
+def test_the_encoder_of_the_config_is_that_of_an_arm_too(
+    config: str, encoder: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained: list[PlannerTraining] = []
+
+    def generate(*_: object) -> None:
+        pass
+
+    def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
+        trained.append(settings)
+        return {}
+
+    monkeypatch.setattr("robotdiffuse.cli.data.generate_with_progress", generate)
+    monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
+    assert run("train", "planner", "--robot", "panda", "--out", "o", "--config", config) == 0
+    assert trained[0].encoder == encoder and not Path("o", "encoder").exists()

@@ -9,18 +9,20 @@ import pytest
 import torch
 
 from helpers.box_arm import box_arm
-from helpers.small_model import small_model
+from helpers.small_model import SMALL_ENCODER, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model, save_network
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import Denoiser
 from robotdiffuse.learning.denoisers.layers import MAX_UNFUSED_TOKENS, attend
 from robotdiffuse.learning.denoisers.settings import (
+    CrossAttentionSettings,
     DecoderOnlySettings,
     EncoderDecoderSettings,
     TransformerSettings,
     UNetSettings,
 )
+from robotdiffuse.learning.encoders.settings import PointsSettings
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.motion_network import MotionNetwork
@@ -28,13 +30,18 @@ from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 
-DOF, FEATURES, CODE = 3, 9, 8
+DOF, FEATURES, CODE = 3, 9, 9
 CONDITION = CODE + 2 * DOF
 SMALL = {
     "transformer": TransformerSettings(32, 2, 2, 48, 1),
     "encoder_decoder": EncoderDecoderSettings(32, 2, 2, 48, 1, encoder_layers=1),
     "decoder_only": DecoderOnlySettings(32, 2, 2, 48, 1),
+    "cross_attention": CrossAttentionSettings(32, 2, 2, 48, 1),
     "unet": UNetSettings(16, (1, 2, 2), 3, 32),
+}
+SMALL_ENCODERS = {
+    "points": PointsSettings(CODE, CODE // 3),
+    "point_autoencoder": replace(SMALL_ENCODER, code=CODE),
 }
 LENGTHS = (12, 48, 254)
 
@@ -73,8 +80,8 @@ def test_shapes(name, waypoints):
 
 @pytest.mark.parametrize("name", DENOISERS)
 def test_untrained_network_predicts_the_mean_trajectory(name):
-    network = DENOISERS.load(name)(DENOISERS.defaults(name), 12, DOF, FEATURES, CONDITION)
-    assert not network(*inputs()).any()
+    network = DENOISERS.load(name)(DENOISERS.defaults(name), 48, DOF, FEATURES, CONDITION)
+    assert not network(*inputs(48)).any()
 
 
 @pytest.mark.parametrize("name", DENOISERS)
@@ -151,9 +158,11 @@ def test_learns_a_small_batch_by_heart(name):
 
 @pytest.mark.parametrize("name", DENOISERS)
 def test_sizes(name):
-    """The defaults are comparable; so are the networks of the paper's size, 8 layers of width 512."""
+    """The defaults are comparable, though cross_attention has a second attention in each of as many layers;
+    so are the networks of the paper's size, 8 layers of width 512."""
+    most = 2.4e6 if name == "cross_attention" else 1.8e6
     for settings, waypoints, low, high in (
-        (DENOISERS.defaults(name), 48, 1.6e6, 1.8e6),
+        (DENOISERS.defaults(name), 48, 1.6e6, most),
         (DENOISERS.defaults(name).paper_size(), 254, 16e6, 19e6),
     ):
         with torch.device("meta"):
@@ -215,16 +224,23 @@ def test_bad_settings(kind, values, message):
         kind(**values)
 
 
-@pytest.mark.parametrize("name", ["transformer", "encoder_decoder", "decoder_only"])
+@pytest.mark.parametrize("name", ["transformer", "encoder_decoder", "decoder_only", "cross_attention"])
 def test_waypoints_must_fill_the_patches(name):
     with pytest.raises(InputError, match=f"{name}.patch is 5; it must divide the 12 waypoints"):
         denoiser(name, 12, replace(SMALL[name], patch=5))
 
 
+def encoder_for(name: str) -> str:
+    return "points" if name == "cross_attention" else "point_autoencoder"
+
+
 def model_with(name: str, null_condition: bool = False) -> MotionNetwork:
     torch.manual_seed(0)
+    encoder = encoder_for(name)
     settings = replace(
         small_model().settings,
+        encoder=encoder,
+        encoder_settings=SMALL_ENCODERS[encoder],
         denoiser=name,
         denoiser_settings=SMALL[name],
         waypoints=12,
@@ -269,7 +285,9 @@ def test_files(tmp_path, name, null_condition):
 
 @pytest.mark.parametrize("name", DENOISERS)
 def test_settings_of_a_run_as_json(name):
-    settings = PlannerTraining(data="data", encoder="encoder", denoiser=name, denoiser_settings=SMALL[name])
+    settings = PlannerTraining(
+        data="data", encoder=encoder_for(name), denoiser=name, denoiser_settings=SMALL[name]
+    )
     text = json.dumps(settings.to_json())
     assert PlannerTraining.from_json(json.loads(text), "x") == settings
     kind = type(DENOISERS.defaults(name))
@@ -280,7 +298,7 @@ def test_settings_of_a_run_as_json(name):
 
 def test_unknown_names_list_the_known():
     values = PlannerTraining(data="data", encoder="encoder", denoiser_settings=SMALL["transformer"]).to_json()
-    known = "'gpt'; known: decoder_only, encoder_decoder, transformer, unet"
+    known = "'gpt'; known: cross_attention, decoder_only, encoder_decoder, transformer, unet"
     for settings in (None, values["denoiser_settings"]):
         with pytest.raises(InputError, match=known):
             given = {"denoiser": "gpt", "denoiser_settings": settings}

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from robotdiffuse.datasets.manifest import write_manifest
 from robotdiffuse.datasets.shards import write_shard
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
-from robotdiffuse.learning.denoisers.settings import TransformerSettings
+from robotdiffuse.learning.denoisers.settings import CrossAttentionSettings, TransformerSettings
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Autoencoder
 from robotdiffuse.learning.encoders.compression_autoencoder import CompressionAutoencoder
@@ -27,6 +28,7 @@ from robotdiffuse.learning.encoders.settings import (
     DGCNNSettings,
     PointAutoencoderSettings,
     PointNetSettings,
+    PointsSettings,
 )
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModelSettings
@@ -49,10 +51,12 @@ SMALL = {
         code=8, cloud=32, first=(8, 12), second=(12, 24), transform=(8, 8), transform_head=(8,), head=(16,)
     ),
     "dgcnn": DGCNNSettings(code=8, cloud=32, neighbours=4, edges=(8, 12), embedding=16, head=(16,)),
+    "points": PointsSettings(code=24, cloud=8),
 }
 ALONE = [name for name, entry in ENCODERS.items() if entry.kind == "alone"]
 JOINTLY = [name for name, entry in ENCODERS.items() if entry.kind == "jointly"]
 every_encoder = pytest.mark.parametrize("name", ENCODERS)
+with_weights = pytest.mark.parametrize("name", [name for name in ENCODERS if name != "points"])
 
 
 def small(name, seed=0):
@@ -77,7 +81,7 @@ def test_every_encoder_is_tested():
 def test_any_number_of_points(name, n):
     encoder = small(name)
     z = encoder(cloud(n, 3))
-    assert z.shape == (3, 8)
+    assert z.shape == (3, SMALL[name].code)
     assert z.dtype == torch.float32
     assert z.isfinite().all()
     assert torch.equal(encoder(cloud(n, 3)), z), "the same cloud has the same code"
@@ -125,7 +129,7 @@ def test_points_out_of_the_region_do_not_count(name):
     assert not torch.allclose(encoder(points), encoder(out))
 
 
-@every_encoder
+@with_weights
 def test_gradients_reach_every_parameter(name):
     """Some clouds are empty, and one has fewer points than neighbours: no gradient may be NaN there."""
     encoder = small(name)
@@ -159,10 +163,10 @@ def test_files(name, tmp_path):
 
 @every_encoder
 def test_settings_are_read_by_name(name):
-    settings = MotionModelSettings(encoder=name, encoder_settings=SMALL[name])
+    settings = MotionModelSettings(encoder=name, encoder_settings=SMALL[name], **denoiser_for(name))
     assert MotionModelSettings.from_json(settings.to_json(), "x") == settings
     z = MotionNetwork(RobotIdentity.of(box_arm()), settings).encode(cloud(3000)[0].numpy().astype(np.float64))
-    assert z.shape == (8,)
+    assert z.shape == (SMALL[name].code,)
     other = next(other for other in SMALL.values() if other is not SMALL[name])
     with pytest.raises(InputError, match=f"encoder is {name}, but its settings are {type(other).__name__}"):
         replace(settings, encoder_settings=other)
@@ -185,6 +189,7 @@ def test_sizes_of_the_papers(name):
         (PointNetSettings, {"second": (8, 0)}, "encoder.second is"),
         (DGCNNSettings, {"neighbours": 0}, "encoder.neighbours is 0"),
         (CompressionAutoencoderSettings, {"code": 0}, "encoder.code is 0"),
+        (PointsSettings, {"cloud": 20}, "points.code is 96; it must be three times cloud, 60"),
     ],
 )
 def test_bad_settings(kind, changes, message):
@@ -330,11 +335,16 @@ def data(tmp_path, monkeypatch):
     return folder
 
 
+def denoiser_for(encoder: str) -> dict[str, Any]:
+    if encoder == "points":
+        return {"denoiser": "cross_attention", "denoiser_settings": CrossAttentionSettings(32, 2, 2, 48, 8)}
+    return {"denoiser_settings": TransformerSettings(32, 2, 2, 48, 8)}
+
+
 def planner(data, encoder, **changes) -> PlannerTraining:
     planned = PlannerTraining(
         data=str(data), encoder=encoder, minutes=None, samples=96, batch=16, warmup_steps=1,
-        denoiser_settings=TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8),
-        validation_problems=1,
+        validation_problems=1, **denoiser_for(encoder),
     )  # fmt: skip
     return replace(planned, **changes)
 
@@ -379,7 +389,7 @@ def test_joint_training_resumes(data, tmp_path, monkeypatch):
     assert train_planner(planned, str(tmp_path / "parts")) == whole
 
 
-@every_encoder
+@with_weights
 @pytest.mark.usefixtures("no_export")
 def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
     save_encoder(small(name), tmp_path / "encoder", {})
@@ -408,3 +418,30 @@ def test_batches_with_clouds_instead_of_codes(data):
 def test_a_frozen_encoder_takes_no_settings(data):
     with pytest.raises(InputError, match="unknown encoder 'runs/encoder'"):
         planner(data, "runs/encoder", encoder_settings=SMALL["pointnet"])
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"encoder": "points"},
+        {"encoder": "runs/encoder", "denoiser": "cross_attention"},
+        {"encoder": None, "denoiser": "cross_attention"},
+    ],
+)
+def test_points_and_cross_attention_need_each_other(parts):
+    wanted = f"encoder is {parts['encoder']} and denoiser is .* need each other"
+    with pytest.raises(InputError, match=wanted):
+        PlannerTraining(data="data", **parts)
+
+
+def test_a_model_of_points_needs_both_parts():
+    settings = MotionModelSettings(
+        encoder="points",
+        encoder_settings=PointsSettings(),
+        denoiser="cross_attention",
+        denoiser_settings=CrossAttentionSettings(),
+    )
+    for name in ("encoder", "denoiser"):
+        parts = {key: getattr(MotionModelSettings(), key) for key in (name, f"{name}_settings")}
+        with pytest.raises(InputError, match=r"model\.encoder is point.* need each other"):
+            replace(settings, **parts)

@@ -36,7 +36,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--planners",
         metavar="NAME,...",
         help="names from `robotdiffuse planners`, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
-        "or until=first|converged|time_limit and clearance=M of the calls; NAME@FOLDER uses other weights",
+        "or until=first|converged|time_limit, objective=length|time and clearance=M of the calls; "
+        "NAME@FOLDER uses other weights",
     )
     run.add_argument(
         "--problems",
@@ -47,8 +48,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     run.add_argument(
         "--preset",
         metavar="NAME",
-        help="a comparison of docs/results.md with its planners, limits and seeds: equal_time, learning, "
-        "durations, anytime or restarts",
+        help="a stored comparison with its planners, limits and seeds (benchmarks/README.md): equal_time, "
+        "learning, durations, anytime or restarts",
     )
     run.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems and results")
     run.add_argument("--time-limit", type=positive, metavar="S", help="time limit of a call [s] (default: 1)")

@@ -58,7 +58,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--weights",
         metavar="FOLDER",
-        help="weights of `robotdiffuse train`, for a learned planner (default: the bundled ones)",
+        help="weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
+        "without clearances as inputs (default: the bundled ones)",
     )
     parser.add_argument(
         "--set",
@@ -75,7 +76,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--until",
         choices=UNTIL,
         default=CONVERGED,
-        help="stop at the first motion, when paths stop getting shorter (default), or at the time limit",
+        help="stop at the first motion, when more time hardly improves it (default), or at the time limit",
     )
     parser.add_argument(
         "--clearance",

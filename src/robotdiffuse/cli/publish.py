@@ -20,7 +20,10 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--to", required=True, type=address, metavar="HOST[:PORT]", help=f"rosbridge server (port: {PORT})"
     )
     parser.add_argument(
-        "--topic", default="/joint_trajectory", metavar="NAME", help="(default: /joint_trajectory)"
+        "--topic",
+        default="/joint_trajectory",
+        metavar="NAME",
+        help="topic to publish on (default: /joint_trajectory)",
     )
     parser.add_argument(
         "--timeout", type=positive, default=5.0, metavar="S", help="timeout of the connection (default: 5 s)"

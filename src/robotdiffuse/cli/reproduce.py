@@ -77,7 +77,11 @@ def add(commands: argparse._SubParsersAction) -> None:
 def _add_planning(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems, results, page")
     parser.add_argument(
-        "--problems", type=count, default=300, metavar="N", help="of each kind of goal (default: 300)"
+        "--problems",
+        type=count,
+        default=300,
+        metavar="N",
+        help="problems of each kind of goal (default: 300)",
     )
     parser.add_argument(
         "--time-limit", type=positive, default=10.0, metavar="S", help="of a call [s] (default: 10)"
@@ -85,8 +89,8 @@ def _add_planning(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--paper-weights",
         metavar="FOLDER",
-        help="weights of `train planner --config paper`, for the row of the paper's method as it says "
-        "(default: the row says how to train them)",
+        help="weights of `train planner --config paper`, or points, for a row of the diffusion model without "
+        "clearances, guidance and further samples (default: a note says how to train them)",
     )
     parser.add_argument(
         "--workers", type=count, metavar="N", help="planners that run at once (default: half of the cores)"

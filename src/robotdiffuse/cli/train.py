@@ -82,14 +82,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--config",
         default="compact",
         metavar="NAME",
-        help="compact (default), paper, trajectory_prior (for MPD and EDMP), or a row of the paper's Table "
-        "2: table2_jpc, table2_unet, ...",
+        help="compact (default), paper, points (no clearances as inputs), trajectory_prior (for MPD and "
+        "EDMP), or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
     )
     planner.add_argument(
         "--encoder",
         metavar="FOLDER",
-        help="folder of a trained encoder; or pointnet or dgcnn, which are trained with the planner "
-        "(default: that of the config, or the bundled one)",
+        help="folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
+        "for the denoiser cross_attention (default: that of the config, or the bundled one)",
     )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (default: panda)")
     planner.add_argument(
@@ -105,7 +105,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     _add_device(planner)
     parts = planner.add_argument_group("parts of the model that replace those of the config")
     parts.add_argument(
-        "--denoiser", metavar="NAME", help="transformer, encoder_decoder, decoder_only or unet"
+        "--denoiser",
+        metavar="NAME",
+        help="transformer, encoder_decoder, decoder_only, unet, or cross_attention for the encoder points",
     )
     parts.add_argument("--sampler", metavar="NAME", help="sampler for planning: ddim or ddpm")
     parts.add_argument("--objective", metavar="NAME", help="what the denoiser predicts: clean or noise")
@@ -211,9 +213,12 @@ def run_planner(arguments: argparse.Namespace) -> int:
         known = [f"{name}: {config.description}" for name, config in CONFIGS.items()]
         raise InputError(f"unknown config {shown(arguments.config)}; known:", known)
     given = _given(arguments, ("data", "encoder", "robot", "device", *TRAINING_OPTIONS, *MODEL_OPTIONS))
-    if "denoiser" in given and CONFIGS[arguments.config].changes.get("denoiser_settings") is not None:
+    config = CONFIGS[arguments.config].changes
+    if "denoiser" in given and config.get("denoiser_settings") is not None:
         # the config's settings are for its own denoiser; another one gets settings of the same size
         given["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
+    if "encoder" in config:
+        given.setdefault("encoder", config["encoder"])
     if arguments.data is None:
         return _run_for_robot(arguments, given)
     if arguments.out is None:
@@ -221,14 +226,16 @@ def run_planner(arguments: argparse.Namespace) -> int:
     for option in ("trajectories", "workers"):
         if getattr(arguments, option) is not None:
             raise InputError(f"--{option} is for data to be generated; --data names existing data")
-    named = {**CONFIGS[arguments.config].changes, **given}
-    if (
-        "encoder" not in named and int(os.environ.get("WORLD_SIZE", "1")) == 1
-    ):  # several would write it at once
+    # several processes would write it at once
+    bundled = "encoder" not in given and int(os.environ.get("WORLD_SIZE", "1")) == 1
+    if bundled:
+        given["encoder"] = str(Path(arguments.out) / "encoder")
+    settings = planner_training(arguments.config, given)
+    if bundled:
         from robotdiffuse.cli.train_robot import copy_bundled_encoder
 
-        given["encoder"] = str(copy_bundled_encoder(Path(arguments.out) / "encoder"))
-    _print_report(train_planner(planner_training(arguments.config, given), arguments.out), arguments.out)
+        copy_bundled_encoder(Path(arguments.out) / "encoder")
+    _print_report(train_planner(settings, arguments.out), arguments.out)
     return 0
 
 

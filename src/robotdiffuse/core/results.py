@@ -56,8 +56,8 @@ class PlanResult:
     """Problems with views: probability that the motion is free of obstacles in unknown space. `verified`
     covers observed obstacles only."""
     swept_probability: float | None = None
-    """Sum of the predicted occupancy probabilities of all voxels that the motion sweeps, from which
-    `confidence` follows; None without the predicted policy for unknown space."""
+    """Sum of the predicted occupancy probabilities of all unknown voxels that the motion sweeps; None without
+    the predicted policy for unknown space."""
     unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner, in the base frame [m], of a box around the crossed unknown space that is most
     likely occupied; None if the motion crosses none."""

@@ -46,7 +46,7 @@ class Status(Enum):
 
 
 FIRST, CONVERGED, TIME_LIMIT = UNTIL = ("first", "converged", "time_limit")
-"""When planning ends: at the first verified motion, when paths stop getting shorter, or at the time limit."""
+"""When planning ends: at the first verified motion, when more time hardly helps, or at the time limit."""
 
 LENGTH, TIME = OBJECTIVES = ("length", "time")
 """What anytime planners minimize: the length of the path in joint space, or the duration of the motion."""

@@ -35,7 +35,7 @@ from robotdiffuse.learning.network import Network
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.weight_files import FORMAT, checked_bytes, read_description
-from robotdiffuse.learning.weights_registry import BUNDLED, completion_folder, weights_folder
+from robotdiffuse.learning.weights_registry import completion_folder, folder_of, weights_folder
 from robotdiffuse.robots.robot import Robot
 
 
@@ -216,9 +216,7 @@ def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionNetw
 
     Raises InputError, naming the file, if it is missing, damaged, or made for another robot than `robot`.
     """
-    folder = FilePath(folder)
-    if not folder.is_dir() and (BUNDLED / folder.name).is_dir():
-        folder = BUNDLED / folder.name
+    folder = folder_of(folder)
     model = _load("model", folder)
     assert isinstance(model, MotionNetwork)
     if robot is not None:

@@ -78,6 +78,15 @@ class ModelParts(Settings):
             NoiseSchedule(self.schedule).sampling_levels(self.sampling_steps)
 
 
+def check_points(where: str, encoder: str | None, denoiser: str) -> None:
+    """Raises InputError, naming the encoder's field, if only one of both handles a scene as points."""
+    if (encoder == "points") != (denoiser == "cross_attention"):
+        raise InputError(
+            f"{where} is {encoder} and denoiser is {denoiser}; "
+            "the encoder points and the denoiser cross_attention need each other"
+        )
+
+
 @dataclass(frozen=True)
 class MotionModelSettings(ModelParts, name="model"):
     """The parts of the model and its defaults for sampling."""
@@ -110,6 +119,7 @@ class MotionModelSettings(ModelParts, name="model"):
             )
         if self.encoder is None and self.denoiser == "encoder_decoder":
             raise InputError("model.denoiser is encoder_decoder and encoder is None; it needs a condition")
+        check_points("model.encoder", self.encoder, self.denoiser)
 
     @property
     def network(self) -> str:

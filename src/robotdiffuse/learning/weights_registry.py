@@ -14,6 +14,8 @@ from robotdiffuse.robots.user_data_dir import user_robots
 
 BUNDLED = FilePath(__file__).parent / "weights"
 """Folder of the weights that come with the package; those for a robot are in a folder of its name."""
+POINTS = "panda_points"
+"""Weights of config `points` in that folder: without clearances as inputs."""
 
 
 def user_weights(robot: Robot) -> FilePath:
@@ -48,10 +50,16 @@ def _identity(file: FilePath, _changed: int) -> RobotIdentity:
     return RobotIdentity.from_json(about, f"{file}: robot")
 
 
+def folder_of(folder: str | FilePath) -> FilePath:
+    """The folder of weights; the name of one that comes with the package stands for it."""
+    place = FilePath(folder)
+    return BUNDLED / folder if not place.exists() and (BUNDLED / folder).is_dir() else place
+
+
 def check_weights(name: str, folder: str | FilePath | None) -> None:
     """Raises InputError if a folder is given that holds no weights of this network."""
     NETWORKS.entry(name)
-    if folder is not None and not is_file(FilePath(folder) / f"{name}.json"):
+    if folder is not None and not is_file(folder_of(folder) / f"{name}.json"):
         what = f"{folder} holds no {name}" if os.path.isdir(folder) else f"there are no weights {folder}"
         raise no_weights_error(name, what)
 
@@ -63,7 +71,7 @@ def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> Fi
     """
     check_weights(name, folder)
     if folder is not None:
-        return FilePath(folder)
+        return folder_of(folder)
     found = weights_for(name, robot)
     if found is None and (BUNDLED / robot.name / f"{name}.json").is_file():
         return BUNDLED / robot.name  # made for another arm of that name, which the caller finds

@@ -1,10 +1,8 @@
-"""The probability that a motion is free of what no camera saw, fitted on the calibration half of the problems
-of `benchmarks/cameras.py`.
-
-python benchmarks/cameras.py --fit
-"""
+"""The probability that a motion is free of what no camera saw."""
 
 import math
+
+from robotdiffuse.perception.unknown_space import CrossedSpace
 
 RATES: dict[str, float] = {
     "as seen": 0.64,
@@ -13,26 +11,36 @@ RATES: dict[str, float] = {
     "points padded by 4 cm": 0.5,
     "unknown is occupied": 0.99,
 }
-"""Part of the motions under an assumption that were free in the true scene, without a prediction."""
-BY_RISK: dict[str, tuple[float, float]] = {
-    "predicted": (3.48, -0.81),
-    "as seen": (0.98, -0.14),
-    "explored": (4.05, -1.15),
-}
-"""With a prediction, for motions under a predicted assumption, for those as seen, and for those of an
-Explorer: the log odds of a motion that sweeps a summed probability of 1, and the slope of the log odds over
-its logarithm. The last is fitted on 493 motions of `benchmarks/exploring.py`, half of them with noise; see
+"""Part of the motions under an assumption that were free in the true scene, without a prediction, as
+`python benchmarks/cameras.py --fit` prints it for the calibration half of its problems."""
+
+MAX_CONFIDENCE = 0.995
+"""Of a motion that is free in every sampled world: the network and 256 worlds cannot tell more."""
+
+
+def confidence(assumption: str, crossed: CrossedSpace) -> float:
+    """The probability that a motion under an assumption is free in the true scene.
+
+    It is the share of sampled worlds in which the motion is free; see `sampled_worlds`. Without a prediction,
+    it is the assumption's rate.
+    """
+    share = crossed.free_share
+    return RATES[assumption] if share is None else min(share, MAX_CONFIDENCE)
+
+
+EXPLORED = (4.05, -1.15)
+"""Of an Explorer's motions: the log odds of one that sweeps a summed probability of 1, and the slope of the
+log odds over its logarithm, fitted to 493 motions of `benchmarks/exploring.py`, half of them with noise; see
 its report."""
 MIN_RISK = 0.2
 """Smaller summed probabilities are raised to this."""
 
 
-def confidence(assumption: str, risk: float | None = None) -> float:
-    """The probability that a motion under an assumption is free in the true scene.
+def explored_confidence(risk: float) -> float:
+    """The probability that a motion is free in the true scene, where an Explorer's views left little unknown.
 
-    risk: the predicted probability that the motion sweeps, summed over voxels; None without a prediction.
+    Sampled worlds, which suit the large parts that one view leaves unknown, state too little there.
+    risk: the predicted probability that the motion sweeps, summed over voxels.
     """
-    if risk is None:
-        return RATES[assumption]
-    odds, slope = BY_RISK.get(assumption, BY_RISK["predicted"])
+    odds, slope = EXPLORED
     return 1 / (1 + math.exp(-(odds + slope * math.log(max(risk, MIN_RISK)))))

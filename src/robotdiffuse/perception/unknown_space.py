@@ -15,6 +15,7 @@ from robotdiffuse.perception.assumptions import (
     VoxelGrid,
     voxels_in,
 )
+from robotdiffuse.perception.sampled_worlds import free_share
 from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, sweep
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
@@ -67,6 +68,11 @@ class CrossedSpace:
     def risk(self) -> float | None:
         """The summed probability of the voxels; None without a prediction."""
         return None if self.probability is None else float(summed(self.probability, self.voxels))
+
+    @cached_property
+    def free_share(self) -> float | None:
+        """The part of the sampled worlds in which all of the voxels are free; None without a prediction."""
+        return None if self.probability is None else free_share(self.probability, self.voxels)
 
     @property
     def region(self) -> Box | None:

@@ -20,8 +20,8 @@ SAMPLES_PER_GOAL = 4
 @dataclass(frozen=True)
 class LearnedSettings(Settings):
     weights: str | None = None
-    """Folder of trained weights; None: those trained on this machine for the robot, or those of the
-    package."""
+    """Folder of trained weights, or panda_points: those of the package without clearances as inputs. None:
+    those trained on this machine for the robot, or those of the package."""
 
 
 LearnedPlannerSettings = TypeVar("LearnedPlannerSettings", bound=LearnedSettings)

@@ -144,7 +144,7 @@ def _round_and_time(
             scale = max(SHRINK_FACTOR * slower.acceleration_scale, MIN_SCALING)
             slower = replace(slower, acceleration_scale=scale)
         else:  # the motion as a whole is refused: every corner is in doubt
-            deviations = _smaller(deviations)
+            deviations, slower = _smaller(deviations), settings
     deviations = np.zeros(len(waypoints) - 2)
     return deviations, _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
 

@@ -1,5 +1,6 @@
 """Table 1: its ComScores by hand, its rows, and a page from a run that a second call does not repeat."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,10 @@ from robotdiffuse.evaluation.paper import table1
 from robotdiffuse.evaluation.paper.comscore import PAPER_TABLE_1, Indicators, comscores
 from robotdiffuse.evaluation.paper.table1 import ROWS, Row, Table1Settings
 from robotdiffuse.evaluation.records import Record, read_records
+from robotdiffuse.learning.denoisers.settings import CrossAttentionSettings
+from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings, PointsSettings
+from robotdiffuse.learning.motion_model import MotionModelSettings
+from robotdiffuse.learning.weight_files import FORMAT
 from robotdiffuse.learning.weights_registry import BUNDLED
 
 ROW_NAMES = {row.paper: row.name for row in ROWS if row.paper}
@@ -39,13 +44,42 @@ def test_indicators_of_solved_and_refused_calls() -> None:
 
 
 def test_the_papers_method_has_a_row_only_with_weights_that_see_the_code_alone(tmp_path: Path) -> None:
-    names = [row.name for row in Table1Settings(tmp_path).rows]
-    assert table1.AS_IN_PAPER not in names
+    assert Table1Settings(tmp_path).rows == ROWS
     with_weights = Table1Settings(tmp_path, paper_weights=str(BUNDLED / "panda"))
-    assert table1.AS_IN_PAPER in [row.name for row in with_weights.rows]
     with pytest.raises(InputError, match="whose inputs include clearances"):
         table1.run_table1(with_weights, lambda _: None, lambda *_: None)
     assert table1.NO_WEIGHTS in table1.notes(Table1Settings(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        (
+            MotionModelSettings(
+                encoder="points",
+                encoder_settings=PointsSettings(),
+                denoiser="cross_attention",
+                denoiser_settings=CrossAttentionSettings(),
+            ),
+            f"{table1.WITHOUT_CLEARANCES}: points, cross_attention, 50 % of 1.6 M samples",
+        ),
+        (
+            MotionModelSettings(
+                waypoints=254,
+                encoder="compression_autoencoder",
+                encoder_settings=CompressionAutoencoderSettings(),
+            ),
+            f"{table1.AS_IN_PAPER}: compression_autoencoder, transformer, 50 % of 1.6 M samples",
+        ),
+    ],
+)
+def test_the_row_of_weights_says_what_they_are(
+    settings: MotionModelSettings, name: str, tmp_path: Path
+) -> None:
+    about = {"format": FORMAT, "settings": settings.to_json(), "training": {"samples": 800_000.0}}
+    (tmp_path / "model.json").write_text(json.dumps(about))
+    row = Table1Settings(tmp_path, paper_weights=str(tmp_path)).rows[5]
+    assert row == Row(name, f"diffusion@{tmp_path}:samples=1:guidance_steps=0:repeat=false")
 
 
 @pytest.mark.slow

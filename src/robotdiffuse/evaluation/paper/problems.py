@@ -16,7 +16,7 @@ from robotdiffuse.core.types import Path
 from robotdiffuse.evaluation.problem_sets import validator
 from robotdiffuse.planning.pose_goals import GOAL_COUNT, pose_configurations
 from robotdiffuse.problems.families.family import POSITION
-from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.goals import JointGoal, PoseGoal
 from robotdiffuse.problems.held_out import SEED, Case, CaseFile, Report
 from robotdiffuse.problems.problem import Problem
@@ -82,15 +82,15 @@ def write_problems(out: FilePath, count: int, report: Report) -> None:
         report(f"problems: {count} of {', '.join(GOALS)}")
 
 
-def straight_line_shares(count: int) -> dict[str, int]:
+def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
     """Of `count` problems with ten goal configurations by the position alone, as the authors draw them, the
-    number with a free straight line: to the first, to the nearest, to any."""
+    number with a free straight line: to the first, to the nearest, to any. family: the obstacles."""
     robot = load_robot("panda")
     names = ("a single goal", "the nearest of ten goals", "any of ten goals")
     found: dict[str, int] = dict.fromkeys(names, 0)
     for number in range(count):
         rng = np.random.default_rng([SEED, STREAM + 1, number])
-        drawn = ROP.draw(robot, rng, GOAL_COUNT, POSITION)
+        drawn = family.draw(robot, rng, GOAL_COUNT, POSITION)
         problem = drawn.problem(robot)
         lines = free_lines(problem, drawn.goals.astype(np.float64))
         single = free_lines(problem, drawn.goals[:1].astype(np.float64))

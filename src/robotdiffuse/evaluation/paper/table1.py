@@ -15,14 +15,21 @@ from robotdiffuse.evaluation.paper.problems import GOALS, POSE, case_name, probl
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.statistics import wilson_interval
 from robotdiffuse.evaluation.tables import Column, Figure, Table
+from robotdiffuse.learning.motion_model import MotionModelSettings
+from robotdiffuse.learning.weight_files import read_description
+from robotdiffuse.learning.weights_registry import POINTS
 
 AS_IN_PAPER = "diffusion, as the paper says"
+WITHOUT_CLEARANCES = "diffusion, no clearances, one unguided sample"
+PAPER_PARTS = "compression_autoencoder", "transformer", 254
+"""Encoder, denoiser and waypoints of the paper's method."""
+PAPER_SAMPLES = 1_600_000
+"""Samples of the paper's training: 25,000 batches of 64."""
 ONE_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
 """One sample, no guidance by distances, no further batches where the validator refuses it."""
 NO_WEIGHTS = (
-    f"{AS_IN_PAPER}: no weights. The bundled ones have clearances as inputs; train others with `robotdiffuse "
-    "train planner --config paper --data FOLDER --encoder FOLDER --out FOLDER` and name them by "
-    "--paper-weights."
+    f"{AS_IN_PAPER}: no weights of its size and with its encoder. Train them with `robotdiffuse train "
+    "planner --config paper --data FOLDER --encoder FOLDER --out FOLDER` and name them by --paper-weights."
 )
 OURS = "RobotDiffuse"
 """The paper's name of its own row."""
@@ -44,6 +51,7 @@ ROWS = (
     Row("diffusion, as it ships: clearances as inputs", "diffusion", OURS),
     Row("diffusion, a single sample", "diffusion:samples=1:repeat=false"),
     Row("diffusion, a single sample, no guidance", ":".join(["diffusion", *ONE_SAMPLE])),
+    Row("the same, no clearances: 32 points of the scene", ":".join([f"diffusion@{POINTS}", *ONE_SAMPLE])),
     Row("robotdiffuse (hybrid)", "robotdiffuse"),
     Row("aorrtc", "aorrtc"),
     Row("no planner: line to the nearest goal", "straight_line:goals=nearest"),
@@ -62,18 +70,19 @@ class Table1Settings:
     time_limit: float = 10.0
     """Of a call [s]; RRT* uses all of it."""
     paper_weights: str | None = None
-    """Folder with weights of config `paper`, or of another one without clearances as inputs."""
+    """Folder with weights of config `paper`, `points` or another one without clearances as inputs, for a row
+    of single samples without guidance."""
     workers: int = 1
     cluster: str | None = None
     """As for `BenchSettings`."""
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Of the table; the paper's method as it says only with weights for it."""
+        """Of the table; without clearances as inputs only with weights for it."""
         if self.paper_weights is None:
             return ROWS
         planner = ":".join([f"diffusion@{self.paper_weights}", *ONE_SAMPLE])
-        return (*ROWS[:5], Row(AS_IN_PAPER, planner), *ROWS[5:])
+        return (*ROWS[:5], Row(_title(self.paper_weights), planner), *ROWS[5:])
 
     @property
     def bench(self) -> BenchSettings:
@@ -100,6 +109,15 @@ def run_table1(settings: Table1Settings, report: Report, done: Done) -> Bench:
     return read_bench(settings.out, list(settings.bench.specs))
 
 
+def _title(folder: str) -> str:
+    """The name of the row of a folder's weights: what they are. Raises InputError if there are none."""
+    about = read_description(FilePath(folder), "model")
+    of = MotionModelSettings.from_json(about.get("settings"), f"{folder}/model.json: settings")
+    title = AS_IN_PAPER if (of.encoder, of.denoiser, of.waypoints) == PAPER_PARTS else WITHOUT_CLEARANCES
+    seen = about.get("training", {}).get("samples", 0.0) / PAPER_SAMPLES
+    return f"{title}: {of.encoder}, {of.denoiser}, {100 * seen:.0f} % of {PAPER_SAMPLES / 1e6:g} M samples"
+
+
 def _check_paper_weights(folder: str) -> None:
     """Raises InputError for weights that get the clearances of the scene as inputs."""
     from robotdiffuse.learning.exported_model import exported_model
@@ -108,7 +126,7 @@ def _check_paper_weights(folder: str) -> None:
     if exported_model("model", folder, load_robot("panda")).settings.clearance_features:
         raise InputError(
             f"paper_weights is {folder}, whose inputs include clearances; the paper's method sees the scene "
-            "by its code alone: train with --config paper"
+            "by its code alone: train with --config paper or points"
         )
 
 
@@ -223,7 +241,8 @@ def notes(settings: Table1Settings) -> list[str]:
         "success: the motion passes the validator and ends within 1 cm and 15° of the pose, with the 95 % "
         "interval by Wilson. collision: share of problems on which the validator refused the planner's last "
         "path because it collides. RRT*, MPNet, MPiNets, MPD and diffusion as it ships try again until time "
-        "runs out; the rows of a single sample have one motion a problem, as in the paper.",
+        "runs out; the rows of a single sample have one motion a problem, as in the paper, whose training "
+        "saw 1.6 M samples.",
         "Means are over the problems that a row solves, with 95 % intervals: rows that solve only easy "
         "problems seem short. length of links 1 to 7: path lengths of the origins of the links that joints "
         "move, which the paper calls path length (its arm has no hand; it names no unit). log jerk: "

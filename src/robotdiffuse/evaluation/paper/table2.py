@@ -34,6 +34,7 @@ from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import load_family
+from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.robots import load_robot
 
@@ -279,6 +280,7 @@ NOTES = (
     "another seed may move a row by more.",
     f"{CONTROL}: smooth noise about the straight line, which networks start from, under the same guidance.",
 )
+LINE_FAMILIES = {"spheres and cubes": ROP, "spheres alone": Rop(kinds=("sphere",))}
 LINE_NOTES = (
     "The straight line in joint space, under the authors' own draw of problems, with inverse kinematics of "
     "the position alone: share of problems on which it is free. The paper's rows are of all problems, "
@@ -331,11 +333,11 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
 def straight_line_table(problems: int) -> Table:
     """No planner under the authors' own draw, beside the paper's rows of Table 2."""
     rows: list[tuple[str, float, str]] = []
-    for goals, free in straight_line_shares(problems).items():
-        low, high = (100 * x for x in wilson_interval(free, problems))
-        rows.append(
-            (f"no planner: straight line to {goals}", 100 * free / problems, f"{low:.1f} to {high:.1f}")
-        )
+    for obstacles, family in LINE_FAMILIES.items():
+        for goals, free in straight_line_shares(problems, family).items():
+            low, high = (100 * x for x in wilson_interval(free, problems))
+            name = f"no planner: straight line to {goals}, {obstacles}"
+            rows.append((name, 100 * free / problems, f"{low:.1f} to {high:.1f}"))
     rows += [(f"paper: {name}", float(row.paper[0] or 0), "") for name, row in ROWS.items()]
     columns = "row", Column("success", "%", ".1f"), Column("95 %", dim=True)
     rows.sort(key=lambda row: row[1])

@@ -10,6 +10,7 @@ accurate to about 20 %.
 | transformer     |   1.7   |     18.0     | 1.0  | 1.0  |
 | encoder_decoder |   1.7   |     18.2     | 0.95 | 0.8  |
 | decoder_only    |   1.7   |     18.0     | 1.0  | 1.0  |
+| cross_attention |   2.3   |     17.1     | 1.5  | 1.5  |
 | unet            |   1.7   |     16.4     | 1.1  | 1.3  |
 """
 
@@ -34,6 +35,11 @@ DENOISERS = Registry(
             _PACKAGE + "decoder_only:DecoderOnly",
             "decoder-only transformer",
             _SETTINGS + "DecoderOnlySettings",
+        ),
+        "cross_attention": Entry(
+            _PACKAGE + "cross_attention:CrossAttention",
+            "transformer whose waypoints attend to points of the scene, of the encoder points",
+            _SETTINGS + "CrossAttentionSettings",
         ),
         "unet": Entry(_PACKAGE + "unet:UNet", "temporal U-Net", _SETTINGS + "UNetSettings"),
     },

@@ -92,6 +92,16 @@ class DecoderOnlySettings(AttentionSettings, name="decoder_only"):
 
 
 @dataclass(frozen=True)
+class CrossAttentionSettings(AttentionSettings, name="cross_attention"):
+    patch: Count = 8
+    """Waypoints per token; a divisor of the number of waypoints."""
+
+    @classmethod
+    def paper_size(cls) -> "CrossAttentionSettings":
+        return cls(512, 5, 4, 1024, patch=1)
+
+
+@dataclass(frozen=True)
 class UNetSettings(DenoiserSettings, name="unet"):
     width: Count = 48
     """Channels at the full resolution; even."""

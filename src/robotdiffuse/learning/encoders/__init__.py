@@ -30,10 +30,17 @@ ENCODERS = Registry(
             _PACKAGE + "pointnet:PointNet", "PointNet", _SETTINGS + "PointNetSettings", "jointly"
         ),
         "dgcnn": Entry(_PACKAGE + "dgcnn:DGCNN", "DGCNN", _SETTINGS + "DGCNNSettings", "jointly"),
+        "points": Entry(
+            _PACKAGE + "points:Points",
+            "the points themselves, for the denoiser cross_attention",
+            _SETTINGS + "PointsSettings",
+            "jointly",
+        ),
     },
 )
 """By the name in settings and checkpoints. Two kinds: "alone" is trained with a loss of its own and then
-frozen; "jointly" is trained with the planner, by the planner's loss."""
+frozen; "jointly" is a part of the planner's network, whose loss trains what weights it has, on fresh clouds
+for every batch."""
 
 
 def make_encoder(name: str, settings: "EncoderSettings | None" = None) -> "Encoder":

@@ -8,12 +8,10 @@ activation is PReLU, as in MPNet (Qureshi et al. 2019), whose encoder has the sa
 from collections.abc import Iterable
 from itertools import pairwise
 
-import torch
 from jaxtyping import Float
 from numpy.random import Generator
 from torch import Tensor, nn
 
-from robotdiffuse.datasets.surface_clouds import sort_points
 from robotdiffuse.learning.encoders.base import Autoencoder, fp32
 from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings
 
@@ -27,27 +25,6 @@ class CompressionAutoencoder(Autoencoder):
         super().__init__(settings)
         sizes = (3 * settings.cloud, *settings.hidden, settings.code)
         self.encoder, self.decoder = _perceptron(sizes), _perceptron(sizes[::-1])
-
-    def arrange(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch cloud 3"]:
-        """As many points as the network takes, sorted by x, then y, then z.
-
-        More points are thinned evenly in that order, fewer are repeated, and an empty cloud becomes zeros.
-        Clouds of that size by `surface_clouds(..., ordered=True)` stay as they are, up to rounding.
-        """
-        batch, points, _ = cloud.shape
-        wanted = self.settings.cloud
-        if points == 0:
-            return cloud.new_zeros(batch, wanted, 3)
-        near = self.near(cloud)
-        coordinates = list((cloud * near[..., None]).unbind(-1))
-        sort_points(coordinates)
-        ordered = torch.stack(coordinates, -1)
-        # points that do not count are zeros now: move them behind the others, which keep their order
-        filled = (ordered != 0).any(-1)
-        ordered = ordered.gather(1, (~filled).byte().argsort(stable=True, dim=1)[..., None].expand(-1, -1, 3))
-        at = (torch.arange(wanted, device=cloud.device) * 2 + 1) * filled.sum(1, keepdim=True)
-        index = at.div(2 * wanted, rounding_mode="floor")
-        return ordered.gather(1, index[..., None].expand(-1, -1, 3))
 
     def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
         with fp32(cloud):

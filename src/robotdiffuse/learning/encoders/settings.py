@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Settings, Sizes
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
@@ -49,7 +50,7 @@ def in_order(points: Float32[ndarray, "n 3"], count: int) -> Float32[ndarray, "{
     """`count` of the points, sorted by x, then y, then z: thinned evenly, or repeated if there are fewer.
 
     Coordinates are rounded to a millionth of the largest one. Zeros without any point. See also
-    `CompressionAutoencoder.arrange`, for batches of tensors.
+    `Encoder.arrange`, for batches of tensors.
     """
     if not len(points):
         return np.zeros((count, 3), np.float32)
@@ -86,6 +87,25 @@ class CompressionAutoencoderSettings(EncoderSettings):
     """Points of an input cloud; the input has three numbers for each."""
     hidden: Sizes = (786, 512, 256)
     """Layers of the encoder between the cloud and z; the decoder has the same in reverse order."""
+
+
+@dataclass(frozen=True)
+class PointsSettings(EncoderSettings, name="points"):
+    any_size = False
+    ordered = True
+    code: Count = 96
+    """Size of z: three numbers for each point."""
+    cloud: Count = 32
+    """Points of an input cloud."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.code != 3 * self.cloud:
+            raise InputError(f"points.code is {self.code}; it must be three times cloud, {3 * self.cloud}")
+
+    @classmethod
+    def paper_size(cls) -> "PointsSettings":
+        return cls(code=60, cloud=20)
 
 
 @dataclass(frozen=True)

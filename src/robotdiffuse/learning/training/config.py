@@ -19,7 +19,7 @@ from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.settings import DenoiserSettings
 from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.encoders.settings import EncoderSettings
-from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts
+from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts, check_points
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.training.losses import LossSettings
 
@@ -118,8 +118,9 @@ class PlannerTraining(MotionTraining, ModelParts):
 
     encoder: str | None
     """Folder with a trained encoder, which stays frozen; or the name of an encoder, for example pointnet or
-    dgcnn, that is trained jointly, by the planner's loss, on fresh clouds for every batch. None for a prior,
-    whose inputs do not include the scene."""
+    dgcnn, that is trained jointly, by the planner's loss, on fresh clouds for every batch; points, for the
+    denoiser cross_attention, has nothing to train. None for a prior, whose inputs do not include the
+    scene."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
     """Peak learning rate of AdamW (paper: 3e-4)."""
@@ -152,6 +153,7 @@ class PlannerTraining(MotionTraining, ModelParts):
             raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
         if self.encoder_settings is not None:
             ENCODERS.entry(self.encoder)  # a folder holds a trained encoder with its own settings
+        check_points("encoder", self.encoder, self.denoiser)
 
     @property
     def jointly(self) -> bool:

@@ -1,5 +1,6 @@
-"""Named settings of planner training: the paper's, those of the bundled weights, the rows of the paper's
-Table 2, and the prior of MPD and EDMP (see `planning.baselines.guided_prior`).
+"""Named settings of planner training: the paper's, those of the bundled weights, those of a network that sees
+points of the scene, the rows of the paper's Table 2, and the prior of MPD and EDMP (see
+`planning.baselines.guided_prior`).
 
 The rows of Table 2 differ only in what they compare, and have a size that a CPU can train. Unlike `paper`
 they diffuse 48 waypoints in patches of 4, as residuals to the straight line, with smooth noise, which takes
@@ -57,6 +58,17 @@ CONFIGS: dict[str, Config] = {
             "sampling_steps": None,
             "denoiser_settings": TransformerSettings.paper_size(),
             **_TABLE2_ROW,
+        },
+    ),
+    "points": Config(
+        "no clearances: waypoints attend to 32 points of the obstacles, in place of one code",
+        {
+            **_TABLE2_ROW,
+            "minutes": None,
+            "samples": 1_600_000,
+            "encoder": "points",
+            "denoiser": "cross_attention",
+            "turned_copies": 15,
         },
     ),
     "table2_pointnet": Config("encoder PointNet, trained jointly", {**_TABLE2_ROW, "encoder": "pointnet"}),

@@ -28,7 +28,7 @@ from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
 from robotdiffuse.perception.assumptions import voxels_in, voxels_of
-from robotdiffuse.perception.confidence import confidence
+from robotdiffuse.perception.confidence import explored_confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, Corners, OccupancyMap
 from robotdiffuse.perception.seen_points import point_shapes
@@ -356,7 +356,8 @@ class Explorer:
             return motion
         unknown = self._unknown(motion.path.positions[[0, -1]], predicted)
         swept = unknown.crossed(motion.path).risk
-        return replace(motion, swept_probability=swept, confidence=confidence("explored", swept))
+        stated = None if swept is None else explored_confidence(swept)
+        return replace(motion, swept_probability=swept, confidence=stated)
 
     def _unknown(
         self, ends: Float[ndarray, "n dof"], predicted: Float32[ndarray, "nx ny nz"] | None

@@ -267,7 +267,7 @@ class _Motion:
         self._result, self._assumption, self.length = result, assumption, result.path.length
         self._crossed = unknown.crossed(result.path)
         self.risk = self._crossed.risk
-        self.confidence = confidence(assumption, self.risk)
+        self.confidence = confidence(assumption, self._crossed)
 
     @property
     def result(self) -> PlanResult:

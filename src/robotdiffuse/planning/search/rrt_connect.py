@@ -17,7 +17,7 @@ class RRTConnectSettings(SearchSettings, name="rrt_connect"):
     searches: Count = 2
     """With until "converged": number of paths to find; the shortest is returned."""
     optimize_time: NotNegative = 0.0
-    """With until "short": time for restarts after the first path [s]."""
+    """With until "converged": time for restarts after the first path [s]."""
 
 
 class RRTConnect(Planner[RRTConnectSettings]):
