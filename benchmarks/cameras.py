@@ -100,7 +100,7 @@ def problems(family: str, count: int, known: set[int]) -> Iterator[tuple[int, Pr
     numbered = (
         ((i, held_out_problem(family, i)) for i in itertools.count())
         if family in FAMILIES
-        else ((i, entry.load()) for i, entry in enumerate(load_problems(Path(family))))
+        else ((i, entry.load()) for i, entry in enumerate(load_problems(Path(family))) if not entry.error)
     )
     hard = (one for one in numbered if one[0] in known or (one[0] > max(known, default=-1) and _hard(one[1])))
     yield from itertools.islice(hard, count)

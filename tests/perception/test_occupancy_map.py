@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import LOW
-from robotdiffuse.perception.occupancy_map import MapSettings, OccupancyMap
+from robotdiffuse.perception.occupancy_map import MAP, MapSettings, OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
@@ -29,7 +27,7 @@ def view_from(bearing: float, distance: float = 1.5, scene: Scene = SCENE) -> De
 
 
 def true(margin: float) -> np.ndarray:
-    return voxels_within(SCENE, LOW, FINE_VOXEL_SIZE, FINE_SHAPE, margin)
+    return voxels_within(SCENE, MAP.low, MAP.edge, MAP.shape, margin)
 
 
 @pytest.mark.parametrize("noisy", (False, True))
@@ -67,7 +65,7 @@ def test_pixels_without_a_return_say_nothing() -> None:
 
 
 def test_what_went_away_becomes_free_and_old_evidence_is_forgotten() -> None:
-    middle = tuple(np.floor((np.array([0.451, 0.29, 0.31]) - LOW) / FINE_VOXEL_SIZE).astype(int))
+    middle = tuple(np.floor((np.array([0.451, 0.29, 0.31]) - MAP.low) / MAP.edge).astype(int))
     known = OccupancyMap(PANDA)
     known.add(view_from(2.8))
     assert known.occupied[middle]

@@ -1,7 +1,7 @@
 """Explorer: what its motions promise, against scenes that it sees by simulated cameras alone."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
@@ -9,16 +9,18 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.assumptions import CARVING_MARGIN, FINE_SHAPE, FINE_VOXEL_SIZE, voxels_in
+from robotdiffuse.perception.assumptions import CARVING_MARGIN, FINE_SHAPE, voxels_in
 from robotdiffuse.perception.depth_noise import DepthNoise
-from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, OccupancyMap
 from robotdiffuse.perception.ray_caster import voxels_within
 from robotdiffuse.perception.swept_voxels_kernel import sweep
-from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+from robotdiffuse.planning.exploration.explorer import PROBABILITY_BELOW, ExplorerSettings
 from robotdiffuse.planning.exploration.looks import best_looks
+from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, not_seen_free
 from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
 from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.validation.validator import verify
 
 PANDA = rd.load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -56,13 +58,12 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
     one.set_goal(PROBLEM.start + 0.05)
     step = one.next(PROBLEM.start)
     assert step.kind in ("go", "look") and step.motion is not None and step.motion.path is not None
-    swept, low = np.zeros(FINE_SHAPE, np.bool_), np.array(LOW, np.float32)
-    positions = step.motion.path.positions.astype(np.float32)
-    sweep(compile_robot(PANDA), positions, np.float32(0), low, np.float32(FINE_VOXEL_SIZE), swept)
+    swept, positions = np.zeros(MAP.shape, np.bool_), step.motion.path.positions.astype(np.float32)
+    sweep(compile_robot(PANDA), positions, np.float32(0), *MAP.frame, swept)
     unseen = swept & ~one.map.free
     ends = [placed_spheres(PANDA, q).astype(np.float32) for q in step.motion.path.positions[[0, -1]]]
     # covering spheres are larger than the links that the validator checks
-    assert (unseen & ~voxels_in(np.concatenate(ends), 2 * CARVING_MARGIN)).sum() <= 20
+    assert (unseen & ~voxels_in(np.concatenate(ends), 2 * CARVING_MARGIN, MAP)).sum() <= 20
 
 
 def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
@@ -71,11 +72,11 @@ def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
     assert (
         isinstance(cloud, rd.PointCloud)
         and len(walls) == 6
-        and np.isclose(np.sqrt(3) * FINE_VOXEL_SIZE / 2, COVER_RADIUS)
+        and np.isclose(np.sqrt(3) * MAP.edge / 2, COVER_RADIUS)
     )
-    at = np.floor((cloud.points - LOW) / FINE_VOXEL_SIZE).astype(int)
+    at = np.floor((cloud.points - MAP.low) / MAP.edge).astype(int)
     assert not one.map.free[tuple(at.T)].any()
-    true = voxels_within(rd.Scene([WALL]), LOW, FINE_VOXEL_SIZE, FINE_SHAPE, -0.0)
+    true = voxels_within(rd.Scene([WALL]), MAP.low, MAP.edge, MAP.shape, -0.0)
     assert not (one.map.free & true).sum() > 0.01 * true.sum()
     spheres = placed_spheres(PANDA, HOME)
     distances = np.linalg.norm(cloud.points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
@@ -84,13 +85,18 @@ def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
 
 def test_looks_see_what_is_wanted() -> None:
     one = explorer()
-    camera, wanted = one.cameras[0], np.zeros(FINE_SHAPE, np.bool_)
-    wanted[75:80, 55:60, 20:25] = True
-    target = (np.array([77.5, 57.5, 22.5]) * FINE_VOXEL_SIZE) + LOW
-    looks = best_looks(one.map, rd.Scene([FLOOR]), camera, wanted, None, HOME, np.random.default_rng(0))
-    best = [look for look, _ in zip(looks, range(3), strict=False)]
+    camera, wanted = one.cameras[0], np.zeros(MAP.shape, np.bool_)
+    wanted[75:80, 55:60, 40:45] = True
+    target = (np.array([77.5, 57.5, 42.5]) * MAP.edge) + MAP.low
+    scene = rd.Scene([FLOOR])
+    tree = ReachableTree(PANDA, scene, HOME)
+    looks = best_looks(one.map, tree, camera, wanted, None, np.random.default_rng(0))
+    best = list(islice(looks, 3))
     assert len(best) == 3
-    for T in camera.poses(PANDA, np.stack(best)):
+    for way in best:
+        assert np.array_equal(way[0], HOME)
+        assert verify(rd.Problem(PANDA, scene, HOME, way[-1]), rd.Path(PANDA.joint_names, way)).valid
+    for T in camera.poses(PANDA, np.stack([way[-1] for way in best])):
         x, y, z = T[:3, :3].T @ (target - T[:3, 3])
         fx, fy, cx, cy = camera.intrinsics
         assert z > 0 and 0 <= fx * x / z + cx <= camera.size[0] and 0 <= fy * y / z + cy <= camera.size[1]
@@ -116,15 +122,36 @@ def test_what_keeps_the_arm_from_going_is_said() -> None:
 
 
 def test_a_strict_arm_does_not_look_for_a_goal_outside_of_the_map() -> None:
-    """It used up its looks on goals of MotionBenchMaker below the base."""
-    below = np.array([0.0, 1.7, 0.0, -1.0, 0.0, 2.2, 0.785])
-    one = rd.Explorer(PANDA, [wrist_camera(PANDA)], free_zone=ZONE)
-    one.observe(camera_beside(PROBLEM, None, 0))
-    one.set_goal(below)
-    step = one.next(PROBLEM.start)
+    """It used up its looks on goals that no motion within the map reaches."""
+    long = rd.load_robot("ur10")
+    stretched, folded = np.zeros(6), np.array([0.0, -1.2, 2.0, -0.8, 1.5, 0.0])
+    one = rd.Explorer(long, [wrist_camera(long)], free_zone=ZONE)
+    one.observe(camera_beside(rd.Problem(long, rd.Scene([WALL]), folded, stretched), None, 0))
+    one.set_goal(stretched)
+    step = one.next(folded)
     assert (step.kind, step.reason) == ("stuck", "at the goal the arm reaches out of the map")
-    one.set_goal(np.stack([below, PROBLEM.start + 0.05]))
-    assert one.next(PROBLEM.start).kind in ("go", "look")
+    one.set_goal(np.stack([stretched, folded + 0.01]))
+    assert one.next(folded).kind in ("go", "look")
+
+
+def test_what_lies_below_the_volume_of_the_network_is_looked_at_too() -> None:
+    """An arm on a stand reaches there."""
+    one = explorer()
+    predicted = one.predicted()
+    assert predicted is not None and predicted.shape == MAP.shape == one.map.free.shape
+    below = one.map.unknown[:, :, :LAYERS_BELOW]
+    np.testing.assert_array_equal(predicted[:, :, :LAYERS_BELOW], np.where(below, PROBABILITY_BELOW, 0))
+    assert MAP.shape == (*FINE_SHAPE[:2], FINE_SHAPE[2] + LAYERS_BELOW)
+
+
+def test_a_look_is_found_where_a_narrow_gap_alone_leads_out() -> None:
+    """Searches to looks that were chosen first failed in four scenes where a tree gets out."""
+    known = OccupancyMap(PANDA)
+    known.declare_free(((-1.1, 0.3, 0.0), (1.1, 1.1, 1.1)))
+    scene = rd.Scene(not_seen_free(known, rd.Scene(), (HOME,)))
+    tree, rng = ReachableTree(PANDA, scene, HOME), np.random.default_rng(0)
+    tree.grow(HOME + 0.3 * rng.standard_normal((3000, 7)), rng.random(3000) ** 2)
+    assert len(tree) > 10
 
 
 def test_stray_points_that_other_views_see_through_are_no_obstacles() -> None:

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from robotdiffuse.perception.assumptions import FINE_VOXEL_SIZE
-from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.visualization.voxel_faces import faces_between, faces_surface
 
 
@@ -15,10 +14,10 @@ def test_a_cube_has_six_faces_around_it() -> None:
     assert numbers.tolist() == [at - 30, at, size + at - 6, size + at, 2 * size + at - 1, 2 * size + at]
     assert first.tolist() == [False, True] * 3
     surface = faces_surface(inside, ~inside, (255, 0, 0))
-    center = (np.array([1.5, 2.5, 3.5])) * FINE_VOXEL_SIZE + LOW
+    center = (np.array([1.5, 2.5, 3.5])) * MAP.edge + MAP.low
     away = surface.vertices - center
-    np.testing.assert_allclose(np.abs(away), FINE_VOXEL_SIZE / 2)
-    np.testing.assert_allclose((away * surface.normals).sum(axis=1), FINE_VOXEL_SIZE / 2)
+    np.testing.assert_allclose(np.abs(away), MAP.edge / 2)
+    np.testing.assert_allclose((away * surface.normals).sum(axis=1), MAP.edge / 2)
     assert len(surface.faces) == 12 and (surface.colors == [1, 0, 0]).all()
 
 

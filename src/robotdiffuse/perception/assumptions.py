@@ -36,6 +36,27 @@ FINE_VOXEL_SIZE = VOXEL / 2
 FINE_SHAPE = (2 * SHAPE[0], 2 * SHAPE[1], 2 * SHAPE[2])
 
 
+@dataclass(frozen=True)
+class VoxelGrid:
+    """Cubic voxels in the frame of the base."""
+
+    low: tuple[float, float, float]
+    """Lower corner [m]."""
+    shape: tuple[int, int, int]
+    """Number of voxels along x, y and z."""
+    edge: float
+    """Of a voxel [m]."""
+
+    @property
+    def frame(self) -> tuple[Float32[ndarray, "3"], np.float32]:
+        """The lower corner and the edge as compiled code takes them."""
+        return np.array(self.low, np.float32), np.float32(self.edge)
+
+
+COARSE, FINE = VoxelGrid(LOW, SHAPE, VOXEL), VoxelGrid(LOW, FINE_SHAPE, FINE_VOXEL_SIZE)
+"""The voxels of the observed volume, and those halved."""
+
+
 class Assumption(ABC):
     """Obstacles in addition to what was seen."""
 
@@ -85,22 +106,22 @@ class Voxels(Assumption):
     """What is known without views; voxels within it are left out."""
 
     @property
-    def edge(self) -> float:
-        """Edge of a voxel [m]."""
-        return VOXEL * SHAPE[0] / len(self.occupied)
+    def grid(self) -> VoxelGrid:
+        return COARSE if self.occupied.shape == SHAPE else FINE
 
     def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "nx ny nz"]:
-        return self.occupied & voxels_in(spheres, CARVING_MARGIN + self.edge / 2, self.edge)
+        return self.occupied & voxels_in(spheres, CARVING_MARGIN + self.grid.edge / 2, self.grid)
 
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
         """The voxels at the surface of what is occupied: the arm starts outside and cannot get within. Those
         out of reach, and those in the known scene, are left out."""
-        points = (surface(self.occupied & ~self._touched(spheres)) + 0.5) * self.edge + LOW
-        points = points[np.linalg.norm(points, axis=1) < reach_bound(self.robot) + self.edge]
+        edge = self.grid.edge
+        points = (surface(self.occupied & ~self._touched(spheres)) + 0.5) * edge + LOW
+        points = points[np.linalg.norm(points, axis=1) < reach_bound(self.robot) + edge]
         if self.known_scene.shapes:
-            scene, inside = compile_scene_for(self.robot, self.known_scene), np.float32(self.edge / 2 - 1e-3)
+            scene, inside = compile_scene_for(self.robot, self.known_scene), np.float32(edge / 2 - 1e-3)
             points = points[~near_scene(scene, points.astype(np.float32), inside)]
-        return AssumedPoints(points, self.edge / 2, name="unknown")
+        return AssumedPoints(points, edge / 2, name="unknown")
 
 
 def refined(voxels: Bool[ndarray, "mx my mz"]) -> Bool[ndarray, "nx ny nz"]:
@@ -108,18 +129,18 @@ def refined(voxels: Bool[ndarray, "mx my mz"]) -> Bool[ndarray, "nx ny nz"]:
     return voxels.repeat(2, 0).repeat(2, 1).repeat(2, 2)
 
 
-def voxels_of(points: Float[ndarray, "n 3"]) -> Int[ndarray, "n 3"]:
-    """The indices of the fine voxels that points in the base frame lie in; they may be outside the volume."""
-    return np.floor((points - LOW) / FINE_VOXEL_SIZE).astype(np.int64)
+def voxels_of(points: Float[ndarray, "n 3"], grid: VoxelGrid) -> Int[ndarray, "n 3"]:
+    """The indices of the voxels that points in the base frame lie in; they may be outside of the grid."""
+    return np.floor((points - grid.low) / grid.edge).astype(np.int64)
 
 
 def voxels_in(
-    spheres: Float32[ndarray, "n 4"], margin: float = 0.0, edge: float = FINE_VOXEL_SIZE
+    spheres: Float32[ndarray, "n 4"], margin: float = 0.0, grid: VoxelGrid = FINE
 ) -> Bool[ndarray, "nx ny nz"]:
-    """Voxels of the observed volume with their centres in spheres, inflated by `margin` [m]."""
-    out = np.zeros([round(n * VOXEL / edge) for n in SHAPE], np.bool_)
+    """Voxels with their centres in spheres, inflated by `margin` [m]."""
+    out = np.zeros(grid.shape, np.bool_)
     larger = spheres + np.array([0, 0, 0, margin], np.float32)
-    mark(larger, np.array(LOW, np.float32), np.float32(edge), out)
+    mark(larger, *grid.frame, out)
     return out
 
 

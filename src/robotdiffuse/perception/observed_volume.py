@@ -82,7 +82,7 @@ def _observed(view: DepthView, robot: Robot, start: Float[ndarray, "dof"]) -> Ob
     if len(q) != robot.dof:
         raise InputError(f"view.configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints")
     state, depth, counts = np.empty(SHAPE, np.uint8), np.empty(SHAPE, np.float32), np.empty(SHAPE, np.int32)
-    carve_view(view, robot, q, ARM_MARGIN, VOXEL, state, depth, counts)
+    carve_view(view, robot, q, ARM_MARGIN, LOW, VOXEL, state, depth, counts)
     occupied = counts > 0
     depth[(state != BEHIND) | occupied] = 0.0
     return ObservedVolume(
@@ -95,12 +95,13 @@ def carve_view(
     robot: Robot,
     q: Float[ndarray, "dof"],
     arm_margin: float,
+    low: tuple[float, float, float],
     voxel: float,
     state: UInt8[ndarray, "nx ny nz"],
     behind: Float32[ndarray, "nx ny nz"],
     counts: Int32[ndarray, "nx ny nz"],
 ) -> None:
-    """Write what one view tells of each voxel from `LOW` on, by its filtered image; see `carve`.
+    """Write what one view tells of each voxel from the corner `low` on, by its filtered image; see `carve`.
 
     q: the arm's configuration in the view. arm_margin: points within this distance of its covering spheres
     are points of the arm; more with noise [m]. voxel: edge of a voxel [m].
@@ -114,7 +115,7 @@ def carve_view(
         np.array(view.intrinsics, np.float32),
         T.astype(np.float32),
         spheres.astype(np.float32),
-        np.array(LOW, np.float32),
+        np.array(low, np.float32),
         np.float32(voxel),
         state,
         behind,

@@ -8,12 +8,21 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
-from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, voxels_of
+from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, VoxelGrid, voxels_of
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.free_space_kernel import FREE
 from robotdiffuse.perception.observed_volume import LOW, carve_view
 from robotdiffuse.robots.robot import Robot
 
+LAYERS_BELOW = 20
+"""Layers of voxels of the map below the observed volume."""
+MAP = VoxelGrid(
+    (LOW[0], LOW[1], LOW[2] - LAYERS_BELOW * FINE_VOXEL_SIZE),
+    (FINE_SHAPE[0], FINE_SHAPE[1], FINE_SHAPE[2] + LAYERS_BELOW),
+    FINE_VOXEL_SIZE,
+)
+"""The voxels of a map: those of `ObservedVolume`, halved, and 0.4 m below it, where an arm on a stand
+reaches."""
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Low and high corner of a box [m]."""
 
@@ -40,18 +49,18 @@ class OccupancyMap:
     first, so that a stray pixel neither blocks nor fills a voxel; pixels without a return say nothing; of the
     arm, and of what it holds, nothing is kept. Where views contradict each other, their number decides.
 
-    The voxels are those of `ObservedVolume`, halved: `FINE_SHAPE` from `LOW` on.
+    The voxels are those of `MAP`.
     """
 
     def __init__(self, robot: Robot, settings: MapSettings = MapSettings()) -> None:
         self.robot, self.settings = robot, settings
-        self._evidence = np.zeros(FINE_SHAPE, np.float32)
+        self._evidence = np.zeros(MAP.shape, np.float32)
         """Above 0 occupied, below free, 0 unknown."""
-        self._seen_at = np.full(FINE_SHAPE, -np.inf, np.float64)
-        self._declared = np.zeros(FINE_SHAPE, np.bool_)
+        self._seen_at = np.full(MAP.shape, -np.inf, np.float64)
+        self._declared = np.zeros(MAP.shape, np.bool_)
         self._now = -np.inf
-        self._state, self._behind = np.empty(FINE_SHAPE, np.uint8), np.empty(FINE_SHAPE, np.float32)
-        self._counts = np.empty(FINE_SHAPE, np.int32)
+        self._state, self._behind = np.empty(MAP.shape, np.uint8), np.empty(MAP.shape, np.float32)
+        self._counts = np.empty(MAP.shape, np.int32)
 
     def add(self, view: DepthView, stamp: float = 0.0) -> int:
         """Take a view into account; returns the number of voxels that nothing was known of before.
@@ -65,8 +74,8 @@ class OccupancyMap:
                 f"view.configuration is {shown(q)}; a map needs the {self.robot.dof} joint positions of"
                 f" {self.robot.name} when the view was taken"
             )
-        margin = self.settings.arm_margin
-        carve_view(view, self.robot, q, margin, FINE_VOXEL_SIZE, self._state, self._behind, self._counts)
+        told_by_view = self._state, self._behind, self._counts
+        carve_view(view, self.robot, q, self.settings.arm_margin, MAP.low, MAP.edge, *told_by_view)
         hit, free = self._counts > 0, self._state == FREE
         told = int(np.count_nonzero((hit | free) & (self._evidence == 0)))
         self._update(hit, free, stamp)
@@ -75,19 +84,19 @@ class OccupancyMap:
     def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
         or of `rd.PointCloud.from_file`. They say nothing about free space."""
-        at = voxels_of(np.asarray(points))
-        at = at[((at >= 0) & (at < FINE_SHAPE)).all(axis=1)]
-        hit = np.zeros(FINE_SHAPE, np.bool_)
+        at = voxels_of(np.asarray(points), MAP)
+        at = at[((at >= 0) & (at < MAP.shape)).all(axis=1)]
+        hit = np.zeros(MAP.shape, np.bool_)
         hit[tuple(at.T)] = True
-        self._update(hit, np.zeros(FINE_SHAPE, np.bool_), stamp)
+        self._update(hit, np.zeros(MAP.shape, np.bool_), stamp)
 
     def declare_free(self, zone: Corners) -> None:
         """Voxels inside a box count as seen free unless a view finds them occupied."""
         low, high = np.asarray(zone, np.float64)
         if not (low < high).all():
             raise InputError(f"free_zone is {shown(zone)}; its low corner must be below its high corner")
-        first = np.maximum(np.ceil((low - LOW) / FINE_VOXEL_SIZE - 1e-6), 0).astype(int)
-        end = np.maximum(np.floor((high - LOW) / FINE_VOXEL_SIZE + 1e-6), 0).astype(int)
+        first = np.maximum(np.ceil((low - MAP.low) / MAP.edge - 1e-6), 0).astype(int)
+        end = np.maximum(np.floor((high - MAP.low) / MAP.edge + 1e-6), 0).astype(int)
         self._declared[tuple(slice(a, b) for a, b in zip(first, end, strict=True))] = True
 
     @property
@@ -114,7 +123,7 @@ class OccupancyMap:
         if self.settings.max_age is not None:
             self._evidence[~np.asarray(self._fresh)] = 0.0
             self._seen_at[hit | free] = stamp
-        gain = np.zeros(FINE_SHAPE, np.float32)
+        gain = np.zeros(MAP.shape, np.float32)
         gain[free], gain[hit] = -self.settings.miss, self.settings.hit
         most = np.float32(self.settings.largest)
         np.clip(self._evidence + gain, -most, most, out=self._evidence)

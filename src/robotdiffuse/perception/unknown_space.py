@@ -11,11 +11,10 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.types import Path
 from robotdiffuse.perception.assumptions import (
     CARVING_MARGIN,
-    FINE_SHAPE,
-    FINE_VOXEL_SIZE,
+    FINE,
+    VoxelGrid,
     voxels_in,
 )
-from robotdiffuse.perception.observed_volume import LOW
 from robotdiffuse.perception.sampled_worlds import free_share
 from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, sweep
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -36,24 +35,24 @@ class UnknownSpace:
         unknown: Bool[ndarray, "nx ny nz"],
         predicted: Float32[ndarray, "nx ny nz"] | None,
         margin: float = CARVING_MARGIN,
+        grid: VoxelGrid = FINE,
     ) -> None:
         """
         occupied_by_arm: configurations at which the arm is known to be free: the start and the goals.
-        unknown: the fine voxels that no view saw.
-        predicted: the probability that each fine voxel is occupied; None without a prediction.
+        unknown: the voxels of the grid that no view saw.
+        predicted: the probability that each voxel is occupied; None without a prediction.
         margin: voxels nearer than this to the arm at those configurations count as occupied by it [m].
         """
-        self._robot = compile_robot(robot)
+        self._robot, self._grid = compile_robot(robot), grid
         spheres = [placed_spheres(robot, q).astype(np.float32) for q in occupied_by_arm]
-        self.unknown = unknown & ~voxels_in(np.concatenate(spheres), margin)
+        self.unknown = unknown & ~voxels_in(np.concatenate(spheres), margin, grid)
         self.probability = None if predicted is None else np.where(self.unknown, predicted, np.float32(0))
 
     def crossed(self, path: Path) -> "CrossedSpace":
         """The unknown voxels that the arm passes through on a path."""
-        swept = np.zeros(FINE_SHAPE, np.bool_)
-        positions, voxel = path.positions.astype(np.float32), np.float32(FINE_VOXEL_SIZE)
-        sweep(self._robot, positions, np.float32(0.0), np.array(LOW, np.float32), voxel, swept)
-        return CrossedSpace(swept & self.unknown, self.probability)
+        swept, positions = np.zeros(self._grid.shape, np.bool_), path.positions.astype(np.float32)
+        sweep(self._robot, positions, np.float32(0.0), *self._grid.frame, swept)
+        return CrossedSpace(swept & self.unknown, self.probability, self._grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +62,7 @@ class CrossedSpace:
     voxels: Bool[ndarray, "nx ny nz"]
     probability: Float32[ndarray, "nx ny nz"] | None
     """That each voxel is occupied."""
+    grid: VoxelGrid = FINE
 
     @cached_property
     def risk(self) -> float | None:
@@ -80,7 +80,7 @@ class CrossedSpace:
         without a prediction; None if there are no voxels."""
         if not self.voxels.any():
             return None
-        weights = np.ones(FINE_SHAPE, np.float32) if self.probability is None else self.probability
-        corners = heaviest_part(self.voxels, weights) * FINE_VOXEL_SIZE + np.array(LOW)
+        weights = np.ones(self.grid.shape, np.float32) if self.probability is None else self.probability
+        corners = heaviest_part(self.voxels, weights) * self.grid.edge + np.array(self.grid.low)
         low, high = corners.round(3).tolist()
         return tuple(low), tuple(high)

@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
-from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
-from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
 from robotdiffuse.planning.exploration.steps import DONE
@@ -79,11 +78,11 @@ def shown_voxels(
 def in_known_scene(explorer: RecordedExplorer) -> Bool[ndarray, "nx ny nz"]:
     """The voxels at or in the scene that is known without views."""
     if not explorer.scene.shapes:
-        return np.zeros(FINE_SHAPE, np.bool_)
-    centers = (np.indices(FINE_SHAPE).reshape(3, -1).T + 0.5) * FINE_VOXEL_SIZE + LOW
+        return np.zeros(MAP.shape, np.bool_)
+    centers = (np.indices(MAP.shape).reshape(3, -1).T + 0.5) * MAP.edge + MAP.low
     scene = compile_scene_for(explorer.robot, explorer.scene)
-    near = near_scene(scene, centers.astype(np.float32), np.float32(FINE_VOXEL_SIZE))
-    return near.reshape(FINE_SHAPE)
+    near = near_scene(scene, centers.astype(np.float32), np.float32(MAP.edge))
+    return near.reshape(MAP.shape)
 
 
 def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Float[ndarray, "n 3"]]:

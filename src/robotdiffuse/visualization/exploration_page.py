@@ -11,8 +11,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
-from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.planning.exploration.recorded import RecordedExplorer
 from robotdiffuse.planning.exploration.steps import DONE, LOOK
 from robotdiffuse.scenes.scene import Scene
@@ -52,9 +51,9 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
     motion = _whole_motion(explorer)
     data = page_data(robot, scene, motion)
     data["exploration"] = {
-        "shape": FINE_SHAPE,
-        "low": LOW,
-        "edge": FINE_VOXEL_SIZE,
+        "shape": MAP.shape,
+        "low": MAP.low,
+        "edge": MAP.edge,
         "layers": LAYERS,
         "look_color": LOOK_COLOR,
         "known": _known(explorer),

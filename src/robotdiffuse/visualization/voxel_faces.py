@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 from numpy import ndarray
 
-from robotdiffuse.perception.assumptions import FINE_VOXEL_SIZE
-from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.visualization.style import Surface
 
 
@@ -35,7 +34,7 @@ def faces_between(
 def faces_surface(
     inside: Bool[ndarray, "nx ny nz"], outside: Bool[ndarray, "nx ny nz"], color: tuple[int, int, int]
 ) -> Surface:
-    """The faces between two sets of voxels, of 2 cm from `LOW` on, as a surface in the base frame; normals
+    """The faces between two sets of voxels, of a map, as a surface in the base frame; normals
     point out of the set inside."""
     numbers, first = faces_between(inside, outside)
     axis, flat = np.divmod(numbers, inside.size)
@@ -46,7 +45,7 @@ def faces_surface(
     normals = np.where(first[:, None], along, -along)
     one = np.array([[0, 1, 2], [0, 2, 3]])
     faces = (4 * np.arange(len(numbers))[:, None, None] + one).reshape(-1, 3)
-    vertices = vertices.reshape(-1, 3) * FINE_VOXEL_SIZE + LOW
+    vertices = vertices.reshape(-1, 3) * MAP.edge + MAP.low
     return Surface(
         vertices, normals.repeat(4, axis=0), np.tile(np.array(color) / 255.0, (len(vertices), 1)), faces
     )

@@ -15,6 +15,7 @@ from robotdiffuse.core.results import load_result
 from robotdiffuse.core.types import FIRST, Status
 from robotdiffuse.perception.assumptions import (
     CARVING_MARGIN,
+    COARSE,
     FINE_SHAPE,
     FINE_VOXEL_SIZE,
     PADDINGS,
@@ -128,10 +129,9 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
     assert result.path is not None
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, near)]).astype(np.float32)
     swept, path = np.zeros(SHAPE, np.bool_), result.path.positions.astype(np.float32)
-    sweep(compile_robot(PANDA), path, np.float32(0), np.array(LOW, np.float32), np.float32(VOXEL), swept)
-    unknown = observe(problem.views, PANDA, START).unknown & ~voxels_in(
-        ends, CARVING_MARGIN + VOXEL / 2, VOXEL
-    )
+    sweep(compile_robot(PANDA), path, np.float32(0), *COARSE.frame, swept)
+    filled = voxels_in(ends, CARVING_MARGIN + VOXEL / 2, COARSE)
+    unknown = observe(problem.views, PANDA, START).unknown & ~filled
     assert unknown.any() and not (swept & unknown).any()
 
 

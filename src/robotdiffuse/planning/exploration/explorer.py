@@ -27,10 +27,10 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
-from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in, voxels_of
+from robotdiffuse.perception.assumptions import voxels_in, voxels_of
 from robotdiffuse.perception.confidence import explored_confidence
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap
+from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, Corners, OccupancyMap
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.swept_voxels_kernel import surface
 from robotdiffuse.perception.unknown_space import UnknownSpace
@@ -39,6 +39,7 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
+from robotdiffuse.planning.exploration.reachable import ReachableTree, first_parts
 from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free, reaches_outside
 from robotdiffuse.planning.exploration.steps import (
     CHANCE,
@@ -62,13 +63,13 @@ from robotdiffuse.scenes.scene import Scene
 
 NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2
-"""Part of the time limit for a search within space seen free that a look, or another search, may follow."""
+"""Part of the time limit for a search that a look, or another search, may follow. Within space seen free it
+doubles with each look: the more was seen, the less likely a search fails for lack of it."""
 TENTATIVE_MOTIONS = 2
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
-MAX_LOOKS_FOR = 2
-"""Voxels that this many looks did not show are avoided by the motions that looks are made for."""
-WAY_BACK_SHARES = (0.25, 0.5, 1.0)
-"""Parts of the way in that the arm may go back."""
+PROBABILITY_BELOW = np.float32(0.1)
+"""That a voxel below the volume that the network predicts is occupied, where the map does not know it: the
+share of unknown voxels within reach that are."""
 AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
 
@@ -101,8 +102,8 @@ class Explorer:
         self._views = ViewMemory(robot, settings.max_views)
         self._goal: Goal | None = None
         self._looks = 0
-        self._looked_for = np.zeros(FINE_SHAPE, np.uint8)
-        """How many looks were made for each voxel."""
+        self._looked_for = np.zeros(MAP.shape, np.bool_)
+        """The voxels that looks were to show."""
         self._way_in: Float[ndarray, "n dof"] | None = None
         """Waypoints of the latest motion that was returned."""
         self._news: list[DepthView] = []
@@ -115,7 +116,7 @@ class Explorer:
         middle = 0.5 * (self.robot.lower + self.robot.upper)
         self._goal = Problem(self.robot, NOTHING, middle, goal).goal
         self._looks = 0
-        self._looked_for[:] = 0
+        self._looked_for[:] = False
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
@@ -159,8 +160,8 @@ class Explorer:
     def _seen_points(self) -> Float[ndarray, "n 3"]:
         """The points that kept views observed, without those where more views see through: stray pixels."""
         points = self._views.points()
-        at = voxels_of(points)
-        inside = ((at >= 0) & (at < FINE_SHAPE)).all(axis=1)
+        at = voxels_of(points, MAP)
+        inside = ((at >= 0) & (at < MAP.shape)).all(axis=1)
         stray = np.zeros(len(points), np.bool_)
         stray[inside] = self.map.free[tuple(at[inside].T)]
         return points[~stray]
@@ -185,12 +186,14 @@ class Explorer:
         predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit
-        quick = may_look and policy == STRICT
-        motion = self._motion(problem, policy, predicted, self._quick_limit if quick else limit)
+        quick = limit
+        if may_look and policy == STRICT:
+            quick = min(self._quick_limit * 2**self._looks, limit)
+        motion = self._motion(problem, policy, predicted, quick)
         if self._good(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
-        if look.kind == STUCK and quick:
+        if look.kind == STUCK and quick < limit:
             motion = self._motion(problem, policy, predicted, limit)
             if motion.solved:
                 return self._go(motion, policy)
@@ -238,17 +241,18 @@ class Explorer:
         if policy == STRICT:
             obstacles = not_seen_free(self.map, self.scene, (problem.start,))
             allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
+        tree = ReachableTree(self.robot, allowed, problem.start)
         for camera in self.cameras:
-            looks = best_looks(self.map, allowed, camera, wanted, predicted, problem.start, self._rng)
-            for there in islice(looks, self.settings.look_attempts):
-                look = replace(problem, goal=JointGoal(there[None]))
+            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng)
+            for waypoints in islice(ways, self.settings.look_attempts):
+                look = replace(problem, goal=JointGoal(waypoints[-1:]))
                 if policy == STRICT:
-                    way = self._planned(replace(look, scene=allowed), self._quick_limit)
+                    way = self._along(replace(look, scene=allowed), waypoints, "look")
                 else:
                     way = self._by_chance(look, predicted, self.settings.time_limit)
-                if self._good(way, policy):
+                if way is not None and self._good(way, policy):
                     stated = way.confidence if policy == CHANCE else None
-                    self._looked_for += wanted
+                    self._looked_for |= wanted
                     return Step(LOOK, f"{why}; look at unseen space on the way", policy, way, stated)
         if policy == self.settings.policy == CHANCE:
             strict = self._look(problem, STRICT, predicted, motion)
@@ -264,8 +268,7 @@ class Explorer:
         way = self._way_in
         if way is None or np.abs(way[-1] - problem.start).max() > AT_GOAL:
             return None
-        for share in WAY_BACK_SHARES:
-            waypoints = _first_part(way[::-1], share)
+        for waypoints in first_parts(way[::-1]):
             found = self._within_seen_free(problem, waypoints, "back on the way in")
             if found is not None:
                 return found
@@ -277,10 +280,13 @@ class Explorer:
         """The motion along waypoints, if the validator accepts it within space seen free; else None."""
         obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
         scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-        within = replace(problem, scene=scene, goal=JointGoal(waypoints[-1:]))
-        context = PlanningContext(self._planner.name, within, PlanRequest(self.settings.time_limit))
+        return self._along(replace(problem, scene=scene, goal=JointGoal(waypoints[-1:])), waypoints, name)
+
+    def _along(self, problem: Problem, waypoints: Float[ndarray, "n dof"], name: str) -> PlanResult | None:
+        """The motion along waypoints, if the validator accepts it in the problem's scene; else None."""
+        context = PlanningContext(self._planner.name, problem, PlanRequest(self.settings.time_limit))
         found = context.finish(waypoints, name, name)
-        return None if found is None else replace(found, problem=within)
+        return None if found is None else replace(found, problem=problem)
 
     def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Bool[ndarray, "nx ny nz"]]:
         """A motion among what was seen, and what looks are to show of it: the least of several. Without any,
@@ -289,7 +295,7 @@ class Explorer:
         They avoid occupied voxels, and those that looks were made for in vain, if they can."""
         goals = as_seen.goal.positions if isinstance(as_seen.goal, JointGoal) else ()
         ends = near_ends(self.map, (as_seen.start, *goals))
-        in_vain = (self._looked_for >= MAX_LOOKS_FOR) & self.map.unknown
+        in_vain = self._looked_for & self.map.unknown
         blocked = surface((self.map.occupied | in_vain) & ~ends)
         avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
@@ -338,7 +344,8 @@ class Explorer:
         request = PlanRequest(limit, self._seed, FIRST)
         goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
         unknown = self._unknown(np.stack([problem.start, *goals]), predicted)
-        result = plan_with_unknown_space(self._planner, asked, request, predicted, unknown)
+        above = None if predicted is None else predicted[:, :, LAYERS_BELOW:]
+        result = plan_with_unknown_space(self._planner, asked, request, above, unknown)
         return replace(self._with_confidence(result, predicted), problem=asked)
 
     def _with_confidence(
@@ -356,7 +363,7 @@ class Explorer:
         self, ends: Float[ndarray, "n dof"], predicted: Float32[ndarray, "nx ny nz"] | None
     ) -> UnknownSpace:
         """What the map does not know, without the voxels that the arm fills at these configurations."""
-        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, margin=0.0)
+        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
         """A first motion in the problem's scene as it is, found within a time limit [s]."""
@@ -372,7 +379,7 @@ class Explorer:
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 
     def _occupied_by(self, q: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
-        return voxels_in(placed_spheres(self.robot, q).astype(np.float32))
+        return voxels_in(placed_spheres(self.robot, q).astype(np.float32), grid=MAP)
 
     def predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
         """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
@@ -382,15 +389,9 @@ class Explorer:
 
         if not (len(self._views) and self.settings.predict and covers(self.robot)):
             return None
-        return np.where(self.map.free, np.float32(0), predict(self._views.volume()))
-
-
-def _first_part(waypoints: Float[ndarray, "n dof"], share: float) -> Float[ndarray, "m dof"]:
-    """The part of a path before a share of its length."""
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
-    end = share * at[-1]
-    last = np.array([np.interp(end, at, joint) for joint in waypoints.T])
-    return np.concatenate([waypoints[at < end], last[None]])
+        below = ((0, 0), (0, 0), (LAYERS_BELOW, 0))
+        probability = np.pad(predict(self._views.volume()), below, constant_values=PROBABILITY_BELOW)
+        return np.where(self.map.free, np.float32(0), probability)
 
 
 def _said(stated: float | None) -> str:

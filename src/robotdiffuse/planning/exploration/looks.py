@@ -6,22 +6,22 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
-from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.types import Path
-from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE
-from robotdiffuse.perception.observed_volume import LOW
-from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.perception.occupancy_map import MAP, OccupancyMap
 from robotdiffuse.perception.swept_voxels_kernel import sweep
 from robotdiffuse.perception.visibility_kernel import seen_weights
 from robotdiffuse.planning.exploration.cameras import ArmCamera
+from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, near_ends
-from robotdiffuse.scenes.scene import Scene
 
-CONFIGURATIONS = 900
-"""Random configurations that a look is chosen from, at first."""
+CONFIGURATIONS, TARGETS, ROUNDS = 900, 1200, 5
+"""Reachable configurations that a look is chosen from, at first; random ones that they are sought by in a
+round; and the most rounds."""
 SPREADS = (0.3, 0.8, 2.0)
-"""Standard deviations of their distances from the arm's configuration, in equal parts [rad]."""
+"""Standard deviations of the distances of random ones from the arm's, in equal parts [rad]."""
+LONGEST_STEP = 1.0
+"""The longest step towards one [rad, joint-space L2]; most are much shorter, for gaps."""
 REFINEMENTS = (0.25, 0.1)
 """Standard deviations of the configurations around the best ones, in rounds after the first [rad]."""
 REFINED, NEIGHBOURS = 12, 15
@@ -39,27 +39,24 @@ MIN_SEEN = 0.02
 def swept_unseen(known: OccupancyMap, path: Path) -> Bool[ndarray, "nx ny nz"]:
     """The voxels that the map does not know and whose covering balls a path touches, without those near its
     ends, which count as free."""
-    swept = np.zeros(FINE_SHAPE, np.bool_)
-    positions, voxel = path.positions.astype(np.float32), np.float32(FINE_VOXEL_SIZE)
-    low, margin = np.array(LOW, np.float32), np.float32(COVER_RADIUS)
-    sweep(compile_robot(known.robot), positions, margin, low, voxel, swept)
+    swept, positions = np.zeros(MAP.shape, np.bool_), path.positions.astype(np.float32)
+    sweep(compile_robot(known.robot), positions, np.float32(COVER_RADIUS), *MAP.frame, swept)
     return swept & known.unknown & ~near_ends(known, (path.positions[0], path.positions[-1]))
 
 
 def best_looks(
     known: OccupancyMap,
-    scene: Scene,
+    tree: ReachableTree,
     camera: ArmCamera,
     wanted: Bool[ndarray, "nx ny nz"],
     probability: Float32[ndarray, "nx ny nz"] | None,
-    start: Float[ndarray, "dof"],
     rng: np.random.Generator,
-) -> Iterator[Float[ndarray, "dof"]]:
-    """Configurations from which the camera sees wanted voxels, the best first: weighted by the prediction if
-    there is one, against the way to get there.
+) -> Iterator[Float[ndarray, "n dof"]]:
+    """Ways to configurations from which the camera sees wanted voxels, the best first: weighted by the
+    prediction if there is one, against the way to get there.
 
-    scene: the arm does not collide with it at the configurations. A voxel counts by the chance that nothing
-    hides it: neither the arm, nor what is occupied or predicted.
+    tree: of configurations that the arm can reach, which grows here. A voxel counts by the chance that
+    nothing hides it: neither the arm, nor what is occupied or predicted.
     """
     robot = known.robot
     at = np.argwhere(wanted)
@@ -73,12 +70,10 @@ def best_looks(
     if len(at) > MAX_VOXELS:
         chosen = rng.choice(len(at), MAX_VOXELS, replace=False)
         at, weights = at[chosen], weights[chosen]
-    checker, (width, height) = CollisionChecker(robot, scene), camera.size
+    start, (width, height) = tree.configurations[0], camera.size
 
-    def scored(q: Float[ndarray, "n dof"]) -> tuple[Float[ndarray, "m dof"], Float[ndarray, "m"]]:
-        """The configurations without collision that see enough, and their scores."""
-        q = np.clip(q, robot.lower, robot.upper)
-        q = q[checker.free(q)]
+    def scored(q: Float[ndarray, "n dof"]) -> Float[ndarray, "n"]:
+        """The scores of configurations; 0 for those that see too little."""
         seen = (
             seen_weights(
                 compile_robot(robot),
@@ -90,18 +85,24 @@ def best_looks(
                 at,
                 weights,
                 filled,
-                np.array(LOW, np.float32),
-                np.float32(FINE_VOXEL_SIZE),
+                *MAP.frame,
             )
             / weights.sum()
         )
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / FULL_COST_LENGTH)
-        return q[seen >= MIN_SEEN], score[seen >= MIN_SEEN]
+        return np.where(seen < MIN_SEEN, 0.0, score)
 
-    spread = np.repeat(SPREADS, -(-CONFIGURATIONS // len(SPREADS)))[:, None]
-    q, score = scored(start + spread * rng.standard_normal((len(spread), robot.dof)))
+    spread = np.resize(SPREADS, TARGETS)[:, None]
+    for _ in range(ROUNDS):
+        if len(tree) < CONFIGURATIONS:
+            targets = start + spread * rng.standard_normal((TARGETS, robot.dof))
+            tree.grow(targets, LONGEST_STEP * rng.random(TARGETS) ** 2)
+    score = scored(tree.configurations)
     for spread in REFINEMENTS:
-        best = q[np.argsort(-score, kind="stable")[:REFINED]].repeat(NEIGHBOURS, axis=0)
-        more, scores = scored(best + spread * rng.standard_normal(best.shape))
-        q, score = np.concatenate([q, more]), np.concatenate([score, scores])
-    yield from q[np.argsort(-score, kind="stable")]
+        best = tree.configurations[np.argsort(-score, kind="stable")[:REFINED]].repeat(NEIGHBOURS, axis=0)
+        tree.grow(best + spread * rng.standard_normal(best.shape), np.full(len(best), np.inf))
+        score = np.concatenate([score, scored(tree.configurations[len(score) :])])
+    for number in np.argsort(-score, kind="stable"):
+        if score[number] == 0:
+            return
+        yield tree.way(int(number))

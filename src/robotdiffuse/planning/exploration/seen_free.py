@@ -7,10 +7,9 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
-from robotdiffuse.perception.assumptions import CARVING_MARGIN, FINE_SHAPE, FINE_VOXEL_SIZE, voxels_in
+from robotdiffuse.perception.assumptions import CARVING_MARGIN, voxels_in
 from robotdiffuse.perception.depth_view import AssumedPoints
-from robotdiffuse.perception.observed_volume import LOW
-from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.perception.occupancy_map import MAP, OccupancyMap
 from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.perception.swept_voxels_kernel import surface
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -18,7 +17,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape
 
-COVER_RADIUS = FINE_VOXEL_SIZE * 3**0.5 / 2
+COVER_RADIUS = MAP.edge * 3**0.5 / 2
 """Radius of the ball around a voxel's centre that covers the voxel [m]."""
 WALL = 2.0
 """Thickness of the walls around the map [m]."""
@@ -40,14 +39,14 @@ def not_seen_free(
 def near_ends(known: OccupancyMap, ends: Sequence[Float[ndarray, "dof"]]) -> Bool[ndarray, "nx ny nz"]:
     """The voxels around the arm at these configurations that count as free."""
     spheres = np.concatenate([placed_spheres(known.robot, q) for q in ends]).astype(np.float32)
-    return voxels_in(spheres, CARVING_MARGIN + FINE_VOXEL_SIZE / 2)
+    return voxels_in(spheres, CARVING_MARGIN + MAP.edge / 2, MAP)
 
 
 def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], name: str) -> AssumedPoints:
     """Balls that cover the voxels of these indices, without those in the known scene."""
-    points = (voxels + 0.5) * FINE_VOXEL_SIZE + LOW
+    points = (voxels + 0.5) * MAP.edge + MAP.low
     if known_scene.shapes:
-        scene, inside = compile_scene_for(known.robot, known_scene), np.float32(FINE_VOXEL_SIZE / 2 - 1e-3)
+        scene, inside = compile_scene_for(known.robot, known_scene), np.float32(MAP.edge / 2 - 1e-3)
         points = points[~near_scene(scene, points.astype(np.float32), inside)]
     return AssumedPoints(points, COVER_RADIUS, name=name)
 
@@ -60,8 +59,8 @@ def reaches_outside(robot: Robot, q: Float[ndarray, "dof"]) -> bool:
 
 
 def _ends_of_map() -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
-    low = np.array(LOW)
-    return low, low + np.array(FINE_SHAPE) * FINE_VOXEL_SIZE
+    low = np.array(MAP.low)
+    return low, low + np.array(MAP.shape) * MAP.edge
 
 
 def _walls() -> list[Box]:

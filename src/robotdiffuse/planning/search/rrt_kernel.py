@@ -122,6 +122,27 @@ def connect(space, trees, longest, iterations, state):
     return search(space, trees, nowhere, np.float32(np.inf), longest, iterations, state)
 
 
+@kernel(nogil=True)
+def extend(space, trees, targets, longest):
+    """Extend the start's tree from its nearest node towards each of the targets [n, dof], by at most
+    longest[n] [rad], where that motion is free; stops early when the tree is full."""
+    nodes, sizes = trees.nodes, trees.sizes
+    dof = nodes.shape[2]
+    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
+    new = np.empty(dof, np.float32)
+    for n in range(len(targets)):
+        if sizes[0] >= nodes.shape[1]:
+            break
+        near = _nearest(trees, 0, targets[n], np.float32(np.inf))
+        gap = distance(nodes[0, near], targets[n])
+        share = min(longest[n] / max(gap, np.float32(1e-6)), _ONE)
+        for j in range(dof):
+            beyond = nodes[0, near, j] + share * (targets[n, j] - nodes[0, near, j])
+            new[j] = min(max(beyond, space.lower[j]), space.upper[j])
+        if motion_free(space, nodes[0, near], new, block, work):
+            _add(trees, 0, new, trees.costs[0, near] + share * gap, near)
+
+
 @allocation_free(inline="always")
 def _add(trees, tree, q, cost, parent):
     here, dof = trees.sizes[tree], len(q)
