@@ -65,7 +65,7 @@ CONFIGS: dict[str, Config] = {
         {
             **_TABLE2_ROW,
             "minutes": None,
-            "samples": 1_600_000,
+            "samples": 2_400_000,
             "encoder": "points",
             "denoiser": "cross_attention",
             "turned_copies": 15,
