@@ -75,7 +75,7 @@ def test_bounds(values: dict[str, Any], message: str) -> None:
         ({"step": "1"}, "search.step is '1'; it takes float positive"),
         ({"step": None}, "search.step is None; it takes float positive"),
         ({"step": True}, "search.step is True; it takes float positive"),
-        ({"range": []}, r"search.range is \(\); it takes float positive or none"),
+        ({"range": []}, r"search.range is \[\]; it takes float positive or none"),
         ({"order": 1}, "search.order is 1; it takes first, best"),
         ({"inner": 3}, "search.inner is 3; it takes Coarse"),
         ({"levels": 0.1}, "search.levels is 0.1; it takes tuple"),

@@ -136,8 +136,13 @@ class Settings:
         """
         prefix = f"{self.settings_name}." if self.settings_name else ""
         for name, hint in _hints(type(self)).items():
-            object.__setattr__(self, name, _plain(getattr(self, name)))
-            _check(prefix + name, hint, getattr(self, name), self)
+            given = getattr(self, name)
+            value = _plain(given)
+            if _fits(hint, value):
+                object.__setattr__(self, name, value)
+            else:  # the error shows what was given
+                value = given
+            _check(prefix + name, hint, value, self)
 
     def to_json(self) -> dict[str, Any]:
         """All fields as plain JSON values."""

@@ -53,7 +53,7 @@ def _identity(file: FilePath, _changed: int) -> RobotIdentity:
 def folder_of(folder: str | FilePath) -> FilePath:
     """The folder of weights; the name of one that comes with the package stands for it."""
     place = FilePath(folder)
-    return BUNDLED / folder if not place.exists() and (BUNDLED / folder).is_dir() else place
+    return place if os.path.exists(place) or not os.path.isdir(BUNDLED / folder) else BUNDLED / folder
 
 
 def check_weights(name: str, folder: str | FilePath | None) -> None:

@@ -162,8 +162,8 @@ def test_a_clearance_above_the_default_falls_back_through_it() -> None:
 def test_the_clearance_of_a_call_overrides_that_of_the_problem() -> None:
     wide = Problem(PANDA, WALL, LEFT, RIGHT, clearance=0.05)
     kept, less = AORRTC().plan(wide, 5.0), AORRTC().plan(wide, 5.0, clearance=0.0)
-    assert kept.path_length is not None and less.path_length is not None
-    assert kept.path_length > less.path_length
+    assert kept.trajectory is not None and less.trajectory is not None
+    assert kept.trajectory.duration > less.trajectory.duration
     with pytest.raises(InputError, match=r"clearance is -0\.1; it must be a distance from 0 to 0.5 m"):
         Problem(PANDA, WALL, LEFT, RIGHT, clearance=-0.1)
 
