@@ -25,7 +25,9 @@ from robotdiffuse.evaluation.bench.runner import BenchSettings, open_runs, run_b
 from robotdiffuse.evaluation.problem_sets import gather_cases, validator
 from robotdiffuse.evaluation.records import Record, RecordFile, read_records
 from robotdiffuse.evaluation.runs import Run
+from robotdiffuse.learning.weights_registry import BUNDLED
 from robotdiffuse.planning import PLANNERS
+from robotdiffuse.planning.diffusion.diffusion import Diffusion
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
 from robotdiffuse.planning.search.aorrtc import AORRTCSettings
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
@@ -237,6 +239,14 @@ def test_a_planner_with_settings() -> None:
     nested = PlannerSpec.parse("robotdiffuse:search.range=0.5:samples=4").load()
     assert isinstance(nested, RobotDiffuse)
     assert (nested.settings.search.range, nested.settings.samples) == (0.5, 4)
+
+
+def test_weights_of_the_package_are_found_by_their_name() -> None:
+    """They were sought in the working folder, and the row of Table 1 without clearances could not run."""
+    spec = PlannerSpec.parse("diffusion@panda_points:samples=1")
+    assert spec.label == "diffusion@panda_points:samples=1" and list(spec.weights_hashes) == ["model"]
+    planner = spec.load()
+    assert isinstance(planner, Diffusion) and planner.settings.weights == str(BUNDLED / "panda_points")
 
 
 @pytest.mark.parametrize("cut", [1, 20, 100])

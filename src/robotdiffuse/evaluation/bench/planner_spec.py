@@ -39,7 +39,7 @@ class PlannerSpec:
         whole, *settings = text.split(":")
         name, at, folder = whole.partition("@")
         PLANNERS.entry(name)
-        found = cls(name, str(FilePath(folder).resolve()) if at else None, tuple(settings))
+        found = cls(name, str(folder_of(folder).resolve()) if at else None, tuple(settings))
         found.request()
         if settings:
             found._settings()
@@ -63,7 +63,7 @@ class PlannerSpec:
         """SHA-256 of the weights in its folder, by network; empty without a folder."""
         if self.weights is None:
             return {}
-        folder = folder_of(self.weights)
+        folder = FilePath(self.weights)
         names = [name for name in NETWORKS if is_file(folder / f"{name}.json")]
         return {name: read_description(folder, name).get("weights_sha256") for name in names}
 
