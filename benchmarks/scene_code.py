@@ -50,7 +50,7 @@ from robotdiffuse.learning.denoisers.settings import (
     TransformerSettings,
 )
 from robotdiffuse.learning.encoders import make_encoder
-from robotdiffuse.learning.encoders.base import Encoder, fp32
+from robotdiffuse.learning.encoders.base import Encoder, fp32, wave_angles
 from robotdiffuse.learning.encoders.settings import EncoderSettings, PointNetSettings, PointsSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
@@ -125,7 +125,7 @@ class ObstacleCode(Encoder):
 
     def forward(self, cloud: Float[Tensor, "batch slots 9"]) -> Float[Tensor, "batch code"]:
         with fp32(cloud):
-            angles = torch.cat([cloud[..., 2:5] * (np.pi / 2 * 2**k) for k in range(self.OCTAVES)], -1)
+            angles = torch.cat(wave_angles(cloud[..., 2:5], self.OCTAVES), -1)
             known = torch.cat([cloud, angles.sin(), angles.cos()], -1)
             return self.all((self.each(known) * cloud[..., -1:]).sum(1))
 

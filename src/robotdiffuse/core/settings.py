@@ -282,7 +282,7 @@ def _plain(value: Any) -> Any:
 
 
 def _fits(hint: Any, value: Any) -> bool:
-    """Whether a value is of a type, whatever its entries are."""
+    """Whether a value is of a type; entries of tuples are not looked at."""
     for option in _options(_split(hint)[0]):
         bare = _split(option)[0]
         kind = get_origin(bare) or bare

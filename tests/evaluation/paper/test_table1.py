@@ -82,6 +82,11 @@ def test_the_row_of_weights_says_what_they_are(
     assert row == Row(name, f"diffusion@{tmp_path}:samples=1:guidance_steps=0:repeat=false")
 
 
+def test_weights_of_the_package_are_named_without_their_folder(tmp_path: Path) -> None:
+    row = Table1Settings(tmp_path, paper_weights="panda_points").rows[5]
+    assert row.name.startswith(f"{table1.WITHOUT_CLEARANCES}: points, cross_attention")
+
+
 @pytest.mark.slow
 def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lines = Row(ROWS[4].name, "straight_line", table1.OURS), Row("nearest", "straight_line:goals=nearest")

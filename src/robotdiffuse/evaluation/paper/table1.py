@@ -17,7 +17,7 @@ from robotdiffuse.evaluation.statistics import wilson_interval
 from robotdiffuse.evaluation.tables import Column, Figure, Table
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.weight_files import read_description
-from robotdiffuse.learning.weights_registry import POINTS
+from robotdiffuse.learning.weights_registry import POINTS, folder_of
 
 AS_IN_PAPER = "diffusion, as the paper says"
 WITHOUT_CLEARANCES = "diffusion, no clearances, one unguided sample"
@@ -111,7 +111,7 @@ def run_table1(settings: Table1Settings, report: Report, done: Done) -> Bench:
 
 def _title(folder: str) -> str:
     """The name of the row of a folder's weights: what they are. Raises InputError if there are none."""
-    about = read_description(FilePath(folder), "model")
+    about = read_description(folder_of(folder), "model")
     of = MotionModelSettings.from_json(about.get("settings"), f"{folder}/model.json: settings")
     title = AS_IN_PAPER if (of.encoder, of.denoiser, of.waypoints) == PAPER_PARTS else WITHOUT_CLEARANCES
     seen = about.get("training", {}).get("samples", 0.0) / PAPER_SAMPLES

@@ -1,6 +1,5 @@
 """A transformer whose waypoints attend to points of the scene, in place of one vector for the whole scene."""
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -14,9 +13,10 @@ from robotdiffuse.learning.denoisers.layers import (
     two_layers,
 )
 from robotdiffuse.learning.denoisers.settings import CrossAttentionSettings
+from robotdiffuse.learning.encoders.base import wave_angles
 
 OCTAVES = 4
-"""Wavelengths (4 m, 2 m, ...) of the sines and cosines of a point's coordinates that are further inputs."""
+"""Wavelengths of the sines and cosines of a point's coordinates that are inputs too; see `wave_angles`."""
 
 
 class CrossAttention(Denoiser):
@@ -52,7 +52,7 @@ class CrossAttention(Denoiser):
         """The output for noisy trajectories; level is t / T in [0, 1]."""
         batch = features.shape[0]
         points = condition[:, : -2 * self.dof].reshape(batch, -1, 3)
-        angles = torch.cat([points * (np.pi / 2 * 2**k) for k in range(OCTAVES)], -1)
+        angles = torch.cat(wave_angles(points, OCTAVES), -1)
         known = torch.cat([points, angles.sin(), angles.cos()], -1)
         memory = self.norm_points(self.points(known))
         z_tk = self.ends(condition[:, -2 * self.dof :]) + self.level(level)

@@ -107,6 +107,12 @@ def fp32(tensor: Tensor) -> torch.autocast:
     return torch.autocast(tensor.device.type, enabled=False)
 
 
+def wave_angles(points: Float[Tensor, "*batch 3"], octaves: int) -> list[Float[Tensor, "*batch 3"]]:
+    """Coordinates as angles at the wavelengths 4 m, 2 m, ...: with their sines and cosines a small perceptron
+    distinguishes positions."""
+    return [points * (torch.pi / 2 * 2**octave) for octave in range(octaves)]
+
+
 def pool_max(
     features: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
 ) -> Float[Tensor, "batch channels"]:

@@ -14,7 +14,7 @@ from numpy.random import Generator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from robotdiffuse.learning.encoders.base import Autoencoder, fp32
+from robotdiffuse.learning.encoders.base import Autoencoder, fp32, wave_angles
 from robotdiffuse.learning.encoders.settings import PointAutoencoderSettings
 
 DISTANCE_QUERIES = 96
@@ -65,8 +65,8 @@ class PointAutoencoder(Autoencoder):
         return self.head(torch.where(count > 0, pooled, empty)).float()
 
     def _waves(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch waves"]:
-        """Coordinates with their sines and cosines, by which a small perceptron distinguishes positions."""
-        angles = [points * (torch.pi / 2 * 2**octave) for octave in range(self.settings.octaves)]
+        """Coordinates with the sines and cosines of `wave_angles`."""
+        angles = wave_angles(points, self.settings.octaves)
         return torch.cat([points, *(part for a in angles for part in (a.sin(), a.cos()))], -1)
 
     def decode(self, code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch decoded 3"]:
