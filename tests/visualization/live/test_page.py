@@ -59,6 +59,8 @@ def live() -> Iterator["tuple[Page, str]"]:
 
     listening = listen("127.0.0.1", 0)
     page = Page(Session(first_problem(None, None), PageOptions("aorrtc")), listening)
+    # in whichever test a worker begins, it compiles here: later waits are for the page alone
+    until(lambda: page.session.state.motion is not None, COMPILING)
     yield page, "http://{}:{}/".format(*listening.getsockname())
     page.close()
 
@@ -69,12 +71,13 @@ def view(browser: Any, live: "tuple[Page, str]") -> Any:
     view = browser.new_page(viewport={"width": 900, "height": 500})
     view.set_default_timeout(PATIENCE)
     view.goto(live[1])
-    view.locator(VALID).wait_for(timeout=COMPILING)
+    view.locator(VALID).wait_for()
     return view
 
 
-def until(holds: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE / 1000
+def until(holds: Callable[[], object], patience: float = PATIENCE) -> None:
+    """patience [ms]."""
+    end = time.monotonic() + patience / 1000
     while not holds():
         assert time.monotonic() < end
         time.sleep(0.02)
