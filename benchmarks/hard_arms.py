@@ -38,7 +38,7 @@ def hard_ones(name: str, count: int) -> list[Problem]:
         with suppress(InputError):  # many scenes have no free start and goal
             problem = family_for(family, robot).draw(robot, rng).problem(robot)
             if drawn == 1 or not found:
-                search.warm_up(problem, "converged")
+                search.warm_up(problem)
             if not search.plan(problem, SELECTION_LIMIT, seed=SELECTION, until="first").solved:
                 found.append(problem)
     print(f"{name}: {count} hard problems among {drawn} draws", flush=True)
@@ -61,7 +61,7 @@ def main() -> None:
         problems = hard_ones(name, arguments.problems)
         planners = {planner: load_planner(planner) for planner in PLANNERS}
         for planner in planners.values():
-            planner.warm_up(problems[0], "converged")
+            planner.warm_up(problems[0])
         at: dict[str, list[float]] = {planner: [] for planner in PLANNERS}
         longest = max(arguments.limits)
         for i, problem in enumerate(progress(problems, name)):

@@ -28,7 +28,7 @@ import httpx
 import numpy as np
 
 import robotdiffuse as rd
-from common import CONVERGED, header, parse, print_table
+from common import header, parse, print_table
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 
@@ -80,7 +80,7 @@ def requests(planner: str, count: int) -> list[PlanRequest]:
 def plan_alone(plan_requests: list[PlanRequest], planner: str) -> tuple[float, float]:
     """Wall and CPU time of the planner alone for all requests [s]; keeps its answers in these."""
     loaded = rd.load_planner(planner)
-    loaded.warm_up(plan_requests[0].problem, CONVERGED)
+    loaded.warm_up(plan_requests[0].problem)
     for one in plan_requests:
         result = loaded.plan(one.problem, TIME_LIMIT, one.seed)
         waypoints = None if result.path is None else result.path.positions.tolist()

@@ -18,7 +18,7 @@ class SlowPlanner(AORRTC):
     """The problems that it was called with and has planned for."""
     go = threading.Semaphore(0)
 
-    def warm_up(self, problem: Problem, until: str = "first") -> list[PlanResult]:
+    def warm_up(self, problem: Problem, until: str = "converged") -> list[PlanResult]:
         return []
 
     def plan(self, problem: Problem, *request: object, **more: object) -> PlanResult:

@@ -115,3 +115,14 @@ def test_plan_with_a_planner_and_settings_by_name() -> None:
 def test_help_names_every_argument_of_plan() -> None:
     text = inspect.getdoc(plan) or ""
     assert all(name in text for name in inspect.signature(plan).parameters)
+
+
+def test_warming_up_loads_what_a_plan_needs_by_default() -> None:
+    # it ended at first paths, and the first plan then compiled the search for the fastest motion (10 s)
+    defaults = [
+        inspect.signature(call).parameters["until"].default for call in (Planner.warm_up, Planner.plan)
+    ]
+    assert defaults[0] == defaults[1]
+    problem = Problem(load_robot("panda"), Scene([]), START, GOAL)
+    rows = [len(result.path.positions) for result in load_planner("aorrtc").warm_up(problem) if result.path]
+    assert rows[0] == 2 and max(rows) > 2, "balls in the way make corners"

@@ -10,12 +10,12 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.loading import compile_note
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import CONVERGED, FIRST, TIME
+from robotdiffuse.core.types import CONVERGED, TIME
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, planners_that_support
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.pipeline import pipeline_for
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.problems.problem import JointGoal, Problem, check_problem
+from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.mesh import Mesh
@@ -109,7 +109,7 @@ class Planner(ABC, Generic[PlannerSettings]):
                 able = ", ".join(planners_that_support(what))
                 raise InputError(f"planner {self.name} does not support {what}; these do: {able}")
 
-    def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
+    def warm_up(self, problem: Problem, until: str = CONVERGED) -> list[PlanResult]:
         """Load or compile the code of later calls now, for programs that cannot wait in a first call.
 
         A first call loads by itself what it needs, and does not count it as its time, but takes longer.
@@ -120,17 +120,22 @@ class Planner(ABC, Generic[PlannerSettings]):
         """
         from robotdiffuse.collision.exact_meshes import warm_up as load_coal
 
+        def call(task: Problem, seconds: float) -> PlanResult:
+            return self._plan(task, PlanRequest(seconds, until=until))
+
         robot, start, goal = problem.robot, problem.start, problem.goal
-        goals = goal.positions[:1] if isinstance(goal, JointGoal) else []
-        on_line = [start + share * (end - start) for end in goals for share in (0.5, 0.35)]
-        balls = [Sphere(link_pose(robot, q, robot.tip)[:3, 3], WARM_UP_RADIUS) for q in on_line]
+        load_coal(robot)
+        results = [call(Problem(robot, Scene(), start, goal), EASY_TIME_LIMIT)]
+        # around a ball in the way there are corners, whose timing has code of its own
+        ends = [] if results[0].path is None else [results[0].path.positions[-1]]
+        on_line = [start + share * (end - start) for end in ends for share in (0.5, 0.35)]
+        for q in on_line:
+            ball = Sphere(link_pose(robot, q, robot.tip)[:3, 3], WARM_UP_RADIUS)
+            results.append(call(Problem(robot, Scene([ball]), start, goal), EASY_TIME_LIMIT))
         kinds = replace(problem, waypoints=(), blend=(), moving=(), start_velocity=None)
         if not problem.views:
             kinds = replace(kinds, scene=one_of_each(problem.scene))
-        easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]
-        calls = [*((easier, EASY_TIME_LIMIT) for easier in easy), (kinds, SHORT_TIME_LIMIT)]
-        load_coal(robot)
-        return [self._plan(task, PlanRequest(seconds, until=until)) for task, seconds in calls]
+        return [*results, call(kinds, SHORT_TIME_LIMIT)]
 
     def prepare(self, robot: Robot) -> None:
         """Do what does not count as planning time: learned planners load their weights for the robot, and

@@ -97,9 +97,12 @@ def warm_up() -> bool:
     """Load or compile the code that most requests need; returns whether anything was compiled."""
     assert _state is not None
     name, robot = next(iter(_state.robots.items()))
-    middle = (robot.lower + robot.upper) / 2
+    start = (robot.lower + robot.upper) / 2
+    start[1:2] += 0.3  # an arm that points up does not move its tip by its first joint
+    goal = start.copy()
+    goal[0] += (robot.upper[0] - start[0]) / 2
     far = Scene([Box([2.0, 2.0, 2.0], [0.1, 0.1, 0.1])])
-    _warm_up_once(_planner(DEFAULT_PLANNER), Problem(robot, far, middle, middle + 0.1), name)
+    _warm_up_once(_planner(DEFAULT_PLANNER), Problem(robot, far, start, goal), name)
     return compile_seconds() > 0
 
 

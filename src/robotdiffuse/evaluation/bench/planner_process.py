@@ -19,7 +19,6 @@ from typing import TextIO
 
 from robotdiffuse.core.line_process import LineProcess
 from robotdiffuse.core.registry import Entry, added_entries, adopt_entries
-from robotdiffuse.core.types import CONVERGED
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.methods import measure_of, planner_calls
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN
@@ -133,7 +132,7 @@ def _read(tasks: TextIO, lines: "queue.Queue[str]") -> None:
 def _warm_up(planner: Planner, problem: Problem) -> None:
     """Compile, load and fill caches, those of the metrics too."""
     try:
-        for result in planner.warm_up(problem, CONVERGED):
+        for result in planner.warm_up(problem):
             if result.path is not None and result.trajectory is not None:
                 measure_of(problem.robot)(result.path, result.trajectory, result)
     except Exception:  # the timed call will report it
