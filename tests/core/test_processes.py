@@ -98,7 +98,7 @@ def test_shared_calls_of_a_script_that_processes_cannot_import_say_what_to_do(
     script.write_text(CHECKS)
     arguments = {"file": [str(script)], "stdin": ["-"], "text": ["-c", CHECKS]}[by]
     command = [sys.executable, *arguments]
-    ended = subprocess.run(command, input=CHECKS, capture_output=True, text=True, timeout=60, check=True)
+    ended = subprocess.run(command, input=CHECKS, capture_output=True, text=True, timeout=500, check=True)
     if by == "text":
         assert ended.stdout == "[(0, 1), (1, 2)]\n"
     else:

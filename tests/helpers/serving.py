@@ -29,7 +29,7 @@ def serving(*arguments: str, **environment: str) -> Iterator[tuple[httpx.Client,
         assert process.stdout is not None
         found = re.search(r"http://[^;]+", process.stdout.readline())
         assert found is not None and "ready" in process.stdout.readline()
-        with httpx.Client(base_url=found.group(), timeout=60.0) as client:
+        with httpx.Client(base_url=found.group(), timeout=500.0) as client:
             yield client, process
     finally:
         process.send_signal(signal.SIGKILL)

@@ -100,7 +100,7 @@ def test_a_script_that_processes_cannot_import_is_an_error(beginning: str, tmp_p
     """It hung: what a process is given as it starts, robots, does not fit a pipe that nobody reads."""
     script = tmp_path / "script.py"
     script.write_text(beginning + PLANS)
-    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=500)
     lines = ended.stdout.splitlines()
     assert len(lines) == 2 and len({*lines}) == 1
     assert lines[0].startswith("error a worker process could not import the main script")
@@ -109,7 +109,7 @@ def test_a_script_that_processes_cannot_import_is_an_error(beginning: str, tmp_p
 
 def test_a_script_from_standard_input_is_an_error_that_says_what_to_do() -> None:
     ended = subprocess.run(
-        [sys.executable, "-"], input=PLANS, capture_output=True, text=True, timeout=120, check=True
+        [sys.executable, "-"], input=PLANS, capture_output=True, text=True, timeout=500, check=True
     )
     for line in ended.stdout.splitlines():
         assert line.startswith("error worker processes cannot import a script from standard input; save it")
