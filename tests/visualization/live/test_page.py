@@ -34,7 +34,7 @@ FLAGS = [
     "--enable-unsafe-swiftshader",
 ]
 """WebGL without a graphics card."""
-PATIENCE, COMPILING = 30_000, 300_000
+PATIENCE, COMPILING = 120_000, 300_000
 """[ms]; a new machine compiles before the first plan."""
 VALID, INVALID = "[data-validity=valid]", "[data-validity=invalid]"
 
