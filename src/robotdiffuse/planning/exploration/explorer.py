@@ -10,7 +10,7 @@ follows from the predicted probability of all voxels that the map does not know 
 those that the arm fills where it begins and ends.
 
 Looks are chosen by what a tentative motion, planned among what was seen alone, would sweep unseen. A look's
-own motion is subject to the same policy; by chance, a strict one will do where none is confident enough.
+own motion is subject to the same policy; by chance, too, a strict one comes first.
 """
 
 from collections.abc import Sequence
@@ -237,6 +237,27 @@ class Explorer:
         if kept is not None and self._good(kept, under):
             return self._go(kept, under)
         predicted = self.predicted() if predicted is None else predicted
+        # a look has many ways: by chance, too, it takes one through space seen free if there is any
+        policies = (STRICT, CHANCE) if self.settings.policy == CHANCE else (policy,)
+        for under in policies:
+            way = self._way_to_look(problem, under, wanted, predicted)
+            if way is not None:
+                stated = way.confidence if under == CHANCE else None
+                self._looked_for |= wanted
+                return Step(LOOK, f"{why}; look at unseen space on the way", under, way, stated)
+        back = self._way_back(problem) if STRICT in policies else None
+        if back is not None:
+            return Step(LOOK, f"{why}; go back on the way in and look from there", STRICT, back)
+        return Step(STUCK, f"{why}; no look that would help can be reached", policy)
+
+    def _way_to_look(
+        self,
+        problem: Problem,
+        policy: str,
+        wanted: Bool[ndarray, "nx ny nz"],
+        predicted: Float32[ndarray, "nx ny nz"] | None,
+    ) -> PlanResult | None:
+        """A motion by a policy to where a camera sees most of the wanted voxels; None if none was found."""
         allowed = problem.scene
         if policy == STRICT:
             obstacles = not_seen_free(self.map, self.scene, (problem.start,))
@@ -249,19 +270,10 @@ class Explorer:
                 if policy == STRICT:
                     way = self._along(replace(look, scene=allowed), waypoints, "look")
                 else:
-                    way = self._by_chance(look, predicted, self.settings.time_limit)
+                    way = self._by_chance(look, predicted, self.settings.time_limit, to_goal=False)
                 if way is not None and self._good(way, policy):
-                    stated = way.confidence if policy == CHANCE else None
-                    self._looked_for |= wanted
-                    return Step(LOOK, f"{why}; look at unseen space on the way", policy, way, stated)
-        if policy == self.settings.policy == CHANCE:
-            strict = self._look(problem, STRICT, predicted, motion)
-            if strict.kind != STUCK:
-                return strict
-        back = self._way_back(problem) if policy == STRICT else None
-        if back is not None:
-            return Step(LOOK, f"{why}; go back on the way in and look from there", policy, back)
-        return Step(STUCK, f"{why}; no look that would help can be reached", policy)
+                    return way
+        return None
 
     def _way_back(self, problem: Problem) -> PlanResult | None:
         """A motion that leaves by the way in, as far as there is more room; None if there is none."""
@@ -337,24 +349,30 @@ class Explorer:
         return replace(result, reason=f"no motion through space seen free alone was found{why}")
 
     def _by_chance(
-        self, problem: Problem, predicted: Float32[ndarray, "nx ny nz"] | None, limit: float
+        self,
+        problem: Problem,
+        predicted: Float32[ndarray, "nx ny nz"] | None,
+        limit: float,
+        to_goal: bool = True,
     ) -> PlanResult:
-        """A motion among what was seen and predicted, with its confidence."""
+        """A motion among what was seen and predicted, with its confidence; see `_with_confidence`."""
         asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
         request = PlanRequest(limit, self._seed, FIRST)
-        goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
+        goals = problem.goal.positions if to_goal and isinstance(problem.goal, JointGoal) else ()
         unknown = self._unknown(np.stack([problem.start, *goals]), predicted)
         above = None if predicted is None else predicted[:, :, LAYERS_BELOW:]
         result = plan_with_unknown_space(self._planner, asked, request, above, unknown)
-        return replace(self._with_confidence(result, predicted), problem=asked)
+        return replace(self._with_confidence(result, predicted, to_goal), problem=asked)
 
     def _with_confidence(
-        self, motion: PlanResult, predicted: Float32[ndarray, "nx ny nz"] | None
+        self, motion: PlanResult, predicted: Float32[ndarray, "nx ny nz"] | None, to_goal: bool = True
     ) -> PlanResult:
-        """The motion with the confidence that follows from the probability that it sweeps."""
+        """The motion with the confidence that follows from the probability that it sweeps. The arm is taken
+        to be free where a motion begins, and at the goal, but not where a look ends."""
         if motion.path is None or predicted is None:
             return motion
-        unknown = self._unknown(motion.path.positions[[0, -1]], predicted)
+        ends = motion.path.positions[[0, -1] if to_goal else [0]]
+        unknown = self._unknown(ends, predicted)
         swept = unknown.crossed(motion.path).risk
         stated = None if swept is None else explored_confidence(swept)
         return replace(motion, swept_probability=swept, confidence=stated)
@@ -397,4 +415,4 @@ class Explorer:
 def _said(stated: float | None) -> str:
     if stated is None:
         return "a motion through space seen free alone"
-    return f"a motion that is free with a probability of {stated:.2f}"
+    return f"a motion that is free with a probability of {stated:.3f}"
