@@ -189,11 +189,11 @@ class Explorer:
         quick = limit
         if may_look and policy == STRICT:
             quick = min(self._quick_limit * 2**self._looks, limit)
-        motion = self._motion(problem, policy, predicted, quick)
+        motion = self._motion(problem, policy, predicted, quick, may_look)
         if self._good(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
-        if look.kind == STUCK and quick < limit:
+        if look.kind == STUCK and (quick < limit or motion.status is Status.NO_PATH):
             motion = self._motion(problem, policy, predicted, limit)
             if motion.solved:
                 return self._go(motion, policy)
@@ -331,8 +331,10 @@ class Explorer:
         policy: str,
         predicted: Float32[ndarray, "nx ny nz"] | None,
         limit: float,
+        may_look: bool = False,
     ) -> PlanResult:
-        """A motion to the problem's goal by a policy, found within a time limit [s]."""
+        """A motion to the problem's goal by a policy, found within a time limit [s]. If the arm may look first,
+        a strict one is not searched for where there hardly is one."""
         if policy == CHANCE:
             return self._by_chance(problem, predicted, limit)
         goals = self._goals(problem)
@@ -340,6 +342,9 @@ class Explorer:
             return goals
         outside = [int((self.map.unknown & self._occupied_by(q)).sum()) for q in goals]
         goal = goals[int(np.argmin(outside))]
+        if may_look and free_share(self.map, problem.start, goal) < MIN_FREE_SHARE:
+            context = PlanningContext(self._planner.name, problem, PlanRequest(limit))
+            return context.fail(Status.NO_PATH, "too little of the space around the goal was seen free")
         obstacles = not_seen_free(self.map, self.scene, (problem.start, goal))
         scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None])), limit)

@@ -42,6 +42,13 @@ def near_ends(known: OccupancyMap, ends: Sequence[Float[ndarray, "dof"]]) -> Boo
     return voxels_in(spheres, CARVING_MARGIN + MAP.edge / 2, MAP)
 
 
+def free_share(known: OccupancyMap, start: Float[ndarray, "dof"], goal: Float[ndarray, "dof"]) -> float:
+    """The part that was seen free of the space that the arm fills at a goal, with CARVING_MARGIN around it,
+    and not at the start; 1 where there is none."""
+    filled = near_ends(known, (goal,)) & ~near_ends(known, (start,))
+    return float(known.free[filled].mean()) if filled.any() else 1.0
+
+
 def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], name: str) -> AssumedPoints:
     """Balls that cover the voxels of these indices, without those in the known scene."""
     points = (voxels + 0.5) * MAP.edge + MAP.low
