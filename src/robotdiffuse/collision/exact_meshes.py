@@ -37,7 +37,7 @@ from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_surfa
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
 CHUNK_SIZE = 8192
 """Configurations that `collides` processes at once; bounds its memory."""
@@ -119,12 +119,8 @@ def _obstacle(solid: Solid) -> _Obstacle:
             geometry = coal.Cylinder(shape.radius, shape.height)
         case Capsule():
             geometry = coal.Capsule(shape.radius, shape.height)
-        case Triangulated():
-            geometry = coal_surface(shape.mesh.world_vertices, shape.mesh.faces)
-        case PointCloud():
-            # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
-            points = shape.distinct_points
-            geometry = coal_surface(points, np.repeat(np.arange(len(points))[:, None], 3, axis=1))
+        case Triangulated() | PointCloud():
+            geometry = _tree(shape)
         case _:
             raise TypeError(f"no collision geometry for a {type(shape).__name__}")
     # surfaces are given in the base frame
@@ -134,25 +130,26 @@ def _obstacle(solid: Solid) -> _Obstacle:
 
 
 @lru_cache(maxsize=16)
-def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
-    """The Coal objects of a scene, cached: building the tree over 100,000 points takes half a second."""
-    obstacles: list[_Obstacle] = []
-    for solid in solids_of(scene):
-        count, what = _surfaces(solid.shape)
-        if count:
-            check_time(
-                f"the validator's tree over the {count:,} {what} of {solid.shape.name}",
-                TREE_SECONDS_PER_ELEMENT * count,
-            )
-        obstacles.append(_obstacle(solid))
-    return tuple(obstacles)
-
-
-def _surfaces(shape: Shape) -> tuple[int, str]:
-    """Number of elements in Coal's tree for a shape, and what they are; 0 for a solid."""
+def _tree(shape: Triangulated | PointCloud) -> coal.BVHModelOBBRSS:
+    """Coal's tree over a surface or a point cloud, cached because scenes share shapes: building it over
+    100,000 points takes half a second."""
     if isinstance(shape, PointCloud):
-        return len(shape.distinct_points), "points"
-    return (len(shape.mesh.faces), "triangles") if isinstance(shape, Triangulated) else (0, "")
+        # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
+        vertices, what = shape.distinct_points, "points"
+        faces = np.repeat(np.arange(len(vertices))[:, None], 3, axis=1)
+    else:
+        vertices, faces, what = shape.mesh.world_vertices, shape.mesh.faces, "triangles"
+    check_time(
+        f"the validator's tree over the {len(faces):,} {what} of {shape.name}",
+        TREE_SECONDS_PER_ELEMENT * len(faces),
+    )
+    return coal_surface(vertices, faces)
+
+
+@lru_cache(maxsize=16)
+def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
+    """The Coal objects of a scene, cached."""
+    return tuple(map(_obstacle, solids_of(scene)))
 
 
 @dataclass(frozen=True)

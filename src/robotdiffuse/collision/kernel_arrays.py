@@ -202,6 +202,16 @@ def reach_bound(robot: Robot) -> float:
     return float(farthest + extent.max(initial=0.0))
 
 
+@once_per_robot
+def reach_ball(robot: Robot) -> tuple[ndarray, float]:
+    """Centre [3] and radius of a ball around all spheres of moving links [m]. It is about the first joint if
+    that moves them all, and then smaller than the one about the base's origin."""
+    first, reach = robot.frame_offsets[0, :3, 3], reach_bound(robot)
+    return (
+        (first, reach - float(np.linalg.norm(first))) if robot.moved_by[1:, 0].all() else (0 * first, reach)
+    )
+
+
 def _clusters(spheres: ndarray) -> list[ndarray]:
     """Spheres in parts of at most sixteen, by halving along the direction of largest extent."""
     if len(spheres) <= W:

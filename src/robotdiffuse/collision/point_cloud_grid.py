@@ -25,8 +25,8 @@ EXACT_RANGE = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
 VOXELS_PER_RANGE = 10
 """Voxels in the range of distances that the grid knows."""
-MAX_VOXELS = 2e6
-"""A grid of 8 MB still fits a processor's cache."""
+MAX_VOXELS = 1e6
+"""A grid of 4 MB fits a processor's cache."""
 NO_SPHERES = np.zeros((0, 4))
 
 

@@ -27,6 +27,10 @@ FLYING_PIXEL_STEP = np.float32(0.03)
 """A flying pixel is nearer than one neighbour and farther than the opposite one by at least this [m]..."""
 FLYING_PIXEL_WIDTHS = np.float32(4.0)
 """... or, if that is more, by this many widths of a pixel at its distance."""
+BLOCK = 4
+"""Edge of the blocks of voxels of which all are tried at once, in voxels."""
+PIXEL_SLACK, DEPTH_SLACK = np.float32(0.01), np.float32(1e-4)
+"""More than the rounding errors of a place in the image [pixels] and of a depth [m]."""
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
 """All fastmath flags except those that assume finite numbers."""
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
@@ -170,24 +174,101 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
     lower corner of the grid; counts: number of points in each voxel in excess of outliers. All arrays are
     float32, except state, uint8, and counts, int32.
     """
-    fx, fy, cx, cy = intrinsics
     nx, ny, nz = state.shape
-    raw = _filtered(depth, fx)
+    raw = _filtered(depth, intrinsics[0])
     arm = _arm_pixels(raw, intrinsics, spheres)
     counts[:] = 0
     _count_points(raw, arm, intrinsics, T, low, voxel, counts)
-    factor = max(1, int(fx / POOLED_FOCAL_LENGTH))
+    factor = max(1, int(intrinsics[0] / POOLED_FOCAL_LENGTH))
     least, missing = _min_pooled(raw, factor)
-    h, w = least.shape
     table = _minimum_table(least, 6)
+    for i in range(0, nx, BLOCK):
+        for j in range(0, ny, BLOCK):
+            for k in range(0, nz, BLOCK):
+                first, end = (i, j, k), (min(i + BLOCK, nx), min(j + BLOCK, ny), min(k + BLOCK, nz))
+                whole = _state_of_block(first, intrinsics, T, low, voxel, raw.shape, factor, table, missing)
+                if whole >= 0:
+                    state[i : end[0], j : end[1], k : end[2]] = whole
+                    behind[i : end[0], j : end[1], k : end[2]] = _ZERO
+                else:
+                    _carve_block(
+                        first,
+                        end,
+                        raw,
+                        arm,
+                        intrinsics,
+                        T,
+                        low,
+                        voxel,
+                        factor,
+                        table,
+                        missing,
+                        state,
+                        behind,
+                        counts,
+                    )
+
+
+@njit(cache=True, fastmath=FASTMATH)
+def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missing):
+    """OUT or FREE if all voxels of a block are so, by the rectangle that it covers in the image, else -1.
+
+    first: indices of its first voxel.
+    """
+    fx, fy, cx, cy = intrinsics
+    middle = _HALF * np.float32(BLOCK)
+    px = low[0] + (np.float32(first[0]) + middle) * voxel - T[0, 3]
+    py = low[1] + (np.float32(first[1]) + middle) * voxel - T[1, 3]
+    pz = low[2] + (np.float32(first[2]) + middle) * voxel - T[2, 3]
+    z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
+    ez = _HALF * voxel * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
+    near, far = z - np.float32(BLOCK) * ez, z + np.float32(BLOCK) * ez
+    if far <= ez:
+        return OUT
+    if near <= voxel:
+        return -1
+    x = (T[0, 0] * px + T[1, 0] * py + T[2, 0] * pz) / z
+    y = (T[0, 1] * px + T[1, 1] * py + T[2, 1] * pz) / z
+    du, dv = _ZERO, _ZERO
+    for c in range(3):
+        du += abs(T[c, 0] - x * T[c, 2])
+        dv += abs(T[c, 1] - y * T[c, 2])
+    # no rectangle of a voxel, which is a little larger than the voxel in the image, reaches beyond this
+    wide = middle * voxel / near * (_ONE + ez / near)
+    u, v, du, dv = fx * x + cx, fy * y + cy, fx * wide * du + PIXEL_SLACK, fy * wide * dv + PIXEL_SLACK
+    h, w = size
+    if (
+        u + du < -_HALF
+        or v + dv < -_HALF
+        or u - du >= np.float32(w) - _HALF
+        or v - dv >= np.float32(h) - _HALF
+    ):
+        return OUT
+    share = _ONE / np.float32(factor)
+    u0, u1 = int((u - du + _HALF) * share), int((u + du + _HALF) * share)
+    v0, v1 = int((v - dv + _HALF) * share), int((v + dv + _HALF) * share)
+    if u - du < -_HALF or v - dv < -_HALF or u1 >= table.shape[2] or v1 >= table.shape[1]:
+        return -1
+    if missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]:
+        return -1
+    return FREE if _rectangle_minimum(table, v0, v1, u0, u1) > far + DEPTH_SLACK else -1
+
+
+@njit(cache=True, fastmath=FASTMATH)
+def _carve_block(
+    first, end, raw, arm, intrinsics, T, low, voxel, factor, table, missing, state, behind, counts
+):
+    """Does for the voxels of a block what `carve` does for all."""
+    fx, fy, cx, cy = intrinsics
+    h, w = table.shape[1:]
     share = _ONE / np.float32(factor)
     half = _HALF * voxel
     ez = half * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
-    for i in range(nx):
+    for i in range(first[0], end[0]):
         px = low[0] + (np.float32(i) + _HALF) * voxel - T[0, 3]
-        for j in range(ny):
+        for j in range(first[1], end[1]):
             py = low[1] + (np.float32(j) + _HALF) * voxel - T[1, 3]
-            for k in range(nz):
+            for k in range(first[2], end[2]):
                 pz = low[2] + (np.float32(k) + _HALF) * voxel - T[2, 3]
                 z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
                 behind[i, j, k] = _ZERO
@@ -198,7 +279,7 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
                 x, y = x / z, y / z
                 u, v = fx * x + cx, fy * y + cy
                 column, row = int(np.floor(u + _HALF)), int(np.floor(v + _HALF))
-                if column < 0 or row < 0 or column >= depth.shape[1] or row >= depth.shape[0]:
+                if column < 0 or row < 0 or column >= raw.shape[1] or row >= raw.shape[0]:
                     continue
                 if counts[i, j, k] > 0:
                     pixels = fx * fy * (voxel / z) ** 2
@@ -234,3 +315,16 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
                 elif front < z:
                     state[i, j, k] = BEHIND
                     behind[i, j, k] = z - front
+
+
+@njit(cache=True)
+def add_evidence(state, counts, evidence, hit, miss, largest):
+    """Add what a view tells to the evidence for each voxel [nx ny nz]; returns for how many there was none:
+    `hit` for voxels with points, else -`miss` for those that are free. It stays within `largest`."""
+    state, counts, evidence, told = state.ravel(), counts.ravel(), evidence.ravel(), 0
+    for v in range(len(evidence)):
+        points, free, before = counts[v] > 0, state[v] == FREE, evidence[v]
+        gain = hit if points else (-miss if free else _ZERO)
+        told += (points | free) & (before == _ZERO)
+        evidence[v] = min(max(before + gain, -largest), largest)
+    return told

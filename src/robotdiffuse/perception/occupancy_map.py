@@ -10,7 +10,7 @@ from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
 from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, VoxelGrid, voxels_of
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.free_space_kernel import FREE
+from robotdiffuse.perception.free_space_kernel import FREE, HIDDEN, add_evidence
 from robotdiffuse.perception.observed_volume import LOW, carve_view
 from robotdiffuse.robots.robot import Robot
 
@@ -61,6 +61,7 @@ class OccupancyMap:
         self._now = -np.inf
         self._state, self._behind = np.empty(MAP.shape, np.uint8), np.empty(MAP.shape, np.float32)
         self._counts = np.empty(MAP.shape, np.int32)
+        self._known: tuple[Bool[ndarray, "nx ny nz"], ...] | None = None
 
     def add(self, view: DepthView, stamp: float = 0.0) -> int:
         """Take a view into account; returns the number of voxels that nothing was known of before.
@@ -76,19 +77,16 @@ class OccupancyMap:
             )
         told_by_view = self._state, self._behind, self._counts
         carve_view(view, self.robot, q, self.settings.arm_margin, MAP.low, MAP.edge, *told_by_view)
-        hit, free = self._counts > 0, self._state == FREE
-        told = int(np.count_nonzero((hit | free) & (self._evidence == 0)))
-        self._update(hit, free, stamp)
-        return told
+        return self._update(stamp)
 
     def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
         or of `rd.PointCloud.from_file`. They say nothing about free space."""
         at = voxels_of(np.asarray(points), MAP)
         at = at[((at >= 0) & (at < MAP.shape)).all(axis=1)]
-        hit = np.zeros(MAP.shape, np.bool_)
-        hit[tuple(at.T)] = True
-        self._update(hit, np.zeros(MAP.shape, np.bool_), stamp)
+        self._state[:], self._counts[:] = HIDDEN, 0
+        self._counts[tuple(at.T)] = 1
+        self._update(stamp)
 
     def declare_free(self, zone: Corners) -> None:
         """Voxels inside a box count as seen free unless a view finds them occupied."""
@@ -98,32 +96,47 @@ class OccupancyMap:
         first = np.maximum(np.ceil((low - MAP.low) / MAP.edge - 1e-6), 0).astype(int)
         end = np.maximum(np.floor((high - MAP.low) / MAP.edge + 1e-6), 0).astype(int)
         self._declared[tuple(slice(a, b) for a, b in zip(first, end, strict=True))] = True
+        self._known = None
 
     @property
     def occupied(self) -> Bool[ndarray, "nx ny nz"]:
-        return (self._evidence > 0) & self._fresh
+        return self._of_evidence[0]
 
     @property
     def free(self) -> Bool[ndarray, "nx ny nz"]:
         """Seen free, or declared so and not found occupied."""
-        seen = (self._evidence < 0) & self._fresh
-        return seen | (self._declared & ~self.occupied)
+        return self._of_evidence[1]
 
     @property
     def unknown(self) -> Bool[ndarray, "nx ny nz"]:
-        return ~(self.free | self.occupied)
+        return self._of_evidence[2]
 
     @property
-    def _fresh(self) -> Bool[ndarray, "nx ny nz"] | bool:
-        age = self.settings.max_age
-        return True if age is None else self._seen_at >= self._now - age
+    def _of_evidence(self) -> tuple[Bool[ndarray, "nx ny nz"], ...]:
+        """Occupied, free and unknown voxels, computed once after each change; read-only."""
+        if self._known is None:
+            occupied, free = self._evidence > 0, self._evidence < 0
+            if self.settings.max_age is not None:
+                occupied, free = occupied & self._fresh, free & self._fresh
+            free |= self._declared & ~occupied
+            self._known = occupied, free, ~(free | occupied)
+            for voxels in self._known:
+                voxels.flags.writeable = False
+        return self._known
 
-    def _update(self, hit: Bool[ndarray, "nx ny nz"], free: Bool[ndarray, "nx ny nz"], stamp: float) -> None:
+    @property
+    def _fresh(self) -> Bool[ndarray, "nx ny nz"]:
+        assert self.settings.max_age is not None
+        return self._seen_at >= self._now - self.settings.max_age
+
+    def _update(self, stamp: float) -> int:
+        """Take what `_state` and `_counts` tell into account; returns the number of voxels that nothing was
+        known of before."""
         self._now = max(self._now, stamp)
-        if self.settings.max_age is not None:
-            self._evidence[~np.asarray(self._fresh)] = 0.0
-            self._seen_at[hit | free] = stamp
-        gain = np.zeros(MAP.shape, np.float32)
-        gain[free], gain[hit] = -self.settings.miss, self.settings.hit
-        most = np.float32(self.settings.largest)
-        np.clip(self._evidence + gain, -most, most, out=self._evidence)
+        self._known = None
+        settings = self.settings
+        if settings.max_age is not None:
+            self._evidence[~self._fresh] = 0.0
+            self._seen_at[(self._counts > 0) | (self._state == FREE)] = stamp
+        weights = np.array([settings.hit, settings.miss, settings.largest], np.float32)
+        return add_evidence(self._state, self._counts, self._evidence, *weights)

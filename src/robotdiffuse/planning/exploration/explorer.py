@@ -40,7 +40,13 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
 from robotdiffuse.planning.exploration.reachable import ReachableTree, first_parts
-from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free, reaches_outside
+from robotdiffuse.planning.exploration.seen_free import (
+    cover,
+    hardly_seen,
+    near_ends,
+    not_seen_free,
+    reaches_outside,
+)
 from robotdiffuse.planning.exploration.steps import (
     CHANCE,
     DONE,
@@ -189,11 +195,11 @@ class Explorer:
         quick = limit
         if may_look and policy == STRICT:
             quick = min(self._quick_limit * 2**self._looks, limit)
-        motion = self._motion(problem, policy, predicted, quick)
+        motion = self._motion(problem, policy, predicted, quick, may_look)
         if self._good(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
-        if look.kind == STUCK and quick < limit:
+        if look.kind == STUCK and (quick < limit or motion.status is Status.NO_PATH):
             motion = self._motion(problem, policy, predicted, limit)
             if motion.solved:
                 return self._go(motion, policy)
@@ -318,6 +324,8 @@ class Explorer:
                 avoiding = as_seen
                 result = self._planned(as_seen, self.settings.time_limit, seed)
             results.append(result)
+            if result.path is not None and not self.wanted(result.path).any():
+                break
         found = [(one, self.wanted(one.path)) for one in results if one.path is not None]
         return min(found, key=lambda one: int(one[1].sum()), default=(results[-1], ends))
 
@@ -331,8 +339,10 @@ class Explorer:
         policy: str,
         predicted: Float32[ndarray, "nx ny nz"] | None,
         limit: float,
+        may_look: bool = False,
     ) -> PlanResult:
-        """A motion to the problem's goal by a policy, found within a time limit [s]."""
+        """A motion to the problem's goal by a policy, found within a time limit [s]. If the arm may look
+        first, a strict one is not searched for where there hardly is one."""
         if policy == CHANCE:
             return self._by_chance(problem, predicted, limit)
         goals = self._goals(problem)
@@ -340,6 +350,9 @@ class Explorer:
             return goals
         outside = [int((self.map.unknown & self._occupied_by(q)).sum()) for q in goals]
         goal = goals[int(np.argmin(outside))]
+        if may_look and hardly_seen(self.map, problem.start, goal):
+            context = PlanningContext(self._planner.name, problem, PlanRequest(limit))
+            return context.fail(Status.NO_PATH, "too little of the space around the goal was seen free")
         obstacles = not_seen_free(self.map, self.scene, (problem.start, goal))
         scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None])), limit)
