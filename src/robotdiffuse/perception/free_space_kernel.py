@@ -33,7 +33,7 @@ _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 
 
 @njit(cache=True, fastmath=FASTMATH)
-def _filtered(depth, focal):
+def usable_depth(depth, focal):
     """The depths, with MAX_DEPTH for rays without an obstacle and NO_RETURN for missing returns and flying
     pixels."""
     h, w = depth.shape
@@ -172,7 +172,7 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
     """
     fx, fy, cx, cy = intrinsics
     nx, ny, nz = state.shape
-    raw = _filtered(depth, fx)
+    raw = usable_depth(depth, fx)
     arm = _arm_pixels(raw, intrinsics, spheres)
     counts[:] = 0
     _count_points(raw, arm, intrinsics, T, low, voxel, counts)

@@ -16,20 +16,20 @@ class _Kept:
     """A view, and what it shows, computed when it is first needed."""
 
     def __init__(self, view: DepthView, robot: Robot, told: int) -> None:
-        self._view, self._robot, self.told = view, robot, told
+        self.view, self._robot, self.told = view, robot, told
 
     @cached_property
     def volume(self) -> ObservedVolume:
-        return observe([self._view], self._robot, self._configuration)
+        return observe([self.view], self._robot, self._configuration)
 
     @cached_property
     def points(self) -> Float32[ndarray, "n 3"]:
-        return seen_points([self._view], self._robot, self._configuration)
+        return seen_points([self.view], self._robot, self._configuration)
 
     @property
     def _configuration(self) -> Float[ndarray, "dof"]:
-        assert self._view.configuration is not None
-        return self._view.configuration
+        assert self.view.configuration is not None
+        return self.view.configuration
 
 
 class ViewMemory:
@@ -47,6 +47,11 @@ class ViewMemory:
         if len(self) >= self._most:
             self._kept.remove(min(self._kept, key=lambda kept: kept.told))
         self._kept.append(_Kept(view, self._robot, told))
+
+    @property
+    def views(self) -> list[DepthView]:
+        """The kept views."""
+        return [kept.view for kept in self._kept]
 
     def volume(self) -> ObservedVolume:
         """What the kept views together tell of each voxel of 4 cm."""

@@ -38,6 +38,7 @@ from robotdiffuse.perception.view_memory import ViewMemory
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
+from robotdiffuse.planning.exploration.goal_seen import GoalSeen
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
 from robotdiffuse.planning.exploration.reachable import ReachableTree, first_parts
 from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free, reaches_outside
@@ -100,6 +101,7 @@ class Explorer:
         self._planner = load_planner("robotdiffuse")
         self._rng, self._seed = np.random.default_rng(seed), seed
         self._views = ViewMemory(robot, settings.max_views)
+        self._goal_seen = GoalSeen(robot, self.map, self._views) if settings.see_goal else None
         self._goal: Goal | None = None
         self._looks = 0
         self._looked_for = np.zeros(MAP.shape, np.bool_)
@@ -117,11 +119,15 @@ class Explorer:
         self._goal = Problem(self.robot, NOTHING, middle, goal).goal
         self._looks = 0
         self._looked_for[:] = False
+        if self._goal_seen is not None:
+            self._goal_seen.forget()
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
         told = self.map.add(view, stamp)
         self._views.add(view, told)
+        if self._goal_seen is not None:
+            self._goal_seen.observe(view)
         self._news.append(view)
 
     def next(self, configuration: ArrayLike) -> Step:
@@ -154,8 +160,10 @@ class Explorer:
         return replace(step, seen=problem.scene)
 
     def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
-        """The voxels that looks are to show: unknown ones that a tentative motion sweeps."""
-        return swept_unseen(self.map, path)
+        """The voxels that looks are to show: unknown ones that a tentative motion sweeps, and with `see_goal`
+        those at the goal's unseen surface."""
+        swept = swept_unseen(self.map, path)
+        return swept if self._goal_seen is None else swept | self._goal_seen.wanted(path.positions[-1])
 
     def _seen_points(self) -> Float[ndarray, "n 3"]:
         """The points that kept views observed, without those where more views see through: stray pixels."""
@@ -183,6 +191,11 @@ class Explorer:
             if not goals:
                 return Step(STUCK, "at the goal the arm reaches out of the map", policy)
             problem = replace(problem, goal=JointGoal(np.stack(goals)))
+        if self._goal_seen is not None:
+            goals = self._goals(problem)
+            if isinstance(goals, PlanResult):
+                return Step(STUCK, goals.reason, policy)
+            problem = replace(problem, goal=JointGoal(self._goal_seen.best(goals)[None]))
         predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit
@@ -190,12 +203,12 @@ class Explorer:
         if may_look and policy == STRICT:
             quick = min(self._quick_limit * 2**self._looks, limit)
         motion = self._motion(problem, policy, predicted, quick)
-        if self._good(motion, policy):
+        if self._may_go(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
         if look.kind == STUCK and quick < limit:
             motion = self._motion(problem, policy, predicted, limit)
-            if motion.solved:
+            if self._may_go(motion, policy):
                 return self._go(motion, policy)
         return look
 
@@ -204,6 +217,16 @@ class Explorer:
         if not motion.solved or policy == STRICT:
             return motion.solved
         return motion.confidence is not None and motion.confidence >= self.settings.confidence
+
+    def _may_go(self, motion: PlanResult, policy: str) -> bool:
+        """Whether a motion to the goal keeps to the policy and, where the goal must be seen, it was."""
+        return self._good(motion, policy) and not self._why_not_seen(motion)
+
+    def _why_not_seen(self, motion: PlanResult) -> str:
+        """How much of the goal of a motion was not seen; "" if all was, and where it need not be."""
+        if self._goal_seen is None or motion.path is None:
+            return ""
+        return self._goal_seen.why(motion.path.positions[-1])
 
     def _go(self, motion: PlanResult, policy: str) -> Step:
         stated = motion.confidence if policy == CHANCE else None
@@ -219,8 +242,10 @@ class Explorer:
         """A look at what a tentative motion sweeps unseen, or why there is none. `motion`: the one to the
         goal that does not keep to the policy."""
         why = motion.reason
-        if motion.solved:
+        if motion.solved and policy == CHANCE:
             why = f"the motion's confidence is {motion.confidence:.2f}, below {self.settings.confidence:g}"
+        if motion.solved and policy == STRICT:
+            why = self._why_not_seen(motion)
         if not self.cameras:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
         if self._looks >= self.settings.max_looks:
@@ -234,7 +259,7 @@ class Explorer:
             kept = self._with_confidence(tentative, predicted)
         elif not wanted.any():
             kept, under = self._within_seen_free(problem, tentative.path.positions, "as seen"), STRICT
-        if kept is not None and self._good(kept, under):
+        if kept is not None and self._may_go(kept, under):
             return self._go(kept, under)
         predicted = self.predicted() if predicted is None else predicted
         allowed = problem.scene

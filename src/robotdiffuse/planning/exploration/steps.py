@@ -33,6 +33,9 @@ class ExplorerSettings(Settings, name="explorer"):
     predict: bool = True
     """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
     reach."""
+    see_goal: bool = False
+    """Whether the arm's whole surface at the goal must have been seen free before a motion there, by `strict`
+    alone. Costs looks, and goals nearer than 1 to 2 cm to something are rarely reached."""
     map: MapSettings = field(default_factory=MapSettings)
 
 
