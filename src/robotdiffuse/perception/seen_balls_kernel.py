@@ -5,13 +5,15 @@ from numba import njit
 
 from robotdiffuse.perception.free_space_kernel import MAX_DEPTH, usable_depth
 
+MAX_LOST_FRACTION = 0.2
+"""Largest fraction of a ball's pixels without a return."""
 _HALF, _ZERO = np.float32(0.5), np.float32(0.0)
 
 
 @njit(cache=True, nogil=True)
 def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
-    """Mark the balls that an image sees through: their projection lies within the image, and each of its
-    pixels has a return behind the ball.
+    """Mark the balls that an image sees through: their projection lies within the image, and all returns of
+    its pixels are behind the ball; a few pixels may have none.
 
     depth: float32[h, w], infinite where nothing is in range, and not above 0 without a return; intrinsics fx,
     fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centres, and their radius [m]; noise: how far
@@ -37,15 +39,20 @@ def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
         if u0 < _ZERO or v0 < _ZERO or u1 > np.float32(w - 1) or v1 > np.float32(h - 1):
             continue
         behind = min(far + noise * far * far, MAX_DEPTH * _HALF)
-        seen[n] = _all_above(raw, int(v0), int(v1), int(u0), int(u1), behind)
+        seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), behind)
 
 
 @njit(cache=True, nogil=True)
-def _all_above(depth, v0, v1, u0, u1, least):
-    """Whether all pixels of a rectangle, whose bounds are inclusive, are deeper than `least`."""
+def _all_behind(depth, v0, v1, u0, u1, least):
+    """Whether all returns of a rectangle of pixels, whose bounds are inclusive, are deeper than `least`, and
+    no more pixels than may are without one."""
+    lost, most = 0, MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
     for v in range(v0, v1 + 1):
         for u in range(u0, u1 + 1):
-            if not depth[v, u] > least:
+            if depth[v, u] > least:
+                continue
+            lost += 1
+            if depth[v, u] > _ZERO or lost > most:
                 return False
     return True
 

@@ -268,7 +268,8 @@ class Explorer:
             allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         tree = ReachableTree(self.robot, allowed, problem.start)
         for camera in self.cameras:
-            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng)
+            taken = () if self._goal_seen is None else self._goal_seen.taken
+            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng, taken)
             for waypoints in islice(ways, self.settings.look_attempts):
                 look = replace(problem, goal=JointGoal(waypoints[-1:]))
                 if policy == STRICT:

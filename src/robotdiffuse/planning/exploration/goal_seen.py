@@ -18,11 +18,14 @@ from robotdiffuse.perception.occupancy_map import MAP, OccupancyMap
 from robotdiffuse.perception.seen_balls_kernel import see_through, within_voxels
 from robotdiffuse.perception.surface_balls import BALL_RADIUS, surface_balls
 from robotdiffuse.perception.view_memory import ViewMemory
+from robotdiffuse.perception.seen_points_kernel import sphere_distances
+from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
 BORDER = np.float32(1.0)
 """Pixels around a ball's projection that count too in images that were filtered: the filter moves edges by
 about one."""
+
 
 
 class GoalSeen:
@@ -33,15 +36,20 @@ class GoalSeen:
         self._robot, self._known, self._views = robot, known, views
         self._unseen: dict[bytes, Float32[ndarray, "n 3"]] = {}
         """Balls that no view sees through, by configuration."""
+        self.taken: list[Float[ndarray, "dof"]] = []
+        """Configurations of the views since the goal was set."""
 
     def forget(self) -> None:
         """There is another goal."""
         self._unseen.clear()
+        self.taken.clear()
 
     def observe(self, view: DepthView) -> None:
         """Take a new view into account."""
+        if view.configuration is not None:
+            self.taken.append(view.configuration)
         for key, balls in self._unseen.items():
-            self._unseen[key] = _not_seen_through(balls, [view])
+            self._unseen[key] = self._not_shown(balls, [view])
 
     def best(self, goals: Float[ndarray, "n dof"]) -> Float[ndarray, "dof"]:
         """The goal of whose surface least is unseen."""
@@ -52,7 +60,7 @@ class GoalSeen:
         [m]."""
         key = q.tobytes()
         if key not in self._unseen:
-            self._unseen[key] = _not_seen_through(surface_balls(self._robot, q), self._views.views)
+            self._unseen[key] = self._not_shown(surface_balls(self._robot, q), self._views.views)
         balls = self._unseen[key]
         within = np.zeros(len(balls), np.bool_)
         within_voxels(balls, np.float32(BALL_RADIUS), self._known.free, *MAP.frame, within)
@@ -72,22 +80,25 @@ class GoalSeen:
         share = unseen / len(surface_balls(self._robot, q)) if unseen else 0.0
         return f"{100 * share:.2g} % of the arm's surface at the goal was not seen" if unseen else ""
 
-
-def _not_seen_through(
-    balls: Float32[ndarray, "n 3"], views: Iterable[DepthView]
-) -> Float32[ndarray, "n 3"]:
-    for view in views:
-        depth, spread = filtered(view)
-        seen = np.zeros(len(balls), np.bool_)
-        see_through(
-            depth,
-            np.array(view.intrinsics, np.float32),
-            view.T_base_camera.astype(np.float32),
-            balls,
-            np.float32(BALL_RADIUS),
-            np.float32(MARGIN_SPREADS * spread),
-            BORDER if spread else np.float32(0),
-            seen,
-        )
-        balls = balls[~seen]
-    return balls
+    def _not_shown(
+        self, balls: Float32[ndarray, "n 3"], views: Iterable[DepthView]
+    ) -> Float32[ndarray, "n 3"]:
+        """The balls that no view shows to be free. Where the arm was when it was taken is free too."""
+        for view in views:
+            depth, spread = filtered(view)
+            seen = np.zeros(len(balls), np.bool_)
+            if view.configuration is not None:
+                spheres = placed_spheres(self._robot, view.configuration).astype(np.float32)
+                seen |= sphere_distances(balls, spheres) < -BALL_RADIUS
+            see_through(
+                depth,
+                np.array(view.intrinsics, np.float32),
+                view.T_base_camera.astype(np.float32),
+                balls,
+                np.float32(BALL_RADIUS),
+                np.float32(MARGIN_SPREADS * spread),
+                BORDER if spread else np.float32(0),
+                seen,
+            )
+            balls = balls[~seen]
+        return balls
