@@ -14,8 +14,9 @@ from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, OccupancyMap
 from robotdiffuse.perception.ray_caster import voxels_within
 from robotdiffuse.perception.swept_voxels_kernel import sweep
-from robotdiffuse.planning.exploration.explorer import PROBABILITY_BELOW, ExplorerSettings
+from robotdiffuse.planning.exploration.explorer import ExplorerSettings
 from robotdiffuse.planning.exploration.looks import best_looks
+from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
 from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, not_seen_free
 from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera

@@ -1,7 +1,7 @@
 """Small balls that cover the surface of an arm."""
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import Part, parts_of
@@ -16,8 +16,8 @@ BALL_RADIUS = CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
 
 
 def surface_balls(robot: Robot, q: Float[ndarray, "dof"]) -> Float32[ndarray, "n 3"]:
-    """The centres of balls of BALL_RADIUS that cover the surface of the links that move and of what they hold,
-    at a configuration, in the base frame [m]."""
+    """The centres of balls of BALL_RADIUS that cover the surface of moving links and of what they hold, at a
+    configuration, in the base frame [m]."""
     placed = [
         points @ T[:3, :3].T + T[:3, 3]
         for T, points in zip(forward_frames(robot, q[None])[0], _balls_by_frame(robot), strict=True)

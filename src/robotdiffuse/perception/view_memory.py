@@ -3,11 +3,13 @@
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
+from robotdiffuse.perception.assumptions import voxels_of
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import ObservedVolume, merged, observe
+from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.perception.seen_points import VOXEL, seen_points
 from robotdiffuse.robots.robot import Robot
 
@@ -57,13 +59,18 @@ class ViewMemory:
         """What the kept views together tell of each voxel of 4 cm."""
         return merged([kept.volume for kept in self._kept])
 
-    def points(self) -> Float[ndarray, "n 3"]:
-        """The mean of the points that the kept views observed in each cell of a grid [m]; see
-        `seen_points`."""
+    def points(self, free: Bool[ndarray, "nx ny nz"]) -> Float[ndarray, "n 3"]:
+        """The mean of the points that the kept views observed in each cell of a grid [m]; see `seen_points`.
+        Those in the free voxels of a map are left out: more views see through them, so they are stray."""
         every = np.concatenate([kept.points for kept in self._kept]).astype(np.float64)
         _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)
         sums = [np.bincount(cell, every[:, axis], len(counts)) for axis in range(3)]
-        return np.stack(sums, axis=1) / counts[:, None]
+        points = np.stack(sums, axis=1) / counts[:, None]
+        at = voxels_of(points, MAP)
+        inside = ((at >= 0) & (at < MAP.shape)).all(axis=1)
+        stray = np.zeros(len(points), np.bool_)
+        stray[inside] = free[tuple(at[inside].T)]
+        return points[~stray]
 
 
 def _cells(points: Float[ndarray, "n 3"]) -> ndarray:

@@ -2,7 +2,8 @@
 
 **Strict.** The arm enters no voxel that was not seen free: the validator accepts each motion among obstacles
 that cover all other space (`seen_free.py`). Exempt is the space within 2 cm of the arm where a motion begins
-and ends; seen points count there too. So the promise is as good as the map: in a scene that does not change,
+and ends; seen points count there too. With `see_goal` the arm's surface at the goal must have been seen free
+as well (`goal_seen.py`). So the promise is as good as the map: in a scene that does not change,
 with a camera whose poses and errors are as stated, such a motion meets nothing.
 
 **Chance.** The arm goes if the motion's stated `confidence` is high enough, and looks first if it is not. It
@@ -27,7 +28,6 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
-from robotdiffuse.perception.assumptions import voxels_in, voxels_of
 from robotdiffuse.perception.confidence import explored_confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, Corners, OccupancyMap
@@ -40,8 +40,15 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.goal_seen import GoalSeen
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
+from robotdiffuse.planning.exploration.prediction import predicted_occupancy
 from robotdiffuse.planning.exploration.reachable import ReachableTree, first_parts
-from robotdiffuse.planning.exploration.seen_free import cover, near_ends, not_seen_free, reaches_outside
+from robotdiffuse.planning.exploration.seen_free import (
+    cover,
+    least_unknown,
+    near_ends,
+    not_seen_free,
+    reaches_outside,
+)
 from robotdiffuse.planning.exploration.steps import (
     CHANCE,
     DONE,
@@ -58,7 +65,6 @@ from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.goals import Goal
 from robotdiffuse.problems.problem import PADDED, PREDICTED, JointGoal, Problem
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -68,9 +74,6 @@ QUICK_FRACTION = 0.2
 doubles with each look: the more was seen, the less likely a search fails for lack of it."""
 TENTATIVE_MOTIONS = 2
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
-PROBABILITY_BELOW = np.float32(0.1)
-"""That a voxel below the volume that the network predicts is occupied, where the map does not know it: the
-share of unknown voxels within reach that are."""
 AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
 
@@ -101,7 +104,7 @@ class Explorer:
         self._planner = load_planner("robotdiffuse")
         self._rng, self._seed = np.random.default_rng(seed), seed
         self._views = ViewMemory(robot, settings.max_views)
-        self._goal_seen = GoalSeen(robot, self.map, self._views) if settings.see_goal else None
+        self._goal_seen = GoalSeen(robot, self.map, self._views, settings.see_goal)
         self._goal: Goal | None = None
         self._looks = 0
         self._looked_for = np.zeros(MAP.shape, np.bool_)
@@ -119,15 +122,13 @@ class Explorer:
         self._goal = Problem(self.robot, NOTHING, middle, goal).goal
         self._looks = 0
         self._looked_for[:] = False
-        if self._goal_seen is not None:
-            self._goal_seen.forget()
+        self._goal_seen.forget()
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
         told = self.map.add(view, stamp)
         self._views.add(view, told)
-        if self._goal_seen is not None:
-            self._goal_seen.observe(view)
+        self._goal_seen.observe(view)
         self._news.append(view)
 
     def next(self, configuration: ArrayLike) -> Step:
@@ -144,7 +145,7 @@ class Explorer:
         if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
-        seen = point_shapes(self._seen_points(), self.robot, self.scene, q, goals)
+        seen = point_shapes(self._views.points(self.map.free), self.robot, self.scene, q, goals)
         scene = self.scene.with_shapes([*self.scene.shapes, *seen])
         problem = Problem(self.robot, scene, q, self._goal)
         self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
@@ -160,19 +161,9 @@ class Explorer:
         return replace(step, seen=problem.scene)
 
     def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
-        """The voxels that looks are to show: unknown ones that a tentative motion sweeps, and with `see_goal`
-        those at the goal's unseen surface."""
-        swept = swept_unseen(self.map, path)
-        return swept if self._goal_seen is None else swept | self._goal_seen.wanted(path.positions[-1])
-
-    def _seen_points(self) -> Float[ndarray, "n 3"]:
-        """The points that kept views observed, without those where more views see through: stray pixels."""
-        points = self._views.points()
-        at = voxels_of(points, MAP)
-        inside = ((at >= 0) & (at < MAP.shape)).all(axis=1)
-        stray = np.zeros(len(points), np.bool_)
-        stray[inside] = self.map.free[tuple(at[inside].T)]
-        return points[~stray]
+        """The voxels that looks are to show: unknown ones that a tentative motion sweeps, and those of the
+        goal that must be seen."""
+        return swept_unseen(self.map, path) | self._goal_seen.wanted(path.positions[-1])
 
     def stop(self, motion: Trajectory, time: float) -> Stop | None:
         """How a motion under way ends early, if what was observed since `next` returned it is in its way;
@@ -191,11 +182,11 @@ class Explorer:
             if not goals:
                 return Step(STUCK, "at the goal the arm reaches out of the map", policy)
             problem = replace(problem, goal=JointGoal(np.stack(goals)))
-        if self._goal_seen is not None:
-            goals = self._goals(problem)
-            if isinstance(goals, PlanResult):
-                return Step(STUCK, goals.reason, policy)
-            problem = replace(problem, goal=JointGoal(self._goal_seen.best(goals)[None]))
+        if self.settings.see_goal:
+            found = self._goals(problem)
+            if isinstance(found, PlanResult):
+                return Step(STUCK, found.reason, policy)
+            problem = replace(problem, goal=JointGoal(self._goal_seen.best(found)[None]))
         predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit
@@ -219,18 +210,15 @@ class Explorer:
         return motion.confidence is not None and motion.confidence >= self.settings.confidence
 
     def _may_go(self, motion: PlanResult, policy: str) -> bool:
-        """Whether a motion to the goal keeps to the policy and, where the goal must be seen, it was."""
-        return self._good(motion, policy) and not self._why_not_seen(motion)
-
-    def _why_not_seen(self, motion: PlanResult) -> str:
-        """How much of the goal of a motion was not seen; "" if all was, and where it need not be."""
-        if self._goal_seen is None or motion.path is None:
-            return ""
-        return self._goal_seen.why(motion.path.positions[-1])
+        """Whether a motion to the goal keeps to the policy, and the goal was seen if it must be."""
+        return self._good(motion, policy) and not self._goal_seen.missing(motion)
 
     def _go(self, motion: PlanResult, policy: str) -> Step:
         stated = motion.confidence if policy == CHANCE else None
-        return Step(GO, _said(stated), policy, motion, stated)
+        free = "through space seen free alone"
+        if stated is not None:
+            free = f"that is free with a probability of {stated:.2f}"
+        return Step(GO, f"a motion {free}", policy, motion, stated)
 
     def _look(
         self,
@@ -241,11 +229,9 @@ class Explorer:
     ) -> Step:
         """A look at what a tentative motion sweeps unseen, or why there is none. `motion`: the one to the
         goal that does not keep to the policy."""
-        why = motion.reason
+        why = self._goal_seen.missing(motion) or motion.reason
         if motion.solved and policy == CHANCE:
             why = f"the motion's confidence is {motion.confidence:.2f}, below {self.settings.confidence:g}"
-        if motion.solved and policy == STRICT:
-            why = self._why_not_seen(motion)
         if not self.cameras:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
         if self._looks >= self.settings.max_looks:
@@ -268,8 +254,7 @@ class Explorer:
             allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         tree = ReachableTree(self.robot, allowed, problem.start)
         for camera in self.cameras:
-            taken = () if self._goal_seen is None else self._goal_seen.taken
-            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng, taken)
+            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng, self._goal_seen.taken)
             for waypoints in islice(ways, self.settings.look_attempts):
                 look = replace(problem, goal=JointGoal(waypoints[-1:]))
                 if policy == STRICT:
@@ -352,8 +337,7 @@ class Explorer:
         goals = self._goals(problem)
         if isinstance(goals, PlanResult):
             return goals
-        outside = [int((self.map.unknown & self._occupied_by(q)).sum()) for q in goals]
-        goal = goals[int(np.argmin(outside))]
+        goal = least_unknown(self.map, goals)
         obstacles = not_seen_free(self.map, self.scene, (problem.start, goal))
         scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None])), limit)
@@ -400,27 +384,14 @@ class Explorer:
         """The goal configurations, or the result that says why there is none."""
         if isinstance(problem.goal, JointGoal):
             return problem.goal.positions
-        request = PlanRequest(self.settings.time_limit, self._seed, FIRST)
+        seed = 0 if self.settings.see_goal else self._seed  # looks are made for the same ones again
+        request = PlanRequest(self.settings.time_limit, seed, FIRST)
         usable = usable_start_goal(PlanningContext(self._planner.name, problem, request))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
-
-    def _occupied_by(self, q: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
-        return voxels_in(placed_spheres(self.robot, q).astype(np.float32), grid=MAP)
 
     def predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
         """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
         network, and before the first view."""
-        from robotdiffuse.learning.completion import predict
-        from robotdiffuse.learning.completion.coverage import covers
-
-        if not (len(self._views) and self.settings.predict and covers(self.robot)):
+        if not (len(self._views) and self.settings.predict):
             return None
-        below = ((0, 0), (0, 0), (LAYERS_BELOW, 0))
-        probability = np.pad(predict(self._views.volume()), below, constant_values=PROBABILITY_BELOW)
-        return np.where(self.map.free, np.float32(0), probability)
-
-
-def _said(stated: float | None) -> str:
-    if stated is None:
-        return "a motion through space seen free alone"
-    return f"a motion that is free with a probability of {stated:.2f}"
+        return predicted_occupancy(self.robot, self.map, self._views.volume)

@@ -1,8 +1,9 @@
 """What was seen of the space that an arm fills at a goal.
 
-Voxels of 2 cm are too coarse for that: those that a goal's arm touches are rarely seen free as a whole. So
-the arm's surface there is covered with small balls, each of which an image must see through, or which lies in
-voxels that the map knows to be free. What is within the surface needs no view: nothing floats.
+Voxels of 2 cm are too coarse for that: those that the arm touches at a goal are rarely seen free as a whole.
+So small balls cover the arm's surface there, and each must be free: an image sees through it, or it lies in
+voxels that the map knows to be free, or within the arm when an image was taken. What is inside of the surface
+needs no view: nothing floats.
 """
 
 from collections.abc import Iterable
@@ -11,54 +12,58 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.assumptions import voxels_of
 from robotdiffuse.perception.depth_filter import MARGIN_SPREADS, filtered
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import MAP, OccupancyMap
 from robotdiffuse.perception.seen_balls_kernel import see_through, within_voxels
+from robotdiffuse.perception.seen_points_kernel import sphere_distances
 from robotdiffuse.perception.surface_balls import BALL_RADIUS, surface_balls
 from robotdiffuse.perception.view_memory import ViewMemory
-from robotdiffuse.perception.seen_points_kernel import sphere_distances
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
 BORDER = np.float32(1.0)
-"""Pixels around a ball's projection that count too in images that were filtered: the filter moves edges by
-about one."""
+"""Pixels around a ball that count too in images that were filtered: the filter moves edges by about one."""
 
+KEY_DECIMALS = 5
+"""Digits of joint positions that tell configurations apart."""
 
 
 class GoalSeen:
-    """Which balls of the arm's surface at goal configurations no view has shown to be free."""
+    """Which balls of the arm's surface at goal configurations nothing has shown to be free."""
 
-    def __init__(self, robot: Robot, known: OccupancyMap, views: ViewMemory) -> None:
-        """views: kept ones, which count for goals that are new."""
-        self._robot, self._known, self._views = robot, known, views
-        self._unseen: dict[bytes, Float32[ndarray, "n 3"]] = {}
-        """Balls that no view sees through, by configuration."""
+    def __init__(self, robot: Robot, known: OccupancyMap, views: ViewMemory, required: bool) -> None:
+        """views: kept ones, which count for new goals. required: False if goals need not be seen; nothing is
+        missing then."""
+        self._robot, self._known, self._views, self._required = robot, known, views, required
+        self._unseen: dict[tuple[float, ...], Float32[ndarray, "n 3"]] = {}
+        """Centres of the balls that no view has shown to be free, by configuration [m]."""
         self.taken: list[Float[ndarray, "dof"]] = []
         """Configurations of the views since the goal was set."""
 
     def forget(self) -> None:
-        """There is another goal."""
+        """Prepare for another goal."""
         self._unseen.clear()
         self.taken.clear()
 
     def observe(self, view: DepthView) -> None:
-        """Take a new view into account."""
-        if view.configuration is not None:
+        """Take a new view with a configuration into account."""
+        if self._required and view.configuration is not None:
             self.taken.append(view.configuration)
-        for key, balls in self._unseen.items():
-            self._unseen[key] = self._not_shown(balls, [view])
+            self._unseen = {q: self._not_shown(balls, [view]) for q, balls in self._unseen.items()}
 
     def best(self, goals: Float[ndarray, "n dof"]) -> Float[ndarray, "dof"]:
         """The goal of whose surface least is unseen."""
-        return min(goals, key=lambda q: len(self.unseen(q)))
+        found = min(goals, key=lambda q: len(self.unseen(q)))
+        given = set(map(_key, goals))
+        self._unseen = {q: balls for q, balls in self._unseen.items() if q in given}
+        return found
 
     def unseen(self, q: Float[ndarray, "dof"]) -> Float32[ndarray, "n 3"]:
-        """The centres of the balls at a configuration that neither a view nor the map shows to be free
-        [m]."""
-        key = q.tobytes()
+        """The centres of the balls at a configuration that nothing has shown to be free [m]."""
+        key = _key(q)
         if key not in self._unseen:
             self._unseen[key] = self._not_shown(surface_balls(self._robot, q), self._views.views)
         balls = self._unseen[key]
@@ -67,29 +72,34 @@ class GoalSeen:
         return balls[~within]
 
     def wanted(self, q: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
-        """The voxels of the unseen balls at a configuration."""
-        at = voxels_of(self.unseen(q), MAP)
-        at = at[((at >= 0) & (at < MAP.shape)).all(axis=1)]
+        """The voxels that looks are to show for a goal."""
         out = np.zeros(MAP.shape, np.bool_)
-        out[tuple(at.T)] = True
+        if self._required:
+            at = voxels_of(self.unseen(q), MAP)
+            at = at[((at >= 0) & (at < MAP.shape)).all(axis=1)]
+            out[tuple(at.T)] = True
         return out
 
-    def why(self, q: Float[ndarray, "dof"]) -> str:
-        """Says how much of the arm's surface at a configuration was not seen; "" if all was."""
+    def missing(self, motion: PlanResult) -> str:
+        """Says how much was not seen of the arm's surface where a motion ends; "" if nothing is missing."""
+        if not self._required or motion.path is None:
+            return ""
+        q = motion.path.positions[-1]
         unseen = len(self.unseen(q))
-        share = unseen / len(surface_balls(self._robot, q)) if unseen else 0.0
-        return f"{100 * share:.2g} % of the arm's surface at the goal was not seen" if unseen else ""
+        if not unseen:
+            return ""
+        share = unseen / len(surface_balls(self._robot, q))
+        return f"{100 * share:.2g} % of the arm's surface at the goal was not seen"
 
     def _not_shown(
         self, balls: Float32[ndarray, "n 3"], views: Iterable[DepthView]
     ) -> Float32[ndarray, "n 3"]:
-        """The balls that no view shows to be free. Where the arm was when it was taken is free too."""
+        """The balls that no view shows to be free: none sees through them, and the arm was elsewhere."""
         for view in views:
             depth, spread = filtered(view)
-            seen = np.zeros(len(balls), np.bool_)
-            if view.configuration is not None:
-                spheres = placed_spheres(self._robot, view.configuration).astype(np.float32)
-                seen |= sphere_distances(balls, spheres) < -BALL_RADIUS
+            assert view.configuration is not None  # the map takes no other views
+            spheres = placed_spheres(self._robot, view.configuration).astype(np.float32)
+            seen = sphere_distances(balls, spheres) < -BALL_RADIUS
             see_through(
                 depth,
                 np.array(view.intrinsics, np.float32),
@@ -102,3 +112,8 @@ class GoalSeen:
             )
             balls = balls[~seen]
         return balls
+
+
+def _key(q: Float[ndarray, "dof"]) -> tuple[float, ...]:
+    """The same for a goal and for the end of a motion there."""
+    return tuple(np.round(q, KEY_DECIMALS).tolist())
