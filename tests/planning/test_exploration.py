@@ -203,3 +203,46 @@ def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough(
     one.set_goal(PROBLEM.start + 0.02)
     step = one.next(PROBLEM.start)
     assert (step.kind, step.policy, step.confidence) == ("go", "strict", None)
+
+
+def seen_from(one: rd.Explorer, shapes: list[rd.Box], *positions: tuple[float, float, float]) -> None:
+    """Observe a scene with the arm at LEFT."""
+    for position in positions:
+        T = looking_at(np.array(position), np.array([0.45, 0.25, 0.55]))
+        one.observe(ray_cast(rd.Scene(shapes), T, (230.0, 230.0, 159.5, 119.5), (320, 240), PANDA, LEFT))
+
+
+AROUND = (
+    *((1.3, 0.9, 0.6), (1.3, -0.5, 0.6), (-0.3, 1.1, 0.9)),
+    *((0.4, 1.3, 0.2), (0.9, 0.3, 1.4), (1.1, 0.6, 0.05)),
+)
+TURNED = LEFT + np.array([0.12, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("see_goal", (False, True))
+def test_a_goal_behind_a_plate_is_refused_until_views_show_it(see_goal: bool) -> None:
+    """All of this motion is within 2 cm of the arm at its ends, which `strict` takes on trust."""
+    plate = rd.Box((1.0, 0.7, 0.6), (0.02, 0.8, 1.2), wxyz=(0.94, 0, 0, 0.34))
+    settings = ExplorerSettings(time_limit=1.0, see_goal=see_goal)
+    one = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, settings)
+    one.set_goal(TURNED)
+    seen_from(one, [FLOOR, plate], (1.3, 0.9, 0.6))
+    step = one.next(LEFT)
+    if not see_goal:
+        assert step.kind == "go"
+        return
+    assert step.kind == "stuck" and "% of the arm's surface at the goal was not seen" in step.reason
+    seen_from(one, [FLOOR, plate], *AROUND)
+    step = one.next(LEFT)
+    assert step.kind == "go" and step.policy == "strict", step.reason
+
+
+def test_a_goal_inside_of_something_is_not_seen_from_anywhere() -> None:
+    known, views = OccupancyMap(PANDA), ViewMemory(PANDA, 12)
+    seen = GoalSeen(PANDA, known, views, required=True)
+    far = np.array([1.2, *LEFT[1:]])
+    hand = placed_spheres(PANDA, far)[-1, :3]
+    for shapes, free in (([FLOOR], True), ([FLOOR, rd.Box(tuple(hand), (0.01, 0.01, 0.01))], False)):
+        seen.forget()
+        one = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE)
+        seen_from(one, shapes, *AROUND)

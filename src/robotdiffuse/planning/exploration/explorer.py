@@ -163,7 +163,7 @@ class Explorer:
     def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
         """The voxels that looks are to show: unknown ones that a tentative motion sweeps, and those of the
         goal that must be seen."""
-        return swept_unseen(self.map, path) | self._goal_seen.wanted(path.positions[-1])
+        return swept_unseen(self.map, path) | self._goal_seen.wanted(path)
 
     def stop(self, motion: Trajectory, time: float) -> Stop | None:
         """How a motion under way ends early, if what was observed since `next` returned it is in its way;
@@ -186,7 +186,7 @@ class Explorer:
             found = self._goals(problem)
             if isinstance(found, PlanResult):
                 return Step(STUCK, found.reason, policy)
-            problem = replace(problem, goal=JointGoal(self._goal_seen.best(found)[None]))
+            problem = replace(problem, goal=JointGoal(self._goal_seen.best(problem.start, found)[None]))
         predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit

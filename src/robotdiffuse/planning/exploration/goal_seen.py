@@ -2,8 +2,8 @@
 
 Voxels of 2 cm are too coarse for that: those that the arm touches at a goal are rarely seen free as a whole.
 So small balls cover the arm's surface there, and each must be free: an image sees through it, or it lies in
-voxels that the map knows to be free, or within the arm when an image was taken. What is inside of the surface
-needs no view: nothing floats.
+voxels that the map knows to be free, or within a covering sphere of the arm when an image was taken, or in
+what is taken on trust where the motion begins. What is inside of the surface needs no view: nothing floats.
 """
 
 from collections.abc import Iterable
@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.perception.assumptions import voxels_of
+from robotdiffuse.core.types import Path
+from robotdiffuse.perception.assumptions import CARVING_MARGIN, voxels_of
 from robotdiffuse.perception.depth_filter import MARGIN_SPREADS, filtered
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import MAP, OccupancyMap
@@ -54,28 +55,29 @@ class GoalSeen:
             self.taken.append(view.configuration)
             self._unseen = {q: self._not_shown(balls, [view]) for q, balls in self._unseen.items()}
 
-    def best(self, goals: Float[ndarray, "n dof"]) -> Float[ndarray, "dof"]:
+    def best(self, start: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> Float[ndarray, "dof"]:
         """The goal of whose surface least is unseen."""
-        found = min(goals, key=lambda q: len(self.unseen(q)))
+        found = min(goals, key=lambda q: len(self.unseen(start, q)))
         given = set(map(_key, goals))
         self._unseen = {q: balls for q, balls in self._unseen.items() if q in given}
         return found
 
-    def unseen(self, q: Float[ndarray, "dof"]) -> Float32[ndarray, "n 3"]:
-        """The centres of the balls at a configuration that nothing has shown to be free [m]."""
+    def unseen(self, start: Float[ndarray, "dof"], q: Float[ndarray, "dof"]) -> Float32[ndarray, "n 3"]:
+        """The centres of the balls at a configuration that nothing has shown to be free [m]. start: where the
+        arm is."""
         key = _key(q)
         if key not in self._unseen:
             self._unseen[key] = self._not_shown(surface_balls(self._robot, q), self._views.views)
         balls = self._unseen[key]
-        within = np.zeros(len(balls), np.bool_)
+        within = self._distances(balls, start) < CARVING_MARGIN - BALL_RADIUS
         within_voxels(balls, np.float32(BALL_RADIUS), self._known.free, *MAP.frame, within)
         return balls[~within]
 
-    def wanted(self, q: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
-        """The voxels that looks are to show for a goal."""
+    def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
+        """The voxels that looks are to show of the surface where a path ends."""
         out = np.zeros(MAP.shape, np.bool_)
         if self._required:
-            at = voxels_of(self.unseen(q), MAP)
+            at = voxels_of(self.unseen(path.positions[0], path.positions[-1]), MAP)
             at = at[((at >= 0) & (at < MAP.shape)).all(axis=1)]
             out[tuple(at.T)] = True
         return out
@@ -84,8 +86,8 @@ class GoalSeen:
         """Says how much was not seen of the arm's surface where a motion ends; "" if nothing is missing."""
         if not self._required or motion.path is None:
             return ""
-        q = motion.path.positions[-1]
-        unseen = len(self.unseen(q))
+        start, q = motion.path.positions[[0, -1]]
+        unseen = len(self.unseen(start, q))
         if not unseen:
             return ""
         share = unseen / len(surface_balls(self._robot, q))
@@ -98,8 +100,7 @@ class GoalSeen:
         for view in views:
             depth, spread = filtered(view)
             assert view.configuration is not None  # the map takes no other views
-            spheres = placed_spheres(self._robot, view.configuration).astype(np.float32)
-            seen = sphere_distances(balls, spheres) < -BALL_RADIUS
+            seen = self._distances(balls, view.configuration) < -BALL_RADIUS
             see_through(
                 depth,
                 np.array(view.intrinsics, np.float32),
@@ -112,6 +113,10 @@ class GoalSeen:
             )
             balls = balls[~seen]
         return balls
+
+    def _distances(self, balls: Float32[ndarray, "n 3"], q: Float[ndarray, "dof"]) -> Float32[ndarray, "n"]:
+        """Signed distances of the balls' centres to the arm's covering spheres at a configuration [m]."""
+        return sphere_distances(balls, placed_spheres(self._robot, q).astype(np.float32))
 
 
 def _key(q: Float[ndarray, "dof"]) -> tuple[float, ...]:
