@@ -11,10 +11,14 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.assumptions import CARVING_MARGIN, FINE_SHAPE, voxels_in
 from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, OccupancyMap
-from robotdiffuse.perception.ray_caster import voxels_within
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.surface_balls import surface_balls
 from robotdiffuse.perception.swept_voxels_kernel import sweep
+from robotdiffuse.perception.view_memory import ViewMemory
 from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+from robotdiffuse.planning.exploration.goal_seen import GoalSeen
 from robotdiffuse.planning.exploration.looks import best_looks
 from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
 from robotdiffuse.planning.exploration.reachable import ReachableTree
@@ -205,44 +209,53 @@ def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough(
     assert (step.kind, step.policy, step.confidence) == ("go", "strict", None)
 
 
-def seen_from(one: rd.Explorer, shapes: list[rd.Box], *positions: tuple[float, float, float]) -> None:
-    """Observe a scene with the arm at LEFT."""
-    for position in positions:
-        T = looking_at(np.array(position), np.array([0.45, 0.25, 0.55]))
-        one.observe(ray_cast(rd.Scene(shapes), T, (230.0, 230.0, 159.5, 119.5), (320, 240), PANDA, LEFT))
+def seen_from(position: tuple[float, float, float], *shapes: rd.Box) -> DepthView:
+    """A view of shapes and the floor, with the arm at LEFT."""
+    T = looking_at(np.array(position), np.array([0.45, 0.25, 0.55]))
+    intrinsics = (230.0, 230.0, 159.5, 119.5)
+    return ray_cast(rd.Scene([FLOOR, *shapes]), T, intrinsics, (320, 240), PANDA, LEFT)
 
 
-AROUND = (
-    *((1.3, 0.9, 0.6), (1.3, -0.5, 0.6), (-0.3, 1.1, 0.9)),
-    *((0.4, 1.3, 0.2), (0.9, 0.3, 1.4), (1.1, 0.6, 0.05)),
-)
-TURNED = LEFT + np.array([0.12, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+ABOVE_AND_BESIDE = ((1.3, -0.5, 0.6), (-0.3, 1.1, 0.9), (0.4, 1.3, 0.2))
 
 
-@pytest.mark.parametrize("see_goal", (False, True))
-def test_a_goal_behind_a_plate_is_refused_until_views_show_it(see_goal: bool) -> None:
-    """All of this motion is within 2 cm of the arm at its ends, which `strict` takes on trust."""
-    plate = rd.Box((1.0, 0.7, 0.6), (0.02, 0.8, 1.2), wxyz=(0.94, 0, 0, 0.34))
-    settings = ExplorerSettings(time_limit=1.0, see_goal=see_goal)
-    one = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, settings)
-    one.set_goal(TURNED)
-    seen_from(one, [FLOOR, plate], (1.3, 0.9, 0.6))
+def test_a_goal_behind_a_plate_is_refused_until_views_show_it() -> None:
+    """`strict` takes it on trust: all of this motion is within 2 cm of the arm at its ends."""
+    plate, goal = rd.Box((1.0, 0.7, 0.6), (0.02, 0.8, 1.2), wxyz=(0.94, 0, 0, 0.34)), LEFT.copy()
+    goal[0] += 0.12
+    for see_goal in (False, True):
+        settings = ExplorerSettings(time_limit=1.0, see_goal=see_goal)
+        one = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, settings)
+        one.observe(seen_from((1.3, 0.9, 0.6), plate))
+        one.set_goal(goal)
+        step = one.next(LEFT)
+        assert step.kind == ("stuck" if see_goal else "go")
+    assert "% of the arm's surface at the goal was not seen" in step.reason
+    for position in ABOVE_AND_BESIDE:
+        one.observe(seen_from(position, plate))
     step = one.next(LEFT)
-    if not see_goal:
-        assert step.kind == "go"
-        return
-    assert step.kind == "stuck" and "% of the arm's surface at the goal was not seen" in step.reason
-    seen_from(one, [FLOOR, plate], *AROUND)
-    step = one.next(LEFT)
-    assert step.kind == "go" and step.policy == "strict", step.reason
+    assert (step.kind, step.policy) == ("go", "strict"), step.reason
 
 
-def test_a_goal_inside_of_something_is_not_seen_from_anywhere() -> None:
-    known, views = OccupancyMap(PANDA), ViewMemory(PANDA, 12)
-    seen = GoalSeen(PANDA, known, views, required=True)
-    far = np.array([1.2, *LEFT[1:]])
-    hand = placed_spheres(PANDA, far)[-1, :3]
-    for shapes, free in (([FLOOR], True), ([FLOOR, rd.Box(tuple(hand), (0.01, 0.01, 0.01))], False)):
-        seen.forget()
-        one = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE)
-        seen_from(one, shapes, *AROUND)
+def test_a_thing_at_the_surface_of_a_goal_is_seen_as_free_by_no_view() -> None:
+    goal = np.array([1.2, *LEFT[1:]])
+    balls = surface_balls(PANDA, goal)
+    thing = rd.Box(tuple(balls[-1].tolist()), (0.02, 0.02, 0.02))
+    unseen = []
+    for shapes in ((), (thing,)):
+        seen = GoalSeen(PANDA, OccupancyMap(PANDA), ViewMemory(PANDA, 1), required=True)
+        unseen.append([seen.unseen(LEFT, goal)])
+        for position in ABOVE_AND_BESIDE:
+            seen.observe(seen_from(position, *shapes))
+            unseen[-1].append(seen.unseen(LEFT, goal))
+    counts = [[len(balls) for balls in row] for row in unseen]
+    assert counts[0][0] == counts[1][0] and all(row == sorted(row, reverse=True) for row in counts)
+    inside = np.abs(balls - thing.center).max(axis=1) < 0.01
+    left = {tuple(ball) for ball in unseen[1][-1].tolist()}
+    assert inside.sum() > 5 and all(tuple(ball) in left for ball in balls[inside].tolist())
+    assert balls[-1].tolist() not in unseen[0][-1].tolist()
+
+
+def test_a_goal_is_seen_by_strict_alone() -> None:
+    with pytest.raises(InputError, match=r"explorer.see_goal is true and explorer.policy 'chance'"):
+        ExplorerSettings(policy="chance", see_goal=True)

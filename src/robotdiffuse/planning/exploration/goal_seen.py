@@ -95,7 +95,7 @@ class GoalSeen:
 
     def _not_shown(
         self, balls: Float32[ndarray, "n 3"], views: Iterable[DepthView]
-    ) -> Float32[ndarray, "n 3"]:
+    ) -> Float32[ndarray, "m 3"]:
         """The balls that no view shows to be free: none sees through them, and the arm was elsewhere."""
         for view in views:
             depth, spread = filtered(view)
