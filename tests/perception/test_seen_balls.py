@@ -1,14 +1,17 @@
 """Balls on an arm's surface, and which of them a depth image shows to be free."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 import robotdiffuse as rd
-from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.seen_balls_kernel import MAX_LOST_FRACTION, see_through, within_voxels
 from robotdiffuse.perception.surface_balls import BALL_RADIUS, surface_balls
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
 
 PANDA = rd.load_robot("panda")
 Q = np.array([0.3, -0.5, 0.2, -2.0, 0.4, 1.7, 0.5])
@@ -89,14 +92,23 @@ def test_balls_lie_within_voxels_if_all_of_them_do() -> None:
 
 def test_balls_cover_the_surface_of_the_arm_and_of_what_it_holds() -> None:
     held = PANDA.attach(rd.Box((0, 0, 0.1), (0.04, 0.06, 0.1), name="held"), "panda_hand")
-    balls, frames = surface_balls(held, Q), forward_frames(held, Q[None])[0]
-    tree = cKDTree(balls)
     for link in ("panda_link3", "panda_hand", "held"):
-        T_frame_link, frame = held.T_frame_link(link), frames[held.link_frame(link)]
         for mesh in held.meshes[link]:
             corners = mesh.vertices[mesh.faces[RNG.integers(len(mesh.faces), size=200)]]
-            weights = RNG.dirichlet((1, 1, 1), 200)
-            points = (weights[:, None] @ corners)[:, 0] @ T_frame_link[:3, :3].T + T_frame_link[:3, 3]
-            points = points @ frame[:3, :3].T + frame[:3, 3]
-            assert tree.query(points)[0].max() <= BALL_RADIUS
-    assert len(balls) > len(surface_balls(PANDA, Q))
+            points = (RNG.dirichlet((1, 1, 1), 200)[:, None] @ corners)[:, 0]
+            assert from_balls(held, link, points).max() <= BALL_RADIUS
+    assert len(surface_balls(held, Q)) > len(surface_balls(PANDA, Q))
+
+
+def test_balls_cover_the_spheres_of_a_link_without_meshes() -> None:
+    bare = replace(PANDA, meshes={})
+    for sphere in bare.spheres["panda_hand"]:
+        ways = RNG.standard_normal((200, 3))
+        points = sphere[:3] + sphere[3] * ways / np.linalg.norm(ways, axis=1)[:, None]
+        assert from_balls(bare, "panda_hand", points).max() <= BALL_RADIUS
+
+
+def from_balls(robot: Robot, link: str, points: np.ndarray) -> np.ndarray:
+    """Distances of points in a link's frame to the nearest of the arm's balls at Q [m]."""
+    T = link_pose(robot, Q, link)
+    return KDTree(surface_balls(robot, Q)).query(points @ T[:3, :3].T + T[:3, 3])[0]
