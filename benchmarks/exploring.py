@@ -36,6 +36,7 @@ from scipy.ndimage import binary_dilation
 from cameras import PLANNER, is_free, known_scene, problems, unknown_scene, views
 from common import header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.types import FIRST
 from robotdiffuse.core.types import Path as JointPath
@@ -81,10 +82,13 @@ class Method:
     """Whether a camera stands beside the arm."""
     frontier: bool = False
     """Whether looks are to show the frontier of known space, not what a motion sweeps."""
+    see_goal: bool = False
+    """Whether the goal must be seen."""
 
 
 METHODS = {
     "strict": Method(STRICT),
+    "strict, goal seen": Method(STRICT, see_goal=True),
     "chance": Method(CHANCE),
     "strict, then chance": Method(STRICT_THEN_CHANCE),
     "strict, no network": Method(STRICT, predict=False),
@@ -136,7 +140,9 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
     seen, reason = [measured(beside, np.inf, noise, rng)], ""
     reached = collided = False
     about = METHODS.get(method, METHODS["strict"])
-    settings = ExplorerSettings(policy=about.policy, time_limit=TIME_LIMIT, predict=about.predict)
+    settings = ExplorerSettings(
+        policy=about.policy, time_limit=TIME_LIMIT, predict=about.predict, see_goal=about.see_goal
+    )
     zone = free_zone(problem) if about.free_zone else None
     kind = FrontierExplorer if about.frontier else TimedExplorer
     explorer = kind(problem.robot, [camera], known, zone, settings)
@@ -182,10 +188,16 @@ def free_zone(problem: Problem) -> Corners | None:
     return None
 
 
-def usable(problem: Problem) -> bool:
-    """Whether the arm's pose "ready" is free in the scene."""
+def usable(problem: Problem, clearance: float) -> bool:
+    """Whether the arm's pose "ready" is free in the scene, and the start and all goals have a clearance to it
+    [m]."""
     home = replace(problem, start=HOME).start
-    return bool(CollisionChecker(problem.robot, problem.scene).free(home[None])[0])
+    assert isinstance(problem.goal, JointGoal)
+    if not CollisionChecker(problem.robot, problem.scene).free(home[None])[0]:
+        return False
+    exact = ExactCollision(problem.robot, problem.scene)
+    ends = (problem.start, *problem.goal.positions)
+    return all(link.distance >= clearance for q in ends for link in exact.link_distances(q))
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -194,7 +206,7 @@ def run(arguments: argparse.Namespace) -> None:
     done = {(row["family"], row["number"], row["method"], row["noise"]) for row in kept.rows}
     warm = False
     for family in arguments.families:
-        some = (one for one in problems(family, MAX_PROBLEMS, set()) if usable(one[1]))
+        some = (one for one in problems(family, MAX_PROBLEMS, set()) if usable(one[1], arguments.clear))
         end = arguments.skip + arguments.problems // len(arguments.families)
         some = list(islice(some, arguments.skip, end))
         for number, problem in progress(some, family):
@@ -248,6 +260,7 @@ def main() -> None:
     every = [*ONCE, *METHODS]
     parser.add_argument("--problems", type=int, default=28, help="of all families together (28)")
     parser.add_argument("--skip", type=int, default=0, help="the first of each family (0)")
+    parser.add_argument("--clear", type=float, default=0.0, help="least clearance of start and goal [m] (0)")
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
     parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
     parser.add_argument("--noise", action="store_true", help="of depth cameras")

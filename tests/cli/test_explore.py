@@ -38,6 +38,7 @@ def test_explore_writes_a_replay_a_strip_and_a_recording(
         (["--out", "seen.gif"], ".html, .png"),
         (["--record", "seen.bag"], ".mcap"),
         (["--policy", "bold"], "unknown explorer.policy"),
+        (["--policy", "chance", "--see-goal"], "it needs policy 'strict'"),
     ],
 )
 def test_bad_input_is_one_line(

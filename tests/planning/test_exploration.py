@@ -11,11 +11,16 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.assumptions import CARVING_MARGIN, FINE_SHAPE, voxels_in
 from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, OccupancyMap
-from robotdiffuse.perception.ray_caster import voxels_within
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.surface_balls import surface_balls
 from robotdiffuse.perception.swept_voxels_kernel import sweep
-from robotdiffuse.planning.exploration.explorer import PROBABILITY_BELOW, ExplorerSettings
+from robotdiffuse.perception.view_memory import ViewMemory
+from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+from robotdiffuse.planning.exploration.goal_seen import GoalSeen
 from robotdiffuse.planning.exploration.looks import best_looks
+from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
 from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, not_seen_free
 from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
@@ -202,3 +207,55 @@ def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough(
     one.set_goal(PROBLEM.start + 0.02)
     step = one.next(PROBLEM.start)
     assert (step.kind, step.policy, step.confidence) == ("go", "strict", None)
+
+
+def seen_from(position: tuple[float, float, float], *shapes: rd.Box) -> DepthView:
+    """A view of shapes and the floor, with the arm at LEFT."""
+    T = looking_at(np.array(position), np.array([0.45, 0.25, 0.55]))
+    intrinsics = (230.0, 230.0, 159.5, 119.5)
+    return ray_cast(rd.Scene([FLOOR, *shapes]), T, intrinsics, (320, 240), PANDA, LEFT)
+
+
+ABOVE_AND_BESIDE = ((1.3, -0.5, 0.6), (-0.3, 1.1, 0.9), (0.4, 1.3, 0.2))
+
+
+def test_a_goal_behind_a_plate_is_refused_until_views_show_it() -> None:
+    """`strict` takes it on trust: all of this motion is within 2 cm of the arm at its ends."""
+    plate, goal = rd.Box((1.0, 0.7, 0.6), (0.02, 0.8, 1.2), wxyz=(0.94, 0, 0, 0.34)), LEFT.copy()
+    goal[0] += 0.12
+    for see_goal in (False, True):
+        settings = ExplorerSettings(time_limit=1.0, see_goal=see_goal)
+        one = rd.Explorer(PANDA, (), rd.Scene([FLOOR]), ZONE, settings)
+        one.observe(seen_from((1.3, 0.9, 0.6), plate))
+        one.set_goal(goal)
+        step = one.next(LEFT)
+        assert step.kind == ("stuck" if see_goal else "go")
+    assert "% of the arm's surface at the goal was not seen" in step.reason
+    for position in ABOVE_AND_BESIDE:
+        one.observe(seen_from(position, plate))
+    step = one.next(LEFT)
+    assert (step.kind, step.policy) == ("go", "strict"), step.reason
+
+
+def test_a_thing_at_the_surface_of_a_goal_is_seen_as_free_by_no_view() -> None:
+    goal = np.array([1.2, *LEFT[1:]])
+    balls = surface_balls(PANDA, goal)
+    thing = rd.Box(tuple(balls[-1].tolist()), (0.02, 0.02, 0.02))
+    unseen = []
+    for shapes in ((), (thing,)):
+        seen = GoalSeen(PANDA, OccupancyMap(PANDA), ViewMemory(PANDA, 1), required=True)
+        unseen.append([seen.unseen(LEFT, goal)])
+        for position in ABOVE_AND_BESIDE:
+            seen.observe(seen_from(position, *shapes))
+            unseen[-1].append(seen.unseen(LEFT, goal))
+    counts = [[len(balls) for balls in row] for row in unseen]
+    assert counts[0][0] == counts[1][0] and all(row == sorted(row, reverse=True) for row in counts)
+    inside = np.abs(balls - thing.center).max(axis=1) < 0.01
+    left = {tuple(ball) for ball in unseen[1][-1].tolist()}
+    assert inside.sum() > 5 and all(tuple(ball) in left for ball in balls[inside].tolist())
+    assert balls[-1].tolist() not in unseen[0][-1].tolist()
+
+
+def test_a_goal_is_seen_by_strict_alone() -> None:
+    with pytest.raises(InputError, match=r"explorer.see_goal is true and explorer.policy 'chance'"):
+        ExplorerSettings(policy="chance", see_goal=True)

@@ -39,6 +39,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         "strict_then_chance (default: strict)",
     )
     parser.add_argument("--confidence", type=float, default=0.98, metavar="P", help="least, of chance (0.98)")
+    parser.add_argument(
+        "--see-goal",
+        action="store_true",
+        help="go only to goals at which all of the arm's surface was seen to be free (policy strict)",
+    )
     parser.add_argument("--time-limit", type=float, default=1.0, metavar="S", help="of each search (1)")
     parser.add_argument("--noise", action="store_true", help="simulate the noise of depth cameras")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed")
@@ -73,7 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
         recording = check_output(arguments.record, (RECORDING,))
         WRITERS.load(RECORDING)  # its packages are installed
     problem = load_problem(arguments.problem)
-    settings = ExplorerSettings(arguments.policy, arguments.confidence, arguments.time_limit)
+    settings = ExplorerSettings(
+        arguments.policy, arguments.confidence, arguments.time_limit, see_goal=arguments.see_goal
+    )
     noise = DepthNoise() if arguments.noise else None
     explorer, arrived = simulate(problem, settings, noise, arguments.seed)
     for file in outputs:

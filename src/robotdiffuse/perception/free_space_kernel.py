@@ -37,7 +37,7 @@ _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 
 
 @njit(cache=True, fastmath=FASTMATH)
-def _filtered(depth, focal):
+def usable_depth(depth, focal):
     """The depths, with MAX_DEPTH for rays without an obstacle and NO_RETURN for missing returns and flying
     pixels."""
     h, w = depth.shape
@@ -175,7 +175,7 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
     float32, except state, uint8, and counts, int32.
     """
     nx, ny, nz = state.shape
-    raw = _filtered(depth, intrinsics[0])
+    raw = usable_depth(depth, intrinsics[0])
     arm = _arm_pixels(raw, intrinsics, spheres)
     counts[:] = 0
     _count_points(raw, arm, intrinsics, T, low, voxel, counts)

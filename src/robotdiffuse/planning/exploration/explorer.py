@@ -2,7 +2,8 @@
 
 **Strict.** The arm enters no voxel that was not seen free: the validator accepts each motion among obstacles
 that cover all other space (`seen_free.py`). Exempt is the space within 2 cm of the arm where a motion begins
-and ends; seen points count there too. So the promise is as good as the map: in a scene that does not change,
+and ends; seen points count there too. With `see_goal` the arm's surface at the goal must have been seen free
+as well (`goal_seen.py`). So the promise is as good as the map: in a scene that does not change,
 with a camera whose poses and errors are as stated, such a motion meets nothing.
 
 **Chance.** The arm goes if the motion's stated `confidence` is high enough, and looks first if it is not. It
@@ -27,22 +28,23 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
-from robotdiffuse.perception.assumptions import voxels_in, voxels_of
-from robotdiffuse.perception.confidence import explored_confidence
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, Corners, OccupancyMap
+from robotdiffuse.perception.occupancy_map import MAP, Corners, OccupancyMap
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.swept_voxels_kernel import surface
-from robotdiffuse.perception.unknown_space import UnknownSpace
 from robotdiffuse.perception.view_memory import ViewMemory
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera
+from robotdiffuse.planning.exploration.chance import planned_by_chance, with_confidence
+from robotdiffuse.planning.exploration.goal_seen import GoalSeen
 from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
+from robotdiffuse.planning.exploration.prediction import predicted_occupancy
 from robotdiffuse.planning.exploration.reachable import ReachableTree, first_parts
 from robotdiffuse.planning.exploration.seen_free import (
     cover,
     hardly_seen,
+    least_unknown,
     near_ends,
     not_seen_free,
     reaches_outside,
@@ -59,11 +61,9 @@ from robotdiffuse.planning.exploration.steps import (
     Step,
 )
 from robotdiffuse.planning.exploration.stopping import Stop, stop_before
-from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.goals import Goal
-from robotdiffuse.problems.problem import PADDED, PREDICTED, JointGoal, Problem
-from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -73,9 +73,6 @@ QUICK_FRACTION = 0.2
 doubles with each look: the more was seen, the less likely a search fails for lack of it."""
 TENTATIVE_MOTIONS = 2
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
-PROBABILITY_BELOW = np.float32(0.1)
-"""That a voxel below the volume that the network predicts is occupied, where the map does not know it: the
-share of unknown voxels within reach that are."""
 AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
 
@@ -106,6 +103,7 @@ class Explorer:
         self._planner = load_planner("robotdiffuse")
         self._rng, self._seed = np.random.default_rng(seed), seed
         self._views = ViewMemory(robot, settings.max_views)
+        self._goal_seen = GoalSeen(robot, self.map, self._views, settings.see_goal)
         self._goal: Goal | None = None
         self._looks = 0
         self._looked_for = np.zeros(MAP.shape, np.bool_)
@@ -123,11 +121,13 @@ class Explorer:
         self._goal = Problem(self.robot, NOTHING, middle, goal).goal
         self._looks = 0
         self._looked_for[:] = False
+        self._goal_seen.forget()
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
         told = self.map.add(view, stamp)
         self._views.add(view, told)
+        self._goal_seen.observe(view)
         self._news.append(view)
 
     def next(self, configuration: ArrayLike) -> Step:
@@ -144,7 +144,7 @@ class Explorer:
         if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
         goals = self._goal.positions if isinstance(self._goal, JointGoal) else q[None]
-        seen = point_shapes(self._seen_points(), self.robot, self.scene, q, goals)
+        seen = point_shapes(self._views.points(self.map.free), self.robot, self.scene, q, goals)
         scene = self.scene.with_shapes([*self.scene.shapes, *seen])
         problem = Problem(self.robot, scene, q, self._goal)
         self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
@@ -160,17 +160,9 @@ class Explorer:
         return replace(step, seen=problem.scene)
 
     def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
-        """The voxels that looks are to show: unknown ones that a tentative motion sweeps."""
-        return swept_unseen(self.map, path)
-
-    def _seen_points(self) -> Float[ndarray, "n 3"]:
-        """The points that kept views observed, without those where more views see through: stray pixels."""
-        points = self._views.points()
-        at = voxels_of(points, MAP)
-        inside = ((at >= 0) & (at < MAP.shape)).all(axis=1)
-        stray = np.zeros(len(points), np.bool_)
-        stray[inside] = self.map.free[tuple(at[inside].T)]
-        return points[~stray]
+        """The voxels that looks are to show: unknown ones that a tentative motion sweeps, and those of the
+        goal that must be seen."""
+        return swept_unseen(self.map, path) | self._goal_seen.wanted(path)
 
     def stop(self, motion: Trajectory, time: float) -> Stop | None:
         """How a motion under way ends early, if what was observed since `next` returned it is in its way;
@@ -189,6 +181,11 @@ class Explorer:
             if not goals:
                 return Step(STUCK, "at the goal the arm reaches out of the map", policy)
             problem = replace(problem, goal=JointGoal(np.stack(goals)))
+        if self.settings.see_goal:
+            found = self._goals(problem)
+            if isinstance(found, PlanResult):
+                return Step(STUCK, found.reason, policy)
+            problem = replace(problem, goal=JointGoal(self._goal_seen.best(problem.start, found)[None]))
         predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = self.settings.time_limit
@@ -196,12 +193,12 @@ class Explorer:
         if may_look and policy == STRICT:
             quick = min(self._quick_limit * 2**self._looks, limit)
         motion = self._motion(problem, policy, predicted, quick, may_look)
-        if self._good(motion, policy):
+        if self._may_go(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
         if look.kind == STUCK and (quick < limit or motion.status is Status.NO_PATH):
             motion = self._motion(problem, policy, predicted, limit)
-            if motion.solved:
+            if self._may_go(motion, policy):
                 return self._go(motion, policy)
         return look
 
@@ -211,9 +208,16 @@ class Explorer:
             return motion.solved
         return motion.confidence is not None and motion.confidence >= self.settings.confidence
 
+    def _may_go(self, motion: PlanResult, policy: str) -> bool:
+        """Whether a motion to the goal keeps to the policy, and the goal was seen if it must be."""
+        return self._good(motion, policy) and not self._goal_seen.missing(motion)
+
     def _go(self, motion: PlanResult, policy: str) -> Step:
         stated = motion.confidence if policy == CHANCE else None
-        return Step(GO, _said(stated), policy, motion, stated)
+        free = "through space seen free alone"
+        if stated is not None:
+            free = f"that is free with a probability of {stated:.3f}"
+        return Step(GO, f"a motion {free}", policy, motion, stated)
 
     def _look(
         self,
@@ -224,8 +228,8 @@ class Explorer:
     ) -> Step:
         """A look at what a tentative motion sweeps unseen, or why there is none. `motion`: the one to the
         goal that does not keep to the policy."""
-        why = motion.reason
-        if motion.solved:
+        why = self._goal_seen.missing(motion) or motion.reason
+        if motion.solved and policy == CHANCE:
             why = f"the motion's confidence is {motion.confidence:.2f}, below {self.settings.confidence:g}"
         if not self.cameras:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
@@ -237,10 +241,10 @@ class Explorer:
             return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
         kept, under = None, policy
         if policy == CHANCE and predicted is not None:
-            kept = self._with_confidence(tentative, predicted)
+            kept = with_confidence(self.map, problem, tentative, predicted)
         elif not wanted.any():
             kept, under = self._within_seen_free(problem, tentative.path.positions, "as seen"), STRICT
-        if kept is not None and self._good(kept, under):
+        if kept is not None and self._may_go(kept, under):
             return self._go(kept, under)
         predicted = self.predicted() if predicted is None else predicted
         # a look has many ways: by chance, too, it takes one through space seen free if there is any
@@ -270,7 +274,7 @@ class Explorer:
             allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         tree = ReachableTree(self.robot, allowed, problem.start)
         for camera in self.cameras:
-            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng)
+            ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng, self._goal_seen.taken)
             for waypoints in islice(ways, self.settings.look_attempts):
                 look = replace(problem, goal=JointGoal(waypoints[-1:]))
                 if policy == STRICT:
@@ -348,8 +352,7 @@ class Explorer:
         goals = self._goals(problem)
         if isinstance(goals, PlanResult):
             return goals
-        outside = [int((self.map.unknown & self._occupied_by(q)).sum()) for q in goals]
-        goal = goals[int(np.argmin(outside))]
+        goal = least_unknown(self.map, goals)
         if may_look and hardly_seen(self.map, problem.start, goal):
             context = PlanningContext(self._planner.name, problem, PlanRequest(limit))
             return context.fail(Status.NO_PATH, "too little of the space around the goal was seen free")
@@ -368,33 +371,8 @@ class Explorer:
         limit: float,
         to_goal: bool = True,
     ) -> PlanResult:
-        """A motion among what was seen and predicted, with its confidence; see `_with_confidence`."""
-        asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
         request = PlanRequest(limit, self._seed, FIRST)
-        goals = problem.goal.positions if to_goal and isinstance(problem.goal, JointGoal) else ()
-        unknown = self._unknown(np.stack([problem.start, *goals]), predicted)
-        above = None if predicted is None else predicted[:, :, LAYERS_BELOW:]
-        result = plan_with_unknown_space(self._planner, asked, request, above, unknown)
-        return replace(self._with_confidence(result, predicted, to_goal), problem=asked)
-
-    def _with_confidence(
-        self, motion: PlanResult, predicted: Float32[ndarray, "nx ny nz"] | None, to_goal: bool = True
-    ) -> PlanResult:
-        """The motion with the confidence that follows from the probability that it sweeps. The arm is taken
-        to be free where a motion begins, and at the goal, but not where a look ends."""
-        if motion.path is None or predicted is None:
-            return motion
-        ends = motion.path.positions[[0, -1] if to_goal else [0]]
-        unknown = self._unknown(ends, predicted)
-        swept = unknown.crossed(motion.path).risk
-        stated = None if swept is None else explored_confidence(swept)
-        return replace(motion, swept_probability=swept, confidence=stated)
-
-    def _unknown(
-        self, ends: Float[ndarray, "n dof"], predicted: Float32[ndarray, "nx ny nz"] | None
-    ) -> UnknownSpace:
-        """What the map does not know, without the voxels that the arm fills at these configurations."""
-        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP)
+        return planned_by_chance(self._planner, self.map, problem, predicted, request, to_goal)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
         """A first motion in the problem's scene as it is, found within a time limit [s]."""
@@ -405,27 +383,14 @@ class Explorer:
         """The goal configurations, or the result that says why there is none."""
         if isinstance(problem.goal, JointGoal):
             return problem.goal.positions
-        request = PlanRequest(self.settings.time_limit, self._seed, FIRST)
+        seed = 0 if self.settings.see_goal else self._seed  # looks are made for the same ones again
+        request = PlanRequest(self.settings.time_limit, seed, FIRST)
         usable = usable_start_goal(PlanningContext(self._planner.name, problem, request))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
-
-    def _occupied_by(self, q: Float[ndarray, "dof"]) -> Bool[ndarray, "nx ny nz"]:
-        return voxels_in(placed_spheres(self.robot, q).astype(np.float32), grid=MAP)
 
     def predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
         """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
         network, and before the first view."""
-        from robotdiffuse.learning.completion import predict
-        from robotdiffuse.learning.completion.coverage import covers
-
-        if not (len(self._views) and self.settings.predict and covers(self.robot)):
+        if not (len(self._views) and self.settings.predict):
             return None
-        below = ((0, 0), (0, 0), (LAYERS_BELOW, 0))
-        probability = np.pad(predict(self._views.volume()), below, constant_values=PROBABILITY_BELOW)
-        return np.where(self.map.free, np.float32(0), probability)
-
-
-def _said(stated: float | None) -> str:
-    if stated is None:
-        return "a motion through space seen free alone"
-    return f"a motion that is free with a probability of {stated:.3f}"
+        return predicted_occupancy(self.robot, self.map, self._views.volume)

@@ -1,6 +1,6 @@
 """Where to look: configurations from which the arm's camera sees what a motion would sweep."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -34,6 +34,8 @@ UNSEEN_WEIGHT = 0.05
 """Weight of a swept voxel that is surely free, by the prediction; one that is surely occupied has 1 more."""
 MIN_SEEN = 0.02
 """Looks that see a smaller part of the weight are of no use."""
+SIMILAR_LOOK = 0.2
+"""A look that is nearer than this to one that did not show what is wanted counts less [rad]."""
 
 
 def swept_unseen(known: OccupancyMap, path: Path) -> Bool[ndarray, "nx ny nz"]:
@@ -51,12 +53,15 @@ def best_looks(
     wanted: Bool[ndarray, "nx ny nz"],
     probability: Float32[ndarray, "nx ny nz"] | None,
     rng: np.random.Generator,
+    taken: Sequence[Float[ndarray, "dof"]] = (),
 ) -> Iterator[Float[ndarray, "n dof"]]:
     """Ways to configurations from which the camera sees wanted voxels, the best first: weighted by the
     prediction if there is one, against the way to get there.
 
     tree: of configurations that the arm can reach, which grows here. A voxel counts by the chance that
     nothing hides it: neither the arm, nor what is occupied or predicted.
+    taken: configurations of earlier images that did not show the wanted voxels; looks from nearby count
+    less, once for each of them.
     """
     robot = known.robot
     at = np.argwhere(wanted)
@@ -90,6 +95,8 @@ def best_looks(
             / weights.sum()
         )
         score = seen / (1 + np.linalg.norm(q - start, axis=1) / FULL_COST_LENGTH)
+        for earlier in taken:
+            score *= np.minimum(np.abs(q - earlier).max(axis=1) / SIMILAR_LOOK, 1.0)
         return np.where(seen < MIN_SEEN, 0.0, score)
 
     spread = np.resize(SPREADS, TARGETS)[:, None]

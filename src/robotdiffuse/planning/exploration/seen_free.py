@@ -62,6 +62,16 @@ def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], 
     return AssumedPoints(points, COVER_RADIUS, name=name)
 
 
+def least_unknown(known: OccupancyMap, goals: Float[ndarray, "n dof"]) -> Float[ndarray, "dof"]:
+    """The configuration at which the arm fills the fewest unknown voxels."""
+
+    def filled(q: Float[ndarray, "dof"]) -> int:
+        arm = voxels_in(placed_spheres(known.robot, q).astype(np.float32), grid=MAP)
+        return int((known.unknown & arm).sum())
+
+    return min(goals, key=filled)
+
+
 def reaches_outside(robot: Robot, q: Float[ndarray, "dof"]) -> bool:
     """Whether the arm reaches out of the map: centres of its covering spheres lie outside."""
     low, high = _ends_of_map()

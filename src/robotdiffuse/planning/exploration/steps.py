@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
 from robotdiffuse.perception.occupancy_map import MapSettings
@@ -33,7 +34,18 @@ class ExplorerSettings(Settings, name="explorer"):
     predict: bool = True
     """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
     reach."""
+    see_goal: bool = False
+    """Whether all of the arm's surface at the goal must have been seen free before it goes there; for policy
+    strict. It takes more looks, and fails where something is nearer to the goal than about 1 cm."""
     map: MapSettings = field(default_factory=MapSettings)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.see_goal and self.policy != STRICT:
+            raise InputError(
+                f"explorer.see_goal is true and explorer.policy {self.policy!r}; it needs policy {STRICT!r}:"
+                " others take unseen space as free where that is likely enough"
+            )
 
 
 @dataclass(frozen=True, eq=False)
