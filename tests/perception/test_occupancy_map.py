@@ -8,6 +8,8 @@ import pytest
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.free_space_kernel import FREE, OUT
+from robotdiffuse.perception.observed_volume import carve_view
 from robotdiffuse.perception.occupancy_map import MAP, MapSettings, OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.robots import load_robot
@@ -56,6 +58,18 @@ def test_a_view_counts_once_and_the_order_does_not_matter() -> None:
         back.add(view)
     np.testing.assert_array_equal(ahead.free, back.free)
     np.testing.assert_array_equal(ahead.occupied, back.occupied)
+
+
+def test_a_voxel_is_the_same_wherever_its_block_begins() -> None:
+    """Voxels of a block that are all free, or all out of the image, are told so at once."""
+    states = []
+    for shift in (0.0, MAP.edge):
+        x, y, z = (side + shift for side in MAP.low)
+        state, behind, counts = (np.empty(MAP.shape, kind) for kind in (np.uint8, np.float32, np.int32))
+        carve_view(view_from(0.3), PANDA, HOME, 0.015, (x, y, z), MAP.edge, state, behind, counts)
+        states.append(state)
+    assert {FREE, OUT} < set(np.unique(states[0]))
+    assert (states[0][1:, 1:, 1:] != states[1][:-1, :-1, :-1]).mean() < 1e-4
 
 
 def test_pixels_without_a_return_say_nothing() -> None:

@@ -22,7 +22,7 @@ from robotdiffuse.planning.exploration.goal_seen import GoalSeen
 from robotdiffuse.planning.exploration.looks import best_looks
 from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
 from robotdiffuse.planning.exploration.reachable import ReachableTree
-from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, not_seen_free
+from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, hardly_seen, not_seen_free
 from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.validation.validator import verify
@@ -86,6 +86,14 @@ def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
     spheres = placed_spheres(PANDA, HOME)
     distances = np.linalg.norm(cloud.points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
     assert distances.min() > CARVING_MARGIN
+
+
+def test_goals_that_were_hardly_seen() -> None:
+    one = explorer(seen=False)
+    assert hardly_seen(one.map, HOME, RIGHT)
+    assert not hardly_seen(one.map, HOME, HOME)
+    one.map.declare_free(((-1.0, -1.0, -0.4), (1.0, 1.0, 1.1)))
+    assert not hardly_seen(one.map, HOME, RIGHT)
 
 
 def test_looks_see_what_is_wanted() -> None:

@@ -17,7 +17,7 @@ from robotdiffuse.certificates.constraints import constraint_bounds
 from robotdiffuse.cli import main
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.collision.kernel_arrays import reach_bound
+from robotdiffuse.collision.kernel_arrays import reach_ball, reach_bound
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.fitting.covering_spheres import cover
@@ -243,3 +243,6 @@ def test_both_arms_reach_as_far_as_one() -> None:
         spheres = np.concatenate([placed_spheres(robot, one) for one in q])
         far = (np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]).max()
         assert reach(robot) < far < reach_bound(robot)
+        center, radius = reach_ball(robot)
+        assert (np.linalg.norm(spheres[:, :3] - center, axis=1) + spheres[:, 3]).max() < radius
+        assert radius <= reach_bound(robot)

@@ -26,7 +26,7 @@ REFINEMENTS = (0.25, 0.1)
 """Standard deviations of the configurations around the best ones, in rounds after the first [rad]."""
 REFINED, NEIGHBOURS = 12, 15
 """Number of the best ones, and of configurations around each of them."""
-MAX_VOXELS = 1000
+MAX_VOXELS = 1500
 """Most swept voxels from which looks are scored."""
 FULL_COST_LENGTH = 8.0
 """A look this far away counts half [rad, joint-space L2]."""
