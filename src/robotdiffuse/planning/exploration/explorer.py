@@ -196,7 +196,8 @@ class Explorer:
         if self._may_go(motion, policy):
             return self._go(motion, policy)
         look = self._look(problem, policy, predicted, motion)
-        if look.kind == STUCK and (quick < limit or motion.status is Status.NO_PATH):
+        skipped = policy == STRICT and motion.status is Status.NO_PATH
+        if look.kind == STUCK and (quick < limit or skipped):
             motion = self._motion(problem, policy, predicted, limit)
             if self._may_go(motion, policy):
                 return self._go(motion, policy)
