@@ -11,6 +11,7 @@ from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
 from robotdiffuse.planning.exploration.steps import DONE
+from robotdiffuse.visualization import style
 
 LIKELY = 0.5
 """Voxels of unknown space that are occupied with a larger probability are shown as predicted."""
@@ -20,6 +21,15 @@ LOOK_COLOR = (0xD9, 0x8A, 0x12)
 """sRGB colour of the pyramid that shows where a camera looks."""
 FRUSTUM_DEPTH = 0.25
 """Length of the pyramid that shows where a camera looks [m]."""
+READING_TIME = 1.5
+"""Pages rest before each step, for its reason to be read [s]."""
+LAYERS = (
+    {"name": "Occupied", "color": style.OBSERVED, "opacity": 1.0, "order": 0},
+    {"name": "Predicted", "color": style.ASSUMED, "opacity": 0.6, "order": 1},
+    {"name": "Unknown", "color": UNKNOWN, "opacity": 0.28, "order": 20},
+)
+"""Sets of voxels on pages, in the order in which see-through ones are drawn."""
+Voxels = Bool[ndarray, "nx ny nz"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +58,9 @@ def moments(explorer: RecordedExplorer) -> list[Moment]:
     return found
 
 
-def title(moment: Moment) -> str:
+def title(act: RecordedAct) -> str:
     """What the arm does in an act."""
-    step, duration = moment.act.step, moment.act.duration
+    step, duration = act.step, act.duration
     name = {DONE: "at the goal"}.get(step.kind, step.kind)
     return f"{name} ({duration:.1f} s)" if duration else name
 
@@ -65,13 +75,23 @@ class ShownVoxels:
     unknown: Bool[ndarray, "nx ny nz"]
     free: Bool[ndarray, "nx ny nz"]
 
+    @property
+    def layers(self) -> tuple[tuple[Voxels, Voxels], ...]:
+        """Of each layer in LAYERS the voxels inside and outside; their common faces are shown."""
+        return (
+            (self.occupied, ~self.occupied),
+            (self.predicted, ~self.predicted),
+            (self.unknown, self.free),
+        )
+
 
 def shown_voxels(
-    view: RecordedView, act: RecordedAct, in_known_scene: Bool[ndarray, "nx ny nz"]
+    view: RecordedView, act: RecordedAct | None, in_known_scene: Bool[ndarray, "nx ny nz"]
 ) -> ShownVoxels:
     """What is shown after a view, with the prediction of an act."""
     unknown = view.unknown & ~in_known_scene
-    predicted = np.zeros_like(unknown) if act.predicted is None else unknown & (act.predicted > LIKELY)
+    probability = None if act is None else act.predicted
+    predicted = np.zeros_like(unknown) if probability is None else unknown & (probability > LIKELY)
     return ShownVoxels(view.occupied & ~in_known_scene, predicted, unknown, view.free)
 
 

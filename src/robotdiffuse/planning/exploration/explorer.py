@@ -185,8 +185,7 @@ class Explorer:
             problem = replace(problem, goal=JointGoal(np.stack(goals)))
         predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
-        limit = self.settings.time_limit
-        quick = limit
+        limit = quick = self.settings.time_limit
         if may_look and policy == STRICT:
             quick = min(self._quick_limit * 2**self._looks, limit)
         motion = self._motion(problem, policy, predicted, quick)
@@ -253,7 +252,8 @@ class Explorer:
                 if way is not None and self._good(way, policy):
                     stated = way.confidence if policy == CHANCE else None
                     self._looked_for |= wanted
-                    return Step(LOOK, f"{why}; look at unseen space on the way", policy, way, stated)
+                    why += "; look at unseen space on the way"
+                    return Step(LOOK, why, policy, way, stated, wanted=wanted)
         if policy == self.settings.policy == CHANCE:
             strict = self._look(problem, STRICT, predicted, motion)
             if strict.kind != STUCK:
