@@ -59,8 +59,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     live.add_argument(
         "--live",
         action="store_true",
-        help="serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the page "
-        "is first opened",
+        help="serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
+        "page is first opened",
     )
     live.add_argument(
         "--speed", type=positive, default=1.0, metavar="X", help="speed of the motions on it (1: real time)"

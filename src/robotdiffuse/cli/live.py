@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> NoReturn:
 def require_viser(command: str) -> None:
     """Raises InputError if viser is not installed."""
     try:
-        import viser  # noqa: F401
+        import robotdiffuse.visualization.live.server  # noqa: F401
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise

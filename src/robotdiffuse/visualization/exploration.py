@@ -11,7 +11,6 @@ from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
 from robotdiffuse.planning.exploration.steps import DONE
-from robotdiffuse.visualization import style
 
 LIKELY = 0.5
 """Voxels of unknown space that are occupied with a larger probability are shown as predicted."""
@@ -23,12 +22,6 @@ FRUSTUM_DEPTH = 0.25
 """Length of the pyramid that shows where a camera looks [m]."""
 READING_TIME = 1.5
 """Pages rest before each step, for its reason to be read [s]."""
-LAYERS = (
-    {"name": "Occupied", "color": style.OBSERVED, "opacity": 1.0, "order": 0},
-    {"name": "Predicted", "color": style.ASSUMED, "opacity": 0.6, "order": 1},
-    {"name": "Unknown", "color": UNKNOWN, "opacity": 0.28, "order": 20},
-)
-"""Sets of voxels on pages, in the order in which see-through ones are drawn."""
 Voxels = Bool[ndarray, "nx ny nz"]
 
 
@@ -77,7 +70,8 @@ class ShownVoxels:
 
     @property
     def layers(self) -> tuple[tuple[Voxels, Voxels], ...]:
-        """Of each layer in LAYERS the voxels inside and outside; their common faces are shown."""
+        """The voxels inside and outside of the occupied, predicted and unknown layer; the faces between
+        them are shown."""
         return (
             (self.occupied, ~self.occupied),
             (self.predicted, ~self.predicted),

@@ -15,10 +15,11 @@ from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.planning.exploration.recorded import RecordedExplorer
 from robotdiffuse.planning.exploration.steps import DONE, LOOK
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.visualization import style
 from robotdiffuse.visualization.exploration import (
-    LAYERS,
     LOOK_COLOR,
     READING_TIME,
+    UNKNOWN,
     Moment,
     ShownVoxels,
     frustum,
@@ -29,6 +30,13 @@ from robotdiffuse.visualization.exploration import (
 )
 from robotdiffuse.visualization.replay_page import page_data, page_shapes, write_page
 from robotdiffuse.visualization.voxel_faces import faces_between
+
+LAYERS = (
+    {"name": "Occupied", "color": style.OBSERVED, "opacity": 1.0, "order": 0},
+    {"name": "Predicted", "color": style.ASSUMED, "opacity": 0.6, "order": 1},
+    {"name": "Unknown", "color": UNKNOWN, "opacity": 0.28, "order": 20},
+)
+"""Sets of voxels on the page, in the order in which see-through ones are drawn."""
 
 
 def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | FilePath) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import viser
@@ -62,11 +61,10 @@ def add_surface(
     surface: Surface,
     color: tuple[int, int, int],
     opacity: float | None = None,
-    side: Literal["front", "double"] = "front",
 ) -> viser.MeshHandle:
     """Draw a surface in one colour."""
     vertices, faces = surface.vertices.astype(np.float32), surface.faces.astype(np.uint32)
-    return server.scene.add_mesh_simple(name, vertices, faces, color=color, opacity=opacity, side=side)
+    return server.scene.add_mesh_simple(name, vertices, faces, color=color, opacity=opacity)
 
 
 class Arm:

@@ -3,20 +3,21 @@
 import html
 import socket
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import viser
 
 from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer
+from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
 from robotdiffuse.planning.exploration.steps import CHANCE, DONE, LOOK, POLICIES, STRICT
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.robots.scaling import reach
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.exploration import (
-    LAYERS,
     LOOK_COLOR,
+    UNKNOWN,
     frustum,
     in_known_scene,
     shown_voxels,
@@ -49,7 +50,10 @@ from robotdiffuse.visualization.live.server import add_stage, new_server, set_fi
 from robotdiffuse.visualization.live.validity import INVALID, NO_MOTION, PENDING, VALID, Validity
 from robotdiffuse.visualization.voxel_faces import faces_surface
 
-WANTED_OPACITY = 0.6
+CLEAR_OPACITY = 0.6
+"""Of predicted voxels, and of those that a look is to show."""
+UNKNOWN_OPACITY = 0.2
+"""Of the boundary of unknown space, which is drawn where it faces the viewer: it never hides the arm."""
 CAMERA_SIZE, CAMERA_COLOR = 0.12, (40, 48, 58)
 """Length of the pyramid of the camera on the arm [m], and its colour."""
 SPEEDS = (0.1, 10.0)
@@ -66,7 +70,7 @@ class ExplorationPage:
     runs from when the first one opens the page."""
 
     def __init__(self, session: ExplorationSession, listening: socket.socket, token: str = "") -> None:
-        self.session, self._drawn = session, dict[str, Any]()
+        self.session, self._drawn = session, dict[str, tuple[object, ...]]()
         problem, robot = session.problem, session.problem.robot
         self.server, secret = new_server()
         add_stage(self.server, reach(robot))
@@ -74,12 +78,10 @@ class ExplorationPage:
         self._tool = style.tool_point(robot, surfaces)
         self._arm = Arm(self.server, "arm", surfaces)
         self._look = Arm(self.server, "look", surfaces, LOOK_COLOR, GHOST_OPACITY)
-        ends = [problem.start]
-        if isinstance(problem.goal, JointGoal):
-            ends.append(problem.goal.positions[0])
-            goal = Arm(self.server, "goal", surfaces, style.GOAL, GHOST_OPACITY)
-            goal.show(Poses.of(robot, ends[-1][None]))
-        set_first_view(self.server, problem, surfaces, np.stack(ends))
+        self._ghost = Arm(self.server, "goal", surfaces, style.GOAL, GHOST_OPACITY)
+        self._goal = problem.goal.positions[0] if isinstance(problem.goal, JointGoal) else None
+        ends = np.stack([problem.start, problem.start if self._goal is None else self._goal])
+        set_first_view(self.server, problem, surfaces, ends)
         self._obstacles = Obstacles(self.server, lambda _name: None)
         self._add_panel()
         self._drawing = LatestTask[None](lambda _: self._draw(), "draw")
@@ -122,21 +124,20 @@ class ExplorationPage:
             "Noise", initial_value=state.noise, hint="Simulate the noise of depth cameras; restarts"
         )
         gui.add_html(_legend())
-        self._layers = {
-            str(name): gui.add_checkbox(str(name), initial_value=True)
-            for name in (*(layer["name"] for layer in LAYERS), "Next look")
-        }
+        self._unknown = gui.add_checkbox("Unknown space", initial_value=True)
         self._true = gui.add_checkbox("True scene", initial_value=False, hint="What the arm does not know")
         self._steps = gui.add_html("")
         self._run.on_click(lambda _: session.set_mode(RUNNING if session.state.mode == PAUSED else PAUSED))
         self._step.on_click(lambda _: session.set_mode(STEPPING))
         restart.on_click(lambda _: session.restart())
-        for widget, do in (
+        changes: list[tuple[Any, Callable[[Any], None]]] = [
             (self._speed, session.set_speed),
             (self._policy, lambda value: session.restart(policy=value)),
             (self._noise, lambda value: session.restart(noise=value)),
-            *((box, lambda _: self._redraw()) for box in (*self._layers.values(), self._true)),
-        ):
+            (self._unknown, lambda _: self._redraw()),
+            (self._true, lambda _: self._redraw()),
+        ]
+        for widget, do in changes:
             # changes by the page itself have no client
             widget.on_update(lambda event, do=do: event.client and do(event.target.value))
 
@@ -145,34 +146,36 @@ class ExplorationPage:
 
     def _draw(self) -> None:
         """Draw what has changed; only this task draws."""
-        state, robot = self.session.state, self.session.problem.robot
+        state, robot, explorer = self.session.state, self.session.problem.robot, self.session.state.explorer
         act = state.acts[-1] if state.acts else None
         under_way = act if state.phase == MOVING else None
-        shown = tuple(box.value for box in self._layers.values())
         with self.server.atomic():
             self._show_panel(state)
             if self._new("configuration", state.configuration):
                 self._arm.show(Poses.of(robot, state.configuration[None]))
-            if self._new("explorer", state.explorer) and state.explorer is not None:
-                self._known_scene = in_known_scene(state.explorer)
-                self._show_camera(state.explorer)
-            if self._new("scene", (state.explorer, self._true.value)):
-                known = (
-                    self.session.problem.scene.with_shapes([])
-                    if state.explorer is None
-                    else state.explorer.scene
-                )
-                self._obstacles.show(self.session.problem.scene if self._true.value else known, "")
-            if self._new("known", (state.known, act, under_way, shown)):
-                self._show_voxels(state, act, under_way)
-            if self._new("act", (under_way, shown[-1])):
-                self._show_act(state, under_way if shown[-1] else None)
+            arrived = act is not None and act.step.kind == DONE
+            if self._goal is not None and self._new("arrived", arrived):
+                self._ghost.show(None if arrived else Poses.of(robot, self._goal[None]))
+            if explorer is None:
+                return
+            if self._new("explorer", explorer):
+                self._known_scene = in_known_scene(explorer)
+                self._show_camera(explorer)
+            if self._new("scene", explorer, self._true.value):
+                self._obstacles.show(self.session.problem.scene if self._true.value else explorer.scene, "")
+            if self._new("known", state.known, act, under_way, self._unknown.value):
+                self._show_voxels(state.known, act, under_way)
+            if self._new("act", explorer, under_way):
+                self._show_act(explorer, under_way)
 
-    def _new(self, what: str, value: object) -> bool:
-        """Whether a value has changed since the last drawing."""
-        same = what in self._drawn and _same(self._drawn[what], value)
-        self._drawn[what] = value
-        return not same
+    def _new(self, what: str, *values: object) -> bool:
+        """Whether values have changed since the last drawing."""
+        known = self._drawn.get(what)
+        self._drawn[what] = values
+        return known is None or any(
+            a is not b and (a != b if isinstance(a, str | bytes | bool) else True)
+            for a, b in zip(known, values, strict=True)
+        )
 
     def _show_camera(self, explorer: RecordedExplorer) -> None:
         """Attach the first camera to the arm."""
@@ -191,49 +194,50 @@ class ExplorationPage:
         )
 
     def _show_voxels(
-        self, state: ExplorationState, act: RecordedAct | None, under_way: RecordedAct | None
+        self, known: RecordedView | None, act: RecordedAct | None, under_way: RecordedAct | None
     ) -> None:
         """Show what is known, with the prediction of a step, and what the look under way is to show."""
-        sets: list[Any] = [None] * (len(LAYERS) + 1)
-        if state.known is not None:
-            sets[:-1] = shown_voxels(state.known, act, self._known_scene).layers
-            wanted = None if under_way is None else under_way.step.wanted
-            if wanted is not None:
-                wanted = wanted & state.known.unknown
-                sets[-1] = wanted, ~wanted
-        looks = [(layer["color"], layer["opacity"]) for layer in LAYERS]
-        looks.append((LOOK_COLOR, WANTED_OPACITY))
-        for (name, box), pair, (color, opacity) in zip(self._layers.items(), sets, looks, strict=True):
-            node = f"/voxels/{name}"
-            if pair is None or not box.value or not pair[0].any():
-                self.server.scene.remove_by_name(node)
-                continue
-            surface = faces_surface(*pair, color)
-            clear = None if opacity == 1.0 else opacity
-            add_surface(self.server, node, surface, color, clear, side="double")
-
-    def _show_act(self, state: ExplorationState, act: RecordedAct | None) -> None:
-        """Show the trace of a step's motion, and of a look also its end and what the camera will see there."""
-        robot, explorer = self.session.problem.robot, state.explorer
-        trajectory = None if act is None else act.trajectory
-        if trajectory is None:
-            self.server.scene.remove_by_name("/trace")
-        else:
-            draw_trace(self.server, robot, self._tool, trajectory)
-        edges = [] if act is None or explorer is None else frustum(explorer, act)
-        end = None if act is None or act.step.kind != LOOK else Poses.of(robot, act.waypoints[-1:])
-        self._look.show(end)
-        if not edges:
-            self.server.scene.remove_by_name("/pyramid")
+        if known is None:
             return
-        colors = [np.tile(np.array(LOOK_COLOR, float), (len(edge), 1)) for edge in edges]
-        draw_lines(self.server, "/pyramid", edges, colors, 0.5 * TRACE_WIDTH * reach(robot))
+        occupied, predicted, unknown = shown_voxels(known, act, self._known_scene).layers
+        wanted = None if under_way is None else under_way.step.wanted
+        wanted = np.zeros_like(known.free) if wanted is None else wanted & known.unknown
+        nothing = np.zeros_like(known.free), known.free
+        for name, (inside, outside), color, opacity in (
+            ("occupied", occupied, style.OBSERVED, None),
+            ("predicted", predicted, style.ASSUMED, CLEAR_OPACITY),
+            ("wanted", (wanted, ~wanted), LOOK_COLOR, CLEAR_OPACITY),
+            ("unknown", unknown if self._unknown.value else nothing, UNKNOWN, UNKNOWN_OPACITY),
+        ):
+            surface = faces_surface(inside, outside, color)
+            if not self._new(name, surface.vertices.tobytes()):
+                continue
+            if not len(surface.faces):
+                self.server.scene.remove_by_name(f"/{name}")
+            else:
+                add_surface(self.server, f"/{name}", surface, color, opacity)
+
+    def _show_act(self, explorer: RecordedExplorer, act: RecordedAct | None) -> None:
+        """Show the trace of a step's motion, and of a look also its end and what is seen there."""
+        robot = explorer.robot
+        for node in ("/trace", "/pyramid"):
+            self.server.scene.remove_by_name(node)
+        self._look.show(None)
+        if act is None or act.trajectory is None:
+            return
+        draw_trace(self.server, robot, self._tool, act.trajectory)
+        if act.step.kind == LOOK:
+            self._look.show(Poses.of(robot, act.waypoints[-1:]))
+            edges = frustum(explorer, act)
+            colors = [np.tile(np.array(LOOK_COLOR, float), (len(edge), 1)) for edge in edges]
+            draw_lines(self.server, "/pyramid", edges, colors, 0.5 * TRACE_WIDTH * reach(robot))
 
     def _show_panel(self, state: ExplorationState) -> None:
         paused = state.mode == PAUSED
         set_value(self._policy, state.settings.policy)
         set_value(self._noise, state.noise)
-        if self._new("badge", (state.phase, state.mode, state.known, state.acts, state.failure)):
+        set_value(self._speed, float(np.clip(state.speed, *SPEEDS)))
+        if self._new("badge", state.phase, state.mode, state.known, state.acts, state.failure):
             self._badge.content = badge_html(exploration_badge(state))
             self._steps.content = _steps_html(state.acts)
             self._run.label = "Run" if paused else "Pause"
@@ -262,7 +266,7 @@ def exploration_badge(state: ExplorationState) -> Validity:
         lines.append(f"{act.step.policy}: {PROMISES[act.step.policy]}")
     if act.step.confidence is not None:
         lines.append(f"stated confidence that it is free: {100 * act.step.confidence:.0f} %")
-    rest = " (paused)" if state.mode == PAUSED and state.phase != ENDED else ""
+    rest = ", paused" if state.mode == PAUSED and state.phase != ENDED else ""
     return Validity(kind, headline + rest, (*lines, *_shares(state)))
 
 
@@ -283,17 +287,16 @@ def _steps_html(acts: tuple[RecordedAct, ...]) -> str:
 
 
 def _legend() -> str:
-    colors = [(str(layer["name"]), layer["color"]) for layer in LAYERS]
-    colors += [("Next look, and what it is to show", LOOK_COLOR), ("Goal", style.GOAL)]
-    marks = "".join(
-        f'<div><span style="display: inline-block; width: 0.8em; height: 0.8em; border-radius: 2px; '
-        f'margin-right: 0.5em; background: rgb{color}"></span>{name}</div>'
-        for name, color in colors
+    colors = {
+        "seen occupied": style.OBSERVED,
+        "predicted occupied": style.ASSUMED,
+        "boundary of unknown space": UNKNOWN,
+        "next look, and what it is to show": LOOK_COLOR,
+        "goal": style.GOAL,
+    }
+    mark = "display: inline-block; width: 0.8em; height: 0.8em; border-radius: 2px; margin-right: 0.5em"
+    rows = (
+        f'<div><span style="{mark}; background: rgb{color}"></span>{name}</div>'
+        for name, color in colors.items()
     )
-    return f'<div style="margin: 0.4em 1em; font-size: 0.85em">{marks}</div>'
-
-
-def _same(a: object, b: object) -> bool:
-    if isinstance(a, tuple) and isinstance(b, tuple):
-        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
-    return a is b or (isinstance(a, str | bool) and a == b)
+    return f'<div style="margin: 0.4em 1em; font-size: 0.85em">{"".join(rows)}</div>'

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -53,12 +52,12 @@ class ExplorationState:
     """Why the exploration cannot go on, in one line."""
 
 
-class _Outdated(Exception):
+class _OutdatedError(Exception):
     """The exploration was restarted or closed."""
 
 
 class ExplorationSession:
-    """The state of the exploration and its thread. `on_change` is called after each change, from any thread."""
+    """The state of the exploration and its thread. `on_change` is called after each change, by any thread."""
 
     def __init__(
         self, problem: Problem, settings: ExplorerSettings, noise: bool, seed: int, speed: float = 1.0
@@ -92,7 +91,7 @@ class ExplorationSession:
         self.on_change()
 
     def restart(self, policy: str | None = None, noise: bool | None = None) -> None:
-        """Begin anew, with another policy or noise if they are given. Raises InputError for an unknown policy."""
+        """Begin anew, with another policy or noise if given. Raises InputError for an unknown policy."""
         with self._changed:
             old = self._state
             settings = old.settings if policy is None else replace(old.settings, policy=policy)
@@ -116,7 +115,7 @@ class ExplorationSession:
     def _explore(self, run: int) -> None:
         try:
             self._take_steps(run)
-        except _Outdated:
+        except _OutdatedError:
             pass
         except Exception as error:  # the page survives any error
             kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
@@ -163,7 +162,8 @@ class ExplorationSession:
                 last = time.perf_counter()
             time.sleep(1 / FRAME_RATE)
             now = time.perf_counter()
-            at, last = min(at + self._state.speed * (now - last), act.duration), now
+            speed = self._state.speed if at >= 0 else max(self._state.speed, 1.0)
+            at, last = min(at + speed * (now - last), act.duration), now
             if act.trajectory is not None and at > 0:
                 taken = [view for view in views if view.time <= act.begins + at]
                 q = act.trajectory.at(at).positions
@@ -172,7 +172,7 @@ class ExplorationSession:
     def _update(self, run: int, **changes: Any) -> ExplorationState:
         with self._changed:
             if run != self._run:
-                raise _Outdated
+                raise _OutdatedError
             self._state = state = replace(self._state, **changes)
         self.on_change()
         return state
@@ -183,5 +183,5 @@ class ExplorationSession:
             paused = self._state.mode == PAUSED
             self._changed.wait_for(lambda: run != self._run or self._state.mode != PAUSED)
             if run != self._run:
-                raise _Outdated
+                raise _OutdatedError
         return paused
