@@ -33,8 +33,8 @@ pytestmark = [
 
 
 @pytest.fixture
-def view() -> Iterator[tuple[Any, ExplorationSession, set[str]]]:
-    """A browser at the page, the session, and the names of what is drawn."""
+def view() -> Iterator[tuple[Any, ExplorationSession, dict[str, Any]]]:
+    """A browser at the page, the session, and what is drawn by name."""
     from robotdiffuse.visualization.live.exploration_page import ExplorationPage
 
     problem = rd.Problem(rd.load_robot("panda"), rd.Scene([FLOOR, WALL]), HOME, BEYOND)

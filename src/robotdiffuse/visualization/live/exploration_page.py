@@ -84,7 +84,8 @@ class ExplorationPage:
         set_first_view(self.server, problem, surfaces, ends)
         self._obstacles = Obstacles(self.server, lambda _name: None)
         self._add_panel()
-        self._drawing = LatestTask[None](lambda _: self._draw(), "draw")
+        self._lock, self._closed = threading.Lock(), False
+        self._drawing = LatestTask[None](lambda _: self._draw_unless_closed(), "draw")
         session.on_change = self._redraw
         self._redraw()
         seen = threading.Event()
@@ -102,6 +103,8 @@ class ExplorationPage:
         self.session.close()
         self._proxy.close()
         self._drawing.close()
+        with self._lock:  # what is being drawn is still sent
+            self._closed = True
         stop_server(self.server)
 
     def _add_panel(self) -> None:
@@ -143,6 +146,11 @@ class ExplorationPage:
 
     def _redraw(self) -> None:
         self._drawing.submit(None)
+
+    def _draw_unless_closed(self) -> None:
+        with self._lock:
+            if not self._closed:
+                self._draw()
 
     def _draw(self) -> None:
         """Draw what has changed; only this task draws."""
@@ -234,9 +242,12 @@ class ExplorationPage:
 
     def _show_panel(self, state: ExplorationState) -> None:
         paused = state.mode == PAUSED
-        set_value(self._policy, state.settings.policy)
-        set_value(self._noise, state.noise)
-        set_value(self._speed, float(np.clip(state.speed, *SPEEDS)))
+        if self._new(
+            "options", state.settings, state.noise, state.speed
+        ):  # else a change on its way is undone
+            set_value(self._policy, state.settings.policy)
+            set_value(self._noise, state.noise)
+            set_value(self._speed, float(np.clip(state.speed, *SPEEDS)))
         if self._new("badge", state.phase, state.mode, state.known, state.acts, state.failure):
             self._badge.content = badge_html(exploration_badge(state))
             self._steps.content = _steps_html(state.acts)
