@@ -1,5 +1,10 @@
 """The commands `explore` and `demo --explore`: exit status, what they print, and the files they write."""
 
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -39,6 +44,8 @@ def test_explore_writes_a_replay_a_strip_and_a_recording(
         (["--record", "seen.bag"], ".mcap"),
         (["--policy", "bold"], "unknown explorer.policy"),
         (["--policy", "chance", "--see-goal"], "it needs policy 'strict'"),
+        (["--live", "--out", "seen.html"], "--live writes no files; leave out --out, --view and --record"),
+        (["--live", "--port", "0", "--host", "no such host"], "--host is 'no such host'"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -47,6 +54,31 @@ def test_bad_input_is_one_line(
     assert run("explore", write_problem(tmp_path), *options) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+def test_the_live_page_needs_viser(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in [name for name in sys.modules if name.startswith("robotdiffuse.visualization.live")]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert run("explore", write_problem(tmp_path), "--live", "--port", "0") == 2
+    assert "explore --live needs viser: pip install 'robotdiffuse[live]'" in capsys.readouterr().err
+
+
+def test_the_live_page_is_served_until_it_is_stopped(tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="explore --live needs viser: pip install 'robotdiffuse[live]'")
+    command = [sys.executable, "-m", "robotdiffuse", "explore", str(write_problem(tmp_path)), "--live"]
+    server = subprocess.Popen([*command, "--port", "0"], stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout is not None
+        found = re.search(r"http://127.0.0.1:\d+/", server.stdout.readline())
+        assert found is not None
+        with urllib.request.urlopen(found[0], timeout=60) as page:
+            assert b"viser" in page.read().lower()
+    finally:
+        server.send_signal(signal.SIGINT)
+        assert server.wait(timeout=30) == 130
 
 
 @pytest.mark.slow

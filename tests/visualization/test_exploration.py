@@ -13,7 +13,7 @@ def test_moments_show_what_was_known_before_them() -> None:
         assert moment.known.act < moment.number - 1 or moment.known.act == -1
         shown = shown_voxels(moment.known, moment.act, known)
         assert not (shown.occupied & known).any() and not (shown.predicted & ~shown.unknown).any()
-        assert title(moment).startswith(
+        assert title(moment.act).startswith(
             {"done": "at the goal"}.get(moment.act.step.kind, moment.act.step.kind)
         )
         assert len(frustum(explorer, moment.act)) == (5 if moment.act.T_base_camera is not None else 0)

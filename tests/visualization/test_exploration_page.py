@@ -11,7 +11,8 @@ import pytest
 
 from helpers.explorations import FLOOR, recorded
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.visualization.exploration_page import PAUSE, write_exploration
+from robotdiffuse.visualization.exploration import READING_TIME
+from robotdiffuse.visualization.exploration_page import write_exploration
 from robotdiffuse.visualization.voxel_faces import faces_between
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -51,10 +52,12 @@ def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
     assert [shape["name"] for shape in told["true_scene"]] == ["floor", "wall"]
     assert len(told["acts"]) == len(explorer.acts)
     for number, (act, one) in enumerate(zip(explorer.acts, told["acts"], strict=True)):
-        assert one["time"] == pytest.approx(act.begins + number * PAUSE, abs=1e-3)
+        assert one["time"] == pytest.approx(act.begins + number * READING_TIME, abs=1e-3)
         assert one["title"].startswith(f"{number + 1}  ") and one["reason"] == act.step.reason
         assert bool(one["look"]) == (act.T_base_camera is not None) == (one["end"] is not None)
-    assert data["times"][-1] == pytest.approx(explorer.duration + PAUSE * (len(explorer.acts) - 1), abs=1e-3)
+    assert data["times"][-1] == pytest.approx(
+        explorer.duration + READING_TIME * (len(explorer.acts) - 1), abs=1e-3
+    )
     times = [known["time"] for known in told["known"]]
     assert times == sorted(times) and times[0] == 0.0
     unknown: set[int] = set()

@@ -2,10 +2,13 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
+from robotdiffuse.cli.arguments import positive
 from robotdiffuse.cli.drawing import ENDINGS, show
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
+from robotdiffuse.cli.live import add_address, require_viser, serve_until_stopped
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.interop import WRITERS
 
 if TYPE_CHECKING:
@@ -15,11 +18,7 @@ if TYPE_CHECKING:
     from robotdiffuse.planning.exploration.steps import ExplorerSettings
     from robotdiffuse.problems.problem import Problem
 
-FLOOR = "floor"
-"""Shapes of this name are known without being seen."""
 RECORDING = ".mcap"
-FREE_ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
-"""The space around the base that is declared free [m]."""
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -61,6 +60,17 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar="FILE",
         help="write the depth images with camera parameters, poses and joint states to this .mcap file",
     )
+    live = parser.add_argument_group("live page")
+    live.add_argument(
+        "--live",
+        action="store_true",
+        help="serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
+        "page is first opened",
+    )
+    live.add_argument(
+        "--speed", type=positive, default=1.0, metavar="X", help="speed of the motions on it (1: real time)"
+    )
+    add_address(live)
     parser.set_defaults(run=run)
 
 
@@ -77,10 +87,14 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.record is not None:
         recording = check_output(arguments.record, (RECORDING,))
         WRITERS.load(RECORDING)  # its packages are installed
-    problem = load_problem(arguments.problem)
     settings = ExplorerSettings(
         arguments.policy, arguments.confidence, arguments.time_limit, see_goal=arguments.see_goal
     )
+    if arguments.live:
+        if outputs or recording is not None:
+            raise InputError("--live writes no files; leave out --out, --view and --record")
+        show_live(arguments, settings)
+    problem = load_problem(arguments.problem)
     noise = DepthNoise() if arguments.noise else None
     explorer, arrived = simulate(problem, settings, noise, arguments.seed)
     for file in outputs:
@@ -94,20 +108,30 @@ def run(arguments: argparse.Namespace) -> int:
     return SOLVED if arrived else NO_PLAN
 
 
+def show_live(arguments: argparse.Namespace, settings: "ExplorerSettings") -> NoReturn:
+    """Serve the page of an exploration until Ctrl-C."""
+    require_viser("explore --live")
+    from robotdiffuse.problems.files import load_problem
+    from robotdiffuse.visualization.live.access import listen, token_for
+    from robotdiffuse.visualization.live.exploration_page import ExplorationPage
+    from robotdiffuse.visualization.live.exploration_session import ExplorationSession
+
+    listening = listen(arguments.host, arguments.port)
+    problem = load_problem(arguments.problem)
+    session = ExplorationSession(problem, settings, arguments.noise, arguments.seed, arguments.speed)
+    token = token_for(listening)
+    serve_until_stopped(ExplorationPage(session, listening, token), listening, token)
+
+
 def simulate(
     problem: "Problem", settings: "ExplorerSettings", noise: "DepthNoise | None", seed: int
 ) -> "tuple[RecordedExplorer, bool]":
     """Simulate the loop and print its steps; returns the explorer, and whether the arm got to the goal
     without a collision."""
-    from robotdiffuse.planning.exploration.recorded import RecordedExplorer
-    from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+    from robotdiffuse.planning.exploration.simulated import explore, simulated_explorer
     from robotdiffuse.planning.exploration.steps import DONE
-    from robotdiffuse.scenes.scene import Scene
 
-    known = Scene([shape for shape in problem.scene.shapes if shape.name == FLOOR])
-    cameras = [wrist_camera(problem.robot)]
-    explorer = RecordedExplorer(problem.robot, cameras, known, FREE_ZONE, settings, seed)
-    explorer.observe(camera_beside(problem, noise, seed))
+    explorer = simulated_explorer(problem, settings, noise, seed)
     reached, free = False, True
     for number, event in enumerate(explore(problem, explorer, noise, seed), 1):
         print_event(number, event, explorer)

@@ -6,11 +6,15 @@ import signal
 import socket
 import sys
 import threading
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from robotdiffuse.cli.arguments import positive
 from robotdiffuse.cli.exit_status import STOPPED
 from robotdiffuse.core.errors import InputError
+
+if TYPE_CHECKING:
+    from robotdiffuse.visualization.live.exploration_page import ExplorationPage
+    from robotdiffuse.visualization.live.page import Page
 
 LOOPBACK = "127.0.0.1"
 PORT = 8080
@@ -32,6 +36,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--time-limit", type=positive, default=1.0, metavar="S", help="time limit of each plan (default: 1 s)"
     )
+    add_address(parser)
+    parser.set_defaults(run=run)
+
+
+def add_address(parser: argparse._ActionsContainer) -> None:
+    """Add the options that say where a page is served."""
     parser.add_argument(
         "--host",
         default=LOOPBACK,
@@ -42,7 +52,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--port", type=port, default=PORT, metavar="N", help=f"port; 0 for any free one (default: {PORT})"
     )
-    parser.set_defaults(run=run)
 
 
 def port(text: str) -> int:
@@ -53,17 +62,13 @@ def port(text: str) -> int:
 
 
 def run(arguments: argparse.Namespace) -> NoReturn:
-    try:
-        from robotdiffuse.visualization.live.page import Page
-    except ModuleNotFoundError as error:
-        if error.name != "viser":
-            raise
-        raise InputError("live needs viser: pip install 'robotdiffuse[live]'") from None
+    require_viser("live")
     from rich.console import Console
 
     from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
-    from robotdiffuse.visualization.live.access import is_loopback, listen, new_token
+    from robotdiffuse.visualization.live.access import listen, token_for
     from robotdiffuse.visualization.live.files import first_problem
+    from robotdiffuse.visualization.live.page import Page
     from robotdiffuse.visualization.live.session import PageOptions, Session
 
     planner = arguments.planner or DEFAULT_PLANNER
@@ -72,9 +77,24 @@ def run(arguments: argparse.Namespace) -> NoReturn:
     listening = listen(arguments.host, arguments.port)
     with Console(stderr=True).status("loading the robot (preparing a new URDF takes a minute)"):
         problem = first_problem(arguments.problem, arguments.robot)
-    host, number = listening.getsockname()[:2]
-    token = "" if is_loopback(host) else new_token()
+    token = token_for(listening)
     page = Page(Session(problem, options), listening, token)
+    serve_until_stopped(page, listening, token)
+
+
+def require_viser(command: str) -> None:
+    """Raises InputError if viser is not installed."""
+    try:
+        import robotdiffuse.visualization.live.server  # noqa: F401
+    except ModuleNotFoundError as error:
+        if error.name != "viser":
+            raise
+        raise InputError(f"{command} needs viser: pip install 'robotdiffuse[live]'") from None
+
+
+def serve_until_stopped(page: "Page | ExplorationPage", listening: socket.socket, token: str) -> NoReturn:
+    """Print the address of a page, serve it until Ctrl-C, and end the process."""
+    host, number = listening.getsockname()[:2]
     ended = threading.Event()
     for stop_signal in (signal.SIGINT, signal.SIGTERM):
         signal.signal(stop_signal, lambda *_: ended.set())

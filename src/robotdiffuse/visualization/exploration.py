@@ -20,6 +20,9 @@ LOOK_COLOR = (0xD9, 0x8A, 0x12)
 """sRGB colour of the pyramid that shows where a camera looks."""
 FRUSTUM_DEPTH = 0.25
 """Length of the pyramid that shows where a camera looks [m]."""
+READING_TIME = 1.5
+"""Pages rest before each step, for its reason to be read [s]."""
+Voxels = Bool[ndarray, "nx ny nz"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +51,9 @@ def moments(explorer: RecordedExplorer) -> list[Moment]:
     return found
 
 
-def title(moment: Moment) -> str:
+def title(act: RecordedAct) -> str:
     """What the arm does in an act."""
-    step, duration = moment.act.step, moment.act.duration
+    step, duration = act.step, act.duration
     name = {DONE: "at the goal"}.get(step.kind, step.kind)
     return f"{name} ({duration:.1f} s)" if duration else name
 
@@ -65,13 +68,24 @@ class ShownVoxels:
     unknown: Bool[ndarray, "nx ny nz"]
     free: Bool[ndarray, "nx ny nz"]
 
+    @property
+    def layers(self) -> tuple[tuple[Voxels, Voxels], ...]:
+        """The voxels inside and outside of the occupied, predicted and unknown layer; the faces between
+        them are shown."""
+        return (
+            (self.occupied, ~self.occupied),
+            (self.predicted, ~self.predicted),
+            (self.unknown, self.free),
+        )
+
 
 def shown_voxels(
-    view: RecordedView, act: RecordedAct, in_known_scene: Bool[ndarray, "nx ny nz"]
+    view: RecordedView, act: RecordedAct | None, in_known_scene: Bool[ndarray, "nx ny nz"]
 ) -> ShownVoxels:
     """What is shown after a view, with the prediction of an act."""
     unknown = view.unknown & ~in_known_scene
-    predicted = np.zeros_like(unknown) if act.predicted is None else unknown & (act.predicted > LIKELY)
+    probability = None if act is None else act.predicted
+    predicted = np.zeros_like(unknown) if probability is None else unknown & (probability > LIKELY)
     return ShownVoxels(view.occupied & ~in_known_scene, predicted, unknown, view.free)
 
 

@@ -18,6 +18,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.exploration import (
     LOOK_COLOR,
+    READING_TIME,
     UNKNOWN,
     Moment,
     ShownVoxels,
@@ -30,8 +31,6 @@ from robotdiffuse.visualization.exploration import (
 from robotdiffuse.visualization.replay_page import page_data, page_shapes, write_page
 from robotdiffuse.visualization.voxel_faces import faces_between
 
-PAUSE = 1.5
-"""The page rests before each step, for its reason to be read [s]."""
 LAYERS = (
     {"name": "Occupied", "color": style.OBSERVED, "opacity": 1.0, "order": 0},
     {"name": "Predicted", "color": style.ASSUMED, "opacity": 0.6, "order": 1},
@@ -67,7 +66,7 @@ def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | File
 
 def _page_time(time: float, act: int) -> float:
     """The time on the page of a time during an act."""
-    return round(time + PAUSE * (act + 1), 4)
+    return round(time + READING_TIME * (act + 1), 4)
 
 
 def _whole_motion(explorer: RecordedExplorer) -> Trajectory:
@@ -104,12 +103,7 @@ def _known(explorer: RecordedExplorer) -> list[dict[str, Any]]:
 
 def _faces(shown: ShownVoxels) -> list[Int[ndarray, "n"]]:
     """The faces of each layer."""
-    pairs = (
-        (shown.occupied, ~shown.occupied),
-        (shown.predicted, ~shown.predicted),
-        (shown.unknown, shown.free),
-    )
-    return [faces_between(*pair)[0] for pair in pairs]
+    return [faces_between(*pair)[0] for pair in shown.layers]
 
 
 def _packed(numbers: Int[ndarray, "n"]) -> str:
@@ -128,7 +122,7 @@ def _act(explorer: RecordedExplorer, moment: Moment) -> dict[str, Any]:
     end = motion.path.positions[-1] if act.step.kind == LOOK and motion and motion.path else None
     return {
         "time": _page_time(act.begins, moment.number - 2),
-        "title": f"{moment.number}  {title(moment)}",
+        "title": f"{moment.number}  {title(moment.act)}",
         "reason": act.step.reason,
         "known": ", ".join(f"{value} {name}" for name, value in moment.shares),
         "look": [np.round(edge, 4).tolist() for edge in frustum(explorer, act)],

@@ -107,7 +107,7 @@ def _tile(
     }
     facts = [*moment.shares, *((name, "") for name in drawn)]
     colors = (*SHARE_COLORS, *drawn.values())
-    caption(image, f"{moment.number}  {title(moment)}", facts, colors, CAPTION_SIZE)
+    caption(image, f"{moment.number}  {title(moment.act)}", facts, colors, CAPTION_SIZE)
     return image
 
 

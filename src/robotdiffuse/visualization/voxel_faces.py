@@ -35,7 +35,7 @@ def faces_surface(
     inside: Bool[ndarray, "nx ny nz"], outside: Bool[ndarray, "nx ny nz"], color: tuple[int, int, int]
 ) -> Surface:
     """The faces between two sets of voxels, of a map, as a surface in the base frame; normals
-    point out of the set inside."""
+    point out of the set inside, and corners are counterclockwise as seen from there."""
     numbers, first = faces_between(inside, outside)
     axis, flat = np.divmod(numbers, inside.size)
     at = np.stack(np.unravel_index(flat, inside.shape), axis=1)
@@ -44,7 +44,8 @@ def faces_surface(
     vertices = np.stack([corner, corner + across, corner + across + up, corner + up], axis=1)
     normals = np.where(first[:, None], along, -along)
     one = np.array([[0, 1, 2], [0, 2, 3]])
-    faces = (4 * np.arange(len(numbers))[:, None, None] + one).reshape(-1, 3)
+    wound = np.where(first[:, None, None], one, one[:, ::-1])
+    faces = (4 * np.arange(len(numbers))[:, None, None] + wound).reshape(-1, 3)
     vertices = vertices.reshape(-1, 3) * MAP.edge + MAP.low
     return Surface(
         vertices, normals.repeat(4, axis=0), np.tile(np.array(color) / 255.0, (len(vertices), 1)), faces

@@ -1,6 +1,5 @@
 """The page in a real browser: clicks, drags, and what it shows."""
 
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from helpers.browsers import CHROMIUM, FLAGS
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.problems.goals import PoseGoal
 from robotdiffuse.robots.kinematics import link_pose
@@ -22,18 +22,6 @@ if TYPE_CHECKING:
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
 playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
-"""WebGL without a graphics card."""
 PATIENCE, COMPILING = 120_000, 300_000
 """[ms]; a new machine compiles before the first plan."""
 VALID, INVALID = "[data-validity=valid]", "[data-validity=invalid]"

@@ -188,8 +188,7 @@ class Explorer:
             problem = replace(problem, goal=JointGoal(self._goal_seen.best(problem.start, found)[None]))
         predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
-        limit = self.settings.time_limit
-        quick = limit
+        limit = quick = self.settings.time_limit
         if may_look and policy == STRICT:
             quick = min(self._quick_limit * 2**self._looks, limit)
         motion = self._motion(problem, policy, predicted, quick, may_look)
@@ -255,7 +254,8 @@ class Explorer:
             if way is not None:
                 stated = way.confidence if under == CHANCE else None
                 self._looked_for |= wanted
-                return Step(LOOK, f"{why}; look at unseen space on the way", under, way, stated)
+                why += "; look at unseen space on the way"
+                return Step(LOOK, why, under, way, stated, wanted=wanted)
         back = self._way_back(problem) if STRICT in policies else None
         if back is not None:
             return Step(LOOK, f"{why}; go back on the way in and look from there", STRICT, back)

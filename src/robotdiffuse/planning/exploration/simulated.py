@@ -14,9 +14,12 @@ from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.planning.exploration.cameras import ArmCamera
-from robotdiffuse.planning.exploration.explorer import Explorer, Step
+from robotdiffuse.planning.exploration.explorer import Explorer
+from robotdiffuse.planning.exploration.recorded import RecordedExplorer
+from robotdiffuse.planning.exploration.steps import ExplorerSettings, Step
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 WRIST_OFFSET = (0.04, 0.0, 0.03)
@@ -31,6 +34,10 @@ BESIDE_POSITION, BESIDE_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
 """Of the camera beside the arm [m]."""
 BESIDE_SIZE, BESIDE_FOCAL_LENGTH = (640, 480), 460.0
 """Width, height and focal length of its images [pixels]."""
+FLOOR = "floor"
+"""Shapes of this name are known without being seen."""
+FREE_ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
+"""The space around the base that is declared free [m]."""
 IMAGE_PERIOD, MAX_IMAGES = 0.25, 8
 """Time between images during a motion [s], and the most images of a motion, that at its end included."""
 
@@ -64,6 +71,18 @@ def camera_beside(problem: Problem, noise: DepthNoise | None, seed: int) -> Dept
     intrinsics = (BESIDE_FOCAL_LENGTH, BESIDE_FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)
     view = ray_cast(problem.scene, T, intrinsics, BESIDE_SIZE, problem.robot, problem.start)
     return measured(view, np.inf, noise, np.random.default_rng(seed))
+
+
+def simulated_explorer(
+    problem: Problem, settings: ExplorerSettings, noise: DepthNoise | None, seed: int
+) -> RecordedExplorer:
+    """An explorer with a camera at the arm's tip that knows the floor, and one image of a camera beside the
+    arm."""
+    known = Scene([shape for shape in problem.scene.shapes if shape.name == FLOOR])
+    cameras = [wrist_camera(problem.robot)]
+    explorer = RecordedExplorer(problem.robot, cameras, known, FREE_ZONE, settings, seed)
+    explorer.observe(camera_beside(problem, noise, seed))
+    return explorer
 
 
 def taken(

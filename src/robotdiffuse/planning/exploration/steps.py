@@ -3,6 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+from jaxtyping import Bool
+from numpy import ndarray
+
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
@@ -65,3 +68,6 @@ class Step:
     """Stated probability that a motion by chance is free."""
     seen: Scene | None = None
     """The known scene and the points that the kept views saw; None where nothing was planned."""
+    wanted: Bool[ndarray, "nx ny nz"] | None = None
+    """What a look is to show: voxels of the map that are unknown and that a tentative motion to the goal
+    sweeps. None for other steps."""

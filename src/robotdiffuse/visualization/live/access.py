@@ -157,6 +157,6 @@ def _part(url: str, name: str) -> str:
         return ""
 
 
-def new_token() -> str:
-    """A random token for the address of a page."""
-    return secrets.token_urlsafe(16)
+def token_for(listening: socket.socket) -> str:
+    """A random token for the address of a page; "" if only this machine can reach it."""
+    return "" if is_loopback(listening.getsockname()[0]) else secrets.token_urlsafe(16)

@@ -55,13 +55,14 @@ def _faces_of(surface: Surface, chosen: Bool[ndarray, "f"]) -> Surface:
     return Surface(*kept, faces.reshape(-1, 3))
 
 
-def _add(
+def add_surface(
     server: viser.ViserServer,
     name: str,
     surface: Surface,
     color: tuple[int, int, int],
     opacity: float | None = None,
 ) -> viser.MeshHandle:
+    """Draw a surface in one colour."""
     vertices, faces = surface.vertices.astype(np.float32), surface.faces.astype(np.uint32)
     return server.scene.add_mesh_simple(name, vertices, faces, color=color, opacity=opacity)
 
@@ -92,7 +93,7 @@ class Arm:
                     part = replace(
                         part, vertices=part.vertices + opacity / GHOST_OPACITY * GHOST_OFFSET * part.normals
                     )
-                _add(server, f"/{name}/{i}/{k}", part, own, opacity)
+                add_surface(server, f"/{name}/{i}/{k}", part, own, opacity)
 
     def show(self, poses: "Poses | None", at: int = 0) -> None:
         """Show the arm in row `at` of the poses; hide it for None."""
@@ -168,7 +169,7 @@ class Obstacles:
         if isinstance(at_origin, PointCloud):
             points, size = style.thinned(at_origin.points).astype(np.float32), 2 * at_origin.point_radius
             return self._server.scene.add_point_cloud(node, points, color, point_size=size)
-        handle = _add(self._server, node, style.shape_surface(at_origin, color), color)
+        handle = add_surface(self._server, node, style.shape_surface(at_origin, color), color)
         handle.on_click(lambda _event: self._clicked(name))
         return handle
 
@@ -191,7 +192,7 @@ def draw_trace(
     points = style.trace(robot, tool, style.dense(motion.positions, TRACE_POINTS))
     share = np.linspace(0, 1, len(points))[:, None]
     colors = (1 - share) * np.array(START) + share * np.array(GOAL)
-    _lines(server, "/trace", [points], [colors], TRACE_WIDTH * reach(robot))
+    draw_lines(server, "/trace", [points], [colors], TRACE_WIDTH * reach(robot))
 
 
 def draw_candidates(
@@ -204,7 +205,7 @@ def draw_candidates(
     ways = [style.trace(robot, tool, q) for q in candidates.positions]
     of = zip(ways, candidates.clearances, strict=True)
     colors = [np.tile(candidate_color(clearance), (len(way), 1)) for way, clearance in of]
-    _lines(server, "/candidates", ways, colors, CANDIDATE_WIDTH * reach(robot))
+    draw_lines(server, "/candidates", ways, colors, CANDIDATE_WIDTH * reach(robot))
 
 
 def draw_trees(
@@ -214,7 +215,7 @@ def draw_trees(
     for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
         ways = [] if tree is None else _edges(robot, tool, tree)
         if len(ways):
-            _lines(
+            draw_lines(
                 server, name, ways, [np.tile(color, (EDGE_POINTS, 1))] * len(ways), TREE_WIDTH * reach(robot)
             )
         else:
@@ -238,7 +239,7 @@ def candidate_color(clearance: float) -> Float[ndarray, "3"]:
     return (1 - share) * np.array(AMBER) + share * np.array(GOAL)
 
 
-def _lines(
+def draw_lines(
     server: viser.ViserServer, name: str, ways: list[ndarray], colors: list[ndarray], width: float
 ) -> None:
     """Draw polylines; `width` [m], colours in sRGB, converted because viser expects linear ones."""

@@ -1,8 +1,6 @@
 """The page: shows a session in browsers with viser, behind an access proxy."""
 
 import contextlib
-import io
-import secrets
 import socket
 import threading
 from typing import Any
@@ -11,7 +9,6 @@ import numpy as np
 import viser
 from jaxtyping import Float
 from numpy import ndarray
-from viser import infra
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
@@ -20,8 +17,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
 from robotdiffuse.validation.report import Violation
 from robotdiffuse.visualization import style
-from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
-from robotdiffuse.visualization.live.access import SECRET, AccessProxy
+from robotdiffuse.visualization.live.access import AccessProxy
 from robotdiffuse.visualization.live.drawing import (
     GHOST_OPACITY,
     POSE_RATE,
@@ -37,28 +33,13 @@ from robotdiffuse.visualization.live.drawing import (
 from robotdiffuse.visualization.live.latest_task import LatestTask
 from robotdiffuse.visualization.live.panel import Panel, PanelCallbacks
 from robotdiffuse.visualization.live.player import Player
+from robotdiffuse.visualization.live.server import add_stage, new_server, set_first_view, stop_server
 from robotdiffuse.visualization.live.session import Session, State
 from robotdiffuse.visualization.live.validity import validity
 from robotdiffuse.visualization.style import GOAL, START, Surface
 
 GIZMO_SIZE, SMALL_GIZMO_SIZE = 0.23, 0.16
 """Sizes of gizmos, as fractions of the arm's reach."""
-FLOOR_SIZE = 4.7
-"""Edge length of the floor, as a multiple of the arm's reach."""
-VIEW_SIZE, VIEW_MARGINS = (900, 800), (0.06, 0.06)
-"""Window size for which the first view is chosen [pixels], and the fractions of its height left free."""
-LIGHTS = (2.0, (-2.0, -3.0, 5.0)), (1.1, (3.0, 2.0, 3.0)), (0.7, (-3.0, 3.0, 1.0))
-"""Intensity and position of each light."""
-PANEL_OFFSET = 0.2
-"""Shift of the view to the left of the control panel, as a fraction of the window's height."""
-
-
-class _Server(viser.ViserServer):
-    """viser's server without its public share URLs."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """None: a browser must not open a tunnel from the internet to the page."""
-        return None
 
 
 class Page:
@@ -67,10 +48,7 @@ class Page:
     def __init__(self, session: Session, listening: socket.socket, token: str = "") -> None:
         self.session = session
         self._selected, self._drawn = "", dict[str, Any]()
-        secret = secrets.token_urlsafe(32)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints its own address
-            self.server = _Server("127.0.0.1", 0, verbose=False)
-        _require_secret(secret, self.server)
+        self.server, secret = new_server()
         self._add_static_scene()
         callbacks = PanelCallbacks(self.select, self._seek, self._set_playing)
         self._panel = Panel(self.server, session, callbacks)
@@ -98,31 +76,12 @@ class Page:
         for gizmo in self._gizmos:
             gizmo.close()
         self._drawing.close()
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.server.stop()
+        stop_server(self.server)
 
     def _add_static_scene(self) -> None:
         """Add lights, floor and gizmos."""
         server = self.server
-        server.gui.configure_theme(show_logo=False, show_share_button=False)
-        server.gui.set_panel_label("RobotDiffuse")
-        # viser's default lighting, an environment map with shadows, is a hundred times slower without a
-        # graphics card
-        server.scene.configure_environment_map(None)
-        server.scene.configure_default_lights(enabled=False)
-        server.scene.add_light_ambient("/light/sky", intensity=1.1)
-        for i, (intensity, at) in enumerate(LIGHTS):
-            server.scene.add_light_directional(f"/light/{i}", intensity=intensity, position=at)
-        side = FLOOR_SIZE * reach(self.session.state.problem.robot)
-        server.scene.add_grid(
-            "/floor",
-            side,
-            side,
-            cell_size=side / 40,
-            cell_color=(236, 238, 241),
-            section_size=side / 8,
-            section_color=(214, 218, 224),
-        )
+        add_stage(server, reach(self.session.state.problem.robot))
         self.goal_gizmo = _Gizmo(server, "/drag/goal", GIZMO_SIZE, self.session.move_goal)
         self._start_gizmo = _Gizmo(server, "/drag/start", SMALL_GIZMO_SIZE, self.session.move_start)
         self._obstacle_gizmo = _Gizmo(server, "/drag/obstacle", GIZMO_SIZE, self._move_selected)
@@ -194,12 +153,7 @@ class Page:
         state = self.session.state
         problem, goal = state.problem, state.goal_configuration
         q = np.stack([problem.start, problem.start if goal is None else goal])
-        view = view_of_motion(problem.robot, problem.scene, surfaces, self._tool, q, *VIEW_SIZE, VIEW_MARGINS)
-        height = 2 * np.tan(VERTICAL_FIELD / 2) * np.linalg.norm(view.target - view.eye)
-        aside = PANEL_OFFSET * height * view.rotation[0]
-        camera = self.server.initial_camera
-        camera.fov = VERTICAL_FIELD
-        camera.position, camera.look_at = tuple(view.eye + aside), tuple(view.target + aside)
+        set_first_view(self.server, problem, surfaces, q)
 
     def _ghost(self, name: str, q: Float[ndarray, "dof"] | None) -> None:
         robot = self.session.state.problem.robot
@@ -293,19 +247,3 @@ def _starts_at_start(state: State) -> bool:
 
 def _is_collision(violation: Violation) -> bool:
     return violation.kind in ("scene_collision", "self_collision")
-
-
-def _require_secret(secret: str, server: viser.ViserServer) -> None:
-    """Close connections that bypass the access proxy: viser accepts any page in any browser on this machine
-    that finds its port. Raises AttributeError for a version of viser with other internals."""
-    inner = server._websock_server
-    connections = inner._live_connections
-
-    async def check(client: infra.WebsockClientConnection) -> None:
-        connection = connections[client.client_id]
-        request = connection.request
-        given = "" if request is None else request.headers.get(SECRET, "")
-        if not secrets.compare_digest(given.encode(), secret.encode()):
-            await connection.close(1008)
-
-    inner.on_client_connect(check)

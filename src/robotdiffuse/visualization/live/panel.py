@@ -168,7 +168,7 @@ class Panel:
     def show(self, state: State, validity: Validity, selected: str) -> None:
         """Update the widgets to a state."""
         if self._new_value("validity", (validity, state.planning)):
-            self._badge.content = _badge_html(validity, state.planning)
+            self._badge.content = badge_html(validity, state.planning)
         if self._new_value("seconds", state.seconds):
             self._stages.content = _stages_html(state.seconds)
         for widget, value in (
@@ -177,14 +177,14 @@ class Panel:
             (self._candidates, state.options.candidates),
             (self._trees, state.options.trees),
         ):
-            _set(widget, value)
+            set_value(widget, value)
         if self._new_value("motion", state.motion):
             self._show_plot(state)
         if self._new_value("robot", state.problem.robot):
             self._new_joints(state.problem.robot)
         if self._new_value("start", state.problem.start):
             for widget, value in zip(self._joints, state.problem.start, strict=True):
-                _set(widget, round(float(value), 3))
+                set_value(widget, round(float(value), 3))
         self._show_obstacle(state, selected)
 
     def _new_value(self, what: str, value: object) -> bool:
@@ -201,7 +201,7 @@ class Panel:
         if self._new_value("options", options):
             self._selected.options = options
         name = selected if selected in shapes else NO_OBSTACLE
-        _set(self._selected, name)
+        set_value(self._selected, name)
         shape = shapes.get(selected)
         self._delete.visible = shape is not None
         sizes = {} if shape is None else dimensions(shape)
@@ -212,7 +212,7 @@ class Panel:
             with self._sizes_box:
                 self._sizes = {of: self._size_slider(name, of, value) for of, value in sizes.items()}
         for of, value in sizes.items():
-            _set(self._sizes[of], value)
+            set_value(self._sizes[of], value)
 
     def _size_slider(self, name: str, dimension: str, value: float) -> Any:
         most = max(MAX_DIMENSION, value)
@@ -299,7 +299,7 @@ def plotted(robot: Robot, motion: Trajectory, kind: str) -> tuple[np.ndarray, ..
     return (motion.times, *(100.0 * values).T, limit, -limit)
 
 
-def _set(widget: Any, value: object) -> None:
+def set_value(widget: Any, value: object) -> None:
     """Set a widget, without a message to browsers if it already has the value."""
     if widget.value != value:
         widget.value = value
@@ -314,7 +314,8 @@ def _send(event: viser.GuiEvent, name: str, content: bytes) -> None:
         event.client.send_file_download(name, content, save_immediately=True)
 
 
-def _badge_html(validity: Validity, planning: bool) -> str:
+def badge_html(validity: Validity, planning: bool = False) -> str:
+    """A coloured box with a headline and lines."""
     lines = "".join(f"<div>{html.escape(line)}</div>" for line in validity.lines)
     busy = " · planning" if planning and validity.kind != PENDING else ""
     return (

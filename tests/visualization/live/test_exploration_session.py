@@ -1,0 +1,114 @@
+"""The exploration that is watched: its steps one by one, pauses, restarts and errors, without a browser."""
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from helpers.explorations import BEYOND, FLOOR, HOME, WALL
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning.exploration.steps import DONE, LOOK, ExplorerSettings
+from robotdiffuse.visualization.live import exploration_session
+from robotdiffuse.visualization.live.exploration_session import (
+    CHOOSING,
+    ENDED,
+    MOVING,
+    PAUSED,
+    RUNNING,
+    STEPPING,
+    WAITING,
+    ExplorationSession,
+    ExplorationState,
+)
+
+pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
+
+PATIENCE = 300.0
+"""[s]; a new machine compiles first."""
+SETTINGS = ExplorerSettings(time_limit=0.5)
+
+
+def until(session: ExplorationSession, holds: Callable[[ExplorationState], object]) -> ExplorationState:
+    end = time.monotonic() + PATIENCE
+    while not holds(session.state):
+        assert time.monotonic() < end, session.state
+        time.sleep(0.005)
+    return session.state
+
+
+@pytest.fixture
+def session() -> Iterator[ExplorationSession]:
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([FLOOR, WALL]), HOME, BEYOND)
+    session = ExplorationSession(problem, SETTINGS, noise=False, seed=0, speed=1000.0)
+    yield session
+    session.close()
+
+
+def test_it_goes_one_step_and_then_to_the_end(session: ExplorationSession) -> None:
+    seen: list[ExplorationState] = []
+    session.on_change = lambda: seen.append(session.state)
+    assert session.state.phase == WAITING and session.state.known is None
+    session.set_mode(STEPPING)
+    state = until(session, lambda state: state.acts and state.phase == WAITING)
+    [act] = state.acts
+    assert act.trajectory is not None and state.mode == PAUSED
+    np.testing.assert_allclose(state.configuration, act.trajectory.positions[-1], atol=1e-9)
+    if act.step.kind == LOOK:
+        assert act.step.wanted is not None and act.step.wanted.any()
+    session.set_mode(RUNNING)
+    state = until(session, lambda state: state.phase == ENDED)
+    assert not state.failure and not state.violation and state.acts[-1].step.motion is None
+    assert {CHOOSING, MOVING} <= {one.phase for one in seen}
+    assert state.known is state.explorer.views[-1]  # type: ignore[union-attr]
+
+
+def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: ExplorationSession) -> None:
+    session.set_speed(0.2)
+    session.set_mode(RUNNING)
+    until(session, lambda state: state.phase == MOVING and (state.configuration != HOME).any())
+    session.set_mode(PAUSED)
+    time.sleep(0.2)  # the frame that was being computed
+    held = session.state.configuration
+    time.sleep(0.2)
+    assert session.state.configuration is held
+    with pytest.raises(InputError, match=r"unknown explorer\.policy 'bold'"):
+        session.restart(policy="bold")
+    session.restart(policy="chance", noise=True)
+    assert session.state.configuration.tolist() == HOME.tolist() and not session.state.acts
+    assert (session.state.settings.policy, session.state.noise) == ("chance", True)
+    state = until(session, lambda state: state.explorer is not None and state.phase == WAITING)
+    assert state.explorer is not None and state.explorer.settings.policy == "chance"
+
+
+def test_an_error_is_shown_and_a_restart_helps(
+    session: ExplorationSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from robotdiffuse.visualization.live.exploration_page import exploration_badge
+
+    def fails(*_: object) -> None:
+        raise ValueError("no camera")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(exploration_session, "simulated_explorer", fails)
+        session.set_mode(RUNNING)
+        state = until(session, lambda state: state.phase == ENDED)
+        assert exploration_badge(state).lines == ("ValueError: no camera",)
+    session.restart()
+    until(session, lambda state: state.acts)
+
+
+def test_the_badge_says_what_the_arm_does(session: ExplorationSession) -> None:
+    from robotdiffuse.visualization.live.exploration_page import exploration_badge
+    from robotdiffuse.visualization.live.validity import NO_MOTION, VALID
+
+    assert exploration_badge(session.state).headline == "not begun"
+    session.set_mode(RUNNING)
+    state = until(session, lambda state: state.phase == MOVING)
+    badge, step = exploration_badge(state), state.acts[-1].step
+    assert badge.headline.startswith(f"{len(state.acts)}. ") and badge.lines[0] == step.reason
+    assert badge.lines[-1].startswith("of the map ")
+    state = until(session, lambda state: state.phase == ENDED)
+    reached = state.acts[-1].step.kind == DONE
+    assert exploration_badge(state).kind == (VALID if reached else NO_MOTION)

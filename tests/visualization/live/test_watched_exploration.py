@@ -1,0 +1,86 @@
+"""The page of an exploration in a real browser: what it shows while the arm moves, and its buttons."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import robotdiffuse as rd
+from helpers.browsers import CHROMIUM, FLAGS
+from helpers.explorations import BEYOND, FLOOR, HOME, WALL
+from robotdiffuse.planning.exploration.steps import ExplorerSettings
+from robotdiffuse.visualization.live.access import listen
+from robotdiffuse.visualization.live.exploration_session import (
+    ENDED,
+    MOVING,
+    PAUSED,
+    RUNNING,
+    ExplorationSession,
+)
+
+pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
+playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
+
+PATIENCE = 300.0
+"""[s]; a new machine compiles before the first step."""
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
+]
+
+
+@pytest.fixture
+def view() -> Iterator[tuple[Any, ExplorationSession, dict[str, Any]]]:
+    """A browser at the page, the session, and what is drawn by name."""
+    from robotdiffuse.visualization.live.exploration_page import ExplorationPage
+
+    problem = rd.Problem(rd.load_robot("panda"), rd.Scene([FLOOR, WALL]), HOME, BEYOND)
+    session = ExplorationSession(problem, ExplorerSettings(time_limit=1.0), False, 0, speed=0.1)
+    listening = listen("127.0.0.1", 0)
+    page = ExplorationPage(session, listening)
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
+        view = browser.new_page(viewport={"width": 900, "height": 600})
+        view.set_default_timeout(1000 * PATIENCE)
+        view.goto("http://{}:{}/".format(*listening.getsockname()))
+        yield view, session, page.server.scene._handle_from_node_name
+        browser.close()
+    page.close()
+
+
+def until(holds: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_people_watch_pause_go_on_and_restart(view: Any) -> None:
+    page, session, drawn = view
+    until(lambda: session.state.phase == MOVING)  # it runs since the page was opened
+    session.set_mode(PAUSED)
+    [act] = session.state.acts
+    page.get_by_text(f"1. {act.step.kind}").first.wait_for()
+    page.get_by_text("of the map").wait_for()
+    of_a_look = {"/pyramid", "/wanted"} if act.step.wanted is not None else set()
+    until(lambda: {"/occupied", "/unknown", "/trace"} | of_a_look <= drawn.keys())
+    beside = "xpath=following::input[not(@type='hidden')][1]"
+    page.get_by_text("Unknown space", exact=True).locator(beside).uncheck(force=True)
+    until(lambda: "/unknown" not in drawn)
+    page.get_by_text("Unknown space", exact=True).locator(beside).check(force=True)
+    until(lambda: "/unknown" in drawn)
+    page.get_by_role("button", name="Run").click()
+    page.get_by_role("button", name="Pause").click()
+    until(lambda: session.state.mode == PAUSED)
+    session.set_speed(10.0)
+    page.get_by_role("button", name="Run").click()
+    until(lambda: session.state.phase == ENDED)
+    page.locator("[data-validity=valid], [data-validity=none]").wait_for()
+    page.get_by_role("button", name="Restart").click()
+    until(lambda: session.state.phase != ENDED)
+    page.get_by_text("Noise", exact=True).locator(beside).check(force=True)
+    until(lambda: session.state.noise and session.state.phase == MOVING)
+    assert session.state.mode == RUNNING
