@@ -122,7 +122,9 @@ def respond(number: int, endpoint: str, body: bytes) -> Answer:
         return answer._replace(memory=_memory())
     except InputError as error:
         return failed(400, str(error))
-    except Exception as error:
+    except Cancelled:
+        raise
+    except BaseException as error:  # a SystemExit of a planner would end the server's event loop
         traceback.print_exc(file=sys.stderr)
         return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
 
