@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 
 from robotdiffuse.core.results import PlanResult
@@ -10,7 +11,7 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.problem import Problem
 
-SOLVES, RAISES, DIES, HANGS, TALKS, SEARCHES = range(6)
+SOLVES, RAISES, DIES, HANGS, TALKS, SEARCHES, EXITS = range(7)
 
 
 class Faulty(RRTConnect):
@@ -19,6 +20,8 @@ class Faulty(RRTConnect):
     def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0, **request: object) -> PlanResult:
         if seed == RAISES:
             raise ValueError("no such\nthing")
+        if seed == EXITS:
+            sys.exit("no licence")
         if seed == DIES:
             print("about to die", flush=True)
             os.kill(os.getpid(), signal.SIGKILL)

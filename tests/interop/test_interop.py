@@ -254,17 +254,26 @@ def test_positions_and_times_alone_are_validated_on_the_smoothest_curve() -> Non
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "no joints": (lambda: checked_motion([], [[]]), "joint_names is \\[\\]; it must be a list of names"),
     "twice": (lambda: checked_motion(["a", "a"], [[0, 0]]), "joint_names has a more than once"),
-    "no rows": (lambda: checked_motion(["a"], []), "positions is empty: a motion has at least one row"),
-    "ragged": (lambda: checked_motion(["a"], [[0], [0, 1]]), "positions is not rows of numbers"),
+    "no rows": (lambda: checked_motion(["a"], []), "positions is empty; it must be n x 1 finite numbers"),
+    "ragged": (
+        lambda: checked_motion(["a"], [[0], [0, 1]]),
+        r"positions is \[\[0\], \[0, 1\]\]; it must be n x 1",
+    ),
     "nan": (lambda: checked_motion(["a"], [[0], [float("nan")]]), r"positions\[1\] is \[nan\]; its numbers"),
     "huge": (lambda: checked_motion(["a"], [[1e30]]), "must be finite and within ±10000"),
-    "short rates": (lambda: checked_motion(["a"], [[0], [1]], [0, 1], [[0]]), "velocities has 1 rows"),
+    "short rates": (
+        lambda: checked_motion(["a"], [[0], [1]], [0, 1], [[0]]),
+        "velocities is an array of 1 x 1; it must be 2 x 1",
+    ),
     "nan time": (lambda: checked_motion(["a"], [[0], [1]], [0, float("nan")]), r"times\[1\] is nan"),
     "backwards": (
         lambda: checked_motion(["a"], [[0], [1]], [1, 1]),
         "times do not increase: 1 s in row 0, 1 s",
     ),
-    "few times": (lambda: checked_motion(["a"], [[0], [1]], [0]), "it must be 2 numbers, one for each row"),
+    "few times": (
+        lambda: checked_motion(["a"], [[0], [1]], [0]),
+        "must be 2 finite numbers, one for each row",
+    ),
     "another robot": (
         lambda: motion_of_robot(checked_motion(["shoulder", "elbow"], [[0, 0]]), rd.load_robot("panda")),
         "the motion lacks panda_joint1, .* and has shoulder, elbow, which panda lacks",

@@ -17,7 +17,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.commands import run
-from helpers.faulty_planner import DIES, HANGS, RAISES, SEARCHES
+from helpers.faulty_planner import DIES, EXITS, HANGS, RAISES, SEARCHES
 from helpers.serving import serving
 from robotdiffuse.cli.serve import served_robots
 from robotdiffuse.core.types import UNTIL
@@ -150,7 +150,7 @@ def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None
             "/verify",
             {"problem": problem(), "path": {"joint_names": JOINTS, "positions": [[1e9] * 7]}},
             400,
-            "not within",
+            "its numbers must be finite and within",
         ),
         ("/plan", b" " * (2**20 + 1), 413, "it may have 1048576 bytes"),
     ],
@@ -194,6 +194,15 @@ def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -
 def test_an_exception_is_one_line(server: httpx.Client) -> None:
     answer = server.post("/plan", json=asked(RAISES, "faulty"))
     assert answer.status_code == 500 and error(answer) == "ValueError: no such thing"
+
+
+def test_a_planner_that_exits_stops_neither_server_nor_worker(server: httpx.Client) -> None:
+    """Its SystemExit reached the server's event loop and stopped it."""
+    lost = gauge(server, "workers_lost_total")
+    answer = server.post("/plan", json=asked(EXITS, "faulty"))
+    assert answer.status_code == 500 and error(answer) == "SystemExit: no licence"
+    assert server.post("/plan", json=asked(3)).json()["status"] == "solved"
+    assert gauge(server, "workers_lost_total") == lost
 
 
 def test_a_worker_that_dies_costs_one_request(server: httpx.Client) -> None:

@@ -15,6 +15,7 @@ from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof,
 from robotdiffuse.core.bounds import MAX_RATE, numbers, within
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_json
+from robotdiffuse.core.motion_arrays import check_motion_arrays
 from robotdiffuse.core.one_line import one_line
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
@@ -149,16 +150,9 @@ def _certificate(record: dict[str, Any]) -> Certificate:
 
 
 def _motion(record: dict[str, Any]) -> Path | Trajectory:
-    names = tuple(map(str, record["joint_names"]))
-    rows = {name: numbers(record[name]) for name in ("positions", *RATE_ROWS) if name in record}
-    shape = (len(rows["positions"]) if rows["positions"] is not None else 0, len(names))
-    for name, array in rows.items():
-        wanted = shape[:1] if name == "times" else shape
-        if array is None or array.shape != wanted or not len(array) or not within(array, MAX_RATE):
-            raise InputError(f"motion.{name} must be finite numbers of shape {'x'.join(map(str, wanted))}")
-    if len(rows) == 1:
-        return Path(names, rows["positions"])  # type: ignore[arg-type]
-    return Trajectory(names, **rows)  # type: ignore[arg-type]
+    arrays = {name: record[name] for name in ("positions", *RATE_ROWS) if name in record}
+    names, checked = check_motion_arrays(record["joint_names"], arrays, "motion.")
+    return Path(names, **checked) if len(checked) == 1 else Trajectory(names, **checked)
 
 
 def _proof(record: list[dict[str, Any]]) -> StretchProof:

@@ -17,6 +17,8 @@ MIN_SIZE = 1e-9
 """Smallest size [m]; float32 cannot resolve smaller ones beside coordinates."""
 MIN_RATE, MAX_RATE = 1e-6, 1e6
 """Smallest limit of a joint's velocity or acceleration, and largest rate, in their own units."""
+MAX_DURATION = 1e6
+"""Longest motion in files and requests [s]."""
 RIGID_SLACK = 1e-4
 """Largest deviation of any entry: of the rotation from orthonormal, of the last row from 0 0 0 1."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
@@ -121,6 +123,34 @@ def vector(owner: str, name: str, value: object, size: int, most: float = MAX_CO
         raise InputError(f"{owner}.{name} is {shown(value)}; it must be {size} finite numbers")
     if not within(array, most):
         raise InputError(f"{owner}.{name} is {shown(value)}; its numbers must be within ±{most:g}")
+    return array
+
+
+def rows(
+    name: str,
+    value: object,
+    count: int | None,
+    columns: int,
+    most: float = MAX_COORDINATE,
+    meaning: str = "",
+) -> ndarray:
+    """The value as `count` rows, None for one or more, of `columns` numbers within ±most.
+
+    Raises InputError, naming the field or its first wrong row, for anything else; `meaning` ends the sentence
+    about the right shape, e.g. ", a column for each joint".
+    """
+    array = numbers(value)
+    wanted = f"it must be {count or 'n'} x {columns} finite numbers{meaning}"
+    if array is None:
+        raise InputError(f"{name} is {shown(value)}; {wanted}")
+    if array.size == 0:
+        raise InputError(f"{name} is empty; {wanted}")
+    if array.ndim != 2 or array.shape[1] != columns or count not in (None, len(array)):
+        raise InputError(f"{name} is {form(array)}; {wanted}")
+    bad = np.flatnonzero(~(np.abs(array) <= most).all(axis=1))
+    if len(bad):
+        row = shown(array[bad[0]])
+        raise InputError(f"{name}[{bad[0]}] is {row}; its numbers must be finite and within ±{most:g}")
     return array
 
 

@@ -7,10 +7,8 @@ from contextvars import ContextVar
 
 LONG = 0.2
 """Steps shorter than this start whenever any time is left [s]."""
-_left: ContextVar[Callable[[], float] | None] = ContextVar("left", default=None)
-_leave: ContextVar[Callable[[], None] | None] = ContextVar("leave", default=None)
-
-
+_remaining: ContextVar[Callable[[], float] | None] = ContextVar("remaining", default=None)
+_cancel_check: ContextVar[Callable[[], None] | None] = ContextVar("cancel_check", default=None)
 PREPARING, TIMING = "to prepare the scene", "for timing"
 """What a time limit may be too short for."""
 
@@ -25,34 +23,34 @@ class OutOfTimeError(Exception):
 
 
 @contextmanager
-def deadline(left: Callable[[], float]) -> Iterator[None]:
-    """Within the block, `check_time` uses `left()` as the remaining time [s]."""
-    before = _left.set(left)
+def deadline(remaining: Callable[[], float]) -> Iterator[None]:
+    """Within the block, `check_time` uses `remaining()` as the remaining time [s]."""
+    before = _remaining.set(remaining)
     try:
         yield
     finally:
-        _left.reset(before)
+        _remaining.reset(before)
 
 
 @contextmanager
-def left_by(leave: Callable[[], None]) -> Iterator[None]:
-    """Within the block, each `check_left` calls `leave`, which may raise an exception to cancel the work.
+def cancel_check(check: Callable[[], None]) -> Iterator[None]:
+    """Within the block, each `check_cancelled` calls `check`, which may raise to cancel the work.
 
     A signal handler must not raise it instead: compiled code that returns its results runs Python, where an
     unexpected exception ends the process.
     """
-    before = _leave.set(leave)
+    before = _cancel_check.set(check)
     try:
         yield
     finally:
-        _leave.reset(before)
+        _cancel_check.reset(before)
 
 
-def check_left() -> None:
-    """Raise the exception of `left_by` if the call is cancelled."""
-    leave = _leave.get()
-    if leave is not None:
-        leave()
+def check_cancelled() -> None:
+    """Raise the exception of `cancel_check` if the call is cancelled."""
+    check = _cancel_check.get()
+    if check is not None:
+        check()
 
 
 def check_timing(step: str, seconds: float = 0.0) -> None:
@@ -69,11 +67,11 @@ def check_time(step: str, seconds: float = 0.0) -> None:
     _check(step, seconds, PREPARING, 0.0)
 
 
-def _check(step: str, seconds: float, what: str, late: float) -> None:
-    check_left()
-    left = _left.get()
-    remaining = float("inf") if left is None else left()
-    if remaining <= -late:
+def _check(step: str, seconds: float, what: str, overrun: float) -> None:
+    check_cancelled()
+    get_remaining = _remaining.get()
+    remaining = float("inf") if get_remaining is None else get_remaining()
+    if remaining <= -overrun:
         raise OutOfTimeError(step, what)
     if seconds > max(LONG, remaining):
         raise OutOfTimeError(f"{step}, which takes about {seconds:.1f} s", what)

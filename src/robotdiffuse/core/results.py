@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
 
-import numpy as np
-
-from robotdiffuse.core.bounds import MAX_RATE, numbers, within
+from robotdiffuse.core.bounds import MAX_RATE, rows
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_json
+from robotdiffuse.core.motion_arrays import RATES, check_increasing, check_motion_arrays
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.types import ROWS, Path, Status, Trajectory, Tree
+from robotdiffuse.core.types import Path, Status, Trajectory, Tree
 
 PROBLEM_ENDINGS = (".yaml", ".yml", ".jsonl")
 """Endings of problem files that no result has."""
@@ -189,12 +188,11 @@ def _result(record: dict[str, Any]) -> PlanResult:
     if not isinstance(record["status"], str) or record["status"] not in known:
         raise InputError(f"status is {shown(record['status'])}; known: {', '.join(known)}")
     status = known[record["status"]]
-    names = _names(record, "joint_names")
     solved = status is Status.SOLVED
     if record["verified"] is not solved:
         raise InputError(f"verified is {shown(record['verified'])}, but status is {shown(status.value)}")
-    path = Path(names, _rows(record, "waypoints", None, len(names))) if solved else None
-    trajectory = _trajectory(record, names) if solved and record.get("times") else None
+    path = _path(record) if solved else None
+    trajectory = _trajectory(record) if solved and record.get("times") else None
     return PlanResult(
         status=status,
         reason=_text(record, "reason"),
@@ -208,34 +206,41 @@ def _result(record: dict[str, Any]) -> PlanResult:
         min_clearance=_number_or_none(record, "min_clearance"),
         scene_clearance=_number_or_none(record, "scene_clearance"),
         self_clearance=_number_or_none(record, "self_clearance"),
-        notes=_names(record, "notes") if "notes" in record else (),
-        progress=_progress(record),
+        notes=_texts(record, "notes") if "notes" in record else (),
+        progress=_progress(record.get("progress")),
         refused=_text(record, "refused") if "refused" in record else "",
         assumption=_text(record, "assumption") if "assumption" in record else "",
         confidence=_number_or_none(record, "confidence"),
         swept_probability=_number_or_none(record, "swept_probability"),
-        unknown_region=_box(record, "unknown_region"),
+        unknown_region=_box(record.get("unknown_region")),
     )
 
 
-def _box(record: dict[str, Any], name: str) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    if record.get(name) is None:
+def _box(value: object) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    if value is None:
         return None
-    low, high = _rows(record, name, 2, 3).tolist()
+    low, high = rows("unknown_region", value, 2, 3).tolist()
     return tuple(low), tuple(high)
 
 
-def _progress(record: dict[str, Any]) -> tuple[tuple[float, float], ...]:
-    if not record.get("progress"):
+def _progress(value: object) -> tuple[tuple[float, float], ...]:
+    if not value:
         return ()
-    return tuple((at, length) for at, length in _rows(record, "progress", None, 2).tolist())
+    return tuple((at, length) for at, length in rows("progress", value, None, 2, MAX_RATE).tolist())
 
 
-def _trajectory(record: dict[str, Any], names: tuple[str, ...]) -> Trajectory:
-    times = _rows(record, "times", None, None)
-    if (np.diff(times) <= 0).any() or times[0] != 0:
-        raise InputError("times must start at 0 and strictly increase")
-    return Trajectory(names, times, *(_rows(record, what, len(times), len(names)) for what in ROWS))
+def _path(record: dict[str, Any]) -> Path:
+    names, arrays = check_motion_arrays(record["joint_names"], {"waypoints": record.get("waypoints")})
+    return Path(names, arrays["waypoints"])
+
+
+def _trajectory(record: dict[str, Any]) -> Trajectory:
+    fields = {name: record.get(name) for name in ("positions", "times", *RATES)}
+    names, arrays = check_motion_arrays(record["joint_names"], fields)
+    if arrays["times"][0] != 0:
+        raise InputError(f"times begin at {arrays['times'][0]:g} s; they must begin at 0")
+    check_increasing(arrays["times"])
+    return Trajectory(names, **arrays)
 
 
 def _optional(record: dict[str, Any], name: str, kind: type) -> Any:
@@ -251,7 +256,7 @@ def _text(record: dict[str, Any], name: str) -> str:
     return record[name]
 
 
-def _names(record: dict[str, Any], name: str) -> tuple[str, ...]:
+def _texts(record: dict[str, Any], name: str) -> tuple[str, ...]:
     value = record[name]
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
         raise InputError(f"{name} is {shown(value)}; it must be a list of strings")
@@ -267,19 +272,3 @@ def _number(record: dict[str, Any], name: str) -> float:
 
 def _number_or_none(record: dict[str, Any], name: str) -> float | None:
     return None if record.get(name) is None else _number(record, name)
-
-
-def _rows(record: dict[str, Any], name: str, rows: int | None, columns: int | None) -> np.ndarray:
-    """An array of finite numbers: a vector if `columns` is None; any number of rows if `rows` is None."""
-    array = numbers(record.get(name))
-    if array is None:
-        raise InputError(f"{name} must be {'a list' if columns is None else 'rows'} of numbers")
-    shape = "x".join(map(str, array.shape))
-    wanted = f"{rows or 'n'}" + ("" if columns is None else f"x{columns}")
-    if array.ndim != (1 if columns is None else 2) or len(array) == 0:
-        raise InputError(f"{name} has shape {shape or 'none'}; it must be {wanted}")
-    if (rows is not None and len(array) != rows) or (columns is not None and array.shape[1] != columns):
-        raise InputError(f"{name} has shape {shape}; it must be {wanted}")
-    if not within(array, MAX_RATE):
-        raise InputError(f"{name} holds numbers that are not finite, or not within ±{MAX_RATE:g}")
-    return array

@@ -21,7 +21,7 @@ ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
 REST = 1e-3
 """Speed, as a share of a motion's greatest one, at which the arm rests."""
-MAX_RATE = 1e5
+MAX_SAMPLE_RATE = 1e5
 """Largest rate at which trajectories are resampled [Hz]."""
 TIME_TOLERANCE = 1e-9
 """Times this far outside of a trajectory [s] are taken as its ends; rows are no closer when resampled."""
@@ -173,15 +173,15 @@ class Trajectory(Value):
         """Rows of `at` at each multiple of 1 / `rate` [Hz], and the last row, which ends the motion.
 
         The new rows lie on this motion; between them the motion may differ from it where its rows were
-        closer, so validate it again. Raises InputError for a rate that is not in (0, MAX_RATE].
+        closer, so validate it again. Raises InputError for a rate that is not in (0, MAX_SAMPLE_RATE].
         """
         if (
             not isinstance(rate, int | float | np.number)
             or isinstance(rate, bool)
-            or not 0 < rate <= MAX_RATE
+            or not 0 < rate <= MAX_SAMPLE_RATE
         ):
             raise InputError(
-                f"rate is {shown(rate)}; it must be a positive number, at most {MAX_RATE:g} [Hz]"
+                f"rate is {shown(rate)}; it must be a positive number, at most {MAX_SAMPLE_RATE:g} [Hz]"
             )
         if len(self.times) == 1:
             return self

@@ -18,7 +18,7 @@ from robotdiffuse.problems.held_out import Case, CaseFile, Report, line_length
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.validation.validator import VerifySettings, verifier
 
-NONTRIVIAL = "_nontrivial"
+NONTRIVIAL_SUFFIX = "_nontrivial"
 """Suffix of a family: only problems that search solves and the straight line does not."""
 SEARCH_TIME = 10.0
 """Problems that search does not solve in this time count as unsolvable [s]."""
@@ -52,17 +52,17 @@ def hard_cases(
 
 def problem_set_name(text: str) -> str:
     """The name of a set in results. Raises InputError for a text that is no family, file or folder."""
-    family = text.removesuffix(NONTRIVIAL)
+    family = text.removesuffix(NONTRIVIAL_SUFFIX)
     if family in FAMILIES:
         return text
     place = FilePath(text)
     if not place.exists():
         raise InputError(
             f"problems {text!r} are neither a file or folder nor a family; known families: "
-            f"{', '.join(FAMILIES)}, each also with {NONTRIVIAL}"
+            f"{', '.join(FAMILIES)}, each also with {NONTRIVIAL_SUFFIX}"
         )
     name = place.resolve().stem
-    if name.removesuffix(NONTRIVIAL) in FAMILIES:
+    if name.removesuffix(NONTRIVIAL_SUFFIX) in FAMILIES:
         raise InputError(f"problems {text!r} have the name of the family {name}; rename the file or folder")
     return name
 
@@ -83,15 +83,15 @@ def gather_cases(names: list[str], count: int | None, out: FilePath, report: Rep
 
 def read_cases(out: FilePath, problem_set: str) -> list[Case]:
     """All cases of a set in a folder. Raises InputError if their file is damaged."""
-    family = problem_set.removesuffix(NONTRIVIAL)
+    family = problem_set.removesuffix(NONTRIVIAL_SUFFIX)
     name = family if family in FAMILIES else problem_set
     return _of_set(case_file(out / "problems", name).cases(hard=name != problem_set), problem_set)
 
 
 def _set(text: str, count: int | None, folder: FilePath, report: Report) -> list[Case]:
-    name, family = problem_set_name(text), text.removesuffix(NONTRIVIAL)
+    name, family = problem_set_name(text), text.removesuffix(NONTRIVIAL_SUFFIX)
     if family in FAMILIES:
-        finder = search if text.endswith(NONTRIVIAL) else None
+        finder = search if text.endswith(NONTRIVIAL_SUFFIX) else None
         wanted = 100 if count is None else count
         return _of_set(case_file(folder, family).held_out(family, wanted, validator, finder, report), name)
     kept, place, source = case_file(folder, name), FilePath(text), folder / f"{name}.source.json"

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, numbers, within
-from robotdiffuse.core.errors import InputError, joined, shown
+from robotdiffuse.core.errors import InputError, joined
+from robotdiffuse.core.motion_arrays import check_increasing, check_motion_arrays
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
@@ -41,31 +41,24 @@ def checked_motion(
     times: object = None,
     velocities: object = None,
     accelerations: object = None,
-    notes: tuple[str, ...] = (),
 ) -> RecordedMotion:
     """Check the parts of a motion and return it.
 
     Empty rates count as absent. Times are shifted to begin at 0; times that are all 0 count as absent. Raises
-    InputError for missing or repeated names, no rows, rows of different lengths, numbers that are not finite,
-    and times that do not increase.
+    InputError as `check_motion_arrays` does, and for times that do not increase.
     """
-    if not isinstance(names, list | tuple) or not names or not all(isinstance(n, str) and n for n in names):
-        raise InputError(f"joint_names is {shown(names)}; it must be a list of names, not empty")
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(f"joint_names has {', '.join(twice)} more than once")
-    q = _rows("positions", positions, len(names), MAX_COORDINATE)
-    v, a = (
-        None if _empty(rates) else _rows(what, rates, len(names), MAX_RATE)
-        for what, rates in (("velocities", velocities), ("accelerations", accelerations))
-    )
-    for what, rates in (("velocities", v), ("accelerations", a)):
-        if rates is not None and len(rates) != len(q):
-            raise InputError(f"{what} has {len(rates)} rows; positions has {len(q)}")
-    t, more = _times(times, len(q))
-    return RecordedMotion(
-        tuple(names), q, t, v if t is not None else None, a if t is not None else None, notes + more
-    )
+    given = {"times": times, "velocities": velocities, "accelerations": accelerations}
+    arrays = {name: value for name, value in given.items() if not _empty(value)}
+    joints, checked = check_motion_arrays(names, {"positions": positions, **arrays})
+    if "times" not in checked:
+        return RecordedMotion(joints, checked["positions"])
+    t = checked["times"]
+    if len(t) > 1 and not t.any():
+        note = "all times are 0: the motion is validated as a path"
+        return RecordedMotion(joints, checked["positions"], notes=(note,))
+    check_increasing(t)
+    notes = () if t[0] == 0 else (f"times begin at {t[0]:.9g} s; they were shifted to 0",)
+    return RecordedMotion(joints, **checked | {"times": t - t[0]}, notes=notes)
 
 
 def _empty(rates: object) -> bool:
@@ -76,42 +69,6 @@ def _empty(rates: object) -> bool:
         return all(len(row) == 0 for row in rates)  # type: ignore[attr-defined, arg-type, union-attr]
     except TypeError:
         return False
-
-
-def _rows(what: str, value: object, columns: int, most: float) -> Float[ndarray, "n columns"]:
-    array = numbers(value)
-    if array is not None and array.size == 0:
-        raise InputError(f"{what} is empty: a motion has at least one row")
-    if array is None or array.ndim != 2 or array.shape[1] != columns:
-        found = "not rows of numbers" if array is None else f"of shape {'x'.join(map(str, array.shape))}"
-        raise InputError(f"{what} is {found}; it must be rows of {columns} numbers, one for each joint")
-    if not within(array, most):
-        row = int(np.flatnonzero(~(np.abs(array) <= most).all(axis=1))[0])
-        raise InputError(
-            f"{what}[{row}] is {shown(array[row])}; its numbers must be finite and within ±{most:g}"
-        )
-    return array
-
-
-def _times(value: object, count: int) -> tuple[Float[ndarray, "n"] | None, tuple[str, ...]]:
-    if _empty(value):
-        return None, ()
-    times = numbers(value)
-    if times is None or times.shape != (count,):
-        raise InputError(f"times is {shown(value)}; it must be {count} numbers, one for each row")
-    if not np.isfinite(times).all():
-        row = int(np.flatnonzero(~np.isfinite(times))[0])
-        raise InputError(f"times[{row}] is {times[row]}; it must be a finite number")
-    if count > 1 and not times.any():
-        return None, ("all times are 0: the motion is validated as a path",)
-    backwards = np.flatnonzero(np.diff(times) <= 0)
-    if len(backwards):
-        i = int(backwards[0])
-        raise InputError(
-            f"times do not increase: {times[i]:g} s in row {i}, {times[i + 1]:g} s in row {i + 1}"
-        )
-    note = () if times[0] == 0 else (f"times begin at {times[0]:.9g} s; they were shifted to 0",)
-    return times - times[0], note
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.deadline import OutOfTimeError, check_left, deadline
+from robotdiffuse.core.deadline import OutOfTimeError, check_cancelled, deadline
 from robotdiffuse.core.loading import loading_seconds
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural, OneOf, Settings
@@ -120,7 +120,7 @@ class PlanningContext:
     @property
     def elapsed(self) -> float:
         """Wall time since the call began, without that for loading; see `core/loading.py` [s]."""
-        check_left()
+        check_cancelled()
         return time.perf_counter() - loading_seconds() - self.started
 
     @property

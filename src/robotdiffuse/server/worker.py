@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import orjson
 
-from robotdiffuse.core.deadline import check_left, left_by
+from robotdiffuse.core.deadline import cancel_check, check_cancelled
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import parse_json
 from robotdiffuse.core.loading import compile_seconds
@@ -111,18 +111,20 @@ def respond(number: int, endpoint: str, body: bytes) -> Answer:
     state = _state
     assert state is not None
 
-    def leave() -> None:
+    def raise_if_cancelled() -> None:
         if state.shared.cancelled == number:
             raise Cancelled
 
     try:
-        with left_by(leave):
-            leave()  # it may have been cancelled before it began
+        with cancel_check(raise_if_cancelled):
+            raise_if_cancelled()  # it may have been cancelled before it began
             answer = (answer_plan if endpoint == PLAN else answer_verify)(state, body)
         return answer._replace(memory=_memory())
     except InputError as error:
         return failed(400, str(error))
-    except Exception as error:
+    except Cancelled:
+        raise
+    except BaseException as error:  # a SystemExit of a planner would end the server's event loop
         traceback.print_exc(file=sys.stderr)
         return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
 
@@ -203,7 +205,7 @@ def answer_verify(state: _State, body: bytes) -> Answer:
     validator = Verifier(problem)
     reports: dict[str, Report] = {}
     for name, motion in motions.items():
-        check_left()
+        check_cancelled()
         reports[name] = getattr(validator, name)(motion)
     valid = all(report.valid for report in reports.values())
     record = {"valid": valid} | {name: report_record(report) for name, report in reports.items()}

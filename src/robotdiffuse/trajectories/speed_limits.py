@@ -28,7 +28,9 @@ brakes."""
 ACCELERATION_FACTOR = 0.7
 """Factor of the accelerations that are tried next for a motion that its jerk limits slow down."""
 WINDOW_FRACTIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Fractions tried of the window over which a motion is averaged that keeps the jerk limits in any case."""
+"""Averaging windows that are tried in turn, as fractions of the window that keeps the jerk limits of any
+motion: twice the largest ratio of a joint's acceleration limit to its jerk limit [s]. Shorter windows change
+the motion less."""
 DEFAULT_JERK_RATIO = 10.0
 """Jerk limit over acceleration limit of joints that state no jerk limit: full acceleration after 0.1 s
 [1/s]."""
@@ -38,7 +40,7 @@ MIN_JERK = 0.01
 """Smallest jerk limit [rad/s³] or [m/s³], with which a joint takes 15 s to turn by 1 rad."""
 Scaling = Annotated[float, Bound(least=MIN_SCALING, most=1.0)]
 Jerk = Annotated[float, Bound(least=MIN_JERK, infinite=True)]
-SAMPLES_PER_INTERVAL = 8
+CHECKS_PER_INTERVAL = 8
 """Parts of a grid interval at whose ends frame speeds and torques are checked."""
 MIN_TORQUE_SHARE = 2e-3
 """Share of a torque limit that is left to motion where gravity takes all of it."""
@@ -50,7 +52,8 @@ MAX_SHARES = 12
 """Times that the limits of a motion with a start speed are lowered, until they hold between grid points
 too."""
 BRAKING_FRACTION = 0.9
-"""Part of these that `stopping_distance` counts on; the rest lets corners be rounded."""
+"""Fraction of the available acceleration with which `stopping_distance` lets a motion brake; the rest is left
+for rounding corners."""
 MIN_STOPPING_DISTANCE = 0.01
 """Shortest straight line on which a motion stops from a start velocity [rad]: a corner at its end can be
 rounded."""
@@ -359,8 +362,8 @@ def _slow_to_extra_limits(
     """The speeds, slowed down so that frame speeds and torques keep their limits between grid points too."""
     if extra is NO_EXTRA_LIMITS:
         return speeds
-    intervals = np.repeat(np.arange(len(grid) - 1), SAMPLES_PER_INTERVAL + 1)
-    share = np.tile(np.linspace(0.0, 1.0, SAMPLES_PER_INTERVAL + 1), len(grid) - 1)
+    intervals = np.repeat(np.arange(len(grid) - 1), CHECKS_PER_INTERVAL + 1)
+    share = np.tile(np.linspace(0.0, 1.0, CHECKS_PER_INTERVAL + 1), len(grid) - 1)
     s = grid[intervals] + share * np.diff(grid)[intervals]
     squared = speeds[intervals] ** 2 + share * np.diff(speeds**2)[intervals]
     q, first = line(s, 0), line(s, 1)

@@ -12,7 +12,7 @@ import numpy as np
 
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
-SAMPLES_PER_INTERVAL = 16
+SLOWDOWN_CHECKS_PER_INTERVAL = 16
 """Parts of a grid interval at whose ends `slowdown` checks limits; with 4, a reversal was 1.8 % too fast."""
 CURVE_MARGIN, ROUNDING_MARGIN = 1.0002, 1 + 1e-9
 """Factors on rates before they are compared with limits: on curves, where rates between the checked places
@@ -301,8 +301,8 @@ def slowdown(line, grid, speeds, velocity, acceleration):
         evaluate_at(waypoints, knots, directions, half_widths, grid[i] + 0.5 * width, 2, second)
         curved = np.abs(second).max() > 0
         spare = CURVE_MARGIN if curved else ROUNDING_MARGIN
-        for part in range(0, SAMPLES_PER_INTERVAL + 1, 1 if curved else SAMPLES_PER_INTERVAL):
-            at = part / SAMPLES_PER_INTERVAL * width
+        for part in range(0, SLOWDOWN_CHECKS_PER_INTERVAL + 1, 1 if curved else SLOWDOWN_CHECKS_PER_INTERVAL):
+            at = part / SLOWDOWN_CHECKS_PER_INTERVAL * width
             evaluate_at(waypoints, knots, directions, half_widths, grid[i] + at, 1, first)
             evaluate_at(waypoints, knots, directions, half_widths, grid[i] + at, 2, second)
             squared = max(speeds[i] ** 2 + 2 * pull * at, 0.0)

@@ -206,16 +206,16 @@ def _checks(
     moved = _change_since(q, first) / span
     yield limited("velocity", onwards, moved, most, share * most + 2 * resolution / span)
 
-    said, room = _cumulative(step * (v[1:] + v[:-1]) / 2), _cumulative(step * possible)
-    first, span = _worst_earlier_row(times, q - said, room)
-    moved, told = _change_since(q, first) / span, _change_since(said, first) / span
+    stated_positions, allowed = _cumulative(step * (v[1:] + v[:-1]) / 2), _cumulative(step * possible)
+    first, span = _worst_earlier_row(times, q - stated_positions, allowed)
+    moved, stated = _change_since(q, first) / span, _change_since(stated_positions, first) / span
     yield _Check(
         "rates",
         onwards,
         moved,
-        np.abs(moved - told),
-        (_change_since(room, first) + 2 * resolution) / span,
-        lambda i, j: f"but its velocities give {told[i, j]:.6g}",
+        np.abs(moved - stated),
+        (_change_since(allowed, first) + 2 * resolution) / span,
+        lambda i, j: f"but its velocities give {stated[i, j]:.6g}",
     )
 
     most = robot.acceleration

@@ -26,7 +26,7 @@ from robotdiffuse.problems.families import FAMILIES
 
 LIMITS = (0.1, 1.0, 10.0, 60.0)
 """Time limits of a report beside those of its records, up to the longest of these [s]."""
-NONTRIVIAL = ", non-trivial"
+NONTRIVIAL_LABEL = ", non-trivial"
 
 
 class Timed(NamedTuple):
@@ -155,7 +155,7 @@ def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Sectio
         chosen = _limits(records) if limits is None else sorted(limits)
         parts = {problem_set: set(names)}
         if any(r.trivial for r in records) and {r.family for r in records} <= set(FAMILIES):
-            parts[problem_set + NONTRIVIAL] = {r.name for r in records if r.solved and not r.trivial}
+            parts[problem_set + NONTRIVIAL_LABEL] = {r.name for r in records if r.solved and not r.trivial}
         for name, problems in parts.items():
             part = {
                 planner: {key: of[key] for key in of if key[0] in problems} for planner, of in calls.items()
