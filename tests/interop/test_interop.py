@@ -270,6 +270,10 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: checked_motion(["a"], [[0], [1]], [1, 1]),
         "times do not increase: 1 s in row 0, 1 s",
     ),
+    "two weeks": (
+        lambda: checked_motion(["a"], [[0], [1]], [0, 1.2e6]),
+        "times span 1.2e\\+06 s; a motion must",
+    ),
     "few times": (
         lambda: checked_motion(["a"], [[0], [1]], [0]),
         "must be 2 finite numbers, one for each row",

@@ -64,8 +64,8 @@ def check(
     ]
     for name, most in asdict(at_most).items():
         if getattr(certificate.tolerances, name) > most:
-            said = getattr(certificate.tolerances, name)
-            found.append(f"tolerances: {name} is {said:g}, looser than {most:g}")
+            stated = getattr(certificate.tolerances, name)
+            found.append(f"tolerances: {name} is {stated:g}, looser than {most:g}")
     if certificate.motion_hash != hash_of(certificate.motion):
         found.append("motion: it is not the one that was certified: its hash differs")
     with np.errstate(
@@ -88,9 +88,9 @@ def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Differences in the proof in the scene and between links."""
     prover = Prover(problem.robot, problem.scene, configurations(certificate.motion, certificate.between))
     proof = certificate.proof
-    said = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
+    stated = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
     of_pairs = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
-    yield from _bound_errors(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, said)
+    yield from _bound_errors(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, stated)
 
 
 def _moving_proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
@@ -103,14 +103,14 @@ def _moving_proof_errors(problem: Problem, certificate: MotionProof) -> Iterator
         return
     times = np.sort(np.concatenate([motion.times, certificate.between]), kind="stable")
     prover = MovingProver(problem.robot, problem.moving, configurations(motion, certificate.between), times)
-    every, said = np.ones(len(proof.stretches.claim), bool), {"scene": certificate.scene_clearance}
-    yield from _bound_errors(prover, proof, {"scene": every}, said)
+    every, stated = np.ones(len(proof.stretches.claim), bool), {"scene": certificate.scene_clearance}
+    yield from _bound_errors(prover, proof, {"scene": every}, stated)
 
 
 def _bound_errors(
-    prover: Prover, proof: StretchProof, kinds: dict[str, ndarray], said: dict[str, float]
+    prover: Prover, proof: StretchProof, kinds: dict[str, ndarray], stated: dict[str, float]
 ) -> Iterator[str]:
-    """Differences in stretches and bounds. `kinds` marks the stretches of each kind of clearance; `said`
+    """Differences in stretches and bounds. `kinds` marks the stretches of each kind of clearance; `stated`
     holds the clearance that the proof states for each kind [m]."""
     stretches, known = proof.stretches, {claim: k for k, claim in enumerate(prover.claims)}
     for claim in proof.claims:
@@ -141,7 +141,7 @@ def _bound_errors(
             yield f"proof: {what} of {_place(proof, i)} is {right[i]:.6f} m, not {written[i]:.6f} m{more}"
     left = bounds.clearance - bounds.displacement
     for what, which in kinds.items():
-        least = said[what]
+        least = stated[what]
         if not least > 0:
             yield f"proof: its {what} clearance is {least:g} m, which is not positive"
         unproved = np.flatnonzero(which & (left < min(least, CLEARANCE_CAP) - BOUND_TOLERANCE))

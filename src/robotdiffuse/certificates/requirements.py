@@ -91,18 +91,18 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
 
 def _jerk_errors(motion: Trajectory, certificate: MotionProof) -> Iterator[str]:
     """Jerks, where the proof states them, that are larger than it says."""
-    said = dict(certificate.jerks)
-    if not said:
+    stated = dict(certificate.jerks)
+    if not stated:
         return
-    if [*said] != [*motion.joint_names]:
+    if [*stated] != [*motion.joint_names]:
         yield "jerks: their joints are not those of the motion"
         return
     steps = np.diff(motion.times)[:, None]
     ends = np.abs(motion.accelerations[[0, -1]]).max(axis=0)
     most = np.abs(np.diff(motion.accelerations, axis=0) / steps).max(axis=0, initial=0.0)
-    for name, jerk, end in zip(said, most, ends, strict=True):
-        if not jerk <= said[name] * (1 + BOUND_TOLERANCE):
-            yield f"jerks: that of {name} is {jerk:.6g}, not {said[name]:.6g}"
+    for name, jerk, end in zip(stated, most, ends, strict=True):
+        if not jerk <= stated[name] * (1 + BOUND_TOLERANCE):
+            yield f"jerks: that of {name} is {jerk:.6g}, not {stated[name]:.6g}"
         if end != 0:
             yield f"jerks: the acceleration of {name} jumps at the start or the end"
 
@@ -110,21 +110,21 @@ def _jerk_errors(motion: Trajectory, certificate: MotionProof) -> Iterator[str]:
 def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Torque limits that are not shown to be kept with the payload, and torques that differ from the
     proof."""
-    motion, said = certificate.motion, dict(certificate.torques)
+    motion, stated = certificate.motion, dict(certificate.torques)
     if problem.payload is None:
-        if said:
+        if stated:
             yield "torques: the problem has no payload"
         return
-    if [*said] != [*problem.robot.joint_names]:
+    if [*stated] != [*problem.robot.joint_names]:
         yield "torques: their joints are not those of the robot"
         return
     if isinstance(motion, Trajectory) and not (np.diff(motion.times) > 0).all():
         return
     most = torque_bounds(problem, motion, certificate.torque_samples).max(axis=0)
     allowed = problem.robot.effort * (1 + certificate.tolerances.rate_slack)
-    for name, torque, limit in zip(said, most, allowed, strict=True):
-        if abs(torque - said[name]) > BOUND_TOLERANCE:
-            yield f"torques: the bound of {name} is {torque:.6f}, not {said[name]:.6f}"
+    for name, torque, limit in zip(stated, most, allowed, strict=True):
+        if abs(torque - stated[name]) > BOUND_TOLERANCE:
+            yield f"torques: the bound of {name} is {torque:.6f}, not {stated[name]:.6f}"
         if not torque <= limit:
             yield f"torques: {name} is not shown to keep its limit: {torque:.6f} of {limit:.6f}"
 
@@ -139,10 +139,10 @@ def _constraint_errors(
     if [one.name for one in shown] != [name for name, _ in certificate.constraints]:
         yield "constraints: they are not those of the problem"
         return
-    for one, (_, said) in zip(shown, certificate.constraints, strict=True):
+    for one, (_, stated) in zip(shown, certificate.constraints, strict=True):
         most = float(one.bounds.max())
-        if abs(most - said) > BOUND_TOLERANCE:
-            yield f"constraints: the bound of {one.name} is {most:.6f}, not {said:.6f}"
+        if abs(most - stated) > BOUND_TOLERANCE:
+            yield f"constraints: the bound of {one.name} is {most:.6f}, not {stated:.6f}"
         if not most <= one.limit:
             yield f"constraints: {one.name} is not shown to be kept: {most:.6f} of {one.limit:.6f}"
 

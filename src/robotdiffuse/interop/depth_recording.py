@@ -171,14 +171,14 @@ def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> 
         raise InputError(f"{path} holds no depth images (32FC1 or 16UC1); topics: {listed}")
 
 
-def _image_topics(kinds: Mapping[str, Any], asked: Sequence[str] | None) -> list[str]:
+def _image_topics(kinds: Mapping[str, Any], requested: Sequence[str] | None) -> list[str]:
     found = [topic for topic, schema in kinds.items() if schema.name == IMAGE]
-    for topic in asked or ():
+    for topic in requested or ():
         if topic not in found:
             raise InputError(
                 f"topic {topic!r} holds no images; topics of images: {', '.join(found) or 'none'}"
             )
-    return found if asked is None else list(asked)
+    return found if requested is None else list(requested)
 
 
 def _folder(topic: str) -> str:

@@ -115,19 +115,19 @@ def header_seconds(stamp: Mapping[str, Any]) -> float:
     return float(stamp.get("sec", 0)) + 1e-9 * float(stamp.get("nanosec", 0))
 
 
-def choose_topic(topics: Mapping[str, str], asked: str | None, where: str) -> str:
+def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -> str:
     """The topic to read a motion from, given all topics and their types.
 
-    This is `asked`, or else the only topic of the first type of JointTrajectory, RobotTrajectory,
+    This is `requested`, or else the only topic of the first type of JointTrajectory, RobotTrajectory,
     DisplayTrajectory and JointState that occurs. Raises InputError if there is no such topic or several.
     """
     kinds = (JOINT_TRAJECTORY, ROBOT_TRAJECTORY, DISPLAY_TRAJECTORY, JOINT_STATE)
     motions = {topic: kind for topic, kind in topics.items() if kind in kinds}
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "none"
-    if asked is not None:
-        if asked not in motions:
-            raise InputError(f"{where}: topic {asked!r} holds no motion; topics: {listed}")
-        return asked
+    if requested is not None:
+        if requested not in motions:
+            raise InputError(f"{where}: topic {requested!r} holds no motion; topics: {listed}")
+        return requested
     for kind in kinds:
         found = [topic for topic, of in motions.items() if of == kind]
         if len(found) > 1:

@@ -155,18 +155,18 @@ def _record(body: bytes) -> object:
 
 def answer_plan(state: _State, body: bytes) -> Answer:
     """The answer to a request to plan. Raises InputError for a bad request."""
-    asked = check_fields("the request", _record(body), ("problem",), ARGUMENTS)
-    problem = problem_from_record(asked["problem"], state.robots)
-    given = {name: value for name, value in asked.items() if name not in ("problem", "planner")}
+    requested = check_fields("the request", _record(body), ("problem",), ARGUMENTS)
+    problem = problem_from_record(requested["problem"], state.robots)
+    given = {name: value for name, value in requested.items() if name not in ("problem", "planner")}
     request = PlanRequest(**given)
     if request.time_limit > state.max_time_limit:
         most = f"it must be at most {state.max_time_limit:g} s here"
         raise InputError(f"time_limit is {shown(request.time_limit)}; {most}")
     if request.seed > MAX_SEED:
         raise InputError(f"seed is {shown(request.seed)}; it must be at most {MAX_SEED}")
-    planner = _planner(asked.get("planner", DEFAULT_PLANNER))
+    planner = _planner(requested.get("planner", DEFAULT_PLANNER))
     planner.prepare(problem.robot)
-    _warm_up_once(planner, problem, asked["problem"]["robot"])
+    _warm_up_once(planner, problem, requested["problem"]["robot"])
     state.shared.due = time.monotonic() + request.time_limit + GRACE_TIME
     result: PlanResult = planner.plan(problem, **given)
     return _answer(result.record(), result.status.value)

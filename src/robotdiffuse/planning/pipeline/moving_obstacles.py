@@ -164,8 +164,8 @@ def _timed(
     check_timing(f"a grid of {count} times", CELL_SECONDS * count * len(configurations))
     times = GRID_STEP * np.arange(count)
     speed = max(one.top_speed for one in problem.moving)
-    asked = clearance + (GRID_TRAVEL + speed * GRID_STEP) / 2
-    clear = free_at_times(links, collision.tracks, configurations, times, asked)
+    needed = clearance + (GRID_TRAVEL + speed * GRID_STEP) / 2
+    clear = free_at_times(links, collision.tracks, configurations, times, needed)
     cells = list[ndarray]()
     for motion in rests.motions:
         check_timing("the grid of times")
