@@ -27,7 +27,6 @@ from robotdiffuse.robots.robot import Robot
 
 BORDER = np.float32(1.0)
 """Pixels around a ball that count too in images that were filtered: the filter moves edges by about one."""
-
 KEY_DECIMALS = 5
 """Digits of joint positions that tell configurations apart."""
 
