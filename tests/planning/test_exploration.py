@@ -24,7 +24,7 @@ from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
 from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, hardly_seen, not_seen_free
 from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
-from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.validation.validator import verify
 
 PANDA = rd.load_robot("panda")
@@ -56,6 +56,15 @@ def test_the_loop_ends_and_strict_motions_do_not_collide(policy: str) -> None:
     assert all(step.policy in policy for step in moved)
     stated = [step.confidence for step in moved if step.policy == "chance"]
     assert all(value is None or value >= 0.98 for value in stated)
+
+
+def test_an_arm_at_a_goal_pose_is_done() -> None:
+    # it went on for ever: only configurations were compared
+    one, q = explorer(), PROBLEM.start
+    one.set_goal(rd.PoseGoal("panda_hand", link_pose(PANDA, q + 0.05, "panda_hand")))
+    step = one.next(q)
+    assert step.kind != "done"
+    assert one.next(q + 0.05).kind == "done"
 
 
 def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:

@@ -66,6 +66,7 @@ from robotdiffuse.problems.goals import Goal
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.validation.tolerances import VerifySettings, goal_error
 
 NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2
@@ -75,6 +76,7 @@ TENTATIVE_MOTIONS = 2
 """Motions among what was seen, of which looks are made for the one that sweeps the least unseen."""
 AT_GOAL = 1e-3
 """Largest distance of any joint to a goal that the arm is at [rad], [m] for prismatic joints."""
+ARRIVED = VerifySettings(goal_tolerance=AT_GOAL)
 
 
 class Explorer:
@@ -139,7 +141,7 @@ class Explorer:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
         self._news, self._free = [], self.map.free
-        if isinstance(self._goal, JointGoal) and self._at_goal(q, self._goal.positions):
+        if goal_error(self.robot, self._goal, q, ARRIVED) is None:
             return Step(DONE, "the arm is at the goal")
         if not len(self._views):
             return Step(LOOK, "nothing was seen yet: observe a view from here")
@@ -170,9 +172,6 @@ class Explorer:
         ask `next` again. See `stopping.stop_before`.
         """
         return stop_before(self.robot, self.scene, self._news, self._free, motion, time)
-
-    def _at_goal(self, q: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> bool:
-        return bool((np.abs(goals - q).max(axis=1) < AT_GOAL).any())
 
     def _step(self, problem: Problem, policy: str) -> Step:
         """The step under one policy."""
