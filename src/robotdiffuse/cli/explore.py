@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NoReturn
 from robotdiffuse.cli.arguments import positive
 from robotdiffuse.cli.drawing import ENDINGS, show
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
-from robotdiffuse.cli.live import add_address, require_viser, serve_until_stopped
+from robotdiffuse.cli.live import LOOPBACK, PORT, add_address, require_viser, serve_until_stopped
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.interop import WRITERS
 
@@ -94,6 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
         if outputs or recording is not None:
             raise InputError("--live writes no files; leave out --out, --view and --record")
         show_live(arguments, settings)
+    elif (arguments.speed, arguments.host, arguments.port) != (1.0, LOOPBACK, PORT):
+        raise InputError("--speed, --host and --port say how --live is served; add --live")
     problem = load_problem(arguments.problem)
     noise = DepthNoise() if arguments.noise else None
     explorer, arrived = simulate(problem, settings, noise, arguments.seed)

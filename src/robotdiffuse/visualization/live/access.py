@@ -113,7 +113,7 @@ async def _forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
         writer.close()
 
 
-_PAGE = b"The address of this page ends with a token: see what `robotdiffuse live` printed.\n"
+_PAGE = b"The address of this page ends with a token: see what the command printed.\n"
 REFUSAL = (
     b"HTTP/1.1 403 Forbidden\r\nContent-Type: text/plain\r\nConnection: close\r\n"
     b"Content-Length: %d\r\n\r\n%s" % (len(_PAGE), _PAGE)

@@ -228,17 +228,18 @@ class ExplorationPage:
     def _show_act(self, explorer: RecordedExplorer, act: RecordedAct | None) -> None:
         """Show the trace of a step's motion, and of a look also its end and what is seen there."""
         robot = explorer.robot
-        for node in ("/trace", "/pyramid"):
-            self.server.scene.remove_by_name(node)
-        self._look.show(None)
         if act is None or act.trajectory is None:
+            self.server.scene.remove_by_name("/trace")
+        else:
+            draw_trace(self.server, robot, self._tool, act.trajectory)
+        if act is None or act.step.kind != LOOK:
+            self.server.scene.remove_by_name("/pyramid")
+            self._look.show(None)
             return
-        draw_trace(self.server, robot, self._tool, act.trajectory)
-        if act.step.kind == LOOK:
-            self._look.show(Poses.of(robot, act.waypoints[-1:]))
-            edges = frustum(explorer, act)
-            colors = [np.tile(np.array(LOOK_COLOR, float), (len(edge), 1)) for edge in edges]
-            draw_lines(self.server, "/pyramid", edges, colors, 0.5 * TRACE_WIDTH * reach(robot))
+        self._look.show(Poses.of(robot, act.waypoints[-1:]))
+        edges = frustum(explorer, act)
+        colors = [np.tile(np.array(LOOK_COLOR, float), (len(edge), 1)) for edge in edges]
+        draw_lines(self.server, "/pyramid", edges, colors, 0.5 * TRACE_WIDTH * reach(robot))
 
     def _show_panel(self, state: ExplorationState) -> None:
         paused = state.mode == PAUSED
@@ -276,7 +277,8 @@ def exploration_badge(state: ExplorationState) -> Validity:
     if act.step.policy and act.step.motion is not None:
         lines.append(f"{act.step.policy}: {PROMISES[act.step.policy]}")
     if act.step.confidence is not None:
-        lines.append(f"stated confidence that it is free: {100 * act.step.confidence:.0f} %")
+        confidence = np.floor(1000 * act.step.confidence) / 10  # never rounded up to 100 %
+        lines.append(f"stated confidence that it is free: {confidence:g} %")
     rest = ", paused" if state.mode == PAUSED and state.phase != ENDED else ""
     return Validity(kind, headline + rest, (*lines, *_shares(state)))
 

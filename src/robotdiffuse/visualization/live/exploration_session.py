@@ -157,14 +157,14 @@ class ExplorationSession:
         views = [*before[-1:], *(view for view in explorer.views if view.act == number)]
         self._update(run, phase=MOVING, acts=tuple(explorer.acts), known=views[0])
         at, last = -READING_TIME, time.perf_counter()
-        while at < act.duration:
+        while act.trajectory is not None and at < act.duration:
             if self._wait_while_paused(run):
                 last = time.perf_counter()
             time.sleep(1 / FRAME_RATE)
             now = time.perf_counter()
             speed = self._state.speed if at >= 0 else max(self._state.speed, 1.0)
             at, last = min(at + speed * (now - last), act.duration), now
-            if act.trajectory is not None and at > 0:
+            if at > 0:
                 taken = [view for view in views if view.time <= act.begins + at]
                 q = act.trajectory.at(at).positions
                 self._update(run, configuration=q, known=taken[-1])
