@@ -120,8 +120,9 @@ class ExplorationPage:
             initial_value=float(np.clip(state.speed, *SPEEDS)),
             hint="1: real time",
         )
+        policies = (STRICT,) if state.settings.see_goal else POLICIES
         self._policy = gui.add_dropdown(
-            "Policy", POLICIES, initial_value=state.settings.policy, hint="Restarts the exploration"
+            "Policy", policies, initial_value=state.settings.policy, hint="Restarts the exploration"
         )
         self._noise = gui.add_checkbox(
             "Noise", initial_value=state.noise, hint="Simulate the noise of depth cameras; restarts"
