@@ -319,12 +319,12 @@ def _carve_block(
 
 @njit(cache=True)
 def add_evidence(state, counts, evidence, hit, miss, largest):
-    """Add what a view tells to the evidence for each voxel [nx ny nz]; returns for how many there was none:
+    """Add what a view shows to the evidence for each voxel [nx ny nz]; returns for how many there was none:
     `hit` for voxels with points, else -`miss` for those that are free. It stays within `largest`."""
-    state, counts, evidence, told = state.ravel(), counts.ravel(), evidence.ravel(), 0
+    state, counts, evidence, new = state.ravel(), counts.ravel(), evidence.ravel(), 0
     for v in range(len(evidence)):
         points, free, before = counts[v] > 0, state[v] == FREE, evidence[v]
         gain = hit if points else (-miss if free else _ZERO)
-        told += (points | free) & (before == _ZERO)
+        new += (points | free) & (before == _ZERO)
         evidence[v] = min(max(before + gain, -largest), largest)
-    return told
+    return new

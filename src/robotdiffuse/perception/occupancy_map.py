@@ -75,8 +75,8 @@ class OccupancyMap:
                 f"view.configuration is {shown(q)}; a map needs the {self.robot.dof} joint positions of"
                 f" {self.robot.name} when the view was taken"
             )
-        told_by_view = self._state, self._behind, self._counts
-        carve_view(view, self.robot, q, self.settings.arm_margin, MAP.low, MAP.edge, *told_by_view)
+        arrays = self._state, self._behind, self._counts
+        carve_view(view, self.robot, q, self.settings.arm_margin, MAP.low, MAP.edge, *arrays)
         return self._update(stamp)
 
     def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
@@ -130,7 +130,7 @@ class OccupancyMap:
         return self._seen_at >= self._now - self.settings.max_age
 
     def _update(self, stamp: float) -> int:
-        """Take what `_state` and `_counts` tell into account; returns the number of voxels that nothing was
+        """Take what `_state` and `_counts` show into account; returns the number of voxels that nothing was
         known of before."""
         self._now = max(self._now, stamp)
         self._known = None

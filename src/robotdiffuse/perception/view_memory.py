@@ -1,4 +1,4 @@
-"""ViewMemory: the views that told most, with what each of them shows, computed once."""
+"""ViewMemory: the views that showed most, with what each of them shows, computed once."""
 
 from functools import cached_property
 
@@ -23,8 +23,8 @@ ALONE_DISTANCE = 0.02
 class _Kept:
     """A view, and what it shows, computed when it is first needed."""
 
-    def __init__(self, view: DepthView, robot: Robot, told: int) -> None:
-        self.view, self._robot, self.told = view, robot, told
+    def __init__(self, view: DepthView, robot: Robot, new_voxels: int) -> None:
+        self.view, self._robot, self.new_voxels = view, robot, new_voxels
 
     @cached_property
     def volume(self) -> ObservedVolume:
@@ -41,7 +41,7 @@ class _Kept:
 
 
 class ViewMemory:
-    """Keeps a number of views: a new one takes the place of the kept one that told least."""
+    """Keeps a number of views: a new one takes the place of the kept one that showed least."""
 
     def __init__(self, robot: Robot, most: int) -> None:
         self._robot, self._most = robot, most
@@ -50,11 +50,11 @@ class ViewMemory:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def add(self, view: DepthView, told: int) -> None:
-        """Keep a view with a configuration. told: the number of voxels that no view before it told of."""
+    def add(self, view: DepthView, new_voxels: int) -> None:
+        """Keep a view with a configuration. new_voxels: the number of voxels that it showed first."""
         if len(self) >= self._most:
-            self._kept.remove(min(self._kept, key=lambda kept: kept.told))
-        self._kept.append(_Kept(view, self._robot, told))
+            self._kept.remove(min(self._kept, key=lambda kept: kept.new_voxels))
+        self._kept.append(_Kept(view, self._robot, new_voxels))
 
     @property
     def views(self) -> list[DepthView]:

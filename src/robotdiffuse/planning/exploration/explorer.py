@@ -127,8 +127,8 @@ class Explorer:
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
-        told = self.map.add(view, stamp)
-        self._views.add(view, told)
+        new_voxels = self.map.add(view, stamp)
+        self._views.add(view, new_voxels)
         self._goal_seen.observe(view)
         self._news.append(view)
 

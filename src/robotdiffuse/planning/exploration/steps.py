@@ -32,8 +32,8 @@ class ExplorerSettings(Settings, name="explorer"):
     look_attempts: Count = 4
     """Looks to which a motion is searched for in a step, the most useful first."""
     max_views: Count = 12
-    """The views that told most, this many, give seen points and the prediction; the map holds what all views
-    told."""
+    """This many views, those that showed most, give seen points and the prediction; the map holds what all
+    views showed."""
     predict: bool = True
     """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
     reach."""
