@@ -28,9 +28,8 @@ brakes."""
 ACCELERATION_FACTOR = 0.7
 """Factor of the accelerations that are tried next for a motion that its jerk limits slow down."""
 WINDOW_FRACTIONS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Averaging windows that are tried in turn, as fractions of the window that keeps the jerk limits of any
-motion: twice the largest ratio of a joint's acceleration limit to its jerk limit [s]. Shorter windows change
-the motion less."""
+"""Averaging windows tried in turn, as fractions of the one that keeps the jerk limits of any motion: twice
+the largest ratio of a joint's acceleration limit to its jerk limit [s]."""
 DEFAULT_JERK_RATIO = 10.0
 """Jerk limit over acceleration limit of joints that state no jerk limit: full acceleration after 0.1 s
 [1/s]."""
@@ -52,8 +51,7 @@ MAX_SHARES = 12
 """Times that the limits of a motion with a start speed are lowered, until they hold between grid points
 too."""
 BRAKING_FRACTION = 0.9
-"""Fraction of the available acceleration with which `stopping_distance` lets a motion brake; the rest is left
-for rounding corners."""
+"""Fraction of the acceleration with which `stopping_distance` brakes; the rest lets corners be rounded."""
 MIN_STOPPING_DISTANCE = 0.01
 """Shortest straight line on which a motion stops from a start velocity [rad]: a corner at its end can be
 rounded."""
