@@ -321,18 +321,17 @@ class Explorer:
         blocked = surface((self.map.occupied | in_vain) & ~ends)
         avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
-        results = list[tuple[PlanResult, Bool[ndarray, "nx ny nz"]]]()
+        results = list[PlanResult]()
         for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):
             result = self._planned(avoiding, self._quick_limit, seed)
-            if result.path is None and not any(one.solved for one, _ in results):
+            if result.path is None and not any(one.solved for one in results):
                 avoiding = as_seen
                 result = self._planned(as_seen, self.settings.time_limit, seed)
-            wanted = ends if result.path is None else self.wanted(result.path)
-            results.append((result, wanted))
-            if result.path is not None and not wanted.any():
+            results.append(result)
+            if result.path is not None and not self.wanted(result.path).any():
                 break
-        found = [(one, wanted) for one, wanted in results if one.path is not None]
-        return min(found, key=lambda one: int(one[1].sum()), default=results[-1])
+        found = [(one, self.wanted(one.path)) for one in results if one.path is not None]
+        return min(found, key=lambda one: int(one[1].sum()), default=(results[-1], ends))
 
     @property
     def _quick_limit(self) -> float:
