@@ -1,5 +1,6 @@
 """Runs the whole package under jaxtyping and beartype: a wrong shape annotation fails the suite."""
 
+import ast
 import os
 import re
 import threading
@@ -11,7 +12,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 from hypothesis import settings
-from jaxtyping import _import_hook, install_import_hook
+from jaxtyping import install_import_hook
 
 APART = ("learning", "robots", "scenes")
 """Packages whose tests need little of the compiled code of searches."""
@@ -30,21 +31,21 @@ def checked_modules() -> list[str]:
     ]
 
 
-def one_import_at_a_time() -> None:
-    """Lets the hook parse one module at a time. CPython 3.11 counts the depth of the syntax trees of all
-    threads together (gh-106905): parsing in two ended in "SystemError: AST constructor recursion depth
-    mismatch", and the live page's first plan failed."""
-    parse, parsing = _import_hook._JaxtypingLoader.source_to_code, threading.Lock()
+def parse_in_one_thread_at_a_time() -> None:
+    """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905): parsing in two
+    ended in "SystemError: AST constructor recursion depth mismatch", and the live page's first plan failed.
+    The hook parses each module, and NumPy and beartype parse too: a lock of the hook alone is not enough."""
+    parse, parsing = ast.parse, threading.RLock()
 
     def alone(*args: Any, **kwargs: Any) -> Any:
         with parsing:
             return parse(*args, **kwargs)
 
-    _import_hook._JaxtypingLoader.source_to_code = alone
+    ast.parse = alone
 
 
+parse_in_one_thread_at_a_time()
 install_import_hook(checked_modules(), "beartype.beartype")
-one_import_at_a_time()
 
 # the same examples at every run: a suite that fails by chance guards nothing
 settings.register_profile("suite", deadline=None, max_examples=40, derandomize=True)
