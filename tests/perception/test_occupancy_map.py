@@ -61,7 +61,7 @@ def test_a_view_counts_once_and_the_order_does_not_matter() -> None:
 
 
 def test_a_voxel_is_the_same_wherever_its_block_begins() -> None:
-    """Voxels of a block that are all free, or all out of the image, are told so at once."""
+    """Voxels of a block that are all free, or all out of the image, are decided at once."""
     states = []
     for shift in (0.0, MAP.edge):
         x, y, z = (side + shift for side in MAP.low)

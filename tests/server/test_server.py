@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers import waiting
 from helpers.commands import run
 from helpers.faulty_planner import DIES, EXITS, HANGS, RAISES, SEARCHES
 from helpers.serving import serving
@@ -50,11 +52,7 @@ def gauge(server: httpx.Client, name: str) -> float:
     return float(found.group(1))
 
 
-def until(true: Any) -> None:
-    end = time.monotonic() + 30
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
+until = partial(waiting.until, patience=30.0)
 
 
 def error(answer: httpx.Response) -> str:

@@ -52,6 +52,14 @@ class VoxelGrid:
         """The lower corner and the edge as compiled code takes them."""
         return np.array(self.low, np.float32), np.float32(self.edge)
 
+    def centers(self, at: Int[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+        """The centres of the voxels of these indices [m]."""
+        return (at + 0.5) * self.edge + self.low
+
+    def contains(self, at: Int[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+        """Which of these indices are of voxels of the grid."""
+        return np.asarray(((at >= 0) & (at < self.shape)).all(axis=1))
+
 
 COARSE, FINE = VoxelGrid(LOW, SHAPE, VOXEL), VoxelGrid(LOW, FINE_SHAPE, FINE_VOXEL_SIZE)
 """The voxels of the observed volume, and those halved."""
@@ -116,12 +124,20 @@ class Voxels(Assumption):
         """The voxels at the surface of what is occupied: the arm starts outside and cannot get within. Those
         out of reach, and those in the known scene, are left out."""
         edge = self.grid.edge
-        points = (surface(self.occupied & ~self._touched(spheres)) + 0.5) * edge + LOW
+        points = self.grid.centers(surface(self.occupied & ~self._touched(spheres)))
         points = points[np.linalg.norm(points, axis=1) < reach_bound(self.robot) + edge]
-        if self.known_scene.shapes:
-            scene, inside = compile_scene_for(self.robot, self.known_scene), np.float32(edge / 2 - 1e-3)
-            points = points[~near_scene(scene, points.astype(np.float32), inside)]
+        points = without_known(points, edge, self.robot, self.known_scene)
         return AssumedPoints(points, edge / 2, name="unknown")
+
+
+def without_known(
+    centers: Float[ndarray, "n 3"], edge: float, robot: Robot, known_scene: Scene
+) -> Float[ndarray, "m 3"]:
+    """The centres of voxels with this edge, without those of voxels in the known scene [m]."""
+    if not known_scene.shapes:
+        return centers
+    scene, inside = compile_scene_for(robot, known_scene), np.float32(edge / 2 - 1e-3)
+    return centers[~near_scene(scene, centers.astype(np.float32), inside)]
 
 
 def refined(voxels: Bool[ndarray, "mx my mz"]) -> Bool[ndarray, "nx ny nz"]:

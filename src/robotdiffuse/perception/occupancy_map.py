@@ -83,7 +83,7 @@ class OccupancyMap:
         """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
         or of `rd.PointCloud.from_file`. They say nothing about free space."""
         at = voxels_of(np.asarray(points), MAP)
-        at = at[((at >= 0) & (at < MAP.shape)).all(axis=1)]
+        at = at[MAP.contains(at)]
         self._state[:], self._counts[:] = HIDDEN, 0
         self._counts[tuple(at.T)] = 1
         self._update(stamp)

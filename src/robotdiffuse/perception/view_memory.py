@@ -76,7 +76,7 @@ class ViewMemory:
         sums = [np.bincount(cell, every[:, axis], len(counts)) for axis in range(3)]
         points = np.stack(sums, axis=1) / counts[:, None]
         at = voxels_of(points, MAP)
-        inside = ((at >= 0) & (at < MAP.shape)).all(axis=1)
+        inside = MAP.contains(at)
         stray = np.zeros(len(points), np.bool_)
         stray[inside] = free[tuple(at[inside].T)]
         if any(filtered(kept.view).spread for kept in self._kept):

@@ -93,7 +93,7 @@ def in_known_scene(explorer: RecordedExplorer) -> Bool[ndarray, "nx ny nz"]:
     """The voxels at or in the scene that is known without views."""
     if not explorer.scene.shapes:
         return np.zeros(MAP.shape, np.bool_)
-    centers = (np.indices(MAP.shape).reshape(3, -1).T + 0.5) * MAP.edge + MAP.low
+    centers = MAP.centers(np.indices(MAP.shape).reshape(3, -1).T)
     scene = compile_scene_for(explorer.robot, explorer.scene)
     near = near_scene(scene, centers.astype(np.float32), np.float32(MAP.edge))
     return near.reshape(MAP.shape)

@@ -1,13 +1,15 @@
 """The exploration that is watched: its steps one by one, pauses, restarts and errors, without a browser."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import pytest
 
 import robotdiffuse as rd
 from helpers.explorations import BEYOND, FLOOR, HOME, WALL
+from helpers.waiting import state_when
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.planning.exploration.steps import DONE, LOOK, ExplorerSettings
 from robotdiffuse.visualization.live import exploration_session
@@ -28,14 +30,7 @@ pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdif
 PATIENCE = 300.0
 """[s]; a new machine compiles first."""
 SETTINGS = ExplorerSettings(time_limit=0.5)
-
-
-def until(session: ExplorationSession, holds: Callable[[ExplorationState], object]) -> ExplorationState:
-    end = time.monotonic() + PATIENCE
-    while not holds(session.state):
-        assert time.monotonic() < end, session.state
-        time.sleep(0.005)
-    return session.state
+until = partial(state_when, patience=PATIENCE)
 
 
 @pytest.fixture

@@ -1,13 +1,15 @@
 """The page in a real browser: clicks, drags, and what it shows."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from helpers import waiting
 from helpers.browsers import CHROMIUM, FLAGS
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.problems.goals import PoseGoal
@@ -25,6 +27,8 @@ playwright = pytest.importorskip("playwright.sync_api", reason="browsers are dri
 PATIENCE, COMPILING = 120_000, 300_000
 """[ms]; a new machine compiles before the first plan."""
 VALID, INVALID = "[data-validity=valid]", "[data-validity=invalid]"
+
+until = partial(waiting.until, patience=PATIENCE / 1000)
 
 pytestmark = [
     pytest.mark.browser,
@@ -48,7 +52,7 @@ def live() -> Iterator["tuple[Page, str]"]:
     listening = listen("127.0.0.1", 0)
     page = Page(Session(first_problem(None, None), PageOptions("aorrtc")), listening)
     # in whichever test a worker begins, it compiles here: later waits are for the page alone
-    until(lambda: page.session.state.motion is not None, COMPILING)
+    until(lambda: page.session.state.motion is not None, patience=COMPILING / 1000)
     yield page, "http://{}:{}/".format(*listening.getsockname())
     page.close()
 
@@ -61,14 +65,6 @@ def view(browser: Any, live: "tuple[Page, str]") -> Any:
     view.goto(live[1])
     view.locator(VALID).wait_for()
     return view
-
-
-def until(holds: Callable[[], object], patience: float = PATIENCE) -> None:
-    """patience [ms]."""
-    end = time.monotonic() + patience / 1000
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def beside(view: Any, label: str) -> Any:

@@ -3,12 +3,14 @@
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import pytest
 
 from helpers.slow_planner import SlowPlanner
+from helpers.waiting import state_when
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.transforms import rotation_about, transform
@@ -31,14 +33,7 @@ START = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 END = np.array([1.2, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 PATIENCE = 300.0
 """Timeout [s]; a new machine compiles first."""
-
-
-def until(session: Session, holds: Callable[[State], object]) -> State:
-    end = time.monotonic() + PATIENCE
-    while not holds(session.state):
-        assert time.monotonic() < end, session.state
-        time.sleep(0.005)
-    return session.state
+until = partial(state_when, patience=PATIENCE)
 
 
 def settled(state: State) -> bool:

@@ -1,12 +1,13 @@
 """The page of an exploration in a real browser: what it shows while the arm moves, and its buttons."""
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import pytest
 
 import robotdiffuse as rd
+from helpers import waiting
 from helpers.browsers import CHROMIUM, FLAGS
 from helpers.explorations import BEYOND, FLOOR, HOME, WALL
 from robotdiffuse.planning.exploration.steps import ExplorerSettings
@@ -24,6 +25,8 @@ playwright = pytest.importorskip("playwright.sync_api", reason="browsers are dri
 
 PATIENCE = 300.0
 """[s]; a new machine compiles before the first step."""
+
+until = partial(waiting.until, patience=PATIENCE)
 
 pytestmark = [
     pytest.mark.browser,
@@ -49,13 +52,6 @@ def view() -> Iterator[tuple[Any, ExplorationSession, dict[str, Any]]]:
         yield view, session, page.server.scene._handle_from_node_name
         browser.close()
     page.close()
-
-
-def until(holds: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_people_watch_pause_go_on_and_restart(view: Any) -> None:

@@ -321,17 +321,18 @@ class Explorer:
         blocked = surface((self.map.occupied | in_vain) & ~ends)
         avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
-        results = list[PlanResult]()
+        results = list[tuple[PlanResult, Bool[ndarray, "nx ny nz"]]]()
         for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):
             result = self._planned(avoiding, self._quick_limit, seed)
-            if result.path is None and not any(one.solved for one in results):
+            if result.path is None and not any(one.solved for one, _ in results):
                 avoiding = as_seen
                 result = self._planned(as_seen, self.settings.time_limit, seed)
-            results.append(result)
-            if result.path is not None and not self.wanted(result.path).any():
+            wanted = ends if result.path is None else self.wanted(result.path)
+            results.append((result, wanted))
+            if result.path is not None and not wanted.any():
                 break
-        found = [(one, self.wanted(one.path)) for one in results if one.path is not None]
-        return min(found, key=lambda one: int(one[1].sum()), default=(results[-1], ends))
+        found = [(one, wanted) for one, wanted in results if one.path is not None]
+        return min(found, key=lambda one: int(one[1].sum()), default=results[-1])
 
     @property
     def _quick_limit(self) -> float:

@@ -77,8 +77,7 @@ class GoalSeen:
         out = np.zeros(MAP.shape, np.bool_)
         if self._required:
             at = voxels_of(self.unseen(path.positions[0], path.positions[-1]), MAP)
-            at = at[((at >= 0) & (at < MAP.shape)).all(axis=1)]
-            out[tuple(at.T)] = True
+            out[tuple(at[MAP.contains(at)].T)] = True
         return out
 
     def missing(self, motion: PlanResult) -> str:

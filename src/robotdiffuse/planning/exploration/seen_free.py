@@ -6,12 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_ball
+from robotdiffuse.collision.kernel_arrays import reach_ball
 from robotdiffuse.collision.motions import with_covering_spheres
-from robotdiffuse.perception.assumptions import CARVING_MARGIN, voxels_in
+from robotdiffuse.perception.assumptions import CARVING_MARGIN, voxels_in, without_known
 from robotdiffuse.perception.depth_view import AssumedPoints
 from robotdiffuse.perception.occupancy_map import MAP, OccupancyMap
-from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.perception.swept_voxels_kernel import surface
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
@@ -54,12 +53,10 @@ def hardly_seen(known: OccupancyMap, start: Float[ndarray, "dof"], goal: Float[n
 
 def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], name: str) -> AssumedPoints:
     """Balls that cover the voxels of these indices, without those in the known scene and out of reach."""
-    points = (voxels + 0.5) * MAP.edge + MAP.low
+    points = MAP.centers(voxels)
     center, reach = reach_ball(with_covering_spheres(known.robot))
     points = points[np.linalg.norm(points - center, axis=1) < reach + COVER_RADIUS]
-    if known_scene.shapes:
-        scene, inside = compile_scene_for(known.robot, known_scene), np.float32(MAP.edge / 2 - 1e-3)
-        points = points[~near_scene(scene, points.astype(np.float32), inside)]
+    points = without_known(points, MAP.edge, known.robot, known_scene)
     return AssumedPoints(points, COVER_RADIUS, name=name)
 
 

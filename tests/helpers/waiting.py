@@ -1,0 +1,19 @@
+"""Waiting for what threads and servers do."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+
+def until(holds: Callable[[], object], patience: float, about: Callable[[], object] = lambda: "") -> None:
+    """Wait until `holds()`, for at most `patience` [s]; a failure shows `about()`."""
+    end = time.monotonic() + patience
+    while not holds():
+        assert time.monotonic() < end, about()
+        time.sleep(0.005)
+
+
+def state_when(session: Any, holds: Callable[[Any], object], patience: float) -> Any:
+    """The state of a page's session, as soon as it holds."""
+    until(lambda: holds(session.state), patience, lambda: session.state)
+    return session.state
