@@ -62,7 +62,7 @@ def both_hands() -> tuple[rd.Problem, PosesGoal]:
 
 def test_both_hands_are_brought_to_their_poses() -> None:
     problem, goal = both_hands()
-    found = pose_configurations(problem, goal, None, np.random.default_rng(0))
+    found = pose_configurations(problem, goal, np.random.default_rng(0))
     assert len(found) == 10
     assert max(off(baxter(), goal, q) for q in found) < 1e-5
     apart = np.abs(found[:, None] - found).max(axis=2)
@@ -84,7 +84,7 @@ def test_links_that_share_a_joint_are_brought_there_together(tmp_path: Path) -> 
     there = np.random.default_rng(1).uniform(0.5 * robot.lower, 0.5 * robot.upper)
     goal = poses_at(robot, there, robot.tips)
     problem = rd.Problem(robot, rd.Scene(), np.zeros(robot.dof), goal)
-    found = pose_configurations(problem, goal, None, np.random.default_rng(0))
+    found = pose_configurations(problem, goal, np.random.default_rng(0))
     assert len(found) and max(off(robot, goal, q) for q in found) < 1e-5
     assert ((found >= robot.lower) & (found <= robot.upper)).all()
 
@@ -93,7 +93,7 @@ def test_tolerances_of_each_pose_are_used_and_validated() -> None:
     start, there = free()[:2]
     goal = poses_at(baxter(), there, HANDS, [0.05, 0.05, 0.0], [0.0, 0.0, np.pi])
     problem = rd.Problem(baxter(), rd.Scene([TABLE]), start, goal)
-    found = pose_configurations(problem, goal, None, np.random.default_rng(0))
+    found = pose_configurations(problem, goal, np.random.default_rng(0))
     assert len(found) == 10 and not any(goal_error(baxter(), goal, q) for q in found)
     assert max(off(baxter(), goal, q) for q in found) > 0.1, "not the very poses alone"
 
@@ -118,7 +118,7 @@ def test_constraints_are_kept_at_the_poses() -> None:
     )
     upright = rd.AxisCone("left_gripper", [0, 0, 1], [0, 0, -1], 0.1)
     problem = rd.Problem(baxter(), rd.Scene(), start, goal, constraints=[upright])
-    found = pose_configurations(problem, goal, None, np.random.default_rng(0))
+    found = pose_configurations(problem, goal, np.random.default_rng(0))
     assert len(found) and not any(goal_error(baxter(), goal, q) for q in found)
     assert min(-link_pose(baxter(), q, "left_gripper")[2, 2] for q in found) >= np.cos(0.1)
 

@@ -1,4 +1,4 @@
-"""Goal configurations for poses of one link, or of several links at once, by inverse kinematics."""
+"""Goal configurations for poses of one link, or of several links at once, those nearest to the start first."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -7,29 +7,36 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.problems.compiled_constraints import PathConstraints
-from robotdiffuse.problems.constraints import PositionBox
-from robotdiffuse.problems.goals import PoseGoal, PosesGoal
+from robotdiffuse.core.deadline import check_time
+from robotdiffuse.problems.compiled_constraints import POSE_TOLERANCE, PathConstraints
+from robotdiffuse.problems.goals import PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, beside, inverse_kinematics
-from robotdiffuse.validation.tolerances import DEFAULT, goal_error
+from robotdiffuse.robots.inverse_kinematics import (
+    InverseKinematicsSettings,
+    beside,
+    inverse_kinematics,
+    random_seeds,
+)
+from robotdiffuse.robots.robot import Robot
 
 GOAL_COUNT = 10
 """Number of configurations to find for a pose (the paper's k)."""
-SAMPLED_POSES, CONFIGURATIONS_PER_POSE = 20, 2
-"""Poses sampled within the tolerances of a goal, and configurations to find for each."""
-SAMPLED_POSE_SETTINGS = InverseKinematicsSettings(max_rounds=2, patience=1)
-"""For sampled poses: many of them may be out of reach."""
-CONSTRAINED_SETTINGS = InverseKinematicsSettings(max_rounds=8, patience=2)
-"""Under path constraints, which no configuration may keep; and for each of several poses."""
-TOLERANCE_FRACTION, MIN_HALF_BOX = 0.9, 2e-4
-"""Part of the tolerances that projected goals keep; smallest half edge of the box that they are kept in
-[m]."""
-COMBINATIONS, MAX_ROUNDS, PATIENCE = 64, 8, 2
-"""For several poses: combinations of the configurations of each that are tried in a round, most rounds, and
-most rounds in a row without a new configuration."""
+SEEDS = 64
+"""Seeds of a round."""
+ROUND = InverseKinematicsSettings(seeds_per_round=SEEDS, max_rounds=1)
+"""For a pose without tolerances."""
+MAX_ROUNDS, PATIENCE, REACH_ROUNDS = 64, 4, 16
+"""Most rounds, most rounds in a row without a new configuration once there is one, and rounds after which a
+pose that none reached is given up."""
+TOLERANCE_FRACTION = 0.9
+"""Part of the tolerances of path constraints that goals keep."""
 MIN_DIFFERENCE = 0.1
-"""Configurations for several poses differ by more than this in at least one joint [rad] or [m]."""
+"""Configurations differ by more than this in at least one joint [rad] or [m]."""
+PULL, MAX_PULLS, MIN_PULL_GAIN = 0.5, 12, 0.01
+"""Part of the way to the start that a configuration is moved before it is projected onto the goal again; how
+often; and the part of its distance by which this must bring it nearer."""
+EXACT = POSE_TOLERANCE, POSE_TOLERANCE
+"""Tolerances of poses that give none [m], [rad]."""
 
 Accept = Callable[[Float[ndarray, "n dof"]], ndarray]
 
@@ -37,146 +44,104 @@ Accept = Callable[[Float[ndarray, "n dof"]], ndarray]
 def pose_configurations(
     problem: Problem,
     goal: PoseGoal | PosesGoal,
-    constraints: PathConstraints | None,
     rng: np.random.Generator,
     accept: Accept | None = None,
+    count: int = GOAL_COUNT,
+    rounds: int = MAX_ROUNDS,
+    exact: tuple[float, float] = EXACT,
 ) -> Float[ndarray, "k dof"]:
-    """At most GOAL_COUNT configurations that bring links to their poses, or to poses within their tolerances.
+    """At most `count` configurations that bring links to their poses, or to poses within their tolerances, and
+    keep the problem's path constraints; those nearest to the problem's start first.
 
-    Other arms of the robot stay at the problem's start.
+    The first seed is the start. Poses without tolerances are reached by inverse kinematics; tolerances, path
+    constraints and several poses by damped Newton steps for all of them together. Configurations are then
+    drawn towards the start, as far as the goal allows. Other arms of the robot stay at the start.
 
-    constraints: path constraints that the configurations keep; None: none.
-    accept: which configurations are acceptable, as for `inverse_kinematics`.
+    accept: which configurations are acceptable, such as those free of collision.
+    rounds: most rounds of seeds.
+    exact: tolerances of poses that give none [m], [rad].
     """
-    if isinstance(goal, PosesGoal):
-        return _several_poses(problem, goal, rng, accept)
-    if constraints is not None:
-        return _with_constraints(problem, goal, constraints, rng, accept)
-    robot, rest = problem.robot, problem.start
-    if not goal.tolerant:
-        return inverse_kinematics(
-            robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=accept, rest=rest
-        )
+    robot, start, poses = problem.robot, problem.start, poses_of(goal)
+    together = PathConstraints(problem, poses, exact)
+    solutions = [np.zeros((0, robot.dof))] * len(poses)
     found = np.zeros((0, robot.dof))
-    for i in range(SAMPLED_POSES):
-        T_base_frame = goal.draw(rng) if i else goal.T_base_frame
-        few = inverse_kinematics(
-            robot,
-            goal.frame,
-            T_base_frame,
-            CONFIGURATIONS_PER_POSE,
-            rng=rng,
-            accept=accept,
-            settings=SAMPLED_POSE_SETTINGS,
-            rest=rest,
-        )
-        found = np.concatenate([found, few])
-        if len(found) >= GOAL_COUNT:
-            break
-    return found[:GOAL_COUNT]
-
-
-def _with_constraints(
-    problem: Problem,
-    goal: PoseGoal,
-    constraints: PathConstraints,
-    rng: np.random.Generator,
-    accept: Accept | None,
-) -> Float[ndarray, "k dof"]:
-    """`pose_configurations` under path constraints: for a pose with tolerances, configurations are projected
-    onto the constraints, and kept if they are still within the tolerances."""
-    found = np.zeros((0, problem.robot.dof))
-
-    def keeps(q: ndarray) -> ndarray:
-        kept = constraints.satisfied(q)
-        return kept if accept is None else kept & accept(q)
-
-    def reached(T_base_frame: ndarray, count: int, accept: Accept | None) -> ndarray:
-        robot, settings = problem.robot, CONSTRAINED_SETTINGS
-        return inverse_kinematics(
-            robot,
-            goal.frame,
-            T_base_frame,
-            count,
-            rng=rng,
-            accept=accept,
-            settings=settings,
-            rest=problem.start,
-        )
-
-    if not goal.tolerant:
-        return reached(goal.T_base_frame, GOAL_COUNT, keeps)
-    xyz = np.full(3, 0.5 * DEFAULT.goal_distance) if goal.xyz_tolerance is None else goal.xyz_tolerance
-    half = np.maximum(xyz, MIN_HALF_BOX)
-    box = PositionBox(goal.frame, -half, half, goal.T_base_frame)
-    within = PathConstraints(replace(problem, constraints=(*problem.constraints, box)))
-    for i in range(SAMPLED_POSES):
-        few = reached(goal.draw(rng) if i else goal.T_base_frame, CONFIGURATIONS_PER_POSE, None)
-        few = np.concatenate([few[constraints.satisfied(few)], within.projected(few, TOLERANCE_FRACTION)])
-        at_goal = [goal_error(problem.robot, goal, q) is None for q in few]
-        few = few[np.array(at_goal, bool)]
-        found = np.concatenate([found, few if accept is None or not len(few) else few[accept(few)]])
-        if len(found) >= GOAL_COUNT:
-            break
-    return found[:GOAL_COUNT]
-
-
-def _several_poses(
-    problem: Problem, goal: PosesGoal, rng: np.random.Generator, accept: Accept | None
-) -> Float[ndarray, "k dof"]:
-    """`pose_configurations` for several poses together, with the problem's constraints."""
-    found = np.zeros((0, problem.robot.dof))
-    for i in range(SAMPLED_POSES if goal.tolerant else 1):
-        poses = [replace(pose, T_base_frame=pose.draw(rng)) if i else pose for pose in goal.poses]
-        count = min(CONFIGURATIONS_PER_POSE, GOAL_COUNT - len(found)) if goal.tolerant else GOAL_COUNT
-        found = np.concatenate([found, _at_poses(problem, poses, count, rng, accept)])
-        if len(found) >= GOAL_COUNT:
-            break
-    return found
-
-
-def _at_poses(
-    problem: Problem,
-    poses: Sequence[PoseGoal],
-    count: int,
-    rng: np.random.Generator,
-    accept: Accept | None,
-) -> Float[ndarray, "k dof"]:
-    """Configurations with all links exactly at their poses, by combining configurations for each pose alone.
-
-    That is enough for arms that share no joint. Where they share joints, a combination takes these from one
-    of the poses, and Newton steps for all poses and constraints together start from there.
-    """
-    robot, start = problem.robot, problem.start
-    each = [
-        inverse_kinematics(
-            robot,
-            pose.frame,
-            pose.T_base_frame,
-            GOAL_COUNT,
-            rng=rng,
-            settings=CONSTRAINED_SETTINGS,
-            rest=start,
-        )
-        for pose in poses
-    ]
-    found = np.zeros((0, robot.dof))
-    if not all(len(alone) for alone in each):
-        return found
-    together = PathConstraints(problem, poses)
-    own = [~beside(robot, pose.frame) for pose in poses]
+    reached = False
     idle = 0
-    for _ in range(MAX_ROUNDS):
-        seeds, before = np.tile(start, (COMBINATIONS, 1)), len(found)
-        for k in rng.permutation(len(poses)):
-            seeds[:, own[k]] = each[k][rng.integers(len(each[k]), size=COMBINATIONS)][:, own[k]]
-        solved = together.projected(seeds, TOLERANCE_FRACTION)
-        if accept is not None and len(solved):
-            solved = solved[accept(solved)]
-        for q in solved:
-            if len(found) < count and (np.abs(found - q).max(axis=1, initial=0.0) > MIN_DIFFERENCE).all():
-                found = np.concatenate([found, q[None]])
+    for k in range(rounds):
+        check_time("configurations of the goal pose")
+        most = count if k == 0 else SEEDS
+        new = [_at_pose(problem, pose, most, rng, exact) for pose in poses]
+        solutions = [np.concatenate([before, more]) for before, more in zip(solutions, new, strict=True)]
+        seeds = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
+        if len(poses) > 1 or problem.constraints:
+            seeds = together.projected(np.concatenate([start[None], seeds]), TOLERANCE_FRACTION)
+        reached = reached or len(seeds) > 0
+        accepted = _accepted(robot.nearest_turns(seeds, start), accept)
+        before = len(found)
+        found = _distinct(np.concatenate([found, accepted]))[:count]
         idle = 0 if len(found) > before else idle + 1
-        if len(found) >= count or (len(found) and idle >= PATIENCE):
+        if len(found) >= count or (len(found) and idle >= PATIENCE) or (k >= REACH_ROUNDS and not reached):
             break
-    return found
+    nearer = _accepted(_pulled(together, found, start), accept)
+    every = np.concatenate([nearer, found])
+    return _distinct(every[np.argsort(np.linalg.norm(every - start, axis=1), kind="stable")])[:count]
+
+
+def _at_pose(
+    problem: Problem, pose: PoseGoal, count: int, rng: np.random.Generator, exact: tuple[float, float]
+) -> Float[ndarray, "k dof"]:
+    """At most `count` configurations for one pose from a round of seeds, of which the first is the start;
+    without path constraints."""
+    robot, start = problem.robot, problem.start
+    if not pose.tolerant and exact == EXACT:
+        return inverse_kinematics(
+            robot, pose.frame, pose.T_base_frame, count, rng=rng, settings=ROUND, near=start, rest=start
+        )
+    seeds = random_seeds(robot, robot.lower, robot.upper, SEEDS, rng, start)
+    seeds = np.where(beside(robot, pose.frame), start, seeds)
+    seeds[0] = start
+    alone = PathConstraints(replace(problem, constraints=()), [pose], exact)
+    return alone.projected(seeds, TOLERANCE_FRACTION)[:count]
+
+
+def _combined(
+    problem: Problem, poses: Sequence[PoseGoal], solutions: Sequence[ndarray], rng: np.random.Generator
+) -> Float[ndarray, "n dof"]:
+    """Random combinations of configurations for each pose alone; joints that several poses move take the
+    values of one of them."""
+    seeds = np.tile(problem.start, (SEEDS if all(len(alone) for alone in solutions) else 0, 1))
+    for k in rng.permutation(len(poses)):
+        moving = ~beside(problem.robot, poses[k].frame)
+        if len(seeds):
+            seeds[:, moving] = solutions[k][rng.integers(len(solutions[k]), size=SEEDS)][:, moving]
+    return seeds
+
+
+def _pulled(
+    together: PathConstraints, q: Float[ndarray, "n dof"], start: Float[ndarray, "dof"]
+) -> Float[ndarray, "n dof"]:
+    """The configurations drawn towards the start, as far as the goal allows."""
+    robot = together.robot
+    nearest = q
+    for _ in range(MAX_PULLS):
+        moved, reached = together.project(nearest + PULL * (start - nearest), TOLERANCE_FRACTION)
+        moved = robot.nearest_turns(moved, start)
+        before = np.linalg.norm(nearest - start, axis=1)
+        nearer = reached & (np.linalg.norm(moved - start, axis=1) < (1 - MIN_PULL_GAIN) * before)
+        if not nearer.any():
+            break
+        nearest = np.where(nearer[:, None], moved, nearest)
+    return nearest
+
+
+def _accepted(q: Float[ndarray, "n dof"], accept: Accept | None) -> Float[ndarray, "k dof"]:
+    return q if accept is None or not len(q) else q[accept(q)]
+
+
+def _distinct(q: Float[ndarray, "n dof"]) -> Float[ndarray, "k dof"]:
+    """The configurations without those close to one before them."""
+    kept = q[:0]
+    for row in q:
+        if (np.abs(kept - row).max(axis=1, initial=0.0) > MIN_DIFFERENCE).all():
+            kept = np.concatenate([kept, row[None]])
+    return kept

@@ -1,11 +1,11 @@
 """Start and goal states: usable configurations for a search, or the reason why there are none."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -15,17 +15,22 @@ from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, OneGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.units import arm_in_cloud_note
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.validation.tolerances import DEFAULT
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
-MAX_IK_ROUNDS, IK_TIME_FRACTION = 100, 0.5
-"""Most rounds of inverse kinematics for a pose whose configurations all collide, and the part of the time
-left that they may take."""
+GOAL_TIME_FRACTION = 0.5
+"""Of several goals, no more are tried after this part of the time limit once one is free."""
+NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
+"""Where a pose cannot be reached exactly, parts of the validator's tolerances to reach it within, in turn."""
+NEAR_POSE_ROUNDS, MAX_EXACT_GOALS, FIRST_TRY_COUNT = 2, 20, 3
+"""Rounds of seeds for that; number of configurations whose exact meshes are checked where the covering spheres
+collide; and number of configurations for each of several poses."""
 END_MARGIN = 0.0005
 """Near a start or goal with less than the requested clearance, paths keep its clearance less this margin
 [m]."""
@@ -134,7 +139,8 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
     """The start and the goals for a search of this call, or the result that says why there are none.
 
     For poses, up to `pose_goals.GOAL_COUNT` configurations by inverse kinematics. Goals whose covering
-    spheres are free are preferred; if there are none, those whose exact meshes are free are used.
+    spheres are free are preferred; if there are none, those whose exact meshes are free are used. Of several
+    goals, each is tried once; only if none is free, each is tried again for longer.
     """
     checker = CollisionChecker(context.problem.robot, context.problem.scene)
     goals = _usable_goals(context, checker)
@@ -229,15 +235,48 @@ def _goals(
     """The free configurations of a goal, or of any of several goals; or the result that says why there are
     none."""
     if isinstance(goal, AnyGoal):
-        each = [_goals(context, one, checker) for one in goal.goals]
-        found = [goals for goals in each if not isinstance(goals, PlanResult)]
-        if found:
-            return np.concatenate(found)
-        none = next(result for result in each if isinstance(result, PlanResult))
-        return replace(none, reason=f"none of {len(each)} goals can be reached, the first: {none.reason}")
+        return _any_goals(context, goal.goals, checker)
     if isinstance(goal, JointGoal):
         return _free_goals(context, goal, checker)
     return _pose_goals(context, goal, checker)
+
+
+def _any_goals(
+    context: PlanningContext, goals: Sequence[OneGoal], checker: CollisionChecker
+) -> Float[ndarray, "k dof"] | PlanResult:
+    """The free configurations of several goals, by one try for each."""
+    until = GOAL_TIME_FRACTION * context.request.time_limit
+    free = list[ndarray]()
+    for goal in goals:
+        if free and context.elapsed > until:
+            break
+        found = _first_try(context, goal, checker)
+        free += [found] if len(found) else []
+    if free:
+        return np.concatenate(free)
+    failures = list[PlanResult]()
+    for goal in goals:
+        found = _goals(context, goal, checker)
+        if not isinstance(found, PlanResult):
+            return found
+        failures.append(found)
+    return replace(
+        failures[0], reason=f"none of {len(goals)} goals can be reached, the first: {failures[0].reason}"
+    )
+
+
+def _first_try(
+    context: PlanningContext, goal: OneGoal, checker: CollisionChecker
+) -> Float[ndarray, "k dof"]:
+    """Free configurations of one of several goals, by little work."""
+    if isinstance(goal, JointGoal):
+        constraints = context.validator.constraints
+        kept = checker.free(goal.positions)
+        return goal.positions[kept if constraints is None else kept & constraints.satisfied(goal.positions)]
+    found = _pose_configurations()(
+        context.problem, goal, context.rng, checker.free, count=FIRST_TRY_COUNT, rounds=1
+    )
+    return _with_turns(context, found) if len(found) else found
 
 
 def _free_goals(
@@ -267,38 +306,56 @@ def _free_goals(
 def _pose_goals(
     context: PlanningContext, goal: PoseGoal | PosesGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    with loading():
-        from robotdiffuse.planning.pose_goals import (
-            pose_configurations,  # imports inverse kinematics, rarely needed
-        )
+    pose_configurations = _pose_configurations()
+    problem, rng = context.problem, context.rng
+    robot, scene, start = problem.robot, problem.scene, problem.start
+    rejected = np.zeros((0, robot.dof))
 
-    problem, robot, scene = context.problem, context.problem.robot, context.problem.scene
-    constraints, rng = context.validator.constraints, context.rng
-    found = pose_configurations(problem, goal, constraints, rng, checker.free)
+    def free(q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
+        nonlocal rejected
+        free = checker.free(q)
+        rejected = np.concatenate([rejected, q[~free]])
+        return free
+
+    def distances(q: Float[ndarray, "n dof"]) -> Float[ndarray, "n"]:
+        return np.linalg.norm(q - start, axis=1)
+
+    found = pose_configurations(problem, goal, rng, free)
+    note = ""
+    if not len(found) and not len(rejected):
+        for part in NEAR_POSE_FRACTIONS:
+            near = part * DEFAULT.goal_distance, part * DEFAULT.goal_angle
+            found = pose_configurations(problem, goal, rng, free, rounds=NEAR_POSE_ROUNDS, exact=near)
+            if len(found) or len(rejected):
+                note = (
+                    f"no configuration reaches the goal pose exactly; the motion ends within {1e3 * near[0]:g} mm "
+                    f"and {np.degrees(near[1]):.2g} degrees of it"
+                )
+                break
+    # meshes may be free where the covering spheres are not
+    rejected = rejected[np.unique(np.round(rejected, 1), axis=0, return_index=True)[1]]
+    rejected = rejected[np.argsort(distances(rejected), kind="stable")][:MAX_EXACT_GOALS]
     if len(found):
+        rejected = rejected[:1][distances(rejected[:1]) < distances(found[:1])]
+    collisions = [_explained(robot, scene, q) for q in rejected]
+    grazing = rejected[[collision is None for collision in collisions]]
+    found = np.concatenate([grazing, found])
+    if len(found):
+        context.notes += [note] if note else []
         return _with_turns(context, found)
-    until, collisions = context.elapsed + IK_TIME_FRACTION * context.remaining, list[str | None]()
-    for _ in range(MAX_IK_ROUNDS):
-        reached = pose_configurations(problem, goal, constraints, rng)
-        found = [_explained(robot, scene, q) for q in reached]
-        kept = [q for q, collision in zip(reached, found, strict=True) if collision is None]
-        if kept:
-            return _with_turns(context, kept)
-        collisions += found
-        if not goal.tolerant or context.elapsed > until:
-            break
     places = [", ".join(f"{value:.3f}" for value in pose.T_base_frame[:3, 3]) for pose in poses_of(goal)]
     named = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
     of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in named.items())
-    if not collisions and constraints is not None:
-        any_of_it = pose_configurations(replace(problem, constraints=()), goal, None, rng)
-        wrong = constraints.worst_violation(any_of_it[0]) if len(any_of_it) else None
+    unconstrained = replace(problem, constraints=())
+    if not collisions and context.validator.constraints is not None:
+        reached = pose_configurations(unconstrained, goal, rng)
+        wrong = context.validator.constraints.worst_violation(reached[0]) if len(reached) else None
         if wrong is not None:
             what = f"no configuration was found for {of_poses} that keeps the"
             return context.fail(Status.INVALID_GOAL, f"{what} constraints, e.g. {wrong.message}")
     if not collisions:
         several = poses_of(goal) if len(named) > 1 else ()
-        alone = [pose.frame for pose in several if not len(pose_configurations(problem, pose, None, rng))]
+        alone = [pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))]
         brought = " and ".join(f"{frame} to the pose at {named[frame]}" for frame in alone or named)
         return context.fail(
             Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {brought}"
@@ -307,6 +364,14 @@ def _pose_goals(
         Status.INVALID_GOAL,
         f"all {len(collisions)} configurations found for {of_poses} are in collision, e.g. {collisions[0]}",
     )
+
+
+def _pose_configurations() -> "Callable[..., Float[ndarray, 'k dof']]":
+    """The function `pose_configurations`, imported here because it imports compiled code, rarely needed."""
+    with loading():
+        from robotdiffuse.planning.pose_goals import pose_configurations
+
+    return pose_configurations
 
 
 def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:

@@ -18,7 +18,7 @@ from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import inverse, rotation_angle, rotation_z_to, transform
 from robotdiffuse.problems import constraint_kernel as kernel
-from robotdiffuse.problems.constraint_kernel import CONE, DISTANCE, TURN, Rows
+from robotdiffuse.problems.constraint_kernel import CONE, DISTANCE, ROLL_PITCH_YAW, TURN, Rows
 from robotdiffuse.problems.constraints import (
     AxisCone,
     CartesianLine,
@@ -28,7 +28,7 @@ from robotdiffuse.problems.constraints import (
 )
 from robotdiffuse.problems.goals import JointGoal, PoseGoal, poses_of
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.problems.projection_kernel import project
+from robotdiffuse.problems.projection_kernel import project_each
 from robotdiffuse.robots.inverse_kinematics import KINDS
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -41,6 +41,9 @@ PROJECTION_FRACTION = 0.5
 """Fraction of a tolerance that projection aims for."""
 POSE_TOLERANCE = 2e-6
 """Tolerance of the pose of a projected link [m], [rad]."""
+GOAL_MARGIN, INNER_GOAL_FRACTION = 1e-3, 0.9
+"""Part of the tolerances of a goal that projected configurations leave free, and the part of them that
+projection aims for."""
 MIN_LINE_LENGTH = 1e-3
 """Minimum length of a Cartesian line [m]."""
 SAME_POSE_TOLERANCE = 1e-3
@@ -94,8 +97,15 @@ class _Row(NamedTuple):
 class PathConstraints:
     """All path constraints of a problem, as rows of scalar constraints."""
 
-    def __init__(self, problem: Problem, poses: Sequence[PoseGoal] = ()) -> None:
-        """poses: poses that links must reach exactly, as additional rows for projection.
+    def __init__(
+        self,
+        problem: Problem,
+        poses: Sequence[PoseGoal] = (),
+        exact: tuple[float, float] = (POSE_TOLERANCE, POSE_TOLERANCE),
+    ) -> None:
+        """poses: poses that links must reach within the tolerances of each, as additional rows for
+        projection.
+        exact: the tolerances of positions and orientations without one [m], [rad].
 
         Raises InputError if a Cartesian line has no unique end pose.
         """
@@ -103,7 +113,7 @@ class PathConstraints:
         each = [(constraint, row) for constraint in problem.constraints for row in _rows(problem, constraint)]
         self.owners = [constraint for constraint, _ in each]
         """The constraint of each row."""
-        at = [(pose.frame, row) for pose in poses for row in _pose_rows(pose)]
+        at = [(pose.frame, row) for pose in poses for row in _pose_rows(pose, *exact)]
         frames = [owner.frame for owner in self.owners] + [frame for frame, _ in at]
         self.rows = _arrays(problem.robot, frames, [row for _, row in each + at])
         self._paced = [
@@ -128,9 +138,15 @@ class PathConstraints:
 
     def projected(self, q: Float[ndarray, "n dof"], tolerance_fraction: float) -> Float[ndarray, "k dof"]:
         """The configurations projected onto a fraction of the tolerances; failed projections are left out."""
-        limits, work = self.limits(tolerance_fraction), kernel.make_work(self.rows)
-        rows = [row for row in q.astype(np.float64) if project(self.rows, limits, row, work)]
-        return np.stack(rows) if rows else np.zeros((0, self.robot.dof))
+        rows, satisfied = self.project(q, tolerance_fraction)
+        return rows[satisfied]
+
+    def project(
+        self, q: Float[ndarray, "n dof"], tolerance_fraction: float
+    ) -> tuple[Float[ndarray, "n dof"], Bool[ndarray, "n"]]:
+        """The configurations projected onto a fraction of the tolerances, and which of them then keep it."""
+        rows = np.array(q, np.float64, order="C")
+        return rows, project_each(self.rows, self.limits(tolerance_fraction), rows)
 
     def worst_violation(self, q: Float[ndarray, "dof"]) -> ConstraintViolation | None:
         """The largest violation of a configuration, relative to the tolerances; None if there is none."""
@@ -272,10 +288,24 @@ def _rotation_vector(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
     return angle * axis * (-1.0 if skew @ axis < 0 else 1.0)
 
 
-def _pose_rows(pose: PoseGoal) -> list[_Row]:
-    """Rows for the position and the orientation of a pose, whose tolerances are ignored."""
-    T, zero = pose.T_base_frame, np.zeros(3)
-    return [_Row(kind, POSE_TOLERANCE, POSE_TOLERANCE, T, zero, zero) for kind in (DISTANCE, TURN)]
+def _pose_rows(pose: PoseGoal, position: float, angle: float) -> list[_Row]:
+    """Rows for the position and the orientation of a pose.
+
+    position, angle: the tolerances where the pose has none [m], [rad].
+    """
+    T = pose.T_base_frame
+    rows = []
+    for kind, tolerances, exact in (
+        (DISTANCE, pose.xyz_tolerance, position),
+        (ROLL_PITCH_YAW, pose.rpy_tolerance, angle),
+    ):
+        limit = exact if tolerances is None else POSE_TOLERANCE
+        half = np.zeros(3) if tolerances is None else (1 - GOAL_MARGIN) * tolerances
+        if kind == ROLL_PITCH_YAW:
+            half = np.where(half >= (1 - GOAL_MARGIN) * np.pi, np.inf, half)
+            kind = kind if half.any() else TURN
+        rows.append(_Row(kind, limit, limit, T, half, INNER_GOAL_FRACTION * half))
+    return rows
 
 
 def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:

@@ -8,6 +8,8 @@ row is a scalar function of the pose of a link, its frame, whose value must not 
 - CONE: the angle between an axis of the frame and a direction [rad].
 - TURN: the angle from the frame's orientation to the orientation interpolated at its position on a segment
   [rad].
+- ROLL_PITCH_YAW: of a goal's tolerances, for projection alone: the most that roll, pitch or yaw of the frame's
+  orientation relative to a reference exceeds its tolerance [rad].
 
 A piece of a motion is proved to satisfy a row from the poses at its two ends. Along the piece, the joints
 move by dq at constant rates, so the frame's origin p leaves the straight line between its end positions by at
@@ -24,7 +26,7 @@ import numpy as np
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.robots.ik_kernel import PRISMATIC, forward, pose_error
 
-DISTANCE, CONE, TURN = 0, 1, 2
+DISTANCE, CONE, TURN, ROLL_PITCH_YAW = 0, 1, 2, 3
 
 
 class Rows(NamedTuple):
@@ -41,7 +43,7 @@ class Rows(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
     row_kind: np.ndarray
-    """[m] DISTANCE, CONE or TURN."""
+    """[m] DISTANCE, CONE, TURN or ROLL_PITCH_YAW."""
     chain_length: np.ndarray
     """[m] number of joints that move the frame."""
     same_frame: np.ndarray
@@ -49,11 +51,12 @@ class Rows(NamedTuple):
     T_joint_frame: np.ndarray
     """[m, 4, 4] pose of the frame relative to the last joint of its chain."""
     reference_pose: np.ndarray
-    """[m, 4, 4] DISTANCE: T_base_box; TURN: pose of the frame at the start."""
+    """[m, 4, 4] DISTANCE: T_base_box; TURN: pose of the frame at the start; ROLL_PITCH_YAW: the reference."""
     half_size: np.ndarray
-    """[m, 3] DISTANCE: half edge lengths of the box, may be infinite."""
+    """[m, 3] DISTANCE: half edge lengths of the box; ROLL_PITCH_YAW: tolerances; may be infinite."""
     inner_half_size: np.ndarray
-    """[m, 3] DISTANCE: half edge lengths of the box that projection aims for."""
+    """[m, 3] DISTANCE, ROLL_PITCH_YAW: half edge lengths of the box, or tolerances, that projection aims
+    for."""
     a: np.ndarray
     """[m, 3] CONE: the axis in the frame; TURN: the rotation vector from start to goal."""
     b: np.ndarray
@@ -180,12 +183,39 @@ def _turn(rows, m, T, target, error):
 
 
 @inner_kernel()
+def _roll_pitch_yaw(rows, m, T, angles):
+    """The value of a ROLL_PITCH_YAW; writes to angles[3] roll, pitch and yaw, in that of their two
+    representations which exceeds the tolerances less."""
+    R = rows.reference_pose[m]
+    r00 = r10 = r20 = r21 = r22 = 0.0
+    for i in range(3):
+        r00 += R[i, 0] * T[i, 0]
+        r10 += R[i, 1] * T[i, 0]
+        r20 += R[i, 2] * T[i, 0]
+        r21 += R[i, 2] * T[i, 1]
+        r22 += R[i, 2] * T[i, 2]
+    roll, yaw = np.arctan2(r21, r22), np.arctan2(r10, r00)
+    pitch = np.arctan2(-r20, np.sqrt(r21 * r21 + r22 * r22))
+    half = rows.half_size[m]
+    value = max(abs(roll) - half[0], abs(pitch) - half[1], abs(yaw) - half[2])
+    other = roll - np.copysign(np.pi, roll), np.copysign(np.pi, pitch) - pitch, yaw - np.copysign(np.pi, yaw)
+    other_value = max(abs(other[0]) - half[0], abs(other[1]) - half[1], abs(other[2]) - half[2])
+    if other_value < value:
+        angles[0], angles[1], angles[2] = other
+        return other_value
+    angles[0], angles[1], angles[2] = roll, pitch, yaw
+    return value
+
+
+@inner_kernel()
 def row_value(rows, m, work):
     """The value of row m at the pose in work.T."""
     if rows.row_kind[m] == CONE:
         return _cone(rows, m, work.T, work.error)
     if rows.row_kind[m] == TURN:
         return _turn(rows, m, work.T, work.target, work.error)
+    if rows.row_kind[m] == ROLL_PITCH_YAW:
+        return _roll_pitch_yaw(rows, m, work.T, work.error)
     outside, deepest = 0.0, -np.inf
     for r in range(3):
         d = abs(in_box(rows, m, work.T, r)) - rows.half_size[m, r]

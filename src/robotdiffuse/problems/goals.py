@@ -14,11 +14,6 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import Value, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.transforms import rotation_from_rpy, transform
-
-SAMPLING_MARGIN = 1e-3
-"""Fraction by which tolerances are reduced for sampling, because inverse kinematics has an error of its
-own."""
 
 
 @no_type_check
@@ -92,15 +87,6 @@ class PoseGoal(Value):
     def tolerant(self) -> bool:
         """Whether more than one pose reaches the goal."""
         return any(t is not None and t.max() > 0 for t in (self.xyz_tolerance, self.rpy_tolerance))
-
-    def draw(self, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
-        """A random T_base_frame within the tolerances, uniform in each of the six coordinates."""
-        ranges = np.zeros((2, 3))
-        for i, tolerance in enumerate((self.xyz_tolerance, self.rpy_tolerance)):
-            if tolerance is not None:
-                ranges[i] = np.minimum(tolerance, np.inf if i == 0 else np.pi) * (1 - SAMPLING_MARGIN)
-        xyz, rpy = rng.uniform(-1.0, 1.0, (2, 3)) * ranges
-        return self.T_base_frame @ transform(xyz, rotation_from_rpy(*rpy))
 
 
 @no_type_check

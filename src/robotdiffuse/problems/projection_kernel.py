@@ -9,9 +9,11 @@ from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.problems.constraint_kernel import (
     CONE,
     DISTANCE,
+    ROLL_PITCH_YAW,
     TURN,
     add_velocity,
     in_box,
+    make_work,
     pose_frame,
     row_value,
 )
@@ -19,9 +21,27 @@ from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step
 
 ANGLE_WEIGHT = 0.3
 """Metres that correspond to one radian in projection."""
+MIN_COSINE = 0.05
+"""Smallest cosine of a pitch with which rates of roll and yaw are computed."""
 DAMPING, MAX_STEP, MAX_ITERATIONS = 1e-5, 1.0, 30
 """For projection: damping (squared singular values well above it are inverted), longest step [rad], and
 number of steps."""
+
+
+@inner_kernel()
+def _angle_rate(reference, axis, angles, r):
+    """Rate of roll (r = 0), pitch (1) or yaw (2) relative to a reference orientation, at these angles, while
+    the frame turns about an axis at 1 rad/s."""
+    sine, cosine = np.sin(angles[2]), np.cos(angles[2])
+    x = y = z = 0.0
+    for i in range(3):
+        x += axis[i] * (cosine * reference[i, 0] + sine * reference[i, 1])
+        y += axis[i] * (cosine * reference[i, 1] - sine * reference[i, 0])
+        z += axis[i] * reference[i, 2]
+    if r == 1:
+        return y
+    roll_rate = x / np.copysign(max(abs(np.cos(angles[1])), MIN_COSINE), np.cos(angles[1]))
+    return roll_rate if r == 0 else z + roll_rate * np.sin(angles[1])
 
 
 @inner_kernel()
@@ -49,6 +69,11 @@ def _residuals(rows, limits, q, work):
                 work.e[count] = off * keep
             elif rows.row_kind[m] == CONE:
                 work.e[count] = ANGLE_WEIGHT * (value - rows.inner_limit[m])
+            elif rows.row_kind[m] == ROLL_PITCH_YAW:
+                angle, inner = work.error[r], rows.inner_half_size[m, r]
+                if abs(angle) <= rows.half_size[m, r]:
+                    continue
+                work.e[count] = ANGLE_WEIGHT * (min(max(angle, -inner), inner) - angle)
             else:
                 work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * keep
             for j in range(dof):
@@ -63,6 +88,8 @@ def _residuals(rows, limits, q, work):
                         entry += rows.reference_pose[m, i, r] * moved[i]
                 elif rows.joint_kinds[m, k] != PRISMATIC and rows.row_kind[m] == TURN:
                     entry = ANGLE_WEIGHT * work.axes[k, r]
+                elif rows.joint_kinds[m, k] != PRISMATIC and rows.row_kind[m] == ROLL_PITCH_YAW:
+                    entry = ANGLE_WEIGHT * _angle_rate(rows.reference_pose[m], work.axes[k], work.error, r)
                 elif rows.joint_kinds[m, k] != PRISMATIC and sine > 1e-9:
                     for i in range(3):
                         entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
@@ -117,3 +144,12 @@ def project(rows, limits, q, work):
         if left <= 0:
             return left == 0
     return _residuals(rows, limits, q, work) == 0
+
+
+@kernel(nogil=True)
+def project_each(rows, limits, q):
+    """Projects configurations q[n, dof] in place; returns which of them then satisfy the limits [n]."""
+    work, satisfied = make_work(rows), np.zeros(len(q), np.bool_)
+    for i in range(len(q)):
+        satisfied[i] = project(rows, limits, q[i], work)
+    return satisfied

@@ -80,7 +80,8 @@ def inverse_kinematics(
         which to keep, e.g. those free of collision. A rejected
             solution does not block solutions close to it.
         settings: Tolerances and effort.
-        near: First seed: if the pose moves slightly, so does the first solution.
+        near: First seed: if the pose moves slightly, so does the first solution. Results have their whole
+            turns nearest to it, and are sorted by the distance from it.
         rest: Values for joints that are on another arm, neither before nor after the link; random without it.
 
     Returns:
@@ -119,7 +120,7 @@ def inverse_kinematics(
     )
     idle = 0
     for i in range(settings.max_rounds):
-        seeds = rng.uniform(lower, upper, (settings.seeds_per_round, robot.dof))
+        seeds = random_seeds(robot, lower, upper, settings.seeds_per_round, rng, near)
         if i == 0 and near is not None:
             seeds[0] = np.clip(near, lower, upper)
         seeds, before = np.ascontiguousarray(seeds[:, arm]), len(accepted)
@@ -136,7 +137,26 @@ def inverse_kinematics(
         idle = 0 if len(accepted) > before else idle + 1
         if len(accepted) >= count or (len(accepted) and idle >= settings.patience):
             break
-    return accepted
+    if near is None:
+        return accepted
+    accepted = robot.nearest_turns(accepted, near)
+    return accepted[np.argsort(np.linalg.norm(accepted - near, axis=1), kind="stable")]
+
+
+def random_seeds(
+    robot: Robot,
+    lower: Float[ndarray, "dof"],
+    upper: Float[ndarray, "dof"],
+    count: int,
+    rng: np.random.Generator,
+    near: Float[ndarray, "dof"] | None = None,
+) -> Float[ndarray, "n dof"]:
+    """Uniformly random configurations, with joints that turn within half a turn of `near`."""
+    if near is not None:
+        reach = np.where(robot.continuous | np.array(robot.prismatic), np.inf, np.pi)
+        near = np.clip(near, lower, upper)
+        lower, upper = np.maximum(lower, near - reach), np.minimum(upper, near + reach)
+    return rng.uniform(lower, upper, (count, robot.dof))
 
 
 def beside(robot: Robot, link: str) -> Bool[ndarray, "dof"]:

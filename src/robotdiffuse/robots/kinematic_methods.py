@@ -59,11 +59,8 @@ def ik(
     from robotdiffuse.robots.inverse_kinematics import inverse_kinematics  # compiled code
 
     rng, frame = np.random.default_rng(seed), robot.tip if link is None else link
-    if near is None:
-        return inverse_kinematics(robot, frame, cast(ndarray, pose), count, rng=rng)
-    seeded = configurations(robot, near)
-    found = inverse_kinematics(robot, frame, cast(ndarray, pose), count, rng=rng, near=seeded)
-    return found[np.argsort(np.linalg.norm(found - seeded, axis=1), kind="stable")]
+    seeded = None if near is None else configurations(robot, near)
+    return inverse_kinematics(robot, frame, cast(ndarray, pose), count, rng=rng, near=seeded)
 
 
 def configurations(robot: Robot, q: ArrayLike) -> ndarray:

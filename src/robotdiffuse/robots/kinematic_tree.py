@@ -136,9 +136,7 @@ class KinematicTree(Value):
         joint turns the other way, since obstacles may block the short way.
         """
         many = self._turns_twice & ~self.continuous
-        nearest = np.where(many, q - TURN * np.round((q - start) / TURN), q)
-        nearest = np.where(many & (nearest > self.upper), nearest - TURN, nearest)
-        nearest = np.where(many & (nearest < self.lower), nearest + TURN, nearest)
+        nearest = self._turned(q, start, many)
         rows = [nearest]
         for j in np.flatnonzero(many):
             other = nearest.copy()
@@ -146,6 +144,20 @@ class KinematicTree(Value):
             if self.lower[j] <= other[j] <= self.upper[j]:
                 rows.append(other)
         return np.stack(rows)
+
+    def nearest_turns(
+        self, q: Float[ndarray, "n dof"], start: Float[ndarray, "dof"]
+    ) -> Float[ndarray, "n dof"]:
+        """The configurations with continuous joints and joints with a range above one turn turned by whole
+        turns, to be as close to `start` as the limits allow."""
+        return self._turned(q, start, self._turns_twice | self.continuous)
+
+    def _turned(self, q: ndarray, start: ndarray, joints: Bool[ndarray, "dof"]) -> ndarray:
+        """The configurations with whole turns added to these joints, to be as close to `start` as possible."""
+        limited = joints & ~self.continuous
+        nearest = np.where(joints, q - TURN * np.round((q - start) / TURN), q)
+        nearest = np.where(limited & (nearest > self.upper), nearest - TURN, nearest)
+        return np.where(limited & (nearest < self.lower), nearest + TURN, nearest)
 
     @cached_property
     def _turns_twice(self) -> Bool[ndarray, "dof"]:

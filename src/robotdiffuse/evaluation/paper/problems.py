@@ -46,7 +46,7 @@ def goal_configurations(problem: Problem) -> Float[ndarray, "k dof"]:
         return problem.goal.positions
     assert isinstance(problem.goal, PoseGoal)
     checker = CollisionChecker(problem.robot, problem.scene)
-    return pose_configurations(problem, problem.goal, None, np.random.default_rng(0), checker.free)
+    return pose_configurations(problem, problem.goal, np.random.default_rng(0), checker.free)
 
 
 def free_lines(problem: Problem, goals: Float[ndarray, "k dof"]) -> list[float | None]:
