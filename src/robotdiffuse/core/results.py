@@ -43,6 +43,9 @@ class PlanResult:
     """Lower bound on the distance between links [m]."""
     notes: tuple[str, ...] = field(default=())
     """Input that was changed or ignored, e.g. a start clamped to a limit."""
+    goal_index: int | None = None
+    """Which goal of an `AnyGoal`, or which row of several goal configurations, the motion ends at, from 0 on; 0
+    for a single goal, None without a motion."""
     progress: tuple[tuple[float, float], ...] = ()
     """Time [s since the call] and joint-space length [rad] of each shorter path; the last pair is the
     returned path."""
@@ -161,6 +164,7 @@ def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any
         "scene_clearance": result.scene_clearance,
         "self_clearance": result.self_clearance,
         "notes": list(result.notes),
+        "goal_index": result.goal_index,
         "progress": [list(found) for found in result.progress],
         "refused": result.refused,
         "assumption": result.assumption,
@@ -207,6 +211,7 @@ def _result(record: dict[str, Any]) -> PlanResult:
         scene_clearance=_number_or_none(record, "scene_clearance"),
         self_clearance=_number_or_none(record, "self_clearance"),
         notes=_texts(record, "notes") if "notes" in record else (),
+        goal_index=_index_or_none(record, "goal_index"),
         progress=_progress(record.get("progress")),
         refused=_text(record, "refused") if "refused" in record else "",
         assumption=_text(record, "assumption") if "assumption" in record else "",
@@ -272,3 +277,10 @@ def _number(record: dict[str, Any], name: str) -> float:
 
 def _number_or_none(record: dict[str, Any], name: str) -> float | None:
     return None if record.get(name) is None else _number(record, name)
+
+
+def _index_or_none(record: dict[str, Any], name: str) -> int | None:
+    value = record.get(name)
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 0):
+        raise InputError(f"{name} is {shown(value)}; it must be a whole number from 0 on")
+    return value

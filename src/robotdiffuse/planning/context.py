@@ -131,6 +131,8 @@ class PlanningContext:
     @property
     def validates_early(self) -> bool:
         """Whether there is time to validate paths while the search goes on."""
+        if self.problem.constraints:  # each of their few paths is timed
+            return self.remaining > self._reserved
         return self._reserved > 0 and self.remaining > EARLY_VALIDATION_FACTOR * self._reserved
 
     @property

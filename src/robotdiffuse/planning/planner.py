@@ -21,6 +21,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Sphere
+from robotdiffuse.validation.tolerances import goal_index
 
 PlannerSettings = TypeVar("PlannerSettings", bound=Settings)
 EASY_TIME_LIMIT, SHORT_TIME_LIMIT = 1.0, 0.02
@@ -71,8 +72,8 @@ class Planner(ABC, Generic[PlannerSettings]):
         jerk: largest jerk of any joint of the timed motion [rad/s³], at least 0.01. None: the robot's jerk
             limits, or 10 / s times the acceleration limit of joints without one; infinite: no limit.
         objective: what aorrtc, rrt_connect and robotdiffuse minimize in calls that improve a path: "time",
-            the motion's duration, or "length" of the path in joint space. Under path constraints always the
-            length; ignored by planners that return their first path.
+            the motion's duration, or "length" of the path in joint space; ignored by planners that return
+            their first path.
 
         Problems may also have, for every planner:
 
@@ -94,7 +95,12 @@ class Planner(ABC, Generic[PlannerSettings]):
             time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk, objective
         )
         result, note = self._plan(problem, request), compile_note()
-        return replace(result, problem=problem, notes=(*result.notes, note) if note else result.notes)
+        return replace(
+            result,
+            problem=problem,
+            notes=(*result.notes, note) if note else result.notes,
+            goal_index=None if result.path is None else goal_index(problem.robot, problem.goal, result.path.positions[-1]),
+        )
 
     def _plan(self, problem: Problem, request: PlanRequest) -> PlanResult:
         self._check_support(problem, request)

@@ -25,7 +25,7 @@ SEEDS = 64
 """Seeds of a round."""
 ROUND = InverseKinematicsSettings(seeds_per_round=SEEDS, max_rounds=1)
 """For a pose without tolerances."""
-MAX_ROUNDS, PATIENCE, REACH_ROUNDS = 64, 4, 16
+MAX_ROUNDS, PATIENCE, REACH_ROUNDS = 64, 2, 16
 """Most rounds, most rounds in a row without a new configuration once there is one, and rounds after which a
 pose that none reached is given up."""
 TOLERANCE_FRACTION = 0.9
@@ -101,7 +101,7 @@ def _at_pose(
     seeds = np.where(beside(robot, pose.frame), start, seeds)
     seeds[0] = start
     alone = PathConstraints(replace(problem, constraints=()), [pose], exact)
-    return alone.projected(seeds, TOLERANCE_FRACTION)[:count]
+    return alone.projected(seeds, TOLERANCE_FRACTION, count)
 
 
 def _combined(

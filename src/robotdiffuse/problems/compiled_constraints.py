@@ -136,17 +136,20 @@ class PathConstraints:
         """Which configurations satisfy all constraints within a fraction of their tolerances."""
         return np.all(self.values(q) <= self.limits(tolerance_fraction), axis=1)
 
-    def projected(self, q: Float[ndarray, "n dof"], tolerance_fraction: float) -> Float[ndarray, "k dof"]:
-        """The configurations projected onto a fraction of the tolerances; failed projections are left out."""
-        rows, satisfied = self.project(q, tolerance_fraction)
+    def projected(
+        self, q: Float[ndarray, "n dof"], tolerance_fraction: float, most: int = -1
+    ) -> Float[ndarray, "k dof"]:
+        """The configurations projected onto a fraction of the tolerances, at most `most` of them unless that is
+        -1; failed projections are left out."""
+        rows, satisfied = self.project(q, tolerance_fraction, most)
         return rows[satisfied]
 
     def project(
-        self, q: Float[ndarray, "n dof"], tolerance_fraction: float
+        self, q: Float[ndarray, "n dof"], tolerance_fraction: float, most: int = -1
     ) -> tuple[Float[ndarray, "n dof"], Bool[ndarray, "n"]]:
-        """The configurations projected onto a fraction of the tolerances, and which of them then keep it."""
+        """As `projected`, but a row for each configuration, and which of them keep the tolerances."""
         rows = np.array(q, np.float64, order="C")
-        return rows, project_each(self.rows, self.limits(tolerance_fraction), rows)
+        return rows, project_each(self.rows, self.limits(tolerance_fraction), rows, most)
 
     def worst_violation(self, q: Float[ndarray, "dof"]) -> ConstraintViolation | None:
         """The largest violation of a configuration, relative to the tolerances; None if there is none."""

@@ -82,6 +82,7 @@ class PlanAnswer(BaseModel):
     status: Status
     reason: str
     verified: bool
+    goal_index: int | None
     joint_names: list[str]
     waypoints: Rows | None
     times: list[float]

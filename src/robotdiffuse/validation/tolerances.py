@@ -1,5 +1,6 @@
 """The validator's settings, and the error of a configuration with respect to a goal."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -61,6 +62,8 @@ class VerifySettings(Settings, name="verify"):
 
 
 DEFAULT = VerifySettings()
+EXACT = VerifySettings(goal_distance=1e-4, goal_angle=1e-4)
+"""For telling goals close to each other apart."""
 BLEND_SAMPLE_SHARE = 0.25
 """A blend is tested at configurations at most this share of its radius apart [joint-space L2]."""
 
@@ -116,6 +119,19 @@ def goal_error(
         f"pose{more}"
     )
     return GoalError(message, goal.frame, distance)
+
+
+def goal_index(robot: Robot, goal: Goal, q: Float[ndarray, "dof"]) -> int | None:
+    """Which of several goals, or of several goal configurations, a configuration is at; 0 at a single goal, and
+    None at none. Where several goals are close to each other, one that is reached exactly comes first."""
+    goals: Sequence[Goal] = goal.goals if isinstance(goal, AnyGoal) else (goal,)
+    if isinstance(goal, JointGoal):
+        goals = [JointGoal(row) for row in goal.positions]
+    for settings in (EXACT, DEFAULT):
+        for i, one in enumerate(goals):
+            if goal_error(robot, one, q, settings) is None:
+                return i
+    return None
 
 
 def first_place_within(

@@ -2,6 +2,8 @@
 
 With the objective "length" a call returns the shortest path found. With "time", every path found is also
 the start of a local search for a faster motion, and the call returns the motion that takes the least time.
+Under path constraints there is no such local search: each path that is estimated to be the fastest so far is
+timed, and the call returns the fastest of these motions.
 """
 
 from collections.abc import Callable
@@ -15,6 +17,7 @@ from robotdiffuse.core.types import FIRST, TIME, TIME_LIMIT
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search.anytime_search import AnytimeSearch
 from robotdiffuse.planning.search.time_optimization import Candidate, TimeOptimization
+from robotdiffuse.problems.goals import AnyGoal, JointGoal
 
 VALIDATION_INTERVAL = 4_000
 """Iterations between two validations of shorter paths. Validating only at the end could lose everything found
@@ -28,6 +31,8 @@ TIME_GAIN, TIME_PATIENCE = 0.0025, 1_600
 before this many."""
 MIN_TIME_GAIN = 0.01
 """A faster motion is validated before the search ends if its estimated time is less by this part."""
+MAX_DETOUR = 1.05
+"""To a pose, whose nearest configuration a straight line reaches, motions are at most this factor longer."""
 FINAL_CANDIDATES = 2
 """Number of valid motions of which the fastest is returned, if there is time to validate as many."""
 
@@ -38,18 +43,22 @@ class _Validation:
     def __init__(self, context: PlanningContext, search: AnytimeSearch) -> None:
         self.context, self.search = context, search
         self.best: PlanResult | None = None
+        self._by_time = context.request.objective == TIME
         self._path: ndarray | None = None
         self._shortest: PlanResult | None = None
         """The last valid path of the search, and its result."""
+        self._timed = list[ndarray]()
+        """The paths of the search that were validated."""
         self._validated_at = 0
         self._late = False
         """Whether a path was validated after the time for searching had run out."""
 
     @property
     def due(self) -> bool:
-        """Whether to validate now: the first path at once, better ones every VALIDATION_INTERVAL
-        iterations."""
-        rested = self.search.work >= self._validated_at + VALIDATION_INTERVAL
+        """Whether to validate now: the first path at once, better ones every VALIDATION_INTERVAL iterations, or
+        at once under path constraints."""
+        interval = 0 if self.context.problem.constraints else VALIDATION_INTERVAL
+        rested = self.search.work >= self._validated_at + interval
         return self.best is None or (rested and self._improved())
 
     def _improved(self) -> bool:
@@ -85,7 +94,12 @@ class _Validation:
         Results before these count only if time ran out, or else the clock would decide which is returned.
         """
         search, motions, before = self.search, self.search.motions, self.best
-        if motions is None or before is None or self.context.ended or self._late:
+        if before is None or self.context.ended or self._late:
+            return
+        if motions is None:
+            for path, stage in reversed(search.history if self.context.problem.constraints else ()):
+                if self.context.remaining > 0 and not any(path is timed for timed in self._timed):
+                    self._accepts(path, stage)
             return
         self.best = None
         accepted = 0
@@ -102,6 +116,7 @@ class _Validation:
             self._keep(before)
 
     def _accepts(self, path: ndarray, stage: str) -> bool:
+        self._timed.append(path)
         result = self._finished(self.search.start_goal.complete(path), stage, None)
         if result is not None:
             self._path, self._shortest = path, result
@@ -128,7 +143,7 @@ class _Validation:
 
     def _keep(self, result: PlanResult | None) -> None:
         """Make a result the best one, unless its motion takes longer and the objective is time."""
-        if result is not None and (self.search.motions is None or _duration(result) < _duration(self.best)):
+        if result is not None and (not self._by_time or _duration(result) < _duration(self.best)):
             self.best = result
 
 
@@ -151,8 +166,12 @@ def anytime(
     """
     request, problem = context.request, context.problem
     if request.objective == TIME and request.until != FIRST and not problem.constraints:
+        straight = float(np.linalg.norm(search.goals - search.start, axis=1).min())
+        several = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+        given = all(isinstance(goal, JointGoal) for goal in several)
+        longest = np.inf if given else MAX_DETOUR * straight
         search.motions = TimeOptimization(
-            problem.robot, context.timing, search.start, search.goals, request.seed
+            problem.robot, context.timing, search.start, search.goals, request.seed, longest
         )
     motions = search.motions
 

@@ -9,12 +9,15 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import LENGTH
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search import constrained_kernel
 from robotdiffuse.planning.search.anytime import anytime
 from robotdiffuse.planning.search.anytime_search import AnytimeSearch, SearchSettings
+from robotdiffuse.planning.search.time_optimization import estimated_duration
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
+from robotdiffuse.trajectories.speed_limits import scaled_limits
 
 STAGE = "constrained_rrt_connect"
 CLOCK_INTERVAL = 20
@@ -23,7 +26,7 @@ TOLERANCE_FRACTION, END_MARGIN = 0.95, 1e-6
 """The search keeps this part of each tolerance; or the value at the start or a goal, plus the margin, if
 larger."""
 PATHS_TO_FIND = 2
-"""With until "converged": number of paths to find; the shortest is returned."""
+"""With until "converged": number of paths to find; the best is returned."""
 SHORTCUTS = 60
 """Shortcuts that are tried on each path found."""
 
@@ -50,6 +53,9 @@ class ConstrainedSearch(AnytimeSearch):
         self.kept = constraints.limits(TOLERANCE_FRACTION)
         at_ends = constraints.values(np.stack([start, *start_goal.goal_leads])).max(axis=0) + END_MARGIN
         self.kept = np.minimum(np.maximum(self.kept, at_ends), rows.limit)
+        self.cost = np.inf
+        """Of the best path: its estimated duration [s]; its length [rad] if that is the objective."""
+        self._speed_limits = scaled_limits(context.problem.robot, context.timing)
         super().__init__(context, start_goal, settings, STAGE, bounded=False)
         self.start, self.goals = start, np.stack(start_goal.goal_leads)
         self._trees: constrained_kernel.Trees | None = None
@@ -64,15 +70,24 @@ class ConstrainedSearch(AnytimeSearch):
         return corner_kept(self.constraints, q) and super().keeps_clearance(q)
 
     def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
-        """See `AnytimeSearch`; the path also keeps the constraints."""
+        """See `AnytimeSearch`; the path also keeps the constraints, and the one of the least cost is kept."""
         settings = self.settings
         path = constrained_kernel.simplify(self.limits, path, settings.smoothings, SHORTCUTS, self._state)
-        length = constrained_kernel.length(path)
-        return bool(length < self.length) and self._take(path, length, stage)
+        cost = self._cost_of(path)
+        if cost >= self.cost:
+            return False
+        self.cost = cost
+        return self._take(path, constrained_kernel.length(path), stage)
+
+    def _cost_of(self, path: Float[ndarray, "n dof"]) -> float:
+        if self.context.request.objective == LENGTH:
+            return constrained_kernel.length(path)
+        return estimated_duration(path, self.context.timing.corner_deviation, self._speed_limits)
 
     def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
         """See `AnytimeSearch`."""
         super().refuse(accepted)
+        self.cost = np.inf if accepted is None else self._cost_of(accepted)
         self._trees = None
 
     def _set_level(self, level: int) -> None:

@@ -38,6 +38,21 @@ def still_improves(
     return bool(half[-1] - now >= gain * half[-1])
 
 
+def estimated_duration(
+    path: Float[ndarray, "n dof"], deviation: float, limits: tuple[Float[ndarray, "dof"], ...]
+) -> float:
+    """The estimated time of a motion along a path whose corners it leaves by at most `deviation`, with these
+    limits of velocity and acceleration [s]."""
+    path = with_corner(path)
+    return float(estimated_time(rounded_line(path, np.full(len(path) - 2, deviation)), *limits))
+
+
+def with_corner(path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+    """The path in float64; of a single segment with its middle as a waypoint."""
+    path = path.astype(np.float64)
+    return np.insert(path, 1, path.mean(axis=0), axis=0) if len(path) == 2 else path
+
+
 @dataclass
 class Candidate:
     """A polyline with rounded corners."""
@@ -61,7 +76,9 @@ class TimeOptimization:
         start: Float[ndarray, "dof"],
         goals: Float[ndarray, "k dof"],
         seed: int,
+        longest: float = np.inf,
     ) -> None:
+        """longest: candidates that are no longer than this stay so [rad]."""
         self._limits = scaled_limits(robot, settings)
         # no motion is faster than the joint that needs most time is by itself
         alone = [
@@ -72,6 +89,7 @@ class TimeOptimization:
         self._deviation = settings.corner_deviation
         self._intervals = settings.corner_intervals, settings.line_intervals
         self._state = random_state(seed, 1)
+        self._longest = longest
         self._turn = 0
         self.candidates = list[Candidate]()
         """Fastest first."""
@@ -97,9 +115,7 @@ class TimeOptimization:
 
     def offer(self, space: Space, path: Float[ndarray, "n dof"], stage: str) -> None:
         """Make a path whose polyline is free in `space` a candidate, if it is among the fastest."""
-        path = path.astype(np.float64)
-        if len(path) == 2:
-            path = np.insert(path, 1, path.mean(axis=0), axis=0)
+        path = with_corner(path)
         deviations = free_deviations(space, path, self._deviation)
         time = float(estimated_time(rounded_line(path, deviations), *self._limits))
         candidate = Candidate(path, deviations, time, stage)
@@ -126,8 +142,16 @@ class TimeOptimization:
         return least_time(line, *self._limits, *self._intervals)
 
     def _improve(self, space: Space, candidate: Candidate, attempts: int) -> None:
+        length = float(np.linalg.norm(np.diff(candidate.path, axis=0), axis=1).sum())
         found = reduce_time(
-            space, candidate.path, candidate.deviations, candidate.time, *self._limits, attempts, self._state
+            space,
+            candidate.path,
+            candidate.deviations,
+            candidate.time,
+            *self._limits,
+            self._longest if length <= self._longest else np.inf,
+            attempts,
+            self._state,
         )
         candidate.path, candidate.deviations, candidate.time = found[0], found[1], float(found[2])
         self.attempts += attempts

@@ -31,11 +31,12 @@ MAX_CHORD, MAX_CHORDS = 0.05, 16
 
 
 @kernel(nogil=True)
-def reduce_time(space, path, deviations, time, velocity, acceleration, tries, state):
+def reduce_time(space, path, deviations, time, velocity, acceleration, longest, tries, state):
     """A faster rounded polyline: its waypoints [m, dof], its deviations [m - 2] and its estimated time [s].
 
     path: waypoints [n, dof], n >= 3, whose polyline is free, as are its rounded corners; time: its estimated
-    time. After a move that made it faster, the same waypoint moves on in the same direction.
+    time; longest: bound on its length [rad, joint-space L2]. After a move that made it faster, the same waypoint
+    moves on in the same direction.
     """
     dof = path.shape[1]
     work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
@@ -47,6 +48,8 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, tries, st
         if len(new) == 0:
             continue
         line = rounded_line(new, wider)
+        if line[1][-1] > longest:
+            continue
         new_time = estimated_time(line, velocity, acceleration)
         if new_time < time and _is_free(space, line, first, last, a, b, block, work):
             if len(new) == len(path):
