@@ -29,7 +29,7 @@ from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
 
 ROBOTS = ("iiwa14", "gen3", "xarm7", "panda", "ur5e", "fr3")
-SEEDS, STEPS = 300, 120
+SEEDS, STEPS = 150, 80
 """Of the search for the nearest configuration."""
 PULL = 0.3
 """Part of the way to the start that a step of this search goes, as far as the pose allows."""

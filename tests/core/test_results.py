@@ -39,6 +39,7 @@ def solved(trajectory: Trajectory) -> PlanResult:
         scene_clearance=0.02,
         self_clearance=0.05,
         notes=("start clamped",),
+        goal_index=2,
         progress=((0.002, 3.5), (0.008, 3.0)),
         refused="scene_collision",
     )
@@ -88,12 +89,20 @@ def test_results_of_earlier_versions_lack_fields(solved: PlanResult, tmp_path: F
     file = tmp_path / "r.json"
     solved.save(file)
     record = json.loads(file.read_text())
-    for name in ("scene_clearance", "self_clearance", "progress", "refused"):
+    for name in ("scene_clearance", "self_clearance", "goal_index", "progress", "refused"):
         del record[name]
     file.write_text(json.dumps(record))
     read = load_result(file).result
     assert (read.min_clearance, read.scene_clearance, read.self_clearance) == (0.02, None, None)
-    assert (read.progress, read.refused) == ((), "")
+    assert (read.progress, read.refused, read.goal_index) == ((), "", None)
+
+
+@pytest.mark.parametrize("wrong", [-1, 1.5, True, "0"])
+def test_a_goal_index_that_is_none_is_one_line(solved: PlanResult, tmp_path: FilePath, wrong: object) -> None:
+    file = tmp_path / "r.json"
+    file.write_text(json.dumps(solved.record() | {"goal_index": wrong}))
+    with pytest.raises(InputError, match="goal_index is .*; it must be a whole number from 0 on"):
+        load_result(file)
 
 
 def test_failed_result_round_trip(failed: PlanResult, tmp_path: FilePath) -> None:

@@ -1,7 +1,9 @@
-"""A pose for each of several links: configurations that bring all of them there, verdicts, files."""
+"""Poses as goals: the nearest configuration, tolerances of arms of few joints, several goals; a pose for each of
+several links: configurations that bring all of them there, verdicts, files."""
 
 from collections.abc import Sequence
 from functools import cache
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,14 @@ from helpers.urdfs import read_urdf
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import rotation_angle, transform
+from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.core.types import Status
+from robotdiffuse.planning import context, pose_goals
 from robotdiffuse.planning.pose_goals import pose_configurations
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
 from robotdiffuse.problems.goals import PoseGoal, PosesGoal
-from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.kinematics import link_jacobians, link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verify
@@ -183,3 +186,199 @@ def test_a_link_twice_in_a_file_is_one_line(tmp_path: Path) -> None:
     file.write_text(f"robot: baxter\ngoal: {{poses: {{left_gripper: {pose}, left_gripper: {pose}}}}}\n")
     with pytest.raises(InputError, match="left_gripper appears twice in line 2"):
         load_problem(file)
+
+
+ARMS = ("iiwa14", "gen3", "xarm7", "panda", "ur5e", "fr3")
+FREE = rd.Scene()
+
+
+def apart(robot: Robot, count: int, seed: int = 5) -> ndarray:
+    """Configurations without a collision, away from the limits and anywhere within them."""
+    rng = np.random.default_rng(seed)
+    middle, half = 0.5 * (robot.lower + robot.upper), 0.5 * (robot.upper - robot.lower)
+    drawn = rng.uniform(middle - 0.9 * half, middle + 0.9 * half, (60 * count, robot.dof))
+    return drawn[CollisionChecker(robot, FREE).free(drawn)][:count]
+
+
+def followed(robot: Robot, start: ndarray, shift: ndarray) -> ndarray | None:
+    """Where the joints are after the tip has moved straight on by `shift`, by the least motion; None if it cannot.
+    Well-conditioned ways alone."""
+    q = start.copy()
+    T = link_pose(robot, q, robot.tip)
+    target = T.copy()
+    for k in range(1, 41):
+        target[:3, 3] = T[:3, 3] + k / 40 * shift
+        for _ in range(6):
+            now = link_pose(robot, q, robot.tip)
+            turn = target[:3, :3] @ now[:3, :3].T
+            skew = 0.5 * (turn - turn.T)
+            error = np.concatenate([target[:3, 3] - now[:3, 3], [skew[2, 1], skew[0, 2], skew[1, 0]]])
+            J = link_jacobians(robot, q[None], robot.tip)[0]
+            if np.linalg.svd(J, compute_uv=False)[-1] < 0.03:
+                return None
+            q = q + np.linalg.pinv(J) @ error
+    inside = ((q >= robot.lower) & (q <= robot.upper)) | robot.continuous
+    line = start + np.linspace(0, 1, 50)[:, None] * (q - start)
+    return q if inside.all() and CollisionChecker(robot, FREE).free(line).all() else None
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_pose_where_the_hand_is_costs_no_motion(arm: str) -> None:
+    """An iiwa14 moved by 3.2 rad."""
+    robot = rd.load_robot(arm)
+    for k, start in enumerate(apart(robot, 8)):
+        start = start + 2 * np.pi * np.where(robot.continuous, k, 0)
+        here = rd.PoseGoal(robot.tip, link_pose(robot, start, robot.tip))
+        for goal in (here, rd.PoseGoal(robot.tip, here.T_base_frame, [0.01] * 3, [0.1, 0.1, np.pi])):
+            result = rd.plan(rd.Problem(robot, FREE, start, goal), 5.0)
+            assert result.path is not None and result.path.length < 1e-4
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None:
+    """Alone, after a waypoint, as one of several goals, and along a straight line."""
+    robot, rng = rd.load_robot(arm), np.random.default_rng(2)
+    tested = 0
+    for start in apart(robot, 12):
+        shift = rng.normal(size=3)
+        shift *= 0.05 / np.linalg.norm(shift)
+        there = followed(robot, start, shift)
+        if there is None:
+            continue
+        tested += 1
+        T = link_pose(robot, start, robot.tip)
+        here, goal = rd.PoseGoal(robot.tip, T), rd.PoseGoal(robot.tip, transform(T[:3, 3] + shift, T[:3, :3]))
+        far = rd.PoseGoal(robot.tip, link_pose(robot, apart(robot, 1, seed=9)[0], robot.tip))
+        longest = 1.1 * float(np.linalg.norm(there - start))
+        for problem in (
+            rd.Problem(robot, FREE, start, goal),
+            rd.Problem(robot, FREE, start, goal, waypoints=[here]),
+            rd.Problem(robot, FREE, start, rd.AnyGoal((far, goal))),
+            rd.Problem(robot, FREE, start, goal, constraints=[rd.CartesianLine(robot.tip)]),
+        ):
+            result = rd.plan(problem, 10.0)
+            assert result.path is not None, result.reason
+            assert result.path.length <= longest
+            assert result.goal_index == (1 if isinstance(problem.goal, rd.AnyGoal) else 0)
+        if tested == 3:
+            return
+    raise AssertionError("no starts")
+
+
+def test_hands_where_they_are_stay_there() -> None:
+    start = free()[0]
+    result = rd.plan(rd.Problem(baxter(), rd.Scene([TABLE]), start, poses_at(baxter(), start, HANDS)), 10.0)
+    assert result.path is not None and result.path.length < 1e-4
+
+
+def four_joints(folder: Path) -> Robot:
+    joints = chain("base", ["turn", "lift", "bend", "wrist"])
+    robot = read_urdf(written(folder, joints), tip="wrist_link")
+    balls = {link: np.array([[0.0, 0.0, 0.0, 0.045]]) for link in robot.meshes}
+    neighbours = frozenset(frozenset((joint.parent, joint.child)) for joint in robot.joints)
+    return replace(robot, spheres=balls, allowed_collisions=neighbours)
+
+
+@pytest.mark.parametrize("arm", ["so101", "four joints"])
+@pytest.mark.parametrize("kind", ["any orientation", "±0.5 rad", "1 mm off"])
+def test_arms_of_few_joints_reach_poses_with_tolerances(arm: str, kind: str, tmp_path: Path) -> None:
+    """0 of 15 were reached: poses drawn within the tolerances need six joints."""
+    robot = rd.load_robot("so101") if arm == "so101" else four_joints(tmp_path)
+    rng = np.random.default_rng(1)
+    rpy = {"any orientation": [np.pi] * 3, "±0.5 rad": [0.5] * 3, "1 mm off": None}[kind]
+    solved = 0
+    for there in apart(robot, 15):
+        T = link_pose(robot, there, robot.tip)
+        if rpy is None:
+            direction = rng.normal(size=3)
+            T = transform(T[:3, 3] + 1e-3 * direction / np.linalg.norm(direction), T[:3, :3])
+        else:
+            T = T @ transform(np.zeros(3), rotation_from_rpy(*rng.uniform(-0.4, 0.4, 3)))
+        goal = rd.PoseGoal(robot.tip, T, None, rpy)
+        result = rd.plan(rd.Problem(robot, FREE, apart(robot, 1)[0], goal), 10.0, until="first")
+        solved += result.solved
+        if result.path is not None and rpy is None:
+            off = np.linalg.norm(link_pose(robot, result.path.positions[-1], robot.tip)[:3, 3] - T[:3, 3])
+            assert off < 4e-3, "near the pose, not at the edge of what the validator accepts"
+            assert any("no configuration reaches the goal pose exactly" in note for note in result.notes)
+    assert solved >= 14
+
+
+def test_a_pose_out_of_reach_by_more_than_the_validator_accepts_stays_so() -> None:
+    robot = rd.load_robot("panda")
+    goal = rd.PoseGoal(robot.tip, transform(np.array([0.0, 0.0, 1.5])))
+    result = rd.plan(rd.Problem(robot, FREE, apart(robot, 1)[0], goal))
+    assert result.status is Status.UNREACHABLE_GOAL
+
+
+def many_grasps() -> tuple[rd.Problem, ndarray]:
+    """Ten poses inside obstacles, then ten that are free."""
+    robot = rd.load_robot("panda")
+    q = apart(robot, 40)
+    balls = [rd.Sphere(link_pose(robot, row, robot.tip)[:3, 3], 0.05) for row in q[1:11]]
+    q_free = q[11:][CollisionChecker(robot, rd.Scene(balls)).free(q[11:])][:10]
+    goals = [rd.PoseGoal(robot.tip, link_pose(robot, row, robot.tip)) for row in (*q[1:11], *q_free)]
+    return rd.Problem(robot, rd.Scene(balls), q[0], rd.AnyGoal(tuple(goals))), q_free
+
+
+def test_of_several_goals_each_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocked goals took the whole effort of inverse kinematics before the search began."""
+    rounds = []
+    at_pose = pose_goals._at_pose
+    monkeypatch.setattr(pose_goals, "_at_pose", lambda *given: rounds.append(given[1]) or at_pose(*given))
+    problem, q_free = many_grasps()
+    assert isinstance(problem.goal, rd.AnyGoal) and len(problem.goal.goals) == 20 and len(q_free) == 10
+    result = rd.plan(problem, 20.0)
+    assert result.path is not None and result.goal_index is not None and result.goal_index >= 10
+    reached = problem.goal.goals[result.goal_index]
+    assert goal_error(problem.robot, reached, result.path.positions[-1]) is None
+    assert rounds == list(problem.goal.goals)
+    again = rd.plan(problem, 20.0)
+    assert again.path is not None and np.array_equal(again.path.positions, result.path.positions)
+
+
+def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After half of the time limit the search begins with what is free."""
+    tried = []
+    at_pose = pose_goals._at_pose
+
+    def slow(*given: Any) -> ndarray:
+        tried.append(given[1])
+        clock[0] += 0.1
+        return at_pose(*given)
+
+    clock = [0.0]
+    monkeypatch.setattr(pose_goals, "_at_pose", slow)
+    monkeypatch.setattr(context.time, "perf_counter", lambda: clock[0])
+    problem, _ = many_grasps()
+    assert isinstance(problem.goal, rd.AnyGoal)
+    goals = rd.AnyGoal(problem.goal.goals[::-1])
+    result = rd.plan(replace(problem, goal=goals), 1.0, until="first")
+    assert result.solved and 5 <= len(tried) <= 7
+
+
+def test_if_none_of_several_goals_is_free_the_reason_is_that_of_the_first() -> None:
+    problem, _ = many_grasps()
+    assert isinstance(problem.goal, rd.AnyGoal)
+    result = rd.plan(replace(problem, goal=rd.AnyGoal(problem.goal.goals[:2])), 20.0)
+    assert result.status is Status.INVALID_GOAL
+    assert result.reason.startswith("none of 2 goals can be reached, the first: all ")
+
+
+def test_the_goal_index_names_the_goal_that_is_reached() -> None:
+    robot = rd.load_robot("panda")
+    start, near, far = apart(robot, 3)
+    for goal, index in (
+        ([far, start], 1),
+        (rd.AnyGoal((rd.JointGoal([far, near]), rd.JointGoal(start))), 1),
+        (start, 0),
+    ):
+        assert rd.plan(rd.Problem(robot, FREE, start, goal)).goal_index == index
+    # poses 2 mm apart: both are within the validator's centimetre
+    T = link_pose(robot, near, robot.tip)
+    T_beside = transform(T[:3, 3] + [0.002, 0, 0], T[:3, :3])
+    goals = rd.AnyGoal((rd.PoseGoal(robot.tip, T_beside), rd.PoseGoal(robot.tip, T)))
+    result = rd.plan(rd.Problem(robot, FREE, start, goals))
+    assert result.path is not None and result.goal_index is not None
+    error = link_pose(robot, result.path.positions[-1], robot.tip) - goals.goals[result.goal_index].T_base_frame
+    assert np.abs(error).max() < 1e-4

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
@@ -20,6 +22,7 @@ from robotdiffuse.problems.files import load_problem, problem_from_record, probl
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.validation.tolerances import goal_error
 
 PANDA = rd.load_robot("panda")
 START = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
@@ -231,3 +234,32 @@ def test_files_name_the_field(entry: object, message: str) -> None:
 
 def test_every_kind_is_tested() -> None:
     assert {one.kind for one in EACH} == set(CONSTRAINTS)
+
+
+@given(st.integers(0, 2**31))
+def test_projection_onto_tolerances_of_goals_agrees_with_the_validator(seed: int) -> None:
+    """Roll, pitch and yaw near half a turn too, and tolerances of 0 and of any angle."""
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(PANDA.lower, PANDA.upper, (40, 7))
+    xyz, rpy = rng.choice([0.0, 0.02, 0.3], 3), rng.choice([0.0, 0.1, 1.5, 3.0, np.pi], 3)
+    goal = rd.PoseGoal(HAND, link_pose(PANDA, q[0], HAND), xyz, rpy)
+    ready = PathConstraints(Problem(PANDA, rd.Scene(), START, goal), [goal])
+    at_goal = np.array([goal_error(PANDA, goal, row) is None for row in q])
+    satisfied = ready.satisfied(q)
+    assert satisfied[0] and not (satisfied & ~at_goal).any()
+    roomy = rd.PoseGoal(HAND, goal.T_base_frame, 1.01 * xyz + 1e-4, 1.01 * rpy + 1e-4)
+    roomy_rows = PathConstraints(Problem(PANDA, rd.Scene(), START, roomy), [roomy])
+    assert not (at_goal & ~roomy_rows.satisfied(q)).any()
+    for row in ready.projected(q, 0.9):
+        assert goal_error(PANDA, goal, row) is None
+
+
+def test_most_projections_onto_tolerances_of_a_reachable_goal_succeed() -> None:
+    """With wrong derivatives of roll, pitch and yaw hardly any did."""
+    rng = np.random.default_rng(8)
+    share = []
+    for there in rng.uniform(0.8 * PANDA.lower, 0.8 * PANDA.upper, (10, 7)):
+        goal = rd.PoseGoal(HAND, link_pose(PANDA, there, HAND), [0.01] * 3, [0.1, 0.2, 0.3])
+        ready = PathConstraints(Problem(PANDA, rd.Scene(), START, goal), [goal])
+        share.append(len(ready.projected(rng.uniform(PANDA.lower, PANDA.upper, (50, 7)), 0.9)) / 50)
+    assert np.mean(share) > 0.3, share

@@ -122,7 +122,7 @@ def inverse_kinematics(
     for i in range(settings.max_rounds):
         seeds = random_seeds(robot, lower, upper, settings.seeds_per_round, rng, near)
         if i == 0 and near is not None:
-            seeds[0] = np.clip(near, lower, upper)
+            seeds[0] = np.clip(near - robot.whole_turns(near), lower, upper)
         seeds, before = np.ascontiguousarray(seeds[:, arm]), len(accepted)
         while len(seeds) and len(accepted) < count:
             known = np.ascontiguousarray(accepted[:, arm])
@@ -153,8 +153,8 @@ def random_seeds(
 ) -> Float[ndarray, "n dof"]:
     """Uniformly random configurations, with joints that turn within half a turn of `near`."""
     if near is not None:
-        reach = np.where(robot.continuous | np.array(robot.prismatic), np.inf, np.pi)
-        near = np.clip(near, lower, upper)
+        reach = np.where(robot.prismatic, np.inf, np.pi)
+        near = np.clip(near - robot.whole_turns(near), lower, upper)
         lower, upper = np.maximum(lower, near - reach), np.minimum(upper, near + reach)
     return rng.uniform(lower, upper, (count, robot.dof))
 

@@ -11,6 +11,7 @@ import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
 from robotdiffuse.core.types import Path, Status
 from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.search import constrained
 from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose, link_poses
@@ -135,6 +136,18 @@ def test_a_goal_pose_with_tolerance_is_turned_until_it_keeps_the_constraint() ->
     result = load_planner("aorrtc").plan(made, time_limit=20.0)
     assert result.path is not None, result.reason
     assert verify(made, result.path).valid
+
+
+@pytest.mark.parametrize("case", [0, 2, 4])
+def test_more_iterations_give_no_slower_motion(case: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It returned the shortest path, whose motion may be slower than one found before."""
+    durations = []
+    for paths in (1, 2, 4, 8):
+        monkeypatch.setattr(constrained, "PATHS_TO_FIND", paths)
+        result = rd.plan(problem(*CASES[case]), 60.0, planner="rrt_connect", seed=1)
+        durations.append(result.duration)
+    assert durations == sorted(durations, reverse=True)
+    assert durations[-1] < 0.95 * durations[0]
 
 
 def test_same_seed_same_path() -> None:

@@ -27,6 +27,8 @@ TOLERANCE_FRACTION, END_MARGIN = 0.95, 1e-6
 larger."""
 PATHS_TO_FIND = 2
 """With until "converged": number of paths to find; the best is returned."""
+STRAIGHT_FACTOR = 1.02
+"""A path is the shortest if it is longer than the straight line by no more than this factor."""
 SHORTCUTS = 60
 """Shortcuts that are tried on each path found."""
 
@@ -62,8 +64,10 @@ class ConstrainedSearch(AnytimeSearch):
 
     @property
     def shortest(self) -> bool:
-        """Always False: the length of the shortest path under constraints is not known."""
-        return False
+        """Whether no path can be shorter by more than a small part: the constraints hardly bend the straight
+        line."""
+        straight = np.linalg.norm(self.goals - self.start, axis=1).min()
+        return bool(self.length <= STRAIGHT_FACTOR * straight)
 
     def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
         """Whether the polyline through configurations keeps the clearance and the constraints."""

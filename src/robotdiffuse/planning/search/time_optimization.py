@@ -65,6 +65,11 @@ class Candidate:
     stage: str
     """The part of the planner that found the path."""
 
+    @property
+    def length(self) -> float:
+        """Length of the path [rad, joint-space L2]."""
+        return float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
+
 
 class TimeOptimization:
     """The fastest motions found so far near the paths that were offered."""
@@ -78,7 +83,8 @@ class TimeOptimization:
         seed: int,
         longest: float = np.inf,
     ) -> None:
-        """longest: candidates that are no longer than this stay so [rad]."""
+        """longest: candidates that are no longer than this stay so, and once there is one, only such are kept
+        [rad]."""
         self._limits = scaled_limits(robot, settings)
         # no motion is faster than the joint that needs most time is by itself
         alone = [
@@ -142,14 +148,13 @@ class TimeOptimization:
         return least_time(line, *self._limits, *self._intervals)
 
     def _improve(self, space: Space, candidate: Candidate, attempts: int) -> None:
-        length = float(np.linalg.norm(np.diff(candidate.path, axis=0), axis=1).sum())
         found = reduce_time(
             space,
             candidate.path,
             candidate.deviations,
             candidate.time,
             *self._limits,
-            self._longest if length <= self._longest else np.inf,
+            self._longest if candidate.length <= self._longest else np.inf,
             attempts,
             self._state,
         )
@@ -157,6 +162,8 @@ class TimeOptimization:
         self.attempts += attempts
 
     def _sort(self) -> None:
-        self.candidates = sorted(self.candidates, key=lambda candidate: candidate.time)[:MAX_CANDIDATES]
+        short = [candidate for candidate in self.candidates if candidate.length <= self._longest]
+        ordered = sorted(short or self.candidates, key=lambda candidate: candidate.time)
+        self.candidates = ordered[:MAX_CANDIDATES]
         if not self.times or self.candidates[0].time < self.times[-1][1]:
             self.times.append((self.attempts, self.candidates[0].time))
