@@ -28,9 +28,11 @@ GOAL_TIME_FRACTION = 0.5
 """Of several goals, no more are tried after this part of the time limit once one is free."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
 """Where a pose cannot be reached exactly, parts of the validator's tolerances to reach it within, in turn."""
-NEAR_POSE_ROUNDS, MAX_EXACT_GOALS, FIRST_TRY_COUNT = 2, 20, 3
-"""Rounds of seeds for that; number of configurations whose exact meshes are checked where the covering spheres
-collide; and number of configurations for each of several poses."""
+NEAR_POSE_ROUNDS, FIRST_TRY_COUNT = 2, 3
+"""Rounds of seeds for that, and number of configurations for each of several poses."""
+MAX_EXACT_GOALS, MAX_GRAZING_GOALS = 20, 3
+"""Number of configurations of a pose whose exact meshes are checked where the covering spheres collide, and
+number of those that become goals."""
 END_MARGIN = 0.0005
 """Near a start or goal with less than the requested clearance, paths keep its clearance less this margin
 [m]."""
@@ -103,17 +105,17 @@ class StartGoal:
         upper = np.where(turning, np.minimum(space.upper, states.max(axis=0) + MAX_OVERTURN), space.upper)
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
-    def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+    def complete(self, path: Float[ndarray, "n dof"], direct: bool = False) -> Float[ndarray, "m dof"]:
         """The path of a search in float64, with the exact start and goal in place of its ends, or added to
-        them."""
+        them; `direct`: always in place of them."""
         assert self.start_lead is not None
         path = path.astype(np.float64)
         errors = [np.abs(path[-1] - lead).max() for lead in self.goal_leads]
         i = int(np.argmin(errors))
         rows = [self.start[None], path[1:-1], self.goals[i][None]]
-        if self.goal_leads[i] is not self.goals[i] and not np.array_equal(self.goal_leads[i], self.goals[i]):
+        if not direct and not np.array_equal(self.goal_leads[i], self.goals[i]):
             rows.insert(2, self.goal_leads[i][None])
-        if not np.array_equal(self.start_lead, self.start):
+        if not direct and not np.array_equal(self.start_lead, self.start):
             rows.insert(1, self.start_lead[None])
         return np.concatenate(rows) + self._turns if self._turns.any() else np.concatenate(rows)
 
@@ -336,10 +338,9 @@ def _pose_goals(
     rejected = rejected[np.unique(np.round(rejected, 1), axis=0, return_index=True)[1]]
     rejected = rejected[np.argsort(distances(rejected), kind="stable")][:MAX_EXACT_GOALS]
     if len(found):
-        rejected = rejected[:1][distances(rejected[:1]) < distances(found[:1])]
-    collisions = [_explained(robot, scene, q) for q in rejected]
-    grazing = rejected[[collision is None for collision in collisions]]
-    found = np.concatenate([grazing, found])
+        rejected = rejected[distances(rejected) < distances(found[:1])]
+    if len(rejected):
+        found = np.concatenate([_free_meshes(robot, scene, rejected)[:MAX_GRAZING_GOALS], found])
     if len(found):
         context.notes += [note] if note else []
         return _with_turns(context, found)
@@ -347,22 +348,23 @@ def _pose_goals(
     named = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
     of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in named.items())
     unconstrained = replace(problem, constraints=())
-    if not collisions and context.validator.constraints is not None:
+    if not len(rejected) and context.validator.constraints is not None:
         reached = pose_configurations(unconstrained, goal, rng)
         wrong = context.validator.constraints.worst_violation(reached[0]) if len(reached) else None
         if wrong is not None:
             what = f"no configuration was found for {of_poses} that keeps the"
             return context.fail(Status.INVALID_GOAL, f"{what} constraints, e.g. {wrong.message}")
-    if not collisions:
+    if not len(rejected):
         several = poses_of(goal) if len(named) > 1 else ()
         alone = [pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))]
         brought = " and ".join(f"{frame} to the pose at {named[frame]}" for frame in alone or named)
         return context.fail(
             Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {brought}"
         )
+    collision = _explained(robot, scene, rejected[0])
     return context.fail(
         Status.INVALID_GOAL,
-        f"all {len(collisions)} configurations found for {of_poses} are in collision, e.g. {collisions[0]}",
+        f"all {len(rejected)} configurations found for {of_poses} are in collision, e.g. {collision}",
     )
 
 
@@ -379,6 +381,14 @@ def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Float[nda
     turned."""
     robot, start = context.problem.robot, context.problem.start
     return np.concatenate([robot.equivalent_configurations(q, start) for q in goals])
+
+
+def _free_meshes(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"]) -> Float[ndarray, "k dof"]:
+    """The configurations whose exact meshes are free."""
+    with loading():
+        from robotdiffuse.collision.exact_meshes import ExactCollision  # imports Coal, rarely needed
+
+    return q[~ExactCollision(robot, scene).collides(q)]
 
 
 def _explained(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:

@@ -117,7 +117,12 @@ class _Validation:
 
     def _accepts(self, path: ndarray, stage: str) -> bool:
         self._timed.append(path)
-        result = self._finished(self.search.start_goal.complete(path), stage, None)
+        paths = [self.search.start_goal.complete(path, direct) for direct in (True, False)]
+        result = None
+        if len(paths[0]) < len(paths[1]):  # covering spheres touch at an end, but the meshes may be free
+            result = self._finished(paths[0], stage, None)
+        if result is None:
+            result = self._finished(paths[1], stage, None)
         if result is not None:
             self._path, self._shortest = path, result
         return result is not None
