@@ -10,7 +10,6 @@ a configuration.
 
 import argparse
 import time
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -57,7 +56,9 @@ def nearest_distance(
     lower = np.where(continuous, -np.inf, robot.lower)
     upper = np.where(continuous, np.inf, robot.upper)
     half_turn = np.where(np.array(robot.prismatic), np.inf, np.pi)
-    q = rng.uniform(np.maximum(lower, start - half_turn), np.minimum(upper, start + half_turn), (SEEDS, robot.dof))
+    q = rng.uniform(
+        np.maximum(lower, start - half_turn), np.minimum(upper, start + half_turn), (SEEDS, robot.dof)
+    )
     q[0] = start
     q[1 : SEEDS // 4] = np.clip(start + rng.normal(0, 0.5, (SEEDS // 4 - 1, robot.dof)), lower, upper)
     for k in range(STEPS):
@@ -132,7 +133,8 @@ def four_joints() -> Robot:
         file.write_text(text)
         tree = UrdfTree(file, {})
         robot = tree.robot("base")
-        return prepare(robot, {link: tree.surfaces(link) for link in robot.meshes}, PreparationSettings()).robot
+        surfaces = {link: tree.surfaces(link) for link in robot.meshes}
+        return prepare(robot, surfaces, PreparationSettings()).robot
 
 
 def few_joints_rows(poses: int) -> list[list[str]]:
@@ -173,10 +175,7 @@ def several_rows(problems: int) -> list[list[str]]:
         for k in range(problems):
             configurations = free_configurations(robot, 200, rng)
             start, rest = configurations[0], configurations[1:]
-            balls = [
-                rd.Sphere(link_pose(robot, q, robot.tip)[:3, 3], 0.06)
-                for q in rest[:10]
-            ]
+            balls = [rd.Sphere(link_pose(robot, q, robot.tip)[:3, 3], 0.06) for q in rest[:10]]
             exact = ExactCollision(robot, rd.Scene(balls))
             if exact.collides(start[None])[0]:
                 continue

@@ -101,7 +101,7 @@ def test_results_of_earlier_versions_lack_fields(solved: PlanResult, tmp_path: F
 def test_a_goal_index_that_is_none_is_one_line(solved: PlanResult, tmp_path: FilePath, wrong: object) -> None:
     file = tmp_path / "r.json"
     file.write_text(json.dumps(solved.record() | {"goal_index": wrong}))
-    with pytest.raises(InputError, match="goal_index is .*; it must be a whole number from 0 on"):
+    with pytest.raises(InputError, match=r"goal_index is .*; it must be a whole number from 0 on"):
         load_result(file)
 
 

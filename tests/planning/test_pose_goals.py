@@ -1,9 +1,9 @@
-"""Poses as goals: the nearest configuration, tolerances of arms of few joints, several goals; a pose for each of
-several links: configurations that bring all of them there, verdicts, files."""
+"""Poses as goals: the nearest configuration, tolerances of arms of few joints, several goals; a pose for each
+of several links: configurations that bring all of them there, verdicts, files."""
 
 from collections.abc import Sequence
-from functools import cache
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -201,8 +201,8 @@ def apart(robot: Robot, count: int, seed: int = 5) -> ndarray:
 
 
 def followed(robot: Robot, start: ndarray, shift: ndarray) -> ndarray | None:
-    """Where the joints are after the tip has moved straight on by `shift`, by the least motion; None if it cannot.
-    Well-conditioned ways alone."""
+    """Where the joints are after the tip has moved straight on by `shift`, by the least motion; None if it
+    cannot. Well-conditioned ways alone."""
     q = start.copy()
     T = link_pose(robot, q, robot.tip)
     target = T.copy()
@@ -380,5 +380,7 @@ def test_the_goal_index_names_the_goal_that_is_reached() -> None:
     goals = rd.AnyGoal((rd.PoseGoal(robot.tip, T_beside), rd.PoseGoal(robot.tip, T)))
     result = rd.plan(rd.Problem(robot, FREE, start, goals))
     assert result.path is not None and result.goal_index is not None
-    error = link_pose(robot, result.path.positions[-1], robot.tip) - goals.goals[result.goal_index].T_base_frame
+    reached = goals.goals[result.goal_index]
+    assert isinstance(reached, rd.PoseGoal)
+    error = link_pose(robot, result.path.positions[-1], robot.tip) - reached.T_base_frame
     assert np.abs(error).max() < 1e-4

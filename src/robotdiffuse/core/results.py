@@ -44,8 +44,8 @@ class PlanResult:
     notes: tuple[str, ...] = field(default=())
     """Input that was changed or ignored, e.g. a start clamped to a limit."""
     goal_index: int | None = None
-    """Which goal of an `AnyGoal`, or which row of several goal configurations, the motion ends at, from 0 on; 0
-    for a single goal, None without a motion."""
+    """Which goal of an `AnyGoal`, or which row of several goal configurations, the motion ends at, from 0 on;
+    0 for a single goal, None without a motion."""
     progress: tuple[tuple[float, float], ...] = ()
     """Time [s since the call] and joint-space length [rad] of each shorter path; the last pair is the
     returned path."""

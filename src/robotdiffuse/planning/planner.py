@@ -95,12 +95,10 @@ class Planner(ABC, Generic[PlannerSettings]):
             time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk, objective
         )
         result, note = self._plan(problem, request), compile_note()
-        return replace(
-            result,
-            problem=problem,
-            notes=(*result.notes, note) if note else result.notes,
-            goal_index=None if result.path is None else goal_index(problem.robot, problem.goal, result.path.positions[-1]),
-        )
+        if result.path is not None:
+            reached = goal_index(problem.robot, problem.goal, result.path.positions[-1])
+            result = replace(result, goal_index=reached)
+        return replace(result, problem=problem, notes=(*result.notes, note) if note else result.notes)
 
     def _plan(self, problem: Problem, request: PlanRequest) -> PlanResult:
         self._check_support(problem, request)

@@ -1,4 +1,4 @@
-"""Goal configurations for poses of one link, or of several links at once, those nearest to the start first."""
+"""Goal configurations for poses of one link, or of several links at once: those nearest to the start."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,7 +17,6 @@ from robotdiffuse.robots.inverse_kinematics import (
     inverse_kinematics,
     random_seeds,
 )
-from robotdiffuse.robots.robot import Robot
 
 GOAL_COUNT = 10
 """Number of configurations to find for a pose (the paper's k)."""
@@ -50,8 +49,8 @@ def pose_configurations(
     rounds: int = MAX_ROUNDS,
     exact: tuple[float, float] = EXACT,
 ) -> Float[ndarray, "k dof"]:
-    """At most `count` configurations that bring links to their poses, or to poses within their tolerances, and
-    keep the problem's path constraints; those nearest to the problem's start first.
+    """At most `count` configurations that bring links to their poses, or to poses within their tolerances,
+    and keep the problem's path constraints; those nearest to the problem's start first.
 
     The first seed is the start. Poses without tolerances are reached by inverse kinematics; tolerances, path
     constraints and several poses by damped Newton steps for all of them together. Configurations are then

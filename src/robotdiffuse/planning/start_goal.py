@@ -267,9 +267,7 @@ def _any_goals(
     )
 
 
-def _first_try(
-    context: PlanningContext, goal: OneGoal, checker: CollisionChecker
-) -> Float[ndarray, "k dof"]:
+def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecker) -> Float[ndarray, "k dof"]:
     """Free configurations of one of several goals, by little work."""
     if isinstance(goal, JointGoal):
         constraints = context.validator.constraints
@@ -330,8 +328,8 @@ def _pose_goals(
             found = pose_configurations(problem, goal, rng, free, rounds=NEAR_POSE_ROUNDS, exact=near)
             if len(found) or len(rejected):
                 note = (
-                    f"no configuration reaches the goal pose exactly; the motion ends within {1e3 * near[0]:g} mm "
-                    f"and {np.degrees(near[1]):.2g} degrees of it"
+                    f"no configuration reaches the goal pose exactly; the motion ends within "
+                    f"{1e3 * near[0]:g} mm and {np.degrees(near[1]):.2g} degrees of it"
                 )
                 break
     # meshes may be free where the covering spheres are not

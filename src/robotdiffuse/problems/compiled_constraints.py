@@ -139,8 +139,8 @@ class PathConstraints:
     def projected(
         self, q: Float[ndarray, "n dof"], tolerance_fraction: float, most: int = -1
     ) -> Float[ndarray, "k dof"]:
-        """The configurations projected onto a fraction of the tolerances, at most `most` of them unless that is
-        -1; failed projections are left out."""
+        """The configurations projected onto a fraction of the tolerances, at most `most` of them unless that
+        is -1; failed projections are left out."""
         rows, satisfied = self.project(q, tolerance_fraction, most)
         return rows[satisfied]
 

@@ -8,8 +8,8 @@ row is a scalar function of the pose of a link, its frame, whose value must not 
 - CONE: the angle between an axis of the frame and a direction [rad].
 - TURN: the angle from the frame's orientation to the orientation interpolated at its position on a segment
   [rad].
-- ROLL_PITCH_YAW: of a goal's tolerances, for projection alone: the most that roll, pitch or yaw of the frame's
-  orientation relative to a reference exceeds its tolerance [rad].
+- ROLL_PITCH_YAW: for tolerances of goals, never along a motion: the most that roll, pitch or yaw of the
+  frame's orientation relative to a reference exceeds its tolerance [rad].
 
 A piece of a motion is proved to satisfy a row from the poses at its two ends. Along the piece, the joints
 move by dq at constant rates, so the frame's origin p leaves the straight line between its end positions by at

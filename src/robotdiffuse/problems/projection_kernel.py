@@ -148,8 +148,8 @@ def project(rows, limits, q, work):
 
 @kernel(nogil=True)
 def project_each(rows, limits, q, most):
-    """Projects configurations q[n, dof] in place, until `most` of them satisfy the limits; returns which of them
-    do [n]."""
+    """Projects configurations q[n, dof] in place, until `most` of them satisfy the limits; returns which of
+    them do [n]."""
     work, satisfied = make_work(rows), np.zeros(len(q), np.bool_)
     count = 0
     for i in range(len(q)):

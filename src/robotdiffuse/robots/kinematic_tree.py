@@ -153,7 +153,8 @@ class KinematicTree(Value):
         return self._turned(q, start, self._turns_twice | self.continuous)
 
     def _turned(self, q: ndarray, start: ndarray, joints: Bool[ndarray, "dof"]) -> ndarray:
-        """The configurations with whole turns added to these joints, to be as close to `start` as possible."""
+        """The configurations with whole turns added to these joints, to be as close to `start` as the limits
+        allow."""
         limited = joints & ~self.continuous
         nearest = np.where(joints, q - TURN * np.round((q - start) / TURN), q)
         nearest = np.where(limited & (nearest > self.upper), nearest - TURN, nearest)

@@ -122,8 +122,8 @@ def goal_error(
 
 
 def goal_index(robot: Robot, goal: Goal, q: Float[ndarray, "dof"]) -> int | None:
-    """Which of several goals, or of several goal configurations, a configuration is at; 0 at a single goal, and
-    None at none. Where several goals are close to each other, one that is reached exactly comes first."""
+    """Which of several goals, or of several goal configurations, a configuration is at; 0 at a single goal,
+    and None at none. Where several goals are close to each other, one that is reached exactly comes first."""
     goals: Sequence[Goal] = goal.goals if isinstance(goal, AnyGoal) else (goal,)
     if isinstance(goal, JointGoal):
         goals = [JointGoal(row) for row in goal.positions]

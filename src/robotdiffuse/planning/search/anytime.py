@@ -55,8 +55,8 @@ class _Validation:
 
     @property
     def due(self) -> bool:
-        """Whether to validate now: the first path at once, better ones every VALIDATION_INTERVAL iterations, or
-        at once under path constraints."""
+        """Whether to validate now: the first path at once, better ones every VALIDATION_INTERVAL iterations,
+        or at once under path constraints."""
         interval = 0 if self.context.problem.constraints else VALIDATION_INTERVAL
         rested = self.search.work >= self._validated_at + interval
         return self.best is None or (rested and self._improved())

@@ -35,8 +35,8 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
     """A faster rounded polyline: its waypoints [m, dof], its deviations [m - 2] and its estimated time [s].
 
     path: waypoints [n, dof], n >= 3, whose polyline is free, as are its rounded corners; time: its estimated
-    time; longest: bound on its length [rad, joint-space L2]. After a move that made it faster, the same waypoint
-    moves on in the same direction.
+    time; longest: bound on its length [rad, joint-space L2]. After a move that made it faster, the same
+    waypoint moves on in the same direction.
     """
     dof = path.shape[1]
     work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
