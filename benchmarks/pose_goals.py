@@ -100,7 +100,7 @@ def length_rows(name: str, starts: int) -> list[list[str]]:
     rows = []
     for where in ("here", "5 cm", "anywhere"):
         ratios, durations, seconds, solved = [], [], [], 0
-        for k, start in enumerate(progress(configurations[:starts], f"{name}, {where}")):
+        for k, start in enumerate(progress([*configurations[:starts]], f"{name}, {where}")):
             T = link_pose(robot, start, robot.tip)
             if where == "5 cm":
                 direction = rng.normal(size=3)

@@ -324,8 +324,8 @@ def many_grasps() -> tuple[rd.Problem, ndarray]:
 def test_of_several_goals_each_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocked goals took the whole effort of inverse kinematics before the search began."""
     rounds = []
-    at_pose = pose_goals._at_pose
-    monkeypatch.setattr(pose_goals, "_at_pose", lambda *given: rounds.append(given[1]) or at_pose(*given))
+    at_pose = pose_goals.at_pose
+    monkeypatch.setattr(pose_goals, "at_pose", lambda *given: rounds.append(given[1]) or at_pose(*given))
     problem, q_free = many_grasps()
     assert isinstance(problem.goal, rd.AnyGoal) and len(problem.goal.goals) == 20 and len(q_free) == 10
     result = rd.plan(problem, 20.0)
@@ -340,7 +340,7 @@ def test_of_several_goals_each_is_tried_once(monkeypatch: pytest.MonkeyPatch) ->
 def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch) -> None:
     """After half of the time limit the search begins with what is free."""
     tried = []
-    at_pose = pose_goals._at_pose
+    at_pose = pose_goals.at_pose
 
     def slow(*given: Any) -> ndarray:
         tried.append(given[1])
@@ -348,7 +348,7 @@ def test_of_several_goals_no_more_are_tried_late(monkeypatch: pytest.MonkeyPatch
         return at_pose(*given)
 
     clock = [0.0]
-    monkeypatch.setattr(pose_goals, "_at_pose", slow)
+    monkeypatch.setattr(pose_goals, "at_pose", slow)
     monkeypatch.setattr(context.time, "perf_counter", lambda: clock[0])
     problem, _ = many_grasps()
     assert isinstance(problem.goal, rd.AnyGoal)

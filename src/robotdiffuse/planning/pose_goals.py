@@ -69,7 +69,12 @@ def pose_configurations(
     for k in range(rounds):
         check_time("configurations of the goal pose")
         most = count if k == 0 else SEEDS
-        new = [_at_pose(problem, pose, most, rng, exact) for pose in poses]
+        # projection ends at the edges of the tolerances, so every other round keeps only a part of them
+        aims = poses
+        if k % 2:
+            part = rng.uniform()
+            aims = [_within(pose, part) for pose in poses]
+        new = [at_pose(problem, aim, most, rng, exact) for aim in aims]
         solutions = [np.concatenate([before, more]) for before, more in zip(solutions, new, strict=True)]
         seeds = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
         if len(poses) > 1 or problem.constraints:
@@ -86,7 +91,7 @@ def pose_configurations(
     return _distinct(every[np.argsort(np.linalg.norm(every - start, axis=1), kind="stable")])[:count]
 
 
-def _at_pose(
+def at_pose(
     problem: Problem, pose: PoseGoal, count: int, rng: np.random.Generator, exact: tuple[float, float]
 ) -> Float[ndarray, "k dof"]:
     """At most `count` configurations for one pose from a round of seeds, of which the first is the start;
@@ -101,6 +106,16 @@ def _at_pose(
     seeds[0] = start
     alone = PathConstraints(replace(problem, constraints=()), [pose], exact)
     return alone.projected(seeds, TOLERANCE_FRACTION, count)
+
+
+def _within(pose: PoseGoal, part: float) -> PoseGoal:
+    """The pose with a part of its tolerances; angles that are free stay so."""
+    xyz, rpy = pose.xyz_tolerance, pose.rpy_tolerance
+    return replace(
+        pose,
+        xyz_tolerance=None if xyz is None else part * xyz,
+        rpy_tolerance=None if rpy is None else np.where(rpy < np.pi, part * rpy, rpy),
+    )
 
 
 def _combined(

@@ -151,12 +151,16 @@ def random_seeds(
     rng: np.random.Generator,
     near: Float[ndarray, "dof"] | None = None,
 ) -> Float[ndarray, "n dof"]:
-    """Uniformly random configurations, with joints that turn within half a turn of `near`."""
-    if near is not None:
-        reach = np.where(robot.prismatic, np.inf, np.pi)
-        near = np.clip(near - robot.whole_turns(near), lower, upper)
-        lower, upper = np.maximum(lower, near - reach), np.minimum(upper, near + reach)
-    return rng.uniform(lower, upper, (count, robot.dof))
+    """Uniformly random configurations; or, with `near`, random places on the way from there to such ones, with
+    joints that turn within half a turn of it."""
+    if near is None:
+        return rng.uniform(lower, upper, (count, robot.dof))
+    reach = np.where(robot.prismatic, np.inf, np.pi)
+    near = np.clip(near - robot.whole_turns(near), lower, upper)
+    anywhere = rng.uniform(
+        np.maximum(lower, near - reach), np.minimum(upper, near + reach), (count, robot.dof)
+    )
+    return near + rng.uniform(0.0, 1.0, (count, 1)) * (anywhere - near)
 
 
 def beside(robot: Robot, link: str) -> Bool[ndarray, "dof"]:
