@@ -151,8 +151,8 @@ def random_seeds(
     rng: np.random.Generator,
     near: Float[ndarray, "dof"] | None = None,
 ) -> Float[ndarray, "n dof"]:
-    """Uniformly random configurations; or, with `near`, random places on the way from there to such ones, with
-    joints that turn within half a turn of it."""
+    """Uniformly random configurations; or, with `near`, random places on the way from there to such ones,
+    with joints that turn within half a turn of it."""
     if near is None:
         return rng.uniform(lower, upper, (count, robot.dof))
     reach = np.where(robot.prismatic, np.inf, np.pi)
