@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 GOAL_TIME_FRACTION = 0.5
-"""Of several goals, no more are tried after this part of the time limit once one is free."""
+"""Of several goals, no more are tried after this part of the time limit, once one is free or none was at the
+first try."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
 """Where a pose cannot be reached exactly, parts of the validator's tolerances to reach it within, in turn."""
 NEAR_POSE_ROUNDS, FIRST_TRY_COUNT = 2, 3
@@ -246,7 +247,7 @@ def _goals(
 def _any_goals(
     context: PlanningContext, goals: Sequence[OneGoal], checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    """The free configurations of several goals, by one try for each."""
+    """The free configurations of several goals, by one try for each; if none is free, by more for each."""
     until = GOAL_TIME_FRACTION * context.request.time_limit
     free = list[ndarray]()
     for goal in goals:
@@ -258,10 +259,15 @@ def _any_goals(
         return np.concatenate(free)
     failures = list[PlanResult]()
     for goal in goals:
+        if (free or failures) and context.elapsed > until:
+            break
         found = _goals(context, goal, checker)
-        if not isinstance(found, PlanResult):
-            return found
-        failures.append(found)
+        if isinstance(found, PlanResult):
+            failures.append(found)
+        else:
+            free.append(found)
+    if free:
+        return np.concatenate(free)
     return replace(
         failures[0], reason=f"none of {len(goals)} goals can be reached, the first: {failures[0].reason}"
     )
