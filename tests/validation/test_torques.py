@@ -62,10 +62,9 @@ def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
 
 
 def test_a_peak_between_two_times_is_found() -> None:
-    """Slow enough that gravity alone counts; rows a second apart, none level."""
+    """At a constant velocity, so that gravity alone counts; rows a second apart, none level."""
     rows = np.pi / 2 + np.array([[-0.375], [-0.125], [0.125], [0.375]])
-    v = np.array([[0.0], [0.25], [0.25], [0.0]])
-    motion = Trajectory(("hinge",), np.arange(4.0), rows, v, np.zeros((4, 1)))
+    motion = Trajectory(("hinge",), np.arange(4.0), rows, np.full((4, 1), 0.25), np.zeros((4, 1)))
     for effort, beyond in ((9.66, True), (9.75, False)):
         found = first_excess(Dynamics(pendulum(effort), Payload(0.0)), trajectory_pieces(motion), 0.01)
         assert (found is not None) == beyond

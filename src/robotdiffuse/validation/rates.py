@@ -1,12 +1,14 @@
 """Rates of a trajectory: those that follow from its positions and times, and whether its own rates agree.
 
-In a motion from rest to rest whose acceleration never exceeds A, the mean velocity of each step is within its
-velocity limit. Each second difference quotient is a mean of its accelerations and thus at most A, if the arm
-is taken to stand still before the first and after the last row. With velocities v0 and v1 at both ends of a
-step of h seconds, the length of the step is within h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4; the
-extremes are full acceleration followed by full braking and vice versa. So these tests reject nothing that an
-arm can do within its limits. The test of agreement takes for A twice the greatest acceleration in the motion,
-computed or written, if that is less.
+Limits hold all along the cubics through the rows' positions and velocities, which controllers execute (see
+cubics.py), whatever accelerations are written. A motion that is within the limits between its rows, but whose
+cubics are not, needs closer rows. The arm is taken to stand still before the first and after the last row.
+
+Rates agree if they are those of some motion within the limits. With velocities v0 and v1 at both ends of a
+step of h seconds, and accelerations up to A, the length of the step is within
+h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4; the extremes are full acceleration followed by full braking and
+vice versa. The test of agreement takes for A twice the greatest acceleration in the motion, computed or
+written, if that is less. Written accelerations must be near those of the cubics beside their row.
 
 Positions are known only to a resolution, which over a step of nanoseconds hides any velocity. Where rows are
 closer than a millisecond, the tests are therefore repeated from each row to later ones, with the resolution
@@ -23,6 +25,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.validation.cubics import Cubics
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
 """Where rows are closer than the first of these [s], mean accelerations are tested over windows of at least
@@ -38,8 +41,8 @@ class RateTolerances:
     slack: float
     """Share by which limits may be exceeded, and share of a velocity limit that counts as rest."""
     agreement: float
-    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the mean
-    accelerations before and after the row."""
+    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the
+    accelerations of the cubics before and after the row."""
     jump: float
     """A step faster than this times the velocity limit is a jump."""
     resolution: float
@@ -73,7 +76,7 @@ def rate_violations(
     that the robot gives none: then the rates must only agree with each other.
     """
     found: dict[str, RateViolation] = {}
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
         checks = list(_checks(robot, trajectory, tolerances, begins))
     for check in checks:
@@ -97,22 +100,7 @@ def sample_cubics(
     """Times [m] and positions [m, dof] of a trajectory, with added rows on the cubics through its rows'
     positions and velocities, such that straight lines between rows leave the cubics by at most `chord` [rad]
     or [m]."""
-    times, q, v = trajectory.times, trajectory.positions, trajectory.velocities
-    step = np.diff(times)[:, None]
-    mean = (q[1:] - q[:-1]) / step
-    first, last = v[:-1] - mean, v[1:] - mean
-    # A cubic's second derivative is greatest at an end, and its chord is off by an eighth of it.
-    bend = step * np.maximum(np.abs(4 * first + 2 * last), np.abs(2 * first + 4 * last)) / 8
-    counts = np.ceil(np.sqrt(bend.max(axis=1, initial=0.0) / chord)).astype(int)
-    if (counts <= 1).all():
-        return times, q
-    counts = np.maximum(counts, 1)
-    row = np.repeat(np.arange(len(counts)), counts)
-    u = np.concatenate([np.arange(n) / n for n in counts])[:, None]
-    h = step[row]
-    off = h * (u * (1 - u) ** 2 * first[row] - u**2 * (1 - u) * last[row])
-    between = q[row] + u * h * mean[row] + off
-    return np.append(times[row] + (u * h)[:, 0], times[-1]), np.concatenate([between, q[-1:]])
+    return Cubics(trajectory).sampled(chord)[:2]
 
 
 class _Check(NamedTuple):
@@ -134,8 +122,8 @@ def _checks(
     robot: Robot, trajectory: Trajectory, tolerances: RateTolerances, begins: Float[ndarray, "dof"]
 ) -> Iterator[_Check]:
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
-    step = np.diff(trajectory.times)[:, None]
-    mean, change = (q[1:] - q[:-1]) / step, (v[1:] - v[:-1]) / step
+    cubics = Cubics(trajectory)
+    step, mean, change = cubics.steps, cubics.mean, np.diff(v, axis=0) / cubics.steps
     blur = 2 * tolerances.resolution / step
     """Uncertainty of the mean velocities, from the resolution of positions."""
     share = 1 + tolerances.slack
@@ -154,7 +142,9 @@ def _checks(
 
     most, onwards = robot.velocity, "mean velocity from here to the next row"
     yield limited("jump", onwards, mean, most, tolerances.jump * most + blur)
-    yield limited("velocity", onwards, mean, most, share * most + blur)
+    # The cubics' velocities contain up to 3/2 of the mean velocity, their accelerations 6 of it over the step.
+    onwards = "velocity by its positions from here to the next row"
+    yield limited("velocity", onwards, cubics.peak_velocities, most, share * most + 1.5 * blur)
     yield limited("velocity", "velocity", v, most, share * most)
 
     around, length = _padded(2 * begins - mean[:1], mean, -mean[-1:]), _padded(step[:1], step, step[-1:])
@@ -162,7 +152,9 @@ def _checks(
     apart = (length[1:] + length[:-1]) / 2
     second, unsure = (around[1:] - around[:-1]) / apart, (unsure[1:] + unsure[:-1]) / apart
     most = robot.acceleration
+    peaks, bent = cubics.peak_accelerations, 6 * blur / step
     yield limited("acceleration", "mean acceleration by its positions", second, most, share * most + unsure)
+    yield limited("acceleration", "acceleration by its positions", peaks, most, share * most + bent)
     yield limited("acceleration", "mean acceleration by its velocities", change, most, share * most)
     yield limited("acceleration", "acceleration", a, most, share * most)
 
@@ -174,12 +166,13 @@ def _checks(
     """Allowed difference between mean velocities and the means of the rows' velocities."""
     yield _Check(
         "rates",
-        onwards,
+        "mean velocity from here to the next row",
         mean,
         np.abs(mean - (v[1:] + v[:-1]) / 2),
         possible + blur,
         lambda i, j: f"but the velocities of these rows are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
+    near = tolerances.agreement * np.where(most > 0, np.minimum(most, own), own)
     beside = _padded(change[:1], change, change[-1:])
     low, high = np.minimum(beside[1:], beside[:-1]), np.maximum(beside[1:], beside[:-1])
     outside = np.maximum(low - a, a - high)
@@ -193,9 +186,21 @@ def _checks(
         "acceleration",
         a,
         outside,
-        tolerances.agreement * np.where(most > 0, np.minimum(most, own), own),
+        near,
         lambda i, j: f"but its velocities give {low[i, j]:.6g} to {high[i, j]:.6g}",
     )
+    if len(a) > 1:
+        start, end = cubics.accelerations
+        before, after = _padded(start[:1], end), _padded(start, end[-1:])
+        least, most = np.minimum(before, after), np.maximum(before, after)
+        yield _Check(
+            "rates",
+            "acceleration",
+            a,
+            np.maximum(least - a, a - most),
+            near + np.maximum(_padded(bent[:1], bent), _padded(bent, bent[-1:])),
+            lambda i, j: f"but the cubics beside it have {least[i, j]:.6g} to {most[i, j]:.6g}",
+        )
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
         return
@@ -277,8 +282,8 @@ def _second_differences(
     return ((rows[high] - q) / after - (q - rows[low]) / before) / apart, unsure / apart
 
 
-def _padded(before: ndarray, rows: ndarray, after: ndarray) -> ndarray:
-    return np.concatenate([before, rows, after])
+def _padded(*rows: ndarray) -> ndarray:
+    return np.concatenate(rows)
 
 
 def _limits_or_peaks(limit: Float[ndarray, "dof"], *rates: ndarray) -> Float[ndarray, "dof"]:
