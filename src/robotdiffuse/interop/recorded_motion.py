@@ -13,6 +13,7 @@ from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.trajectories.cubics import Cubics
 
 STATIONARY_TOLERANCE = 1e-6
 """A joint that moves less than this counts as stationary [rad] or [m]."""
@@ -85,7 +86,7 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
 
     The recording may contain other joints of the robot, if they stay at their locked values. Absent
     velocities become those of the cubic spline from rest to rest through the rows, absent accelerations the
-    mean rates of change of velocity around each row. Raises InputError for missing or unknown joints, and for
+    means of those of the cubics before and after each row. Raises InputError for missing or unknown joints, and for
     other joints that leave their locked values.
     """
     notes = list(motion.notes)
@@ -116,8 +117,8 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
         v = _spline_velocities(motion.times, q)
         notes.append("no velocities are given: those of a cubic spline from rest to rest are validated")
     if a is None:
-        a = _mean_accelerations(motion.times, v)
-        notes.append("no accelerations are given: the rates of change of velocity are validated")
+        a = _mean_accelerations(robot.joint_names, motion.times, q, v)
+        notes.append("no accelerations are given: those of the cubics through the rows are validated")
     return RobotMotion(Trajectory(robot.joint_names, motion.times, q, v, a), tuple(notes))
 
 
@@ -144,12 +145,14 @@ def _spline_velocities(times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -
     return CubicSpline(times, q, bc_type="clamped")(times, 1)
 
 
-def _mean_accelerations(times: Float[ndarray, "n"], v: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
-    """Mean rate of change of velocity around each row."""
+def _mean_accelerations(
+    names: tuple[str, ...], times: Float[ndarray, "n"], q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"]
+) -> Float[ndarray, "n dof"]:
+    """Means of the accelerations of the cubics before and after each row."""
     if len(times) < 2:
         return np.zeros_like(v)
-    change = np.diff(v, axis=0) / np.diff(times)[:, None]
-    return (np.concatenate([change[:1], change]) + np.concatenate([change, change[-1:]])) / 2
+    of = Cubics(Trajectory(names, times, q, v, np.zeros_like(v))).extremes
+    return (np.concatenate([of.start[:1], of.end]) + np.concatenate([of.start, of.end[-1:]])) / 2
 
 
 def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Problem:

@@ -1,7 +1,7 @@
 """Rates of a trajectory: those that follow from its positions and times, and whether its own rates agree.
 
 Limits hold all along the cubics through the rows' positions and velocities, which controllers execute (see
-cubics.py), whatever accelerations are written. A motion that is within the limits between its rows, but whose
+trajectories/cubics.py), whatever accelerations are written. A motion that is within the limits between its rows, but whose
 cubics are not, needs closer rows. The arm is taken to stand still before the first and after the last row.
 
 Rates agree if they are those of some motion within the limits. With velocities v0 and v1 at both ends of a
@@ -25,7 +25,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.validation.cubics import Cubics
+from robotdiffuse.trajectories.cubics import Cubics
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
 """Where rows are closer than the first of these [s], mean accelerations are tested over windows of at least
@@ -68,9 +68,10 @@ def rate_violations(
     trajectory: Trajectory,
     tolerances: RateTolerances,
     start_velocity: Float[ndarray, "dof"] | None = None,
+    cubics: Cubics | None = None,
 ) -> list[RateViolation]:
     """The first violation of each kind in the rates of a trajectory, whose rows are finite and times
-    increase.
+    increase; `cubics` are its cubics, if they are known.
 
     The motion must begin at `start_velocity` [dof], by default at rest, and end at rest. A limit of 0 means
     that the robot gives none: then the rates must only agree with each other.
@@ -78,19 +79,18 @@ def rate_violations(
     found: dict[str, RateViolation] = {}
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
-        checks = list(_checks(robot, trajectory, tolerances, begins))
-    for check in checks:
-        right = check.off <= check.allowed
-        if right.all():
-            continue
-        wrong = ~right
-        i = int(np.flatnonzero(wrong.any(axis=1))[0])
-        beyond = np.where(wrong, np.nan_to_num(check.off - check.allowed, nan=np.inf), 0.0)
-        j, time = int(beyond[i].argmax()), float(trajectory.times[i])
-        if check.kind not in found or time < found[check.kind].time:
-            name, rate = robot.joint_names[j], abs(float(check.rates[i, j]))
-            message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
-            found[check.kind] = RateViolation(check.kind, time, name, message, float(beyond[i, j]))
+        for check in _checks(robot, cubics or Cubics(trajectory), tolerances, begins):
+            right = check.off <= check.allowed
+            if right.all():
+                continue
+            wrong = ~right
+            i = int(np.flatnonzero(wrong.any(axis=1))[0])
+            beyond = np.where(wrong, np.nan_to_num(check.off - check.allowed, nan=np.inf), 0.0)
+            j, time = int(beyond[i].argmax()), float(trajectory.times[i])
+            if check.kind not in found or time < found[check.kind].time:
+                name, rate = robot.joint_names[j], abs(float(check.rates[i, j]))
+                message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
+                found[check.kind] = RateViolation(check.kind, time, name, message, float(beyond[i, j]))
     return list(found.values())
 
 
@@ -119,11 +119,11 @@ class _Check(NamedTuple):
 
 
 def _checks(
-    robot: Robot, trajectory: Trajectory, tolerances: RateTolerances, begins: Float[ndarray, "dof"]
+    robot: Robot, cubics: Cubics, tolerances: RateTolerances, begins: Float[ndarray, "dof"]
 ) -> Iterator[_Check]:
+    trajectory = cubics.trajectory
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
-    cubics = Cubics(trajectory)
-    step, mean, change = cubics.steps, cubics.mean, np.diff(v, axis=0) / cubics.steps
+    step, mean, change = cubics.steps, cubics.extremes.mean, np.diff(v, axis=0) / cubics.steps
     blur = 2 * tolerances.resolution / step
     """Uncertainty of the mean velocities, from the resolution of positions."""
     share = 1 + tolerances.slack
@@ -144,7 +144,7 @@ def _checks(
     yield limited("jump", onwards, mean, most, tolerances.jump * most + blur)
     # The cubics' velocities contain up to 3/2 of the mean velocity, their accelerations 6 of it over the step.
     onwards = "velocity by its positions from here to the next row"
-    yield limited("velocity", onwards, cubics.peak_velocities, most, share * most + 1.5 * blur)
+    yield limited("velocity", onwards, cubics.extremes.velocity, most, share * most + 1.5 * blur)
     yield limited("velocity", "velocity", v, most, share * most)
 
     around, length = _padded(2 * begins - mean[:1], mean, -mean[-1:]), _padded(step[:1], step, step[-1:])
@@ -152,7 +152,7 @@ def _checks(
     apart = (length[1:] + length[:-1]) / 2
     second, unsure = (around[1:] - around[:-1]) / apart, (unsure[1:] + unsure[:-1]) / apart
     most = robot.acceleration
-    peaks, bent = cubics.peak_accelerations, 6 * blur / step
+    peaks, bent = cubics.extremes.acceleration, 6 * blur / step
     yield limited("acceleration", "mean acceleration by its positions", second, most, share * most + unsure)
     yield limited("acceleration", "acceleration by its positions", peaks, most, share * most + bent)
     yield limited("acceleration", "mean acceleration by its velocities", change, most, share * most)
@@ -190,7 +190,7 @@ def _checks(
         lambda i, j: f"but its velocities give {low[i, j]:.6g} to {high[i, j]:.6g}",
     )
     if len(a) > 1:
-        start, end = cubics.accelerations
+        start, end = cubics.extremes.start, cubics.extremes.end
         before, after = _padded(start[:1], end), _padded(start, end[-1:])
         least, most = np.minimum(before, after), np.maximum(before, after)
         yield _Check(

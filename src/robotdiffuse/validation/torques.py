@@ -15,7 +15,7 @@ from numpy import ndarray
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.torque_bounds import Stretches
-from robotdiffuse.validation.cubics import Cubics
+from robotdiffuse.trajectories.cubics import Cubics
 
 RESOLUTION = 1e-3
 """Halving ends where a value is known up to this share of its limit; if it may exceed the limit, it counts
@@ -56,11 +56,10 @@ def trajectory_pieces(trajectory: Trajectory) -> Pieces:
     if len(trajectory.positions) == 1:
         return static_pieces(trajectory.positions)
     cubics = Cubics(trajectory)
-    start, end = cubics.accelerations
-    h, v, change = cubics.steps, trajectory.velocities, np.abs(end - start)
-    pull = np.stack([cubics.peak_accelerations, change, np.zeros_like(change)])
-    # The velocity is a parabola in the share, which leaves its chord by an eighth of its second derivative.
-    most = np.maximum(np.abs(v[:-1]), np.abs(v[1:])) + h * change / 8
+    extremes, h = cubics.extremes, cubics.steps
+    change = np.abs(extremes.end - extremes.start)
+    pull = np.stack([extremes.acceleration, change, np.zeros_like(change)])
+    most = extremes.velocity
     speed = np.stack([most, h * pull[0], h * change])
     farthest = _farthest(trajectory.positions) + h * most / 2
     return Pieces(cubics.states, Stretches(farthest, h * speed, speed, pull))

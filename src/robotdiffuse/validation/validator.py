@@ -1,7 +1,7 @@
 """The validator: whether a motion is free of collision, within limits, and leads from the start to the goal.
 
 Freedom from collision between waypoints is certified, not sampled: see collision/motions.py. Between its rows
-a trajectory is validated along the cubics that controllers execute: see cubics.py and rates.py. The validator
+a trajectory is validated along the cubics that controllers execute: see trajectories/cubics.py and rates.py. The validator
 does not depend on planners.
 """
 
@@ -21,7 +21,7 @@ from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.trajectories.speed_limits import jerk_limits
-from robotdiffuse.validation.cubics import Cubics
+from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.validation.rates import RateTolerances, rate_violations
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, first_place_within, goal_error
@@ -118,35 +118,34 @@ class Verifier:
             return Report(False, Violation("time", 0.0, message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
+        cubics, begins = Cubics(trajectory), self.problem.start_velocity
         found = [
             Violation(wrong.kind, wrong.time, wrong.message, wrong.joint, None, wrong.excess)
-            for wrong in rate_violations(
-                self.robot, trajectory, self._rate_tolerances, self.problem.start_velocity
-            )
+            for wrong in rate_violations(self.robot, trajectory, self._rate_tolerances, begins, cubics)
         ]
-        at_rest = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
+        at_rest = None
+        if self.problem.waypoints:
+            at_rest = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
         if found:
             return self._report(trajectory.positions, trajectory.times, found, at_rest)
-        cubics = Cubics(trajectory)
         found += self._limits_between(cubics)
-        pieces = trajectory_pieces(trajectory)
         if self.dynamics is not None:
-            found += self._torques(trajectory.times, pieces, ", with the payload")
+            found += self._torques(trajectory.times, trajectory_pieces(trajectory), ", with the payload")
         along = None
         if self.constraints is not None:
-            found += self._too_fast(cubics, pieces)
+            found += self._too_fast(cubics)
             along = cubics.sampled(self.settings.constraint_chord)[:2] if not found else None
         report = self._report_on_chords(cubics, found, at_rest, along)
         if not report.valid:
             return report
-        jerks = np.maximum(trajectory.peak_jerks, cubics.peak_jerks)
+        jerks = np.maximum(trajectory.peak_jerks, cubics.extremes.jerk)
         return replace(report, jerk_share=float((jerks / jerk_limits(self.robot)).max()))
 
     def _report_on_chords(
         self,
         cubics: Cubics,
         found: list[Violation],
-        at_rest: ndarray,
+        at_rest: ndarray | None,
         along: tuple[ndarray, ndarray] | None,
     ) -> Report:
         """The report on straight lines between places on the cubics, whose clearances are reduced by how far
@@ -158,7 +157,7 @@ class Verifier:
         radii = self._continuous.checks.motion_radii
         while True:
             times, positions, off = cubics.sampled(chord)
-            still = np.isin(times, cubics.trajectory.times[at_rest]) if self.problem.waypoints else None
+            still = None if at_rest is None else np.isin(times, cubics.trajectory.times[at_rest])
             report = self._report(positions, times, found, still, along)
             clearance = report.min_clearance
             if clearance is None:
@@ -278,21 +277,24 @@ class Verifier:
 
     def _limits_between(self, cubics: Cubics) -> list[Violation]:
         """The first place between rows where a cubic leaves the joint limits."""
-        q, robot = cubics.trajectory.positions, self.robot
-        high, low = np.maximum(q[1:], q[:-1]) + cubics.chords, np.minimum(q[1:], q[:-1]) - cubics.chords
-        doubtful = ((high > robot.upper) | (low < robot.lower)) & ~robot.continuous
-        if not doubtful.any():
+        robot, extremes = self.robot, cubics.extremes
+        beyond = np.maximum(robot.lower - extremes.lower, extremes.upper - robot.upper)
+        beyond[robot.continuous] = 0.0
+        if not (beyond > self.settings.limit_slack).any():
             return []
-        times, turns = cubics.turns(doubtful)
+        times, turns = cubics.turns()
+        if not len(times):
+            return []
         violation = self._limits(turns, times, "{:.3f} s")
         return [] if violation is None else [violation]
 
-    def _too_fast(self, cubics: Cubics, pieces: Pieces) -> list[Violation]:
+    def _too_fast(self, cubics: Cubics) -> list[Violation]:
         """The first place where a frame is not proved to be as slow as its constraint requires."""
         assert self.constraints is not None
         limits, trajectory = self.constraints.speed_limits, cubics.trajectory
         if not len(limits) or not len(cubics.steps):
             return []
+        pieces = trajectory_pieces(trajectory)
         speeds, bends = self.constraints.speeds, self.constraints.speed_bends(pieces.along.v) / cubics.steps
         beyond = first_beyond(
             limits, lambda q, v, _: speeds(q, v), bends, pieces.states, self.settings.rate_slack
