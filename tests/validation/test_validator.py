@@ -391,9 +391,7 @@ def at_the_limit() -> Trajectory:
     return trajectory(1.5 * 1.2 / 2.0 * 1.0001)
 
 
-@pytest.mark.parametrize(
-    ("factor", "kind"), [(1.0, ""), (1.02, ""), (1.49, ""), (1.6, "jump")]
-)
+@pytest.mark.parametrize(("factor", "kind"), [(1.0, ""), (1.02, ""), (1.49, ""), (1.6, "jump")])
 def test_times_compressed_under_rates_of_zero(factor: float, kind: str) -> None:
     """Rates are recomputed where a trajectory conceals them; with its velocities it stops at each row."""
     robot = replace(box_arm(), joints=tuple(replace(joint, acceleration=1e3) for joint in box_arm().joints))
@@ -440,8 +438,8 @@ def test_motions_begin_and_end_at_rest(end: int) -> None:
 
 @given(st.integers(0, 2**31), st.sampled_from([1e-4, 0.01, 0.05, 0.3]))
 def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
-    """Full acceleration, coasting and braking in random turns, from rest to rest, at random rows and where the
-    acceleration jumps: the cubics are the motion."""
+    """Full acceleration, coasting and braking in random turns, from rest to rest, at random rows and where
+    the acceleration jumps: the cubics are the motion."""
     rng, robot = np.random.default_rng(seed), box_arm()
     limit = robot.acceleration[0]
     count = 800 if most < 1e-3 else 40

@@ -86,8 +86,8 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
 
     The recording may contain other joints of the robot, if they stay at their locked values. Absent
     velocities become those of the cubic spline from rest to rest through the rows, absent accelerations the
-    means of those of the cubics before and after each row. Raises InputError for missing or unknown joints, and for
-    other joints that leave their locked values.
+    means of those of the cubics before and after each row. Raises InputError for missing or unknown joints,
+    and for other joints that leave their locked values.
     """
     notes = list(motion.notes)
     given = {name: j for j, name in enumerate(motion.joint_names)}

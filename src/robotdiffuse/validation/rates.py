@@ -1,8 +1,9 @@
 """Rates of a trajectory: those that follow from its positions and times, and whether its own rates agree.
 
 Limits hold all along the cubics through the rows' positions and velocities, which controllers execute (see
-trajectories/cubics.py), whatever accelerations are written. A motion that is within the limits between its rows, but whose
-cubics are not, needs closer rows. The arm is taken to stand still before the first and after the last row.
+trajectories/cubics.py), whatever accelerations are written. A motion that is within the limits between its
+rows, but whose cubics are not, needs closer rows. The arm is taken to stand still before the first and after
+the last row.
 
 Rates agree if they are those of some motion within the limits. With velocities v0 and v1 at both ends of a
 step of h seconds, and accelerations up to A, the length of the step is within
@@ -142,7 +143,7 @@ def _checks(
 
     most, onwards = robot.velocity, "mean velocity from here to the next row"
     yield limited("jump", onwards, mean, most, tolerances.jump * most + blur)
-    # The cubics' velocities contain up to 3/2 of the mean velocity, their accelerations 6 of it over the step.
+    # Velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step.
     onwards = "velocity by its positions from here to the next row"
     yield limited("velocity", onwards, cubics.extremes.velocity, most, share * most + 1.5 * blur)
     yield limited("velocity", "velocity", v, most, share * most)

@@ -1,8 +1,8 @@
 """The validator: whether a motion is free of collision, within limits, and leads from the start to the goal.
 
 Freedom from collision between waypoints is certified, not sampled: see collision/motions.py. Between its rows
-a trajectory is validated along the cubics that controllers execute: see trajectories/cubics.py and rates.py. The validator
-does not depend on planners.
+a trajectory is validated along the cubics that controllers execute: see trajectories/cubics.py and rates.py.
+The validator does not depend on planners.
 """
 
 from dataclasses import replace
@@ -20,12 +20,18 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.trajectories.cubics import Cubics
+from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.rates import RateTolerances, rate_violations
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, first_place_within, goal_error
-from robotdiffuse.validation.torques import Pieces, first_beyond, first_excess, static_pieces, trajectory_pieces
+from robotdiffuse.validation.torques import (
+    Pieces,
+    first_beyond,
+    first_excess,
+    static_pieces,
+    trajectory_pieces,
+)
 
 if TYPE_CHECKING:  # what most problems do not need is imported where one does
     from robotdiffuse.collision.moving_obstacles import MovingCollision, TimedContact
