@@ -23,6 +23,12 @@ from robotdiffuse.problems.problem import Problem
 
 FILE_MARK, VERSION = "robotdiffuse certificate", 1
 RATE_ROWS = ("times", "velocities", "accelerations")
+FIELDS = {
+    *("is", "version", "robot", "robot_parts", "scene_parts", "motion_hash", "tolerances", "scene_clearance"),
+    *("self_clearance", "problem", "motion", "between", "proof", "request_parts", "moving", "constraints"),
+    *("looks", "torques", "jerks"),
+}
+"""Of a certificate file."""
 STRETCH_FIELDS = ("start", "stop", "by_planes", "clearance", "displacement")
 
 
@@ -121,6 +127,9 @@ def _claim_record(proof: StretchProof, k: int, claim: Claim) -> dict[str, Any]:
 
 
 def _certificate(record: dict[str, Any]) -> Certificate:
+    unknown = sorted(record.keys() - FIELDS)
+    if unknown:
+        raise InputError(f"{unknown[0]} is unknown; the fields are {', '.join(sorted(FIELDS))}")
     tolerances = record["tolerances"]
     names = {f.name for f in fields(Tolerances)}
     if not isinstance(tolerances, dict) or set(tolerances) != names:

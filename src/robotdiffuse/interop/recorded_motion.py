@@ -13,7 +13,6 @@ from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.trajectories.cubics import Cubics
 
 STATIONARY_TOLERANCE = 1e-6
 """A joint that moves less than this counts as stationary [rad] or [m]."""
@@ -117,7 +116,7 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
         v = _spline_velocities(motion.times, q)
         notes.append("no velocities are given: those of a cubic spline from rest to rest are validated")
     if a is None:
-        a = _mean_accelerations(robot.joint_names, motion.times, q, v)
+        a = _mean_accelerations(Trajectory(robot.joint_names, motion.times, q, v, np.zeros_like(v)))
         notes.append("no accelerations are given: those of the cubics through the rows are validated")
     return RobotMotion(Trajectory(robot.joint_names, motion.times, q, v, a), tuple(notes))
 
@@ -145,14 +144,12 @@ def _spline_velocities(times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -
     return CubicSpline(times, q, bc_type="clamped")(times, 1)
 
 
-def _mean_accelerations(
-    names: tuple[str, ...], times: Float[ndarray, "n"], q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"]
-) -> Float[ndarray, "n dof"]:
+def _mean_accelerations(motion: Trajectory) -> Float[ndarray, "n dof"]:
     """Means of the accelerations of the cubics before and after each row."""
-    if len(times) < 2:
-        return np.zeros_like(v)
-    of = Cubics(Trajectory(names, times, q, v, np.zeros_like(v))).extremes
-    return (np.concatenate([of.start[:1], of.end]) + np.concatenate([of.start, of.end[-1:]])) / 2
+    if len(motion.times) < 2:
+        return np.zeros_like(motion.velocities)
+    start, end = motion.cubic_accelerations
+    return (np.concatenate([start[:1], end]) + np.concatenate([start, end[-1:]])) / 2
 
 
 def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Problem:
