@@ -142,7 +142,7 @@ def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> 
     stated = dict(certificate.jerks)
     if not stated:
         return
-    if [*stated] != [*motion.joint_names]:
+    if [name for name, _ in certificate.jerks] != [*motion.joint_names]:
         yield "jerks: their joints are not those of the motion"
         return
     most = cubic_jerks(robot, motion)
@@ -189,7 +189,7 @@ def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
         if stated:
             yield "torques: the problem has no payload"
         return
-    if [*stated] != [*problem.robot.joint_names]:
+    if [name for name, _ in certificate.torques] != [*problem.robot.joint_names]:
         yield "torques: their joints are not those of the robot"
         return
     most = torque_bounds(problem, motion, certificate.torque_samples).max(axis=0)

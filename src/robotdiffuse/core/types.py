@@ -26,6 +26,9 @@ MAX_SAMPLE_RATE = 1e5
 """Largest rate at which trajectories are resampled [Hz]."""
 ACCELERATION_GAIN = 1.005
 """Factor by which resampling may raise the greatest acceleration of a joint."""
+ACCELERATION_SHARE = 0.25
+"""Share of the greatest acceleration of a joint by which those of resampled rows may differ from those of the
+cubics between them."""
 TIME_TOLERANCE = 1e-9
 """Times this far outside of a trajectory [s] are taken as its ends; rows are no closer when resampled."""
 
@@ -183,10 +186,10 @@ class Trajectory(Value):
     def resample(self, rate: float | int) -> "Trajectory":
         """Rows of `at` at each multiple of 1 / `rate` [Hz], and the last row, which ends the motion.
 
-        The cubics between fewer rows can need more acceleration than the motion, where its own changes
-        quickly. Then a motion from rest to rest is averaged: its rows lie on the uniform cubic B-spline of
-        these configurations, whose velocities and accelerations are means of the motion's. It leaves the path
-        by up to a sixth of the acceleration over rate², and lasts up to three steps longer.
+        Where the acceleration of the motion changes quickly, the cubics between fewer rows can need more of
+        it, or other ones. Then a motion from rest to rest is averaged: its rows lie on the uniform cubic
+        B-spline of these configurations, whose velocities and accelerations are means of the motion's. It
+        leaves the path by up to a sixth of the acceleration over rate², and lasts up to three steps longer.
 
         Validate the new motion: between its rows it may differ from this one. Raises InputError for a rate
         that is not in (0, MAX_SAMPLE_RATE].
@@ -205,8 +208,11 @@ class Trajectory(Value):
         times = np.append(np.arange(max(count, 1)) / rate, self.duration)
         state = self.at(times)
         rows = Trajectory(self.joint_names, times, state.positions, state.velocities, state.accelerations)
-        before, after = (np.abs(of.cubic_accelerations).max(axis=(0, 1)) for of in (self, rows))
-        if (after <= ACCELERATION_GAIN * before).all() or self.velocities[[0, -1]].any():
+        start, end = rows.cubic_accelerations
+        most = np.abs(self.cubic_accelerations).max(axis=(0, 1))
+        off = np.maximum(np.abs(start - rows.accelerations[:-1]), np.abs(end - rows.accelerations[1:]))
+        as_strong = (np.maximum(np.abs(start), np.abs(end)) <= ACCELERATION_GAIN * most).all()
+        if self.velocities[[0, -1]].any() or (as_strong and (off <= ACCELERATION_SHARE * most).all()):
             return rows
         return Trajectory(self.joint_names, *spline_rows(state.positions, 1 / rate))
 

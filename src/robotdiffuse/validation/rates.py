@@ -165,42 +165,30 @@ def _checks(
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
     """Allowed difference between mean velocities and the means of the rows' velocities."""
+    off, allowed = np.abs(mean - (v[1:] + v[:-1]) / 2), possible + blur
     yield _Check(
         "rates",
         "mean velocity from here to the next row",
         mean,
-        np.abs(mean - (v[1:] + v[:-1]) / 2),
-        possible + blur,
+        off,
+        allowed,
         lambda i, j: f"but the velocities of these rows are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
-    near = tolerances.agreement * np.where(most > 0, np.minimum(most, own), own)
-    beside = _padded(change[:1], change, change[-1:])
-    low, high = np.minimum(beside[1:], beside[:-1]), np.maximum(beside[1:], beside[:-1])
-    outside = np.maximum(low - a, a - high)
-    if len(a) > 1:  # at an end, no row lies beyond; accelerations that are linear have the step's mean
-        linear = np.abs((a[[0, -2]] + a[[1, -1]]) / 2 - change[[0, -1]])
-        outside[[0, -1]] = np.minimum(outside[[0, -1]], linear)
-    if begins.any():
-        outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
-    yield _Check(
-        "rates",
-        "acceleration",
-        a,
-        outside,
-        near,
-        lambda i, j: f"but its velocities give {low[i, j]:.6g} to {high[i, j]:.6g}",
-    )
-    if len(a) > 1:
+    if len(a) > 1 and (off <= allowed).all():  # else the cubics are not those of the positions
         start, end = cubics.extremes.start, cubics.extremes.end
         before, after = _padded(start[:1], end), _padded(start, end[-1:])
-        least, most = np.minimum(before, after), np.maximum(before, after)
+        low, high = np.minimum(before, after), np.maximum(before, after)
+        outside = np.maximum(low - a, a - high)
+        if begins.any():
+            outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
+        near = tolerances.agreement * np.where(most > 0, np.minimum(most, own), own)
         yield _Check(
             "rates",
             "acceleration",
             a,
-            np.maximum(least - a, a - most),
+            outside,
             near + np.maximum(_padded(bent[:1], bent), _padded(bent, bent[-1:])),
-            lambda i, j: f"but the cubics beside it have {least[i, j]:.6g} to {most[i, j]:.6g}",
+            lambda i, j: f"but the cubics beside it have {low[i, j]:.6g} to {high[i, j]:.6g}",
         )
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
