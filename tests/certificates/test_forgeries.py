@@ -4,6 +4,7 @@ import copy
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -14,7 +15,9 @@ import robotdiffuse as rd
 from robotdiffuse.certificates.certificate import load_certificate
 from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.content_hashes import request_parts, scene_parts
+from robotdiffuse.certificates.requirements import not_checked
 from robotdiffuse.certificates.search import certify
+from robotdiffuse.cli.certificate import described
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.files import problem_from_record
@@ -67,12 +70,15 @@ def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Problem]:
     return json.loads(file.read_text()), problem
 
 
-def sealed(record: Record) -> None:
-    """Recompute all hashes of the motion and the problem, as a forger does."""
+def motion_of(record: Record) -> Path | Trajectory:
     motion = record["motion"]
     rows = {name: np.array(motion[name], float) for name in motion if name != "joint_names"}
-    kind = Trajectory if "times" in rows else Path
-    record["motion_hash"] = hash_of(kind(tuple(motion["joint_names"]), **rows))
+    return (Trajectory if "times" in rows else Path)(tuple(motion["joint_names"]), **rows)
+
+
+def sealed(record: Record) -> None:
+    """Recompute all hashes of the motion and the problem, as a forger does."""
+    record["motion_hash"] = hash_of(motion_of(record))
     problem = problem_from_record(record["problem"])
     record["scene_parts"], record["request_parts"] = scene_parts(problem.scene), request_parts(problem)
 
@@ -387,3 +393,34 @@ def test_the_true_certificate_holds(true: tuple[Record, Problem], tmp_path: File
     (tmp_path / "true.json").write_text(json.dumps(record))
     certificate = load_certificate(tmp_path / "true.json")
     assert certificate.check().differences == () and certificate.check(true[1]).differences == ()
+
+
+def test_thin_spheres_are_refused() -> None:
+    panda = rd.load_robot("panda")
+    thin = {link: spheres * [1, 1, 1, 0.5] for link, spheres in panda.spheres.items()}
+    problem = Problem(replace(panda, spheres=thin), rd.Scene(), START, GOAL)
+    certificate = certify(problem, Path(panda.joint_names, np.array([START, GOAL])))
+    found = certificate.check(problem).differences
+    assert any(
+        re.match("robot: the meshes of panda_link5 stick out of its spheres by 0.0", line) for line in found
+    )
+
+
+def test_the_robot_is_described() -> None:
+    panda = rd.load_robot("panda", {"panda_finger_joint1": 0.01})
+    assert described(panda) == "panda, the bundled one"
+    small = {
+        link: tuple(replace(m, vertices=0.5 * m.vertices) for m in of) for link, of in panda.meshes.items()
+    }
+    shrunk = described(replace(panda, meshes=small, source="/robots/panda"))
+    assert shrunk.startswith(
+        "panda from /robots/panda, not the bundled one: meshes of panda_link0 has changed"
+    )
+    assert "not bundled" in described(replace(panda, name="mine"))
+
+
+def test_what_is_not_checked_is_told(true: tuple[Record, Problem]) -> None:
+    panda = rd.load_robot("panda")
+    problem = Problem(panda, rd.Scene(), START, GOAL, start_velocity=[0.1, 0, 0, 0, 0, 0, 0])
+    assert "start_velocity" in not_checked(problem, Path(panda.joint_names, np.array([START, GOAL])))
+    assert not_checked(true[1], motion_of(true[0])) == ["sharp reversals"]

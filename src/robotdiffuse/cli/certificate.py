@@ -49,7 +49,7 @@ def run_check(arguments: argparse.Namespace) -> int:
         print(f"note: {note}")
     found = certificate.check(problem).differences
     if problem is not None:
-        print(f"robot: {_described(problem.robot)}")
+        print(f"robot: {described(problem.robot)}")
         print(f"problem: {arguments.problem or 'the one in the certificate'}")
         print(f"not checked: {'; '.join(not_checked(problem, certificate.motion))}")
     for line in found:
@@ -59,7 +59,7 @@ def run_check(arguments: argparse.Namespace) -> int:
     return FAILS if found else HOLDS
 
 
-def _described(robot: "Robot") -> str:
+def described(robot: "Robot") -> str:
     """The robot's name, its source, and whether it is the bundled one."""
     from robotdiffuse.certificates.content_hashes import differences, robot_parts
     from robotdiffuse.core.errors import joined
