@@ -276,7 +276,7 @@ def unknown_ball(moving: list[Any]) -> list[Any]:
 
 FORGED: dict[str, tuple[Callable[[Record], None], str]] = {
     # planes
-    "normals of denormal length": (normals(1e-310), "is not the normal of a plane"),
+    "normals of denormal length": (normals(1e-310), "has a normal of length"),
     "normals of small length": (normals(1e-160), "has a normal of length"),
     "normals of huge length": (normals(1e200), "has a normal of length|is not the normal"),
     "normals a millionth too long": (normals(1 + 1e-6), "has a normal of length"),

@@ -181,7 +181,7 @@ def _proof(record: list[dict[str, Any]]) -> StretchProof:
             if not 0 <= int(stretch) < count:
                 raise InputError(f"proof of {claims[-1].link}: it has no stretch {shown(stretch)}")
             plane = Plane(begin + int(stretch), int(part), int(other), tuple(map(float, normal)))  # type: ignore[arg-type]
-            if len(normal) != 3 or not 0 < np.linalg.norm(normal) < np.inf:
+            if len(normal) != 3 or not 0 < math.hypot(*normal) < math.inf:
                 raise InputError(f"proof of {claims[-1].link}: {shown(normal)} is not the normal of a plane")
             planes.append(plane)
         begin += count
