@@ -197,6 +197,11 @@ def zero_stretches(record: Record) -> None:
         claim["stop"] = list(claim["start"])
 
 
+def no_stretches(record: Record) -> None:
+    for claim in record["proof"]:
+        claim.update(start=[], stop=[], clearance=[], displacement=[], by_planes=[], planes=[])
+
+
 def twice(record: Record) -> None:
     record["proof"].append(copy.deepcopy(record["proof"][0]))
 
@@ -295,16 +300,7 @@ FORGED: dict[str, tuple[Callable[[Record], None], str]] = {
     "stretches that begin late": (of_widest("start", lambda x: [0.5, *x[1:]]), "is missing from row"),
     "stretches beyond the motion": (of_widest("stop", lambda x: [*x[:-1], x[-1] + 9]), "is missing from row"),
     "stretches backwards": (reversed_proof, "is missing from row"),
-    "no stretches": (
-        lambda record: (
-            [
-                claim.update(start=[], stop=[], clearance=[], displacement=[], by_planes=[], planes=[])
-                for claim in record["proof"]
-            ]
-            and None
-        ),
-        "is missing from row",
-    ),
+    "no stretches": (no_stretches, "is missing from row"),
     "a claim twice": (twice, "contains a claim twice"),
     "a claim against nothing": (against_nothing, "needs no proof"),
     "claims of other links": (exchanged_claims, "proof: "),

@@ -29,6 +29,7 @@ from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.validator import VerifySettings, verifier, verify, verify_trajectory
+from robotdiffuse.validation.violations import violations
 
 Z = np.array([0.0, 0.0, 1.0])
 RATES = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
@@ -451,7 +452,8 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     place = np.concatenate([np.zeros((1, 3)), np.cumsum((speed[1:] + speed[:-1]) / 2, axis=0)]) * step
     every = max(int(most / step), 1)
     jumps = np.arange(0, len(place), count)
-    rows = np.unique([*jumps, *rng.choice(len(place), len(place) // every + 1), len(place) - 1])
+    chosen = rng.choice(len(place), len(place) // every + 1)
+    rows = np.unique(np.concatenate([jumps, chosen, [len(place) - 1]]))
     accelerations = np.concatenate([fine, fine[-1:]])[rows]
     place += rng.uniform(-1, 1, place.shape) * 0.99 * RATES.resolution
     motion = Trajectory(robot.joint_names, rows * step, place[rows], speed[rows], accelerations)
@@ -593,7 +595,10 @@ def test_limits_hold_between_rows() -> None:
     high = box_arm().upper[1] - 0.5e-3
     rows, v = np.array([[0, 2.5, 0], [0, high, 0], [0, high, 0], [0, 2.5, 0]]), np.zeros((4, 3))
     v[1:3, 1] = 0.01, -0.01
-    found = refused(verified(between_rest(rows, [0.0, 2.0, 2.7, 4.7], v)), "limits")
+    motion = between_rest(rows, [0.0, 2.0, 2.7, 4.7], v)
+    found = refused(verified(motion), "limits")
+    problem = Problem(box_arm(), Scene(), rows[0], JointGoal(rows[-1:]))
+    assert [one.kind for one in violations(problem, motion)] == ["limits"]
     assert found.subject == "j1" and found.time == pytest.approx(2.35, abs=1e-6)
     assert found.excess == pytest.approx(0.01 * 0.7 / 4 - 0.5e-3, rel=1e-3)
     assert verified(between_rest(rows - [0, 2e-3, 0], [0.0, 2.0, 2.7, 4.7], v)).valid

@@ -98,9 +98,9 @@ def check(
 def _cover_errors(robot: Robot) -> Iterator[str]:
     """Links whose spheres, by which most stretches are proved, do not cover their meshes."""
     for link, meshes in robot.meshes.items():
-        spheres = robot.spheres.get(link, ())
-        if not len(spheres) or not meshes:
+        if link not in robot.spheres or not len(robot.spheres[link]) or not meshes:
             continue
+        spheres = robot.spheres[link]
         corners = np.concatenate([mesh.vertices for mesh in meshes])
         apart = np.linalg.norm(corners[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]
         beyond = float(apart.min(axis=1).max())
