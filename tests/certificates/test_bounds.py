@@ -16,7 +16,9 @@ from robotdiffuse.certificates import bounds
 from robotdiffuse.certificates.bounds import SCENE, Prover, Stretches
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.certificates.obstacles import CLEARANCE_CAP, Obstacles, Rounded, Surface
+from robotdiffuse.certificates.requirements import configurations, deviations
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.scenes.mesh import Mesh
@@ -201,3 +203,26 @@ def test_a_link_that_is_called_like_the_scene_is_refused(monkeypatch: pytest.Mon
     monkeypatch.setattr(bounds, "SCENE", "l2")
     with pytest.raises(InputError, match="a link called 'l2'"):
         Prover(box_arm(), Scene(), np.zeros((2, 3)))
+
+
+def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
+    """Along the cubics, clearances are at least what is left of those in the middle of the straight lines."""
+    rng, robot = np.random.default_rng(0), box_arm()
+    for _ in range(30):
+        rows, v = rng.uniform(-0.5, 0.5, (2, 4, 3))
+        motion = Trajectory(robot.joint_names, 0.3 * np.arange(4.0), rows, v, 0 * v)
+        scene = Scene([Sphere([*rng.uniform(-1, 1, 2), 0.0], 0.05)])
+        between = np.sort(rng.uniform(0.0, 0.9, 5))
+        prover = Prover(robot, scene, configurations(motion, between), deviations(motion, between))
+        times = np.sort(np.concatenate([motion.times, between]))
+        count = len(prover.claims)
+        start, stop = np.sort(rng.uniform(0, len(times) - 1, 2))
+        whole = Stretches(np.arange(count), np.full(count, start), np.full(count, stop))
+        found = prover.bounds(whole, np.zeros(count, bool), [])
+        low, high = np.interp([start, stop], np.arange(len(times)), times)
+        dense = motion.at(np.linspace(low, high, 100)).positions
+        exact = Prover(robot, scene, dense)
+        for place in range(100):
+            here = Stretches(np.arange(count), np.full(count, float(place)), np.full(count, float(place)))
+            there = exact.bounds(here, np.zeros(count, bool), [])
+            assert (there.clearance >= found.clearance - found.displacement - 1e-9).all()

@@ -303,7 +303,7 @@ def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytes
     monkeypatch.setattr("robotdiffuse.certificates.search.verify", lambda *_: report)
     found = certify(problem, motion).check(problem).differences
     assert any(wanted in line for line in found), found
-    assert all(line.startswith("motion: j0 exceeds its limit of mean") for line in found), found
+    assert all(line.startswith("motion: ") and "j0" in line for line in found), found
 
 
 @pytest.mark.parametrize("with_times", [False, True])

@@ -59,6 +59,8 @@ def test_bounds_are_bounds(name: str, step: float) -> None:
     for _ in range(5):
         motion = wild(problem.robot, rng, step)
         samples = np.linspace(0, motion.times[-1], 201)[1:-1]
+        # accelerations jump at rows, to which rounding would assign samples at random
+        samples = samples[np.abs(samples[:, None] - motion.times).min(axis=1) > 1e-9]
         for one, at in ((motion, samples), (Path(motion.joint_names, motion.positions), samples / step)):
             few = torque_bounds(problem, one, np.zeros(0))
             dense = torque_bounds(problem, one, at)

@@ -45,7 +45,9 @@ def test_a_certificate_is_written_and_checked(planned: Path, capsys: pytest.Capt
     assert run("verify", planned / "r.json", "--certificate", "c.json") == 0
     assert "wrote c.json" in capsys.readouterr().out
     assert run("certificate", "check", "c.json") == 0
-    assert capsys.readouterr().out.startswith("holds: at least")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("robot: panda, ") and lines[1] == "problem: the one in the certificate"
+    assert lines[2].startswith("not checked: ") and lines[3].startswith("holds: at least")
     assert run("certificate", "check", "c.json", "--problem", planned / "problem.json") == 0
     assert run("certificate", "check", "c.json", "--problem", planned / "other.json") == 1
     assert "scene: new was added" in capsys.readouterr().out

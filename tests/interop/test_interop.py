@@ -205,7 +205,7 @@ def test_joints_are_put_into_order_by_name() -> None:
     found = motion_of_robot(motion_from_record(record, "it"), rd.load_robot("panda"))
     assert found.motion.positions[0].tolist() == START
     assert "joints were reordered by name" in found.notes
-    assert "no accelerations are given: the rates of change of velocity are validated" in found.notes
+    assert "no accelerations are given: those of the cubics through the rows are validated" in found.notes
 
 
 def test_all_forms_of_messages_hold_the_same_motion() -> None:

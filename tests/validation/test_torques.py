@@ -62,15 +62,22 @@ def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
 
 
 def test_a_peak_between_two_times_is_found() -> None:
-    """Slow enough that gravity alone counts; rows a second apart, none level."""
+    """At a constant velocity, so that gravity alone counts; rows a second apart, none level."""
     rows = np.pi / 2 + np.array([[-0.375], [-0.125], [0.125], [0.375]])
-    v = np.array([[0.0], [0.25], [0.25], [0.0]])
-    motion = Trajectory(("hinge",), np.arange(4.0), rows, v, np.zeros((4, 1)))
+    motion = Trajectory(("hinge",), np.arange(4.0), rows, np.full((4, 1), 0.25), np.zeros((4, 1)))
     for effort, beyond in ((9.66, True), (9.75, False)):
         found = first_excess(Dynamics(pendulum(effort), Payload(0.0)), trajectory_pieces(motion), 0.01)
         assert (found is not None) == beyond
         if found is not None:
             assert 1 < found.place < 2 and 1.01 * effort < found.torque < 9.82
+
+
+def test_torques_are_those_of_the_cubics() -> None:
+    """Two rows at rest: 12 rad/s² at both ends, whatever is written; gravity alone needs 2.4 N m."""
+    rows, still = np.array([[-0.25], [0.25]]), np.zeros((2, 1))
+    motion = Trajectory(("hinge",), np.array([0.0, 0.5]), rows, still, still)
+    assert first_excess(Dynamics(pendulum(5.3), Payload(0.0)), trajectory_pieces(motion), 0.01) is not None
+    assert first_excess(Dynamics(pendulum(6.0), Payload(0.0)), trajectory_pieces(motion), 0.01) is None
 
 
 def test_a_motion_that_winds_on_and_on_is_refused_in_bounded_time() -> None:

@@ -88,10 +88,19 @@ class Bounds:
 
 
 class Prover:
-    """Computes bounds for a robot in a scene along straight lines through configurations."""
+    """Computes bounds for a robot in a scene along straight lines through configurations, or near them."""
 
-    def __init__(self, robot: Robot, scene: Scene, q: Float[ndarray, "rows dof"]) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        scene: Scene,
+        q: Float[ndarray, "rows dof"],
+        off: Float[ndarray, "rows1 dof"] | None = None,
+    ) -> None:
+        """`off`: how far the motion leaves the straight line from each configuration to the next; 0 if it is
+        None."""
         self.robot, self.q = robot, q
+        self.off = np.zeros_like(q[1:]) if off is None else off
         self.linkage, self.obstacles = Linkage(robot), Obstacles(scene)
         self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
         if SCENE in self.links:
@@ -146,7 +155,15 @@ class Prover:
             least = np.minimum.reduceat(rows, edges)[::2]
             beyond = np.maximum(most - q[within], q[within] - least)
             spans[within] = np.maximum(spans[within], beyond)
-        return spans
+        return spans + self.deviations(start, stop)
+
+    def deviations(self, start: ndarray, stop: ndarray) -> Float[ndarray, "n dof"]:
+        """How far each joint leaves the straight lines along stretches [rad] or [m]."""
+        if not len(self.off):
+            return np.zeros((len(start), self.q.shape[1]))
+        first = np.minimum(np.floor(start).astype(int), len(self.off) - 1)
+        edges = np.column_stack([first, np.maximum(np.ceil(stop).astype(int), first + 1)]).ravel()
+        return np.maximum.reduceat(np.concatenate([self.off, 0 * self.off[:1]]), edges)[::2]
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
         """Bounds of stretches, by `planes` for those that `by_planes` marks, else by the spheres."""
@@ -167,7 +184,8 @@ class Prover:
                 clearance[rows], displacement[rows] = found
         marked = np.flatnonzero(by_planes)
         if len(marked):
-            ways = [_steps(self, *ends[k]) for k in which[marked]]
+            off = self.deviations(ends[:, 0], ends[:, 1])
+            ways = [(_steps(self, *ends[k]), off[k]) for k in which[marked]]
             found = self._by_planes(stretches, marked, planes, postures, which, ways, displacement[marked])
             clearance[marked], displacement[marked] = found
         return Bounds(clearance, displacement)
@@ -244,7 +262,7 @@ class Prover:
         planes: list[Plane],
         postures: Postures,
         which: ndarray,
-        ways: list[ndarray],
+        ways: list[tuple[ndarray, ndarray]],
         displacement: ndarray,
     ) -> tuple[ndarray, ndarray]:
         """Clearance and displacement of the `marked` stretches by planes.
@@ -268,7 +286,7 @@ class Prover:
                 other = self._moved[self._of[claim.against]]
                 mine, theirs = mine & ~other, other & ~mine
             mine, theirs = np.flatnonzero(mine), np.flatnonzero(theirs)
-            at = which[marked[k]]
+            at, (way, off) = which[marked[k]], ways[k]
             for p, part in enumerate(standing[k]):
                 bodies = self.others(claim, T, part)
                 if claim.against == SCENE:
@@ -283,11 +301,11 @@ class Prover:
                         n = np.array(shown)
                         n /= np.sqrt((n**2).sum(axis=1, keepdims=True))
                         axes = postures.origins[at], postures.axes[at]
-                        nearer = self.linkage.approach(*axes, part.vertices, mine, ways[k], n)
+                        nearer = self.linkage.approach(*axes, part.vertices, mine, way, n, off)
                         against = np.zeros(len(n))
                         if len(theirs):
                             assert isinstance(body, Part)
-                            comes = self.linkage.approach(*axes, body.vertices, theirs, ways[k], -n)
+                            comes = self.linkage.approach(*axes, body.vertices, theirs, way, -n, off)
                             heights = n @ body.vertices.T
                             against = (heights + comes).max(axis=1) - heights.max(axis=1)
                         widest = gaps(part, body, n).max(axis=-1)

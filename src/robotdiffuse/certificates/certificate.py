@@ -23,6 +23,12 @@ from robotdiffuse.problems.problem import Problem
 
 FILE_MARK, VERSION = "robotdiffuse certificate", 1
 RATE_ROWS = ("times", "velocities", "accelerations")
+FIELDS = {
+    *("is", "version", "robot", "robot_parts", "scene_parts", "motion_hash", "tolerances", "scene_clearance"),
+    *("self_clearance", "problem", "motion", "between", "proof", "request_parts", "moving", "constraints"),
+    *("looks", "torques", "jerks"),
+}
+"""Of a certificate file."""
 STRETCH_FIELDS = ("start", "stop", "by_planes", "clearance", "displacement")
 
 
@@ -121,6 +127,9 @@ def _claim_record(proof: StretchProof, k: int, claim: Claim) -> dict[str, Any]:
 
 
 def _certificate(record: dict[str, Any]) -> Certificate:
+    unknown = sorted(record.keys() - FIELDS)
+    if unknown:
+        raise InputError(f"{unknown[0]} is unknown; the fields are {', '.join(sorted(FIELDS))}")
     tolerances = record["tolerances"]
     names = {f.name for f in fields(Tolerances)}
     if not isinstance(tolerances, dict) or set(tolerances) != names:
@@ -172,7 +181,7 @@ def _proof(record: list[dict[str, Any]]) -> StretchProof:
             if not 0 <= int(stretch) < count:
                 raise InputError(f"proof of {claims[-1].link}: it has no stretch {shown(stretch)}")
             plane = Plane(begin + int(stretch), int(part), int(other), tuple(map(float, normal)))  # type: ignore[arg-type]
-            if len(normal) != 3 or not 0 < np.linalg.norm(normal) < np.inf:
+            if len(normal) != 3 or not 0 < math.hypot(*normal) < math.inf:
                 raise InputError(f"proof of {claims[-1].link}: {shown(normal)} is not the normal of a plane")
             planes.append(plane)
         begin += count

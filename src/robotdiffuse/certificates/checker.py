@@ -21,12 +21,22 @@ from robotdiffuse.certificates.content_hashes import (
 )
 from robotdiffuse.certificates.moving_obstacles import MovingProver
 from robotdiffuse.certificates.proof import BOUND_TOLERANCE, MotionProof, StretchProof, Tolerances
-from robotdiffuse.certificates.requirements import configurations, requirement_errors
+from robotdiffuse.certificates.requirements import (
+    configurations,
+    deviations,
+    place_errors,
+    requirement_errors,
+)
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.robot import Robot
 
 VALIDATOR = Tolerances()
+NORMAL_TOLERANCE = 1e-9
+"""Normals of planes have length 1 within this."""
+COVER_TOLERANCE = 1e-6
+"""Corners of a link's meshes may stick out of its spheres by this [m]."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +56,9 @@ def check(
 ) -> Findings:
     """Re-check a proof for a problem, by default the one in its file, with tolerances of at most `at_most`.
 
-    Robot, scene and motion must have the content that was certified. The motion must keep the limits, begin
-    at the start and end at the goal, and every stretch must be proved free. Stops at waypoints, twitching,
-    and whether rates agree with positions beyond their limits are left to the validator. Raises InputError if
+    Robot, scene and motion must have the content that was certified. The motion must keep the limits all
+    along its cubics, begin at the start, stop at or pass the waypoints and end at the goal, and every stretch
+    must be proved free. `requirements.not_checked` says what is left to the validator. Raises InputError if
     neither the file nor the caller gives a problem, and for shapes that certificates do not support.
     """
     if problem is None:
@@ -63,19 +73,39 @@ def check(
         *differences("requests", certificate.request_parts, request_parts(problem)),
     ]
     for name, most in asdict(at_most).items():
-        if getattr(certificate.tolerances, name) > most:
-            stated = getattr(certificate.tolerances, name)
+        stated = getattr(certificate.tolerances, name)
+        if not stated <= most:
             found.append(f"tolerances: {name} is {stated:g}, looser than {most:g}")
+        if not stated >= 0:
+            found.append(f"tolerances: {name} is {stated:g}; it must not be negative")
+    if certificate.robot != problem.robot.name:
+        found.append(f"robot: it is {problem.robot.name}, not {certificate.robot}")
     if certificate.motion_hash != hash_of(certificate.motion):
         found.append("motion: it is not the one that was certified: its hash differs")
     with np.errstate(
         over="ignore", invalid="ignore", divide="ignore"
     ):  # non-finite values become differences
-        found += requirement_errors(problem, certificate)
-        if tuple(certificate.motion.joint_names) == problem.robot.joint_names:
+        found += _cover_errors(problem.robot)
+        misplaced = place_errors(problem, certificate)
+        found += misplaced
+        if not misplaced:
+            found += requirement_errors(problem, certificate)
             found += _proof_errors(problem, certificate)
             found += _moving_proof_errors(problem, certificate)
     return Findings(tuple(found))
+
+
+def _cover_errors(robot: Robot) -> Iterator[str]:
+    """Links whose spheres, by which most stretches are proved, do not cover their meshes."""
+    for link, meshes in robot.meshes.items():
+        if link not in robot.spheres or not len(robot.spheres[link]) or not meshes:
+            continue
+        spheres = robot.spheres[link]
+        corners = np.concatenate([mesh.vertices for mesh in meshes])
+        apart = np.linalg.norm(corners[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]
+        beyond = float(apart.min(axis=1).max())
+        if not beyond <= COVER_TOLERANCE:
+            yield f"robot: the meshes of {link} stick out of its spheres by {beyond:.2g} m"
 
 
 def hash_of(motion: Path | Trajectory) -> str:
@@ -86,8 +116,9 @@ def hash_of(motion: Path | Trajectory) -> str:
 
 def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Differences in the proof in the scene and between links."""
-    prover = Prover(problem.robot, problem.scene, configurations(certificate.motion, certificate.between))
-    proof = certificate.proof
+    motion, proof = certificate.motion, certificate.proof
+    q, off = configurations(motion, certificate.between), deviations(motion, certificate.between)
+    prover = Prover(problem.robot, problem.scene, q, off)
     stated = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
     of_pairs = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
     yield from _bound_errors(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, stated)
@@ -96,13 +127,18 @@ def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
 def _moving_proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Differences in the proof among moving obstacles."""
     motion, proof = certificate.motion, certificate.moving
-    if not problem.moving or not isinstance(motion, Trajectory) or not (np.diff(motion.times) > 0).all():
+    if not problem.moving:
+        if proof is not None:
+            yield "proof: there is one among moving obstacles, which the problem has not"
+        return
+    if not isinstance(motion, Trajectory):
         return
     if proof is None:
         yield "proof: there is none among moving obstacles"
         return
     times = np.sort(np.concatenate([motion.times, certificate.between]), kind="stable")
-    prover = MovingProver(problem.robot, problem.moving, configurations(motion, certificate.between), times)
+    q, off = configurations(motion, certificate.between), deviations(motion, certificate.between)
+    prover = MovingProver(problem.robot, problem.moving, q, times, off)
     every, stated = np.ones(len(proof.stretches.claim), bool), {"scene": certificate.scene_clearance}
     yield from _bound_errors(prover, proof, {"scene": every}, stated)
 
@@ -130,11 +166,18 @@ def _bound_errors(
     if wrong_planes:
         yield "proof: planes are given for stretches that are proved by spheres"
         return
+    lengths = np.linalg.norm([plane.normal for plane in proof.planes] or np.eye(3), axis=1)
+    not_unit = np.flatnonzero(~(np.abs(lengths - 1) <= NORMAL_TOLERANCE))
+    if len(not_unit):
+        i = int(not_unit[0])
+        where = _place(proof, proof.planes[i].stretch)
+        yield f"proof: a plane of {where} has a normal of length {lengths[i]:g}, not 1"
+        return
     own = np.array([known[claim] for claim in proof.claims])[stretches.claim]
     bounds = prover.bounds(stretches._replace(claim=own), proof.by_planes, list(proof.planes))
     for what in ("clearance", "displacement"):
         written, right = getattr(proof, what), getattr(bounds, what)
-        off = np.flatnonzero(np.abs(written - right) > BOUND_TOLERANCE)
+        off = np.flatnonzero(~(np.abs(written - right) <= BOUND_TOLERANCE))
         if len(off):
             i = int(off[0])
             more = f" ({len(off) - 1} more)" if len(off) > 1 else ""
@@ -142,9 +185,10 @@ def _bound_errors(
     left = bounds.clearance - bounds.displacement
     for what, which in kinds.items():
         least = stated[what]
-        if not least > 0:
-            yield f"proof: its {what} clearance is {least:g} m, which is not positive"
-        unproved = np.flatnonzero(which & (left < min(least, CLEARANCE_CAP) - BOUND_TOLERANCE))
+        if not 0 < least <= CLEARANCE_CAP:
+            rule = "not positive" if not least > 0 else f"more than the {CLEARANCE_CAP:g} m that are measured"
+            yield f"proof: its {what} clearance is {least:g} m, which is {rule}"
+        unproved = np.flatnonzero(which & ~(left >= least - BOUND_TOLERANCE))
         if len(unproved):
             i = int(unproved[0])
             yield f"proof: {_place(proof, i)} is clear by {left[i]:.6f} m, not by {least:.6f} m"

@@ -80,6 +80,20 @@ class Linkage:
             link = above[link].parent
         return found[::-1]
 
+    def levers(self, link: str, q: Float[ndarray, "n dof"]) -> Float[ndarray, "joints"]:
+        """Upper bounds on the distance of a link's origin from the axes of the planned joints that move it,
+        in order [m]; 1 for a joint that slides. `q` holds the extreme positions of a motion."""
+        found, length = list[float](), 0.0
+        for joint in reversed(self._up_to(link)):
+            j = self._planned.get(joint.name)
+            if j is not None:
+                found.append(1.0 if self.slides[j] else length)
+            if joint.kind == "prismatic":
+                far = self.robot.locked.get(joint.name, 0.0) if j is None else q[:, j]
+                length += float(np.abs(far).max())
+            length += float(np.linalg.norm(joint.T_parent_joint[:3, 3]))
+        return np.array(found[::-1])
+
     def rates(
         self, postures: Postures, link: str
     ) -> tuple[Int[ndarray, "joints"], Float[ndarray, "n joints 3"]]:
@@ -122,22 +136,26 @@ class Linkage:
         moved_by: Int[ndarray, "joints"],
         steps: Float[ndarray, "rows dof"],
         normals: Float[ndarray, "k 3"],
+        off: Float[ndarray, "dof"] | float = 0.0,
     ) -> Float[ndarray, "k v"]:
         """Upper bound on the movement of points against unit vectors [m].
 
-        Joints move from their posture to anywhere on the straight lines through `steps`, which are
-        differences from it. Only the joints `moved_by` count, each behind the one before.
+        Joints move from their posture to anywhere within `off` of the straight lines through `steps`, which
+        are differences from it. Only the joints `moved_by` count, each behind the one before.
 
         To first order a point's movement along the normal is a linear function of the joints, with its
-        minimum at one of the steps. The remainder is at most sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), because
-        the second derivative of the point by joints j <= k is at most its greatest distance L_k from axis k.
+        minimum at one of the steps, less what `off` adds. The remainder is at most
+        sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), because the second derivative of the point by joints j <= k
+        is at most its greatest distance L_k from axis k.
         """
-        which, spans = moved_by.tolist(), np.abs(steps).max(axis=0)
+        which, off = moved_by.tolist(), np.broadcast_to(off, steps.shape[1])
+        spans = np.abs(steps).max(axis=0) + off
         rates = np.cross(axes[which, None], points[None] - origins[which, None])
         rates[self.slides[which]] = axes[which, None][self.slides[which]]
         lengths = np.sqrt((rates**2).sum(axis=2))
         along = np.moveaxis(rates @ normals.T, 2, 1).reshape(len(which), -1)
-        towards = -(steps[:, which] @ along).min(axis=0).reshape(len(normals), len(points))
+        towards = off[which] @ np.abs(along) - (steps[:, which] @ along).min(axis=0)
+        towards = towards.reshape(len(normals), len(points))
         went, rest = np.zeros(len(points)), np.zeros(len(points))
         for i in reversed(range(len(which))):
             j = which[i]

@@ -21,7 +21,7 @@ from robotdiffuse.scenes.scene import Scene
 
 class MovingProver(Prover):
     """Computes bounds for a robot among moving obstacles along straight lines through configurations at
-    times."""
+    times, or near them."""
 
     def __init__(
         self,
@@ -29,8 +29,9 @@ class MovingProver(Prover):
         moving: Sequence[MovingObstacle],
         q: Float[ndarray, "rows dof"],
         times: Float[ndarray, "rows"],
+        off: Float[ndarray, "rows1 dof"] | None = None,
     ) -> None:
-        super().__init__(robot, Scene(), q)
+        super().__init__(robot, Scene(), q, off)
         self.times, self.moving = times, tuple(moving)
         self._shapes = [Obstacles(Scene([one.shape])) for one in moving]
 

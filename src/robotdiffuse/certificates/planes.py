@@ -18,8 +18,8 @@ from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 
 MAX_PLANES = 64
 """Planes between a part and a surface at most; concave surfaces need several."""
-DECIMALS = 7
-"""Decimals of normals in files."""
+DECIMALS = 10
+"""Decimals of normals in files, whose length must be 1 within 1e-9."""
 
 Normal = tuple[float, float, float]
 

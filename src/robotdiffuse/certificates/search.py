@@ -17,19 +17,23 @@ from robotdiffuse.certificates.certificate import Certificate
 from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.constraints import constraint_bounds
 from robotdiffuse.certificates.content_hashes import request_parts, robot_parts, scene_parts
+from robotdiffuse.certificates.cubics import cubics_of
 from robotdiffuse.certificates.moving_obstacles import MovingProver
 from robotdiffuse.certificates.planes import PlaneFinder
 from robotdiffuse.certificates.proof import DECIMALS, StretchProof, Tolerances
-from robotdiffuse.certificates.requirements import configurations, not_covered
+from robotdiffuse.certificates.requirements import configurations, cubic_jerks, deviations, not_covered
 from robotdiffuse.certificates.torques import torque_bounds
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
+from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify
 
 CLEARANCE_SHARE = 0.5
 """The proof shows this share of the clearances that the validator certifies; a larger one needs more
 stretches."""
+CHORD_SHARE = 0.05
+"""Straight lines that stand for the cubics displace no point by more than this share of the clearance."""
 MAX_SPLIT = 8
 """A stretch is split into at most this many parts at a time."""
 PLANES_BELOW = 0.02
@@ -73,16 +77,17 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     tolerances = Tolerances(**{name: getattr(settings, name) for name in Tolerances.__dataclass_fields__})
     if problem.constraints:
         tolerances = replace(tolerances, chord=settings.constraint_chord)
-    between, bounds = _prove_constraints(
-        problem, motion, _between(motion, tolerances.chord), tolerances.chord
-    )
+    clearances = [c for c in (report.scene_clearance, report.self_clearance) if c]
+    reach = float(motion_radii(problem.robot).max(axis=0, initial=0.0).sum())
+    chord = min(tolerances.chord, CHORD_SHARE * min(clearances, default=np.inf) / max(reach, 1e-3))
+    between, bounds = _prove_constraints(problem, motion, _between(motion, chord), tolerances.chord)
     samples, torques = _prove_torques(problem, motion, tolerances.rate_slack)
-    q = configurations(motion, between)
-    proof, left = _prove(Prover(problem.robot, problem.scene, q), least)
+    q, off = configurations(motion, between), deviations(motion, between)
+    proof, left = _prove(Prover(problem.robot, problem.scene, q, off), least)
     moving = None
     if problem.moving and isinstance(motion, Trajectory):
         times = np.sort(np.concatenate([motion.times, between]), kind="stable")
-        moving, others = _prove(MovingProver(problem.robot, problem.moving, q, times), {"": 0.0})
+        moving, others = _prove(MovingProver(problem.robot, problem.moving, q, times, off), {"": 0.0})
         left[SCENE] = min(left[SCENE], *others.values())  # an obstacle may be called "scene"
     return Certificate(
         problem.robot.name,
@@ -101,15 +106,14 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         bounds,
         samples,
         torques,
-        _jerks(motion),
+        _jerks(problem, motion),
     )
 
 
-def _jerks(motion: Path | Trajectory) -> tuple[tuple[str, float], ...]:
+def _jerks(problem: Problem, motion: Path | Trajectory) -> tuple[tuple[str, float], ...]:
     """See `MotionProof.jerks`."""
-    if not isinstance(motion, Trajectory) or not np.isfinite(motion.peak_jerks).all():
-        return ()
-    return tuple(zip(motion.joint_names, motion.peak_jerks.tolist(), strict=True))
+    jerks = cubic_jerks(problem.robot, motion)
+    return () if jerks is None else tuple(zip(motion.joint_names, jerks.tolist(), strict=True))
 
 
 def _prove_constraints(
@@ -168,16 +172,16 @@ def _record(problem: Problem) -> dict[str, object] | None:
 def _between(motion: Path | Trajectory, chord: float) -> Float[ndarray, "k"]:
     """Times between the rows such that the cubics leave the straight lines between them by at most
     `chord`."""
-    if not isinstance(motion, Trajectory) or len(motion.times) < 2:
+    cubics = cubics_of(motion)
+    if cubics is None:
         return np.zeros(0)
-    h = np.diff(motion.times)[:, None]
-    mean, v0, v1 = np.diff(motion.positions, axis=0) / h, motion.velocities[:-1], motion.velocities[1:]
-    bend = np.maximum(np.abs(6 * mean - 4 * v0 - 2 * v1), np.abs(6 * mean - 2 * v0 - 4 * v1)) / h
-    off = (bend * h**2 / 8).max(axis=1, initial=0.0)
+    off = (cubics.pulls * cubics.steps**2 / 8).max(axis=1)
     parts = np.maximum(np.ceil(np.sqrt(off / chord)), 1).astype(int)
     if parts.sum() > MAX_STRETCHES:
         raise InputError("the motion bends too much between its rows to be certified; give more rows")
-    within = [t + d * np.arange(1, n) / n for t, d, n in zip(motion.times, h[:, 0], parts, strict=False)]
+    within = [
+        t + d * np.arange(1, n) / n for t, d, n in zip(cubics.times, cubics.steps[:, 0], parts, strict=True)
+    ]
     return np.concatenate([np.zeros(0), *within])
 
 

@@ -1,9 +1,9 @@
 """Torques of a payload along a motion: the checker's own inverse dynamics, and bounds between samples.
 
 Samples are the rows of the motion and places between them. Between two samples, positions are cubics or
-straight lines, velocities their derivatives, and accelerations are interpolated linearly between the rows. A
-torque then leaves its chord by at most an eighth of its greatest second derivative times the square of the
-time between. Torques are sums and products of vectors that rotate with the links, so the product rule bounds
+straight lines, and velocities and accelerations their derivatives; at rows, accelerations may jump. A torque
+leaves its chord by at most an eighth of its greatest second derivative times the square of the time between.
+Torques are sums and products of vectors that rotate with the links, so the product rule bounds
 that derivative by bounds on the motion of links and joints.
 """
 
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.certificates.cubics import cubics_of
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
@@ -43,14 +44,14 @@ class Bound(NamedTuple):
 
 
 class States(NamedTuple):
-    """A motion at n samples, and bounds [m, dof] from each sample to the next, with derivatives by time (of
-    paths, by the share of the way)."""
+    """The m stretches of a motion from each sample to the next: states at their starts and ends, and bounds
+    [m, dof] with derivatives by time (of paths, by the share of the way)."""
 
-    q: Float[ndarray, "n dof"]
-    v: Float[ndarray, "n dof"]
-    a: Float[ndarray, "n dof"]
+    q: Float[ndarray, "2 m dof"]
+    v: Float[ndarray, "2 m dof"]
+    a: Float[ndarray, "2 m dof"]
     durations: Float[ndarray, "m"]
-    """Time from each sample to the next [s]; 1 for a path."""
+    """Of the stretches [s]; 1 for a path."""
     places: Bound
     """Of positions."""
     speeds: Bound
@@ -68,40 +69,25 @@ def torque_bounds(
     next.
     """
     states = _states(motion, samples)
-    torques = np.abs(inverse_dynamics(problem, states.q, states.v, states.a))
+    torques = [np.abs(inverse_dynamics(problem, *end)) for end in zip(*states[:3], strict=True)]
     second_derivatives = _second_derivative_bounds(problem, states)
-    return np.maximum(torques[:-1], torques[1:]) + second_derivatives * states.durations[:, None] ** 2 / 8
+    return np.maximum(*torques) + second_derivatives * states.durations[:, None] ** 2 / 8
 
 
 def _states(motion: Path | Trajectory, samples: Float[ndarray, "k"]) -> States:
-    if not isinstance(motion, Trajectory) or len(motion.times) == 1:
+    cubics = cubics_of(motion)
+    if cubics is None:
         return _static_states(motion.positions, samples)
-    times, h = motion.times, np.diff(motion.times)[:, None]
-    at = np.sort(np.concatenate([times, samples]))
-    row = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
-    u = (at - times[row])[:, None] / h[row]
-    rows = motion.positions, motion.velocities, motion.accelerations
-    (q0, v0, a0), (q1, v1, a1) = ([of[:-1] for of in rows], [of[1:] for of in rows])
-    mean = (q1 - q0) / h
-    # Hermite's basis, its derivative, and bounds of both derivatives of that, of which the first is linear
-    q = (1 - u) ** 2 * ((1 + 2 * u) * q0[row] + h[row] * u * v0[row])
-    q += u**2 * ((3 - 2 * u) * q1[row] - h[row] * (1 - u) * v1[row])
-    v = 6 * u * (1 - u) * mean[row] + (1 - u) * (1 - 3 * u) * v0[row] + u * (3 * u - 2) * v1[row]
-    third = np.abs(6 * (v0 + v1) - 12 * mean) / h**2
-    second = np.maximum(np.abs(6 * mean - 4 * v0 - 2 * v1), np.abs(6 * mean - 2 * v0 - 4 * v1)) / h
-    first = np.maximum(np.abs(v0), np.abs(v1)) + third * h**2 / 8
-    far = np.maximum(np.abs(q0), np.abs(q1)) + first * h / 2
-    pulls = np.maximum(np.abs(a0), np.abs(a1)), np.abs(a1 - a0) / h, 0 * h + 0 * a0
-    along = row[:-1]
-    return States(
-        q,
-        v,
-        (1 - u) * a0[row] + u * a1[row],
-        np.diff(at),
-        Bound(far[along], first[along], second[along]),
-        Bound(first[along], second[along], third[along]),
-        Bound(*(pull[along] for pull in pulls)),
-    )
+    at = np.sort(np.concatenate([motion.times, samples]))  # type: ignore[union-attr]
+    row = cubics.rows(at[:-1])
+    ends = [cubics.at(row, time - cubics.times[row]) for time in (at[:-1], at[1:])]
+    q, v, a = (np.stack(both) for both in zip(*ends, strict=True))
+    speed, pull = cubics.speeds, cubics.pulls
+    jerk = np.abs(cubics.end - cubics.start) / cubics.steps
+    far = np.abs(cubics.positions) + speed * cubics.steps
+    places, speeds, pulls = (far, speed, pull), (speed, pull, jerk), (pull, jerk, 0 * jerk)
+    bounds = (Bound(*(part[row] for part in of)) for of in (places, speeds, pulls))
+    return States(q, v, a, np.diff(at), *bounds)
 
 
 def _static_states(positions: Float[ndarray, "n dof"], samples: Float[ndarray, "k"]) -> States:
@@ -112,7 +98,8 @@ def _static_states(positions: Float[ndarray, "n dof"], samples: Float[ndarray, "
     step = np.abs(np.diff(q, axis=0))
     places = Bound(np.maximum(np.abs(q[1:]), np.abs(q[:-1])), step, 0 * step)
     none = Bound(0 * step, 0 * step, 0 * step)
-    return States(q, 0 * q, 0 * q, np.ones(len(step)), places, none, none)
+    ends = np.stack([q[:-1], q[1:]])
+    return States(ends, 0 * ends, 0 * ends, np.ones(len(step)), places, none, none)
 
 
 def inverse_dynamics(

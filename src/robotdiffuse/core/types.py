@@ -16,6 +16,7 @@ from robotdiffuse.core.bounds import Value, numbers
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.one_line import one_line
 from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.splines import spline_rows
 
 ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
@@ -23,6 +24,11 @@ REST = 1e-3
 """Speed, as a share of a motion's greatest one, at which the arm rests."""
 MAX_SAMPLE_RATE = 1e5
 """Largest rate at which trajectories are resampled [Hz]."""
+ACCELERATION_GAIN = 1.005
+"""Factor by which resampling may raise the greatest acceleration of a joint."""
+ACCELERATION_SHARE = 0.25
+"""Share of the greatest acceleration of a joint by which those of resampled rows may differ from those of the
+cubics between them."""
 TIME_TOLERANCE = 1e-9
 """Times this far outside of a trajectory [s] are taken as its ends; rows are no closer when resampled."""
 
@@ -169,11 +175,24 @@ class Trajectory(Value):
         velocities = slope * (q1 - q0) + (1 - u) * (1 - 3 * u) * v0 + u * (3 * u - 2) * v1
         return State(positions, velocities, (1 - u) * a0 + u * a1, (a1 - a0) / h + 0 * u)
 
+    @property
+    def cubic_accelerations(self) -> tuple[Float[ndarray, "m dof"], Float[ndarray, "m dof"]]:
+        """Accelerations of the cubic from each row to the next, at its start and at its end; in between they
+        are linear in time."""
+        steps, v = np.diff(self.times)[:, None], self.velocities
+        mean = np.diff(self.positions, axis=0) / steps
+        return (6 * mean - 4 * v[:-1] - 2 * v[1:]) / steps, (2 * v[:-1] + 4 * v[1:] - 6 * mean) / steps
+
     def resample(self, rate: float | int) -> "Trajectory":
         """Rows of `at` at each multiple of 1 / `rate` [Hz], and the last row, which ends the motion.
 
-        The new rows lie on this motion; between them the motion may differ from it where its rows were
-        closer, so validate it again. Raises InputError for a rate that is not in (0, MAX_SAMPLE_RATE].
+        Where the acceleration of the motion changes quickly, the cubics between fewer rows can need more of
+        it, or other ones. Then a motion from rest to rest is averaged: its rows lie on the uniform cubic
+        B-spline of these configurations, whose velocities and accelerations are means of the motion's. It
+        leaves the path by up to a sixth of the acceleration over rate², and lasts up to three steps longer.
+
+        Validate the new motion: between its rows it may differ from this one. Raises InputError for a rate
+        that is not in (0, MAX_SAMPLE_RATE].
         """
         if (
             not isinstance(rate, int | float | np.number)
@@ -188,7 +207,14 @@ class Trajectory(Value):
         count = int(np.ceil((self.duration - TIME_TOLERANCE) * rate))
         times = np.append(np.arange(max(count, 1)) / rate, self.duration)
         state = self.at(times)
-        return Trajectory(self.joint_names, times, state.positions, state.velocities, state.accelerations)
+        rows = Trajectory(self.joint_names, times, state.positions, state.velocities, state.accelerations)
+        start, end = rows.cubic_accelerations
+        most = np.abs(self.cubic_accelerations).max(axis=(0, 1))
+        off = np.maximum(np.abs(start - rows.accelerations[:-1]), np.abs(end - rows.accelerations[1:]))
+        as_strong = (np.maximum(np.abs(start), np.abs(end)) <= ACCELERATION_GAIN * most).all()
+        if self.velocities[[0, -1]].any() or (as_strong and (off <= ACCELERATION_SHARE * most).all()):
+            return rows
+        return Trajectory(self.joint_names, *spline_rows(state.positions, 1 / rate))
 
     def save(self, file: str | FilePath, rate: float | int | None = None) -> None:
         """Write .json or .csv, by the file's ending; resampled at `rate` [Hz] if it is given.

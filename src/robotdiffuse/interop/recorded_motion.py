@@ -85,8 +85,8 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
 
     The recording may contain other joints of the robot, if they stay at their locked values. Absent
     velocities become those of the cubic spline from rest to rest through the rows, absent accelerations the
-    mean rates of change of velocity around each row. Raises InputError for missing or unknown joints, and for
-    other joints that leave their locked values.
+    means of those of the cubics before and after each row. Raises InputError for missing or unknown joints,
+    and for other joints that leave their locked values.
     """
     notes = list(motion.notes)
     given = {name: j for j, name in enumerate(motion.joint_names)}
@@ -116,8 +116,8 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
         v = _spline_velocities(motion.times, q)
         notes.append("no velocities are given: those of a cubic spline from rest to rest are validated")
     if a is None:
-        a = _mean_accelerations(motion.times, v)
-        notes.append("no accelerations are given: the rates of change of velocity are validated")
+        a = _mean_accelerations(Trajectory(robot.joint_names, motion.times, q, v, np.zeros_like(v)))
+        notes.append("no accelerations are given: those of the cubics through the rows are validated")
     return RobotMotion(Trajectory(robot.joint_names, motion.times, q, v, a), tuple(notes))
 
 
@@ -144,12 +144,12 @@ def _spline_velocities(times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -
     return CubicSpline(times, q, bc_type="clamped")(times, 1)
 
 
-def _mean_accelerations(times: Float[ndarray, "n"], v: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
-    """Mean rate of change of velocity around each row."""
-    if len(times) < 2:
-        return np.zeros_like(v)
-    change = np.diff(v, axis=0) / np.diff(times)[:, None]
-    return (np.concatenate([change[:1], change]) + np.concatenate([change, change[-1:]])) / 2
+def _mean_accelerations(motion: Trajectory) -> Float[ndarray, "n dof"]:
+    """Means of the accelerations of the cubics before and after each row."""
+    if len(motion.times) < 2:
+        return np.zeros_like(motion.velocities)
+    start, end = motion.cubic_accelerations
+    return (np.concatenate([start[:1], end]) + np.concatenate([start, end[-1:]])) / 2
 
 
 def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Problem:

@@ -184,6 +184,22 @@ class PathConstraints:
         columns = [kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates)) for m, _ in self._paced]
         return np.stack(columns, axis=1) if columns else np.zeros((len(q), 0))
 
+    def speed_bends(self, way: Float[ndarray, "3 n dof"]) -> Float[ndarray, "n limited"]:
+        """Bounds on the third derivatives of the positions of these frames along n stretches of a motion;
+        `way` bounds the first three derivatives of the joints' positions.
+
+        A derivative of the position by several joints is no longer than the lever of the last of them. The
+        sum of the products whose last joint is m grows with m as the product of the sums up to m does.
+        """
+        bends = np.empty((way.shape[1], len(self._paced)))
+        for k, (m, _) in enumerate(self._paced):
+            count = self.rows.chain_length[m]
+            first, second, third = way[:, :, self.rows.chain[m, :count]]
+            speed, bend = np.cumsum(first, axis=1), np.cumsum(second, axis=1)
+            products = np.diff(3 * bend * speed + speed**3, axis=1, prepend=0.0)
+            bends[:, k] = (third + products) @ self.rows.lever_bounds[m, :count]
+        return bends
+
     @property
     def speed_limits(self) -> Float[ndarray, "limited"]:
         """Speed limits of these frames [m/s]."""

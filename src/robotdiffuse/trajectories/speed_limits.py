@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.deadline import check_timing
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Settings
+from robotdiffuse.core.splines import Rows, spline_rows
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import timing_kernel
@@ -114,10 +115,6 @@ def timing_grid(line: BlendedPolyline, settings: TimingSettings) -> Float[ndarra
     return timing_kernel.timing_grid(line.knots, line.half_widths, *counts)
 
 
-Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]
-"""Times, positions, velocities and accelerations."""
-
-
 def time_line(
     robot: Robot,
     line: BlendedPolyline,
@@ -148,7 +145,7 @@ def time_line(
         controls = sample_positions(line.arrays, grid, speeds, step * np.arange(count + 1))
         controls[-1] = line.waypoints[-1]
         for window in _windows(step, limits[1], jerk):
-            rows = _spline_rows(controls, step, window)
+            rows = spline_rows(controls, step, window)
             rows[1][0] = line.waypoints[0]
             if _keeps_jerk(rows, step, jerk):
                 break
@@ -195,7 +192,7 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
             count = int(np.ceil(_duration(grid, speeds) / step))
             check_timing(f"the {count} rows of a motion", SECONDS_PER_ROW * count)
             controls = sample_positions(rest.arrays, grid, speeds, step * np.arange(count + 1))
-            rows = _spline_rows(controls, step, window, start_speed * direction)
+            rows = spline_rows(controls, step, window, start_speed * direction)
             if window == windows[-1] or _keeps_jerk(rows, step, jerk):
                 rows[1][0] = line.waypoints[0]
                 found = rows
@@ -220,36 +217,8 @@ def stopping_distance(robot: Robot, settings: TimingSettings, velocity: Float[nd
     return max(least, MIN_STOPPING_DISTANCE)
 
 
-def _spline_rows(
-    controls: Float[ndarray, "m dof"], step: float, window: int, velocity: Float[ndarray, "dof"] | float = 0.0
-) -> Rows:
-    """The uniform cubic B-spline whose control points are moving averages of the configurations of a motion
-    that ends at rest, `step` [s] apart, over `window` of them. Before these the arm moved with `velocity`.
-
-    Velocities and accelerations are weighted means of the motion's, and so within the same limits at every
-    time; jerks are constant between rows. The spline leaves the motion's path by no more than about a sixth
-    of the acceleration times `step` squared, and stays on straight lines.
-    """
-    before = np.arange(-window - 2, 0)[:, None] * step * np.broadcast_to(velocity, controls.shape[1])
-    moved = np.concatenate(
-        [
-            before,
-            controls - controls[0],
-            np.repeat(controls[-1:] - controls[0], window + 1, axis=0),
-        ]
-    )
-    total = np.cumsum(moved, axis=0)
-    points = (total[window:] - total[:-window]) / window
-    before, at, after = points[:-2], points[1:-1], points[2:]
-    q = controls[0] + (before + 4 * at + after) / 6
-    v, a = (after - before) / (2 * step), (after - 2 * at + before) / step**2
-    q[-1] = controls[-1]
-    v[0], v[-1], a[[0, -1]] = velocity, 0.0, 0.0
-    return step * np.arange(len(q)), q, v, a
-
-
 def _windows(step: float, acceleration: Float[ndarray, "dof"], jerk: Float[ndarray, "dof"]) -> list[int]:
-    """Numbers of configurations over which `_spline_rows` may average to keep the jerk limits, in the order
+    """Numbers of configurations over which `spline_rows` may average to keep the jerk limits, in the order
     tried; the last keeps them in any case."""
     enough = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
     return sorted({1, *(int(np.ceil(fraction * enough)) for fraction in WINDOW_FRACTIONS), enough})

@@ -1,12 +1,15 @@
 """Rates of a trajectory: those that follow from its positions and times, and whether its own rates agree.
 
-In a motion from rest to rest whose acceleration never exceeds A, the mean velocity of each step is within its
-velocity limit. Each second difference quotient is a mean of its accelerations and thus at most A, if the arm
-is taken to stand still before the first and after the last row. With velocities v0 and v1 at both ends of a
-step of h seconds, the length of the step is within h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4; the
-extremes are full acceleration followed by full braking and vice versa. So these tests reject nothing that an
-arm can do within its limits. The test of agreement takes for A twice the greatest acceleration in the motion,
-computed or written, if that is less.
+Limits hold all along the cubics through the rows' positions and velocities, which controllers execute (see
+trajectories/cubics.py), whatever accelerations are written. A motion that is within the limits between its
+rows, but whose cubics are not, needs closer rows. The arm is taken to stand still before the first and after
+the last row.
+
+Rates agree if they are those of some motion within the limits. With velocities v0 and v1 at both ends of a
+step of h seconds, and accelerations up to A, the length of the step is within
+h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4; the extremes are full acceleration followed by full braking and
+vice versa. The test of agreement takes for A twice the greatest acceleration in the motion, computed or
+written, if that is less. Written accelerations must be near those of the cubics beside their row.
 
 Positions are known only to a resolution, which over a step of nanoseconds hides any velocity. Where rows are
 closer than a millisecond, the tests are therefore repeated from each row to later ones, with the resolution
@@ -23,6 +26,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.trajectories.cubics import Cubics
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
 """Where rows are closer than the first of these [s], mean accelerations are tested over windows of at least
@@ -38,8 +42,8 @@ class RateTolerances:
     slack: float
     """Share by which limits may be exceeded, and share of a velocity limit that counts as rest."""
     agreement: float
-    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the mean
-    accelerations before and after the row."""
+    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the
+    accelerations of the cubics before and after the row."""
     jump: float
     """A step faster than this times the velocity limit is a jump."""
     resolution: float
@@ -65,29 +69,29 @@ def rate_violations(
     trajectory: Trajectory,
     tolerances: RateTolerances,
     start_velocity: Float[ndarray, "dof"] | None = None,
+    cubics: Cubics | None = None,
 ) -> list[RateViolation]:
     """The first violation of each kind in the rates of a trajectory, whose rows are finite and times
-    increase.
+    increase; `cubics` are its cubics, if they are known.
 
     The motion must begin at `start_velocity` [dof], by default at rest, and end at rest. A limit of 0 means
     that the robot gives none: then the rates must only agree with each other.
     """
     found: dict[str, RateViolation] = {}
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
-        checks = list(_checks(robot, trajectory, tolerances, begins))
-    for check in checks:
-        right = check.off <= check.allowed
-        if right.all():
-            continue
-        wrong = ~right
-        i = int(np.flatnonzero(wrong.any(axis=1))[0])
-        beyond = np.where(wrong, np.nan_to_num(check.off - check.allowed, nan=np.inf), 0.0)
-        j, time = int(beyond[i].argmax()), float(trajectory.times[i])
-        if check.kind not in found or time < found[check.kind].time:
-            name, rate = robot.joint_names[j], abs(float(check.rates[i, j]))
-            message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
-            found[check.kind] = RateViolation(check.kind, time, name, message, float(beyond[i, j]))
+        for check in _checks(robot, cubics or Cubics(trajectory), tolerances, begins):
+            right = check.off <= check.allowed
+            if right.all():
+                continue
+            wrong = ~right
+            i = int(np.flatnonzero(wrong.any(axis=1))[0])
+            beyond = np.where(wrong, np.nan_to_num(check.off - check.allowed, nan=np.inf), 0.0)
+            j, time = int(beyond[i].argmax()), float(trajectory.times[i])
+            if check.kind not in found or time < found[check.kind].time:
+                name, rate = robot.joint_names[j], abs(float(check.rates[i, j]))
+                message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
+                found[check.kind] = RateViolation(check.kind, time, name, message, float(beyond[i, j]))
     return list(found.values())
 
 
@@ -97,22 +101,7 @@ def sample_cubics(
     """Times [m] and positions [m, dof] of a trajectory, with added rows on the cubics through its rows'
     positions and velocities, such that straight lines between rows leave the cubics by at most `chord` [rad]
     or [m]."""
-    times, q, v = trajectory.times, trajectory.positions, trajectory.velocities
-    step = np.diff(times)[:, None]
-    mean = (q[1:] - q[:-1]) / step
-    first, last = v[:-1] - mean, v[1:] - mean
-    # A cubic's second derivative is greatest at an end, and its chord is off by an eighth of it.
-    bend = step * np.maximum(np.abs(4 * first + 2 * last), np.abs(2 * first + 4 * last)) / 8
-    counts = np.ceil(np.sqrt(bend.max(axis=1, initial=0.0) / chord)).astype(int)
-    if (counts <= 1).all():
-        return times, q
-    counts = np.maximum(counts, 1)
-    row = np.repeat(np.arange(len(counts)), counts)
-    u = np.concatenate([np.arange(n) / n for n in counts])[:, None]
-    h = step[row]
-    off = h * (u * (1 - u) ** 2 * first[row] - u**2 * (1 - u) * last[row])
-    between = q[row] + u * h * mean[row] + off
-    return np.append(times[row] + (u * h)[:, 0], times[-1]), np.concatenate([between, q[-1:]])
+    return Cubics(trajectory).sampled(chord)[:2]
 
 
 class _Check(NamedTuple):
@@ -131,11 +120,11 @@ class _Check(NamedTuple):
 
 
 def _checks(
-    robot: Robot, trajectory: Trajectory, tolerances: RateTolerances, begins: Float[ndarray, "dof"]
+    robot: Robot, cubics: Cubics, tolerances: RateTolerances, begins: Float[ndarray, "dof"]
 ) -> Iterator[_Check]:
+    trajectory = cubics.trajectory
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
-    step = np.diff(trajectory.times)[:, None]
-    mean, change = (q[1:] - q[:-1]) / step, (v[1:] - v[:-1]) / step
+    step, mean, change = cubics.steps, cubics.extremes.mean, np.diff(v, axis=0) / cubics.steps
     blur = 2 * tolerances.resolution / step
     """Uncertainty of the mean velocities, from the resolution of positions."""
     share = 1 + tolerances.slack
@@ -154,7 +143,9 @@ def _checks(
 
     most, onwards = robot.velocity, "mean velocity from here to the next row"
     yield limited("jump", onwards, mean, most, tolerances.jump * most + blur)
-    yield limited("velocity", onwards, mean, most, share * most + blur)
+    # Velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step.
+    onwards = "velocity by its positions from here to the next row"
+    yield limited("velocity", onwards, cubics.extremes.velocity, most, share * most + 1.5 * blur)
     yield limited("velocity", "velocity", v, most, share * most)
 
     around, length = _padded(2 * begins - mean[:1], mean, -mean[-1:]), _padded(step[:1], step, step[-1:])
@@ -162,7 +153,9 @@ def _checks(
     apart = (length[1:] + length[:-1]) / 2
     second, unsure = (around[1:] - around[:-1]) / apart, (unsure[1:] + unsure[:-1]) / apart
     most = robot.acceleration
+    peaks, bent = cubics.extremes.acceleration, 6 * blur / step
     yield limited("acceleration", "mean acceleration by its positions", second, most, share * most + unsure)
+    yield limited("acceleration", "acceleration by its positions", peaks, most, share * most + bent)
     yield limited("acceleration", "mean acceleration by its velocities", change, most, share * most)
     yield limited("acceleration", "acceleration", a, most, share * most)
 
@@ -172,30 +165,31 @@ def _checks(
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
     """Allowed difference between mean velocities and the means of the rows' velocities."""
+    off, allowed = np.abs(mean - (v[1:] + v[:-1]) / 2), possible + blur
     yield _Check(
         "rates",
-        onwards,
+        "mean velocity from here to the next row",
         mean,
-        np.abs(mean - (v[1:] + v[:-1]) / 2),
-        possible + blur,
+        off,
+        allowed,
         lambda i, j: f"but the velocities of these rows are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
-    beside = _padded(change[:1], change, change[-1:])
-    low, high = np.minimum(beside[1:], beside[:-1]), np.maximum(beside[1:], beside[:-1])
-    outside = np.maximum(low - a, a - high)
-    if len(a) > 1:  # at an end, no row lies beyond; accelerations that are linear have the step's mean
-        linear = np.abs((a[[0, -2]] + a[[1, -1]]) / 2 - change[[0, -1]])
-        outside[[0, -1]] = np.minimum(outside[[0, -1]], linear)
-    if begins.any():
-        outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
-    yield _Check(
-        "rates",
-        "acceleration",
-        a,
-        outside,
-        tolerances.agreement * np.where(most > 0, np.minimum(most, own), own),
-        lambda i, j: f"but its velocities give {low[i, j]:.6g} to {high[i, j]:.6g}",
-    )
+    if len(a) > 1 and (off <= allowed).all():  # else the cubics are not those of the positions
+        start, end = cubics.extremes.start, cubics.extremes.end
+        before, after = _padded(start[:1], end), _padded(start, end[-1:])
+        low, high = np.minimum(before, after), np.maximum(before, after)
+        outside = np.maximum(low - a, a - high)
+        if begins.any():
+            outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
+        near = tolerances.agreement * np.where(most > 0, np.minimum(most, own), own)
+        yield _Check(
+            "rates",
+            "acceleration",
+            a,
+            outside,
+            near + np.maximum(_padded(bent[:1], bent), _padded(bent, bent[-1:])),
+            lambda i, j: f"but the cubics beside it have {low[i, j]:.6g} to {high[i, j]:.6g}",
+        )
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
         return
@@ -277,8 +271,8 @@ def _second_differences(
     return ((rows[high] - q) / after - (q - rows[low]) / before) / apart, unsure / apart
 
 
-def _padded(before: ndarray, rows: ndarray, after: ndarray) -> ndarray:
-    return np.concatenate([before, rows, after])
+def _padded(*rows: ndarray) -> ndarray:
+    return np.concatenate(rows)
 
 
 def _limits_or_peaks(limit: Float[ndarray, "dof"], *rates: ndarray) -> Float[ndarray, "dof"]:

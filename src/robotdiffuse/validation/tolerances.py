@@ -36,18 +36,18 @@ class VerifySettings(Settings, name="verify"):
     rest: NotNegative = 1e-6
     """The arm is at rest where no joint is faster than this [rad/s] or [m/s]."""
     rate_slack: NotNegative = 0.01
-    """Share by which a trajectory may exceed velocity, acceleration and effort limits. Also the share of a
-    velocity limit by which its velocities may disagree with its positions, and below which it starts and ends
-    at rest."""
+    """Share by which a trajectory may exceed velocity, acceleration, effort and speed limits. Also the share
+    of a velocity limit by which its velocities may disagree with its positions, and below which it starts and
+    ends at rest."""
     rate_agreement: NotNegative = 0.5
-    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the mean
+    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the
     accelerations before and after the row."""
     jump: Positive = 1.5
     """A step of a trajectory is a jump if its mean velocity exceeds this times the velocity limit."""
     chord: Positive = 1e-3
-    """Between rows a trajectory is validated on straight lines. Where the cubic through the rows' positions
-    and velocities, which controllers follow, leaves them by more than this [rad] or [m], rows on the cubic
-    are added."""
+    """Collision between rows is validated on straight lines. Where the cubic through the rows' positions and
+    velocities, which controllers follow, leaves them by more than this [rad] or [m], rows on the cubic are
+    added; more where the clearance is so small that the rest matters."""
     constraint_chord: Positive = 1e-6
     """The same for path constraints. This distance is subtracted from their tolerances."""
     reversal_angle: NotNegative = float(np.radians(150))

@@ -1,7 +1,8 @@
 """The validator: whether a motion is free of collision, within limits, and leads from the start to the goal.
 
-Freedom from collision between waypoints is certified, not sampled: see collision/motions.py. The rates of a
-trajectory are computed from its positions and times: see rates.py. The validator does not depend on planners.
+Freedom from collision between waypoints is certified, not sampled: see collision/motions.py. Between its rows
+a trajectory is validated along the cubics that controllers execute: see trajectories/cubics.py and rates.py.
+The validator does not depend on planners.
 """
 
 from dataclasses import replace
@@ -19,11 +20,18 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
+from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.trajectories.speed_limits import jerk_limits
-from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
+from robotdiffuse.validation.rates import RateTolerances, rate_violations
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, first_place_within, goal_error
-from robotdiffuse.validation.torques import Pieces, first_excess, static_pieces, trajectory_pieces
+from robotdiffuse.validation.torques import (
+    Pieces,
+    first_beyond,
+    first_excess,
+    static_pieces,
+    trajectory_pieces,
+)
 
 if TYPE_CHECKING:  # what most problems do not need is imported where one does
     from robotdiffuse.collision.moving_obstacles import MovingCollision, TimedContact
@@ -31,6 +39,10 @@ if TYPE_CHECKING:  # what most problems do not need is imported where one does
 
 MAX_DURATION = 1e5
 """Longest motion that is validated, about a day [s]."""
+CHORD_SHARE = 0.1
+"""The certified clearances of a trajectory are reduced by at most this share for its cubics."""
+CHORD_MARGIN = 0.9
+"""Factor on the chords tried next, so that one trial suffices."""
 
 
 def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT) -> Report:
@@ -48,9 +60,9 @@ def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings
 def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
     """Validate a trajectory for a problem, with its rates and times, and among moving obstacles.
 
-    Its velocities and accelerations must agree with its positions. It must begin at rest, or at the problem's
-    start velocity, and end at rest. `VerifySettings.chord` says how it is validated between its rows. Raises
-    InputError if its joints are not those of the robot, or its shapes are wrong.
+    All limits hold along the cubics through the positions and velocities of its rows. Its velocities and
+    accelerations must agree with its positions. It must begin at rest, or at the problem's start velocity,
+    and end at rest. Raises InputError if its joints are not those of the robot, or its shapes are wrong.
     """
     return _verifier(problem, settings).trajectory(trajectory)
 
@@ -112,27 +124,56 @@ class Verifier:
             return Report(False, Violation("time", 0.0, message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
+        cubics, begins = Cubics(trajectory), self.problem.start_velocity
         found = [
             Violation(wrong.kind, wrong.time, wrong.message, wrong.joint, None, wrong.excess)
-            for wrong in rate_violations(
-                self.robot, trajectory, self._rate_tolerances, self.problem.start_velocity
-            )
+            for wrong in rate_violations(self.robot, trajectory, self._rate_tolerances, begins, cubics)
         ]
-        rows = trajectory.times, trajectory.positions
-        times, positions = rows if found else sample_cubics(trajectory, self.settings.chord)
-        along, at_rest = None, None
+        at_rest = None
         if self.problem.waypoints:
-            still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
-            at_rest = np.isin(times, trajectory.times[still])
-        if not found and self.dynamics is not None:
+            at_rest = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
+        if found:
+            return self._report(trajectory.positions, trajectory.times, found, at_rest)
+        found += self._limits_between(cubics)
+        if self.dynamics is not None:
             found += self._torques(trajectory.times, trajectory_pieces(trajectory), ", with the payload")
+        along = None
         if self.constraints is not None:
-            found += self._too_fast(trajectory)
-            along = sample_cubics(trajectory, self.settings.constraint_chord) if not found else None
-        report = self._report(positions, times, found, at_rest, along)
+            found += self._too_fast(cubics)
+            along = cubics.sampled(self.settings.constraint_chord)[:2] if not found else None
+        report = self._report_on_chords(cubics, found, at_rest, along)
         if not report.valid:
             return report
-        return replace(report, jerk_share=float((trajectory.peak_jerks / jerk_limits(self.robot)).max()))
+        jerks = np.maximum(trajectory.peak_jerks, cubics.extremes.jerk)
+        return replace(report, jerk_share=float((jerks / jerk_limits(self.robot)).max()))
+
+    def _report_on_chords(
+        self,
+        cubics: Cubics,
+        found: list[Violation],
+        at_rest: ndarray | None,
+        along: tuple[ndarray, ndarray] | None,
+    ) -> Report:
+        """The report on straight lines between places on the cubics, whose clearances are reduced by how far
+        any point of the arm leaves these lines.
+
+        Places are added until that is little beside the clearances.
+        """
+        settings, chord = self.settings, self.settings.chord
+        radii = self._continuous.checks.motion_radii
+        while True:
+            times, positions, off = cubics.sampled(chord)
+            still = None if at_rest is None else np.isin(times, cubics.trajectory.times[at_rest])
+            report = self._report(positions, times, found, still, along)
+            clearance = report.min_clearance
+            if clearance is None:
+                return report
+            lost = float((radii @ off).max(initial=0.0))
+            allowed = max(CHORD_SHARE * clearance, settings.tightness * settings.contact / 2)
+            if lost <= allowed:
+                scene, itself = np.array([report.scene_clearance, report.self_clearance]) - lost
+                return replace(report, scene_clearance=float(scene), self_clearance=float(itself))
+            chord = CHORD_MARGIN * float(off.max()) * allowed / lost
 
     def collision_free(self, path: Path) -> bool:
         """Whether a path is certified free of collision and keeps the path constraints. Start, goal and
@@ -240,19 +281,36 @@ class Verifier:
         one = wrong.constraint
         return Violation("constraint", at, wrong.message, one.frame, one.kind, wrong.excess)
 
-    def _too_fast(self, trajectory: Trajectory) -> list[Violation]:
-        """The first place where a frame is faster than its constraint allows."""
-        assert self.constraints is not None
-        speeds = self.constraints.speeds(trajectory.positions, trajectory.velocities)
-        excess = speeds - self.constraints.speed_limits * (1 + self.settings.rate_slack)
-        bad = np.flatnonzero((excess > 0).any(axis=1))
-        if not len(bad):
+    def _limits_between(self, cubics: Cubics) -> list[Violation]:
+        """The first place between rows where a cubic leaves the joint limits."""
+        robot, extremes = self.robot, cubics.extremes
+        beyond = np.maximum(robot.lower - extremes.lower, extremes.upper - robot.upper)
+        beyond[robot.continuous] = 0.0
+        if not (beyond > self.settings.limit_slack).any():
             return []
-        i, k = int(bad[0]), int(excess[bad[0]].argmax())
-        one, at = self.constraints.speed_limited[k], float(trajectory.times[bad[0]])
-        most = self.constraints.speed_limits[k]
-        message = f"{one.frame} moves at {speeds[i, k]:.4g} m/s; {one.kind} allows {most:.4g} m/s"
-        return [Violation("speed", at, message, one.frame, one.kind, float(excess[:, k].max()))]
+        times, turns = cubics.turns()
+        if not len(times):
+            return []
+        violation = self._limits(turns, times, "{:.3f} s")
+        return [] if violation is None else [violation]
+
+    def _too_fast(self, cubics: Cubics) -> list[Violation]:
+        """The first place where a frame is not proved to be as slow as its constraint requires."""
+        assert self.constraints is not None
+        limits, trajectory = self.constraints.speed_limits, cubics.trajectory
+        if not len(limits) or not len(cubics.steps):
+            return []
+        pieces = trajectory_pieces(trajectory)
+        speeds, bends = self.constraints.speeds, self.constraints.speed_bends(pieces.along.v) / cubics.steps
+        beyond = first_beyond(
+            limits, lambda q, v, _: speeds(q, v), bends, pieces.states, self.settings.rate_slack
+        )
+        if beyond is None:
+            return []
+        at = float(np.interp(beyond.place, np.arange(len(trajectory.times)), trajectory.times))
+        one, most = self.constraints.speed_limited[beyond.joint], limits[beyond.joint]
+        message = f"{one.frame} moves at {beyond.torque:.4g} m/s; {one.kind} allows {most:.4g} m/s"
+        return [Violation("speed", at, message, one.frame, one.kind, beyond.excess)]
 
     def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> list[Violation]:
         """The first place where a joint's torque with the payload is not proved to be within its effort

@@ -5,6 +5,7 @@ import numpy as np
 from robotdiffuse.collision.contacts import contacts
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.validation.rates import sample_cubics
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.validator import DEFAULT, VerifySettings, collision_violation, verifier
@@ -36,6 +37,9 @@ def violations(
         clock, q = (motion.times, q) if rates else sample_cubics(motion, settings.chord)
     for contact in contacts(problem.robot, problem.scene, q, settings.contact):
         found.append(collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock))))
+    if timed:
+        times, turns = Cubics(motion).turns()
+        clock, q = np.concatenate([clock, times]), np.concatenate([q, turns])
     found += _limits(problem, q, clock, settings)
     return tuple(sorted(found, key=lambda wrong: wrong.time))
 
@@ -45,7 +49,8 @@ def _limits(problem: Problem, q: np.ndarray, clock: np.ndarray, settings: Verify
     beyond = np.maximum(robot.lower - q, q - robot.upper)
     beyond[:, robot.continuous] = 0.0
     for j in np.flatnonzero((beyond > settings.limit_slack).any(axis=0)).tolist():
-        i, most = int(np.argmax(beyond[:, j] > settings.limit_slack)), float(beyond[:, j].max())
+        over = np.flatnonzero(beyond[:, j] > settings.limit_slack)
+        i, most = int(over[clock[over].argmin()]), float(beyond[:, j].max())
         name, low, high = robot.joint_names[j], robot.lower[j], robot.upper[j]
         message = f"{name} leaves its limits, {low:.6g} to {high:.6g}, by up to {most:.3g}"
         found.append(Violation("limits", float(clock[i]), message, name, None, most))

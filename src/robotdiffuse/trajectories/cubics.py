@@ -1,0 +1,151 @@
+"""The cubics of a trajectory, which controllers execute between its rows, and their extremes in closed form.
+
+Along a step of h seconds with the mean velocity m, from the velocity v to the velocity w, the acceleration is
+linear in time, from (6 m - 4 v - 2 w) / h to (2 v + 4 w - 6 m) / h.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.core.bounds import for_kernels
+from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.core.types import Trajectory
+
+
+class CubicStates(NamedTuple):
+    """Positions, velocities and accelerations on the cubics."""
+
+    positions: Float[ndarray, "n dof"]
+    velocities: Float[ndarray, "n dof"]
+    accelerations: Float[ndarray, "n dof"]
+
+
+class Extremes(NamedTuple):
+    """Extremes of the cubics of a motion."""
+
+    mean: Float[ndarray, "m dof"]
+    """Mean velocity of each step."""
+    start: Float[ndarray, "m dof"]
+    """Acceleration at the start of each step."""
+    end: Float[ndarray, "m dof"]
+    velocity: Float[ndarray, "m dof"]
+    """The largest absolute velocity in each step."""
+    acceleration: Float[ndarray, "m dof"]
+    """The same of the acceleration."""
+    jerk: Float[ndarray, "dof"]
+    """The largest absolute jerk within any step."""
+    chord: Float[ndarray, "m"]
+    """How far each cubic may leave the straight line between its rows, for the joint that does most [rad] or
+    [m]."""
+    chords: Float[ndarray, "dof"]
+    """The same for each joint, in any step."""
+    lower: Float[ndarray, "dof"]
+    """The least position of each joint."""
+    upper: Float[ndarray, "dof"]
+
+
+class Cubics:
+    """The cubics through the positions and velocities of a trajectory, from each of its rows to the next."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        self.steps: Float[ndarray, "m 1"] = np.diff(trajectory.times)[:, None]
+        rows = trajectory.times, trajectory.positions, trajectory.velocities
+        self.extremes = Extremes(*_extremes(*map(for_kernels, rows)))
+
+    def states(self, step: Int[ndarray, "n"], share: Float[ndarray, "n"]) -> CubicStates:
+        """States at shares of steps."""
+        u, h = share[:, None], self.steps[step]
+        start, end = self.extremes.start[step], self.extremes.end[step]
+        q, v = self.trajectory.positions[step], self.trajectory.velocities[step]
+        jerk = end - start
+        return CubicStates(
+            q + u * h * (v + u * h * (start / 2 + u * jerk / 6)),
+            v + u * h * (start + u * jerk / 2),
+            start + u * jerk,
+        )
+
+    def turns(self) -> tuple[Float[ndarray, "k"], Float[ndarray, "k dof"]]:
+        """Times at which any joint turns round within a step, where its position is extreme, and positions of
+        all joints there."""
+        start, v = self.extremes.start, self.trajectory.velocities[:-1] / self.steps
+        curve = self.extremes.end - start
+        root = np.sqrt(np.maximum(start**2 - 2 * curve * v, 0.0))
+        far = -start - np.copysign(root, start)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.stack([2 * v / far, far / curve])
+        within = (shares > 0) & (shares < 1)
+        steps, shares = np.nonzero(within)[1], shares[within]
+        order = np.argsort(steps + shares)
+        steps, shares = steps[order], shares[order]
+        times = self.trajectory.times[steps] + shares * self.steps[steps, 0]
+        return times, self.states(steps, shares).positions
+
+    def sampled(
+        self, chord: float
+    ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "dof"]]:
+        """Times and positions of the rows and of added rows on the cubics, such that straight lines between
+        them leave the cubics by at most `chord`; and by how much they do, for each joint [rad] or [m]."""
+        times, q = self.trajectory.times, self.trajectory.positions
+        bends, off = self.extremes.chord, self.extremes.chords
+        if bends.max(initial=0.0) <= chord:
+            return times, q, off
+        counts = np.ceil(np.sqrt(bends / chord)).astype(int)
+        counts = np.maximum(counts, 1)
+        step = np.repeat(np.arange(len(counts)), counts)
+        share = np.concatenate([np.arange(n) / n for n in counts])
+        between = self.states(step, share).positions
+        pull = self.extremes.acceleration
+        off = (pull * (self.steps / counts[:, None]) ** 2 / 8).max(axis=0)
+        at = times[step] + share * self.steps[step, 0]
+        return np.append(at, times[-1]), np.concatenate([between, q[-1:]]), off
+
+
+@kernel(error_model="numpy")
+def _extremes(times, q, v):
+    """The fields of `Extremes`."""
+    rows, dof = q.shape
+    shape = rows - 1, dof
+    mean, start, end = np.empty(shape), np.empty(shape), np.empty(shape)
+    velocity, acceleration = np.empty(shape), np.empty(shape)
+    jerk, chord, chords = np.zeros(dof), np.zeros(rows - 1), np.zeros(dof)
+    lower, upper = q[0].copy(), q[0].copy()
+    for i in range(rows - 1):
+        h = times[i + 1] - times[i]
+        per = 1 / h
+        for j in range(dof):
+            speed = v[i, j]
+            m = (q[i + 1, j] - q[i, j]) * per
+            a = (6 * m - 4 * speed - 2 * v[i + 1, j]) * per
+            b = (2 * speed + 4 * v[i + 1, j] - 6 * m) * per
+            most = max(abs(speed), abs(v[i + 1, j]))
+            if a * b < 0:
+                most = max(most, abs(speed + h * a * a / (2 * (a - b))))
+            mean[i, j], start[i, j], end[i, j] = m, a, b
+            velocity[i, j], acceleration[i, j] = most, max(abs(a), abs(b))
+            jerk[j] = max(jerk[j], abs(b - a) * per)
+            off = acceleration[i, j] * h * h / 8
+            chord[i], chords[j] = max(chord[i], off), max(chords[j], off)
+            low, high = min(q[i, j], q[i + 1, j]), max(q[i, j], q[i + 1, j])
+            if low - off < lower[j] or high + off > upper[j]:
+                low, high = _range(q[i, j], speed, a, b, h, low, high)
+                lower[j], upper[j] = min(lower[j], low), max(upper[j], high)
+    return mean, start, end, velocity, acceleration, jerk, chord, chords, lower, upper
+
+
+@inner_kernel()
+def _range(q, v, a, b, h, low, high):
+    """The least and the greatest position of a cubic between `low` and `high` at its ends: also where its
+    velocity v + h (a u + (b - a) u² / 2) is 0."""
+    square = a * a - 2 * (b - a) * v / h
+    if square < 0:
+        return low, high
+    far = -a - np.copysign(np.sqrt(square), a)
+    for u in (2 * v / (h * far), far / (b - a)):
+        if 0 < u < 1:
+            at = q + u * h * (v + u * h * (a / 2 + u * (b - a) / 6))
+            low, high = min(low, at), max(high, at)
+    return low, high

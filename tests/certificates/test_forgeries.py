@@ -1,0 +1,422 @@
+"""Forged certificates: whoever alters a true one, hashes included, is refused with the reason."""
+
+import copy
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.certificates.certificate import load_certificate
+from robotdiffuse.certificates.checker import hash_of
+from robotdiffuse.certificates.content_hashes import request_parts, scene_parts
+from robotdiffuse.certificates.requirements import not_checked
+from robotdiffuse.certificates.search import certify
+from robotdiffuse.cli.certificate import described
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.problems.files import problem_from_record
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.trajectories.timing import time_parameterize
+
+pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
+HAND, START, MIDDLE, GOAL = (
+    "panda_hand",
+    [-0.5, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785],
+    [0.0, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785],
+    [0.5, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785],
+)
+Record = dict[str, Any]
+"""The content of a certificate file."""
+
+
+@pytest.fixture(scope="module")
+def true(tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Problem]:
+    """A motion with a stop at a waypoint, above a near table, beside a moving ball, with a load, a cone and a
+    speed limit."""
+    robot = rd.load_robot("panda")
+    table = rd.Box([0.5, 0.0, 0.194], [0.6, 1.6, 0.1], name="table")
+    ball = rd.MovingObstacle(rd.Sphere([0.5, 1.4, 0.5], 0.1, "ball"), velocity=[0.0, -0.05, 0.0])
+    problem = Problem(
+        robot,
+        rd.Scene([table]),
+        START,
+        GOAL,
+        waypoints=[MIDDLE],
+        moving=[ball],
+        constraints=[rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.5)],
+        payload=rd.Payload(1.0, [0.0, 0.0, 0.05], HAND),
+    )
+    rows = np.array([START, MIDDLE, GOAL])
+    halves = [
+        time_parameterize(robot, Path(robot.joint_names, part), lambda _: True, lambda _: True)
+        for part in (rows[:2], rows[1:])
+    ]
+    first, second = (
+        (half.positions, half.velocities, half.accelerations, half.times[:, None]) for half in halves
+    )
+    columns = [np.concatenate([a, b[1:]]) for a, b in zip(first[:3], second[:3], strict=True)]
+    times = np.append(halves[0].times, halves[0].duration + halves[1].times[1:])
+    motion = Trajectory(robot.joint_names, times, *columns)
+    certificate = certify(problem, motion)
+    assert certificate.check(problem).differences == () and certificate.proof.planes
+    file = tmp_path_factory.mktemp("certificates") / "true.json"
+    certificate.save(file)
+    return json.loads(file.read_text()), problem
+
+
+def motion_of(record: Record) -> Path | Trajectory:
+    motion = record["motion"]
+    rows = {name: np.array(motion[name], float) for name in motion if name != "joint_names"}
+    return (Trajectory if "times" in rows else Path)(tuple(motion["joint_names"]), **rows)
+
+
+def sealed(record: Record) -> None:
+    """Recompute all hashes of the motion and the problem, as a forger does."""
+    record["motion_hash"] = hash_of(motion_of(record))
+    problem = problem_from_record(record["problem"])
+    record["scene_parts"], record["request_parts"] = scene_parts(problem.scene), request_parts(problem)
+
+
+def entry(record: Record, planes: bool = True) -> Record:
+    """The claim with most planes, or with most stretches."""
+    return max(record["proof"], key=lambda one: len(one["planes"] if planes else one["start"]))
+
+
+def set_to(*path: str | int, to: Any) -> Callable[[Record], None]:
+    """A forgery that sets one value."""
+
+    def forge(record: Record) -> None:
+        place: Any = record
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = to
+
+    return forge
+
+
+def scaled_rows(name: str, factor: float) -> Callable[[Record], None]:
+    def forge(record: Record) -> None:
+        record["motion"][name] = (factor * np.array(record["motion"][name])).tolist()
+
+    return forge
+
+
+def scaled_time(factor: float) -> Callable[[Record], None]:
+    """All rates agree with each other."""
+
+    def forge(record: Record) -> None:
+        for name, power in (("times", 1), ("velocities", -1), ("accelerations", -2)):
+            scaled_rows(name, factor**power)(record)
+        record["between"] = (factor * np.array(record["between"])).tolist()
+        record["looks"] = (factor * np.array(record["looks"])).tolist()
+
+    return forge
+
+
+def shifted_time(by: float) -> Callable[[Record], None]:
+    def forge(record: Record) -> None:
+        record["motion"]["times"] = (np.array(record["motion"]["times"]) + by).tolist()
+        record["between"] = (np.array(record["between"]) + by).tolist()
+        record["looks"] = (np.array(record["looks"]) + by).tolist()
+
+    return forge
+
+
+def normals(factor: float) -> Callable[[Record], None]:
+    def forge(record: Record) -> None:
+        for claim in record["proof"]:
+            claim["planes"] = [[*p[:3], *(factor * x for x in p[3:])] for p in claim["planes"]]
+
+    return forge
+
+
+def of_widest(name: str, change: Callable[[Any], Any], planes: bool = False) -> Callable[[Record], None]:
+    def forge(record: Record) -> None:
+        claim = entry(record, planes)
+        claim[name] = change(claim[name])
+
+    return forge
+
+
+def sparse(record: Record) -> None:
+    """Two rows at rest, far apart, without anything between."""
+    motion = record["motion"]
+    for name in ("positions", "velocities", "accelerations", "times"):
+        motion[name] = [motion[name][0], motion[name][-1]]
+    record["between"], record["looks"], record["jerks"] = [], [], []
+
+
+def without_rates(record: Record) -> None:
+    """A path: velocities and moving obstacles would go unchecked."""
+    for name in ("times", "velocities", "accelerations"):
+        del record["motion"][name]
+    record["between"], record["looks"], record["jerks"] = [], [], []
+
+
+def still_row(record: Record) -> None:
+    motion = record["motion"]
+    for name in ("velocities", "accelerations"):
+        motion[name][40] = [0.0] * 7
+
+
+def bulge(record: Record) -> None:
+    """A velocity that the positions do not have, opposite at the two neighbours, on a joint at rest."""
+    motion = record["motion"]
+    for row, sign in ((40, 1.0), (41, -1.0)):
+        motion["velocities"][row][6] = sign * 0.5
+
+
+def swapped_rows(record: Record) -> None:
+    q = record["motion"]["positions"]
+    q[40], q[60] = q[60], q[40]
+
+
+def dropped_waypoint(record: Record) -> None:
+    """The motion does not stop in the middle: that row is left out."""
+    motion = record["motion"]
+    middle = next(i for i, q in enumerate(motion["positions"]) if q == MIDDLE)
+    for name in ("positions", "velocities", "accelerations", "times"):
+        del motion[name][middle]
+
+
+def reversed_proof(record: Record) -> None:
+    claim = entry(record, planes=False)
+    for name in ("start", "stop", "clearance", "displacement"):
+        claim[name].reverse()
+
+
+def zero_stretches(record: Record) -> None:
+    """Each stretch shrinks to its start."""
+    for claim in record["proof"]:
+        claim["stop"] = list(claim["start"])
+
+
+def no_stretches(record: Record) -> None:
+    for claim in record["proof"]:
+        claim.update(start=[], stop=[], clearance=[], displacement=[], by_planes=[], planes=[])
+
+
+def twice(record: Record) -> None:
+    record["proof"].append(copy.deepcopy(record["proof"][0]))
+
+
+def against_nothing(record: Record) -> None:
+    record["proof"][0]["against"] = "nothing"
+
+
+def exchanged_claims(record: Record) -> None:
+    one, other = record["proof"][0], record["proof"][-1]
+    one["link"], other["link"] = other["link"], one["link"]
+
+
+def no_moving_claim(record: Record) -> None:
+    record["moving"].pop()
+
+
+def touching(record: Record) -> None:
+    """A contact that the true problem does not allow."""
+    record["problem"]["allowed_contacts"] = {"table": "all"}
+
+
+def held(record: Record) -> None:
+    record["problem"]["locked"] = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
+
+
+def moved_table(record: Record) -> None:
+    record["problem"]["scene"][0]["box"]["center"][2] -= 0.2
+
+
+def no_fields(*names: str) -> Callable[[Record], None]:
+    def forge(record: Record) -> None:
+        for name in names:
+            record["problem"].pop(name, None)
+            empty: dict[str, Any] = {"moving": None, "constraints": [], "payload": None}
+            if name in empty:
+                record["moving" if name == "moving" else "constraints"] = empty[name] or []
+        if "moving" in names:
+            record["moving"] = None
+        if "payload" in names:
+            record["torques"] = []
+
+    return forge
+
+
+def in_problem(name: str, change: Callable[[Any], Any]) -> Callable[[Record], None]:
+    def forge(record: Record) -> None:
+        record["problem"][name] = change(record["problem"][name])
+
+    return forge
+
+
+def wider_cone(constraints: list[Any]) -> list[Any]:
+    constraints[0]["axis_cone"]["angle"] = 3.0
+    return constraints
+
+
+def lighter(payload: dict[str, Any]) -> dict[str, Any]:
+    return payload | {"mass": 0.01}
+
+
+def slower_ball(moving: list[Any]) -> list[Any]:
+    moving[0]["velocity"] = [0.0, 0.0, 0.0]
+    return moving
+
+
+def faster_ball(moving: list[Any]) -> list[Any]:
+    moving[0]["velocity"] = [0.0, -1.0, 0.0]
+    return moving
+
+
+def unknown_ball(moving: list[Any]) -> list[Any]:
+    del moving[0]["velocity"]
+    moving[0]["max_speed"] = 1.0
+    return moving
+
+
+FORGED: dict[str, tuple[Callable[[Record], None], str]] = {
+    # planes
+    "normals of denormal length": (normals(1e-310), "has a normal of length"),
+    "normals of small length": (normals(1e-160), "has a normal of length"),
+    "normals of huge length": (normals(1e200), "has a normal of length|is not the normal"),
+    "normals a millionth too long": (normals(1 + 1e-6), "has a normal of length"),
+    "normals of length 0": (normals(0.0), "is not the normal of a plane"),
+    "normals turned round": (normals(-1.0), "proof: (clearance|displacement) of "),
+    "normals not finite": (normals(float("nan")), "not the normal|NaN|JSON|finite"),
+    "planes left out": (of_widest("planes", lambda _: [], True), "proof: (clearance|displacement) of "),
+    "planes of another stretch": (
+        of_widest("planes", lambda planes: [[p[0] + 10**6, *p[1:]] for p in planes], True),
+        "has no stretch",
+    ),
+    "planes without their mark": (of_widest("by_planes", lambda _: [], True), "planes are given"),
+    # stretches
+    "stretches without length": (zero_stretches, "is missing from row"),
+    "stretches that end early": (of_widest("stop", lambda x: [*x[:-1], x[-1] - 0.5]), "is missing from row"),
+    "stretches that begin late": (of_widest("start", lambda x: [0.5, *x[1:]]), "is missing from row"),
+    "stretches beyond the motion": (of_widest("stop", lambda x: [*x[:-1], x[-1] + 9]), "is missing from row"),
+    "stretches backwards": (reversed_proof, "is missing from row"),
+    "no stretches": (no_stretches, "is missing from row"),
+    "a claim twice": (twice, "contains a claim twice"),
+    "a claim against nothing": (against_nothing, "needs no proof"),
+    "claims of other links": (exchanged_claims, "proof: "),
+    "no claims": (set_to("proof", to=[]), "is missing"),
+    "more clearance": (of_widest("clearance", lambda x: [v + 1e-3 for v in x]), "proof: clearance of"),
+    "less displacement": (of_widest("displacement", lambda x: [0.0 for _ in x]), "proof: displacement of"),
+    "endless clearance": (of_widest("clearance", lambda x: [1e308 for _ in x]), "clearance"),
+    "clearance of 5 m": (set_to("scene_clearance", to=5.0), "more than the 1 m that are measured"),
+    "clearance below 0": (set_to("self_clearance", to=-1.0), "not positive"),
+    "no moving claim": (no_moving_claim, "is missing"),
+    "nothing about what moves": (set_to("moving", to=None), "none among moving obstacles"),
+    # tolerances
+    "a negative tolerance": (set_to("tolerances", "limit_slack", to=-1.0), "must not be negative"),
+    "a wide chord": (set_to("tolerances", "chord", to=1.0), "looser than"),
+    "a wide goal": (set_to("tolerances", "goal_tolerance", to=10.0), "looser than"),
+    "an endless tolerance": (set_to("tolerances", "rate_slack", to=1e308), "looser than"),
+    "a tolerance that is not finite": (set_to("tolerances", "rest", to=float("nan")), "finite|NaN"),
+    # the motion
+    "times 1000 s earlier": (shifted_time(-1000.0), "times begin at -1000 s, not at 0"),
+    "times 1000 s later": (shifted_time(1000.0), "times begin at 1000 s, not at 0"),
+    "times a little later": (shifted_time(1e-6), "not at 0"),
+    "twice as fast": (scaled_time(0.5), "exceeds its limit of"),
+    "a little faster": (scaled_time(0.95), "exceeds its limit of"),
+    "times alone faster": (scaled_rows("times", 0.5), "exceeds its limit of|between its rows"),
+    "times backwards": (scaled_rows("times", -1.0), "do not increase|between its rows"),
+    "velocities of 0": (scaled_rows("velocities", 0.0), "along its cubics"),
+    "velocities turned round": (scaled_rows("velocities", -1.0), "along its cubics"),
+    "accelerations of 0": (scaled_rows("accelerations", 0.0), "accelerations of .* off those of its cubics"),
+    "accelerations turned round": (scaled_rows("accelerations", -1.0), "off those of its cubics"),
+    "a row at rest": (still_row, "along its cubics"),
+    "a bulge between two rows": (bulge, "along its cubics"),
+    "two rows": (sparse, "its cubics leave the straight lines"),
+    "rows swapped": (swapped_rows, "exceeds its limit of"),
+    "no rates": (without_rates, "nothing about|prove anything about moving"),
+    "no stop at the waypoint": (dropped_waypoint, "does not stop at waypoints"),
+    "another start": (set_to("motion", "positions", 0, 6, to=0.8), "off the start"),
+    "another end": (set_to("motion", "positions", -1, 6, to=0.8), "does not end at the goal"),
+    "a row out of limits": (set_to("motion", "positions", 50, 5, to=9.0), "leaves its limits"),
+    "places beyond the motion": (set_to("between", to=[-1.0]), "do not lie between its rows"),
+    "samples beyond the motion": (set_to("looks", to=[1e5]), "do not lie between its rows"),
+    # what is stated besides
+    "less jerk": (set_to("jerks", 0, 1, to=1.0), "jerks: that of panda_joint1"),
+    "less torque": (set_to("torques", 1, 1, to=1.0), "torques: the bound of panda_joint2"),
+    "no torques": (set_to("torques", to=[]), "torques: their joints"),
+    "a smaller angle": (set_to("constraints", 0, 1, to=0.0), "constraints: the bound of axis_cone"),
+    "no constraints": (set_to("constraints", to=[]), "constraints: they are not those"),
+    "another name": (set_to("robot", to="ur5e"), "robot: it is panda, not ur5e"),
+    "spheres of before": (set_to("robot_parts", "spheres of panda_link5", to="0" * 16), "has changed"),
+    "an unknown field": (set_to("holds", to=True), "holds is unknown"),
+    # the problem, judged by the true one
+    "a lower table": (moved_table, "scene: table has changed"),
+    "an allowed contact": (touching, "links that may touch table is missing"),
+    "a wider cone": (in_problem("constraints", wider_cone), r"requests: constraints\[0\] has changed"),
+    "a lighter load": (in_problem("payload", lighter), "requests: payload has changed"),
+    "a ball at rest": (in_problem("moving", slower_ball), "requests: moving ball has changed"),
+    "no ball": (no_fields("moving"), "moving ball was added"),
+    "no load": (no_fields("payload"), "payload was added"),
+    # the problem, judged by itself
+    "closed fingers": (held, "robot: joint panda_finger_joint1 has changed"),
+    "a faster ball": (in_problem("moving", faster_ball), "is not shown to be free|proof: (clear|displ)"),
+    "a ball of unknown motion": (in_problem("moving", unknown_ball), "proof: "),
+}
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_forgeries_are_refused_with_the_reason(
+    name: str, true: tuple[Record, Problem], tmp_path: FilePath
+) -> None:
+    forge, wanted = FORGED[name]
+    record, problem = copy.deepcopy(true[0]), true[1]
+    forge(record)
+    file = tmp_path / "forged.json"
+    alone = ["closed fingers", "a faster ball", "a ball of unknown motion"]
+    try:
+        sealed(record)
+        file.write_text(json.dumps(record))
+        found = load_certificate(file).check(None if name in alone else problem).differences
+    except InputError as error:
+        found = (str(error),)
+    assert any(re.search(wanted, line) for line in found), found
+
+
+def test_the_true_certificate_holds(true: tuple[Record, Problem], tmp_path: FilePath) -> None:
+    record = copy.deepcopy(true[0])
+    sealed(record)
+    (tmp_path / "true.json").write_text(json.dumps(record))
+    certificate = load_certificate(tmp_path / "true.json")
+    assert certificate.check().differences == () and certificate.check(true[1]).differences == ()
+
+
+def test_thin_spheres_are_refused() -> None:
+    panda = rd.load_robot("panda")
+    thin = {link: spheres * [1, 1, 1, 0.5] for link, spheres in panda.spheres.items()}
+    problem = Problem(replace(panda, spheres=thin), rd.Scene(), START, GOAL)
+    certificate = certify(problem, Path(panda.joint_names, np.array([START, GOAL])))
+    found = certificate.check(problem).differences
+    assert any(
+        re.match("robot: the meshes of panda_link5 stick out of its spheres by 0.0", line) for line in found
+    )
+
+
+def test_the_robot_is_described() -> None:
+    panda = rd.load_robot("panda", {"panda_finger_joint1": 0.01})
+    assert described(panda) == "panda, the bundled one"
+    small = {
+        link: tuple(replace(m, vertices=0.5 * m.vertices) for m in of) for link, of in panda.meshes.items()
+    }
+    shrunk = described(replace(panda, meshes=small, source="/robots/panda"))
+    assert shrunk.startswith(
+        "panda from /robots/panda, not the bundled one: meshes of panda_link0 has changed"
+    )
+    assert "not bundled" in described(replace(panda, name="mine"))
+
+
+def test_what_is_not_checked_is_told(true: tuple[Record, Problem]) -> None:
+    panda = rd.load_robot("panda")
+    problem = Problem(panda, rd.Scene(), START, GOAL, start_velocity=[0.1, 0, 0, 0, 0, 0, 0])
+    assert "start_velocity" in not_checked(problem, Path(panda.joint_names, np.array([START, GOAL])))
+    assert not_checked(true[1], motion_of(true[0])) == ["sharp reversals"]
