@@ -147,7 +147,7 @@ class Problem(Value):
             "constraints": path_constraints(self.robot, self.constraints),
             "views": depth_views(self.robot, self.views),
             "moving": moving_obstacles(self.moving, self.scene),
-            "start_velocity": velocity_at_start(self.robot, self.start_velocity),
+            "start_velocity": velocity_at_start(self.robot, self.start_velocity, notes),
             "T_world_base": base_pose(self.T_world_base),
             "notes": tuple(notes),
         }

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, numbers, rigid_transform
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, distinct, shown, unknown_name
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, OneGoal, PoseGoal, PosesGoal
@@ -18,8 +18,10 @@ from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import ALL_LINKS, Scene
 
-LIMIT_SLACK = 1e-5
+LIMIT_SLACK = 1e-3
 """Configurations beyond a joint limit by at most this are clamped to it, with a note [rad] or [m]."""
+VELOCITY_SLACK = 1e-6
+"""The same of start velocities, as a share of the limit: float32 rounds by up to 6e-8."""
 MIN_BLEND, MAX_BLEND = 1e-3, 10.0
 """Bounds of a `Problem.blend` that is not 0 [rad] or [m]."""
 
@@ -114,8 +116,9 @@ def moving_obstacles(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]
     )
 
 
-def velocity_at_start(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
-    """A velocity within limits; None if it is zero, or nearly."""
+def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> Float[ndarray, "dof"] | None:
+    """A velocity, clamped where it is within VELOCITY_SLACK of the limits; `notes` says where. None if it is
+    zero, or nearly."""
     if value is None:
         return None
     velocity = numbers(value)
@@ -124,13 +127,14 @@ def velocity_at_start(robot: Robot, value: object) -> Float[ndarray, "dof"] | No
         raise InputError(
             f"start_velocity is {shown(value)}; it must be {robot.dof} finite numbers [rad/s]: {names}"
         )
-    beyond = np.flatnonzero((np.abs(velocity) > robot.velocity) & (robot.velocity > 0))
-    if len(beyond):
-        j = int(beyond[0])
-        raise InputError(
-            f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; its velocity limit is "
-            f"{robot.velocity[j]:g}"
-        )
+    within = np.clip(velocity, -robot.velocity, robot.velocity)
+    for j in np.flatnonzero((velocity != within) & (robot.velocity > 0)):
+        name, limit = robot.joint_names[j], robot.velocity[j]
+        if abs(velocity[j] - within[j]) > VELOCITY_SLACK * limit:
+            given, _, most = distinct(velocity[j], -limit, limit)
+            raise InputError(f"start_velocity: {name} is {given}; its velocity limit is {most}")
+        notes.append(f"start_velocity: {name} clamped from {velocity[j]!r} to its limit {within[j]!r}")
+        velocity[j] = within[j]
     return velocity if (np.abs(velocity) >= MIN_RATE).any() else None
 
 
@@ -192,8 +196,8 @@ def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float
     within = float(np.clip(value, joint.lower, joint.upper))
     if abs(value - within) > LIMIT_SLACK:
         hint = " (angles are in radians)" if unit == "rad" and abs(value) > 2 * np.pi else ""
-        limits = f"{joint.lower:g} to {joint.upper:g}"
-        raise InputError(f"{field}: {joint.name} is {value:g} {unit}; its limits are {limits}{hint}")
+        given, lower, upper = distinct(value, joint.lower, joint.upper)
+        raise InputError(f"{field}: {joint.name} is {given} {unit}; its limits are {lower} to {upper}{hint}")
     if value != within:
         notes.append(f"{field}: {joint.name} clamped from {float(value)!r} to its limit {within!r} {unit}")
     return within

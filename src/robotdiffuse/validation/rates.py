@@ -38,8 +38,8 @@ class RateTolerances:
     slack: float
     """Share by which limits may be exceeded, and share of a velocity limit that counts as rest."""
     agreement: float
-    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the mean
-    accelerations before and after the row."""
+    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the
+    accelerations of the cubics before and after the row."""
     jump: float
     """A step faster than this times the velocity limit is a jump."""
     resolution: float
@@ -180,21 +180,22 @@ def _checks(
         possible + blur,
         lambda i, j: f"but the velocities of these rows are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
-    beside = _padded(change[:1], change, change[-1:])
-    low, high = np.minimum(beside[1:], beside[:-1]), np.maximum(beside[1:], beside[:-1])
+    start, end = (6 * mean - 4 * v[:-1] - 2 * v[1:]) / step, (2 * v[:-1] + 4 * v[1:] - 6 * mean) / step
+    before, after = _padded(0 * a[:1], end), _padded(start, 0 * a[:1])  # the arm stands still outside
+    low, high = np.minimum(before, after), np.maximum(before, after)
     outside = np.maximum(low - a, a - high)
-    if len(a) > 1:  # at an end, no row lies beyond; accelerations that are linear have the step's mean
-        linear = np.abs((a[[0, -2]] + a[[1, -1]]) / 2 - change[[0, -1]])
-        outside[[0, -1]] = np.minimum(outside[[0, -1]], linear)
     if begins.any():
         outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
+    unsure = 6 * blur / step
+    certain = np.zeros((1, 1))
     yield _Check(
         "rates",
         "acceleration",
         a,
         outside,
-        tolerances.agreement * np.where(most > 0, np.minimum(most, own), own),
-        lambda i, j: f"but its velocities give {low[i, j]:.6g} to {high[i, j]:.6g}",
+        tolerances.agreement * np.where(most > 0, np.minimum(most, own), own)
+        + np.maximum(_padded(certain, unsure), _padded(unsure, certain)),
+        lambda i, j: f"but the cubics beside it have {low[i, j]:.6g} to {high[i, j]:.6g}",
     )
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
@@ -277,8 +278,8 @@ def _second_differences(
     return ((rows[high] - q) / after - (q - rows[low]) / before) / apart, unsure / apart
 
 
-def _padded(before: ndarray, rows: ndarray, after: ndarray) -> ndarray:
-    return np.concatenate([before, rows, after])
+def _padded(*rows: ndarray) -> ndarray:
+    return np.concatenate(rows)
 
 
 def _limits_or_peaks(limit: Float[ndarray, "dof"], *rates: ndarray) -> Float[ndarray, "dof"]:

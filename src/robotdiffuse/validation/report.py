@@ -8,8 +8,8 @@ class Violation:
     """A requirement that a motion violates."""
 
     kind: str
-    """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, waypoint or
-    goal; for trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
+    """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, jump,
+    waypoint or goal; for trajectories also time, rest, velocity, acceleration, rates and speed."""
     time: float
     """Its place: for a path, waypoint index plus fraction of the segment; for a trajectory, time [s]."""
     message: str

@@ -28,7 +28,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import numbers
-from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_type, distinct, shown, unknown_name
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
@@ -189,7 +189,8 @@ class Replanner:
         if clock is None or clock.ndim != 0 or not np.isfinite(clock):
             raise InputError(f"now is {shown(now)}; it must be a finite number of seconds")
         if now <= self._now:
-            raise InputError(f"now is {now:g} s after {self._now:g} s; time must go on from step to step")
+            time, last = distinct(float(clock), self._now)
+            raise InputError(f"now is {time} s after {last} s; time must go on from step to step")
         self._observe(observation, float(now))
         begins = self._now + self.settings.period
         self._filter.advance(self._path, self._motion, self._since, begins)
