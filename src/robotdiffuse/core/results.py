@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -15,6 +15,8 @@ from robotdiffuse.core.types import Path, Status, Trajectory, Tree
 
 PROBLEM_ENDINGS = (".yaml", ".yml", ".jsonl")
 """Endings of problem files that no result has."""
+NO_PROBLEM = "without its problem"
+"""How the note begins that says why a result was saved without its problem."""
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
 
 
@@ -67,7 +69,7 @@ class PlanResult:
     """Search trees from the start and from the goals, when the shortest path was found or time ran out. Only
     if the planner's setting `keep_trees` is true; files do not hold them."""
     problem: Any = field(default=None, repr=False)
-    """The `Problem`, for `rd.show`; None in results read from files."""
+    """The `Problem`, for files and `rd.show`; None in results read from files."""
 
     def __repr__(self) -> str:
         planned = f"{self.planner} in {1e3 * self.planning_time:.3g} ms"
@@ -95,13 +97,23 @@ class PlanResult:
         return None if self.trajectory is None else len(self.trajectory.stops)
 
     def save(self, file: str | FilePath, problem: dict[str, Any] | None = None) -> None:
-        """Write .json (everything, and the problem as in a problem file) or .csv (the trajectory alone).
+        """Write .json (everything, with the problem as in a problem file) or .csv (the trajectory alone).
+
+        problem: None: that of the result. A robot that is neither bundled nor read from a file cannot be
+        named; then the file holds no problem, and a note says so.
 
         Raises InputError for another ending, a file that cannot be written, or .csv without a trajectory.
         """
         path = check_output(file, (".json", ".csv"))
         if path.suffix.lower() == ".json":
-            write_atomically(path, json.dumps(self.record(problem), allow_nan=False) + "\n")
+            notes = self.notes
+            if problem is None and self.problem is not None:
+                try:
+                    problem = self.problem.record()
+                except InputError as error:
+                    notes = (*notes, f"{NO_PROBLEM}: {error}")
+            record = replace(self, notes=notes).record(problem)
+            write_atomically(path, json.dumps(record, allow_nan=False) + "\n")
         elif self.trajectory is None:
             raise InputError(f"{path}: there is no trajectory to write ({self.status.value}); use .json")
         else:

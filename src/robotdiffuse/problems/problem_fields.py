@@ -140,8 +140,13 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> Float[nd
 
 def checked_goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
     """The goal as an object of its class, with its configurations within limits."""
-    if isinstance(goal, list | tuple) and any(isinstance(one, OneGoal) for one in goal):
-        goal = AnyGoal(tuple(goal))
+    if isinstance(goal, list | tuple):
+        goal = [
+            named_pose(robot, f"{field}[{i}]", one) if isinstance(one, str) else one
+            for i, one in enumerate(goal)
+        ]
+        if any(isinstance(one, OneGoal) for one in goal):
+            goal = AnyGoal(tuple(one if isinstance(one, OneGoal) else JointGoal(one) for one in goal))
     if isinstance(goal, AnyGoal):
         fields = (f"{field}.goals[{i}]" for i in range(len(goal.goals)))
         each = [checked_goal(robot, *of, notes) for of in zip(fields, goal.goals, strict=True)]
@@ -173,15 +178,21 @@ def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
             )
 
 
-def checked_configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:
-    """The configuration, clamped where it is within LIMIT_SLACK of the limits; `notes` says where."""
+def configuration(robot: Robot, field: str, value: object) -> Float[ndarray, "dof"]:
+    """The value of each planned joint, of a list of numbers or the name of a pose."""
     q = numbers(named_pose(robot, field, value) if isinstance(value, str) else value)
     names = ", ".join(robot.joint_names)
     if q is None or q.ndim != 1:
         raise InputError(f"{field} is {shown(value)}; it must be a list of {robot.dof} numbers: {names}")
     if len(q) != robot.dof:
         raise InputError(f"{field} has {len(q)} values; {robot.name} has {robot.dof} planned joints: {names}")
-    return np.array([_position(field, *pair, notes) for pair in zip(robot.planned_joints, q, strict=True)])
+    return q
+
+
+def checked_configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:
+    """The configuration, clamped where it is within LIMIT_SLACK of the limits; `notes` says where."""
+    values = zip(robot.planned_joints, configuration(robot, field, value), strict=True)
+    return np.array([_position(field, joint, position, notes) for joint, position in values])
 
 
 def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float:
