@@ -25,7 +25,7 @@ from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
 from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, hardly_seen, not_seen_free
 from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
-from robotdiffuse.planning.exploration.steps import STUCK, Step
+from robotdiffuse.planning.exploration.steps import DONE
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.validation.validator import verify
 
@@ -68,14 +68,13 @@ def test_a_view_of_another_thread_waits_for_the_step(monkeypatch: pytest.MonkeyP
     observer = Thread(target=arm.observe, args=(view,))
     during = list[np.ndarray]()
 
-    def step(problem: rd.Problem, policy: str) -> Step:
+    def at_goal(*_: object) -> None:
         observer.start()
         observer.join(0.1)  # it would take less
         during.append(arm.map.unknown)
-        return Step(STUCK, "")
 
-    monkeypatch.setattr(arm, "_step", step)
-    arm.next(LEFT)
+    monkeypatch.setattr("robotdiffuse.planning.exploration.explorer.goal_error", at_goal)
+    assert arm.next(LEFT).kind == DONE
     observer.join()
     assert np.array_equal(during[0], before)
     assert not np.array_equal(arm.map.unknown, before)

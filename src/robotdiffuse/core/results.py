@@ -23,7 +23,11 @@ REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_tim
 @dataclass(frozen=True, eq=False)
 class PlanResult:
     """The answer of a planner. `path` is set if and only if `status` is SOLVED, and then it passed
-    `verify`."""
+    `verify`.
+
+    What a result without a motion lacks is None; to type checkers it may be anything, so that code for
+    solved results needs no assertions.
+    """
 
     status: Status
     reason: str
@@ -35,13 +39,13 @@ class PlanResult:
     seed: int
     stage: str = ""
     """The part of the planner that produced the path, e.g. 'aorrtc', 'network', 'smooth_noise'."""
-    path: Path | None = None
-    trajectory: Trajectory | None = None
-    min_clearance: float | None = None
+    path: Path | Any = None
+    trajectory: Trajectory | Any = None
+    min_clearance: float | Any = None
     """Lower bound on all distances along the motion [m]: the smaller of the two below."""
-    scene_clearance: float | None = None
+    scene_clearance: float | Any = None
     """Lower bound on the distance to obstacles [m]."""
-    self_clearance: float | None = None
+    self_clearance: float | Any = None
     """Lower bound on the distance between links [m]."""
     notes: tuple[str, ...] = field(default=())
     """Input that was changed or ignored, e.g. a start clamped to a limit."""
@@ -83,16 +87,16 @@ class PlanResult:
         return self.status is Status.SOLVED
 
     @property
-    def path_length(self) -> float | None:
+    def path_length(self) -> float | Any:
         return None if self.path is None else self.path.length
 
     @property
-    def duration(self) -> float | None:
+    def duration(self) -> float | Any:
         """Duration of the motion [s]; None without a trajectory."""
         return None if self.trajectory is None else self.trajectory.duration
 
     @property
-    def stops(self) -> int | None:
+    def stops(self) -> int | Any:
         """Number of times that the arm rests between start and goal; None without a trajectory."""
         return None if self.trajectory is None else len(self.trajectory.stops)
 

@@ -1,6 +1,7 @@
 """What a validation returns."""
 
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Report:
     """The result of a validation."""
 
     valid: bool
-    violation: Violation | None
+    violation: Violation | Any
     """The first violation; None if and only if the motion is valid."""
     scene_clearance: float | None
     """Certified lower bound on the distance of all moving links to all obstacles over the whole motion [m],

@@ -48,7 +48,7 @@ class ObservedObstacle:
             moved = np.linalg.norm(T[:3, 3] - T_before[:3, 3])
             moved += self.obstacle.radius * rotation_angle(T_before[:3, :3].T @ T[:3, :3])
             if moved > most * passed + OBSERVATION_ERROR:
-                way, allowed = distinct(moved, most * passed, digits=3)
+                way, allowed = distinct(float(moved), most * passed, digits=3)
                 raise InputError(
                     f"observation[{name!r}] is {way} m from where it was {passed:.3g} s ago; its "
                     f"maximum speed {most:g} m/s allows {allowed} m"
