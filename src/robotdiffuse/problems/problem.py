@@ -71,7 +71,7 @@ class ProblemOptions(TypedDict, total=False):
     clearance: float | None
     views: Sequence[DepthView]
     unknown: str | None
-    waypoints: Sequence[ArrayLike | Goal | Sequence[OneGoal]]
+    waypoints: Sequence[ArrayLike | Goal | Sequence[OneGoal | ArrayLike]]
     constraints: Sequence[Constraint]
     moving: Sequence[MovingObstacle]
     start_velocity: ArrayLike | None
@@ -187,7 +187,7 @@ class Problem(Value):
             robot: Robot,
             scene: Scene,
             start: ArrayLike,
-            goal: ArrayLike | Goal | Sequence[OneGoal],
+            goal: ArrayLike | Goal | Sequence[OneGoal | ArrayLike],
             *,
             T_world_base: ArrayLike | None = None,
             **options: Unpack[ProblemOptions],
@@ -200,7 +200,7 @@ class Problem(Value):
         robot: Robot,
         scene: Scene,
         start: ArrayLike,
-        goal: "ArrayLike | Goal | Sequence[OneGoal]",
+        goal: "ArrayLike | Goal | Sequence[OneGoal | ArrayLike]",
         **options: Unpack[ProblemOptions],
     ) -> "Problem":
         """The problem of a robot whose base is at `T_world_base`, in the frame of the base.
