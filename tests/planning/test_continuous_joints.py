@@ -86,9 +86,9 @@ def test_values_wrapped_to_half_a_turn_are_no_motion_but_those_of_a_file_are_unw
         violation = verify(problem, rows).violation
         assert violation is not None and violation.kind == "jump" and violation.subject == "j0"
         assert "unwrap" in violation.message
-    for times, rates in ((None, {}), (motion.times, {"velocities": motion.velocities})):
-        recorded = RecordedMotion(ARM.joint_names, wrapped, times, **rates)
-        read = motion_of_robot(recorded, ARM)
+    for times in (None, motion.times):
+        velocities = None if times is None else motion.velocities
+        read = motion_of_robot(RecordedMotion(ARM.joint_names, wrapped, times, velocities), ARM)
         assert isinstance(read.motion, Path if times is None else Trajectory)
         assert read.notes[0] == "values of j0 jump by whole turns; they were unwrapped"
         assert np.allclose(read.motion.positions, motion.positions)
