@@ -12,5 +12,4 @@ wall = rd.Box([0.45, 0.0, 1.05], [0.1, 0.6, 0.5], name="wall")
 problem = rd.Problem(robot, rd.Scene([wall]), start=[-1.2, 0.9, 0.6, 0.2], goal=[1.2, 0.9, 0.6, 0.2])
 result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
-assert result.trajectory is not None
 write_picture(robot, problem.scene, result.trajectory, "01_own_robot.png")

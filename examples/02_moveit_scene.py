@@ -11,5 +11,4 @@ print([shape.name for shape in problem.scene.shapes])
 
 result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
-assert result.trajectory is not None
 write_picture(problem.robot, problem.scene, result.trajectory, "02_moveit_scene.png")

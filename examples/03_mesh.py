@@ -21,5 +21,4 @@ problem = rd.Problem(
 )
 result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason, result.scene_clearance)
-assert result.trajectory is not None
 write_picture(problem.robot, problem.scene, result.trajectory, "03_mesh.png")

@@ -22,6 +22,5 @@ problem = rd.Problem(
 )
 result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason, f"{result.scene_clearance:.3f} m from {len(cloud.points)} points")
-assert result.trajectory is not None
 front = PictureSettings(azimuth=0.5)
 write_picture(problem.robot, problem.scene, result.trajectory, "04_point_cloud.png", settings=front)

@@ -17,7 +17,6 @@ scene, robot = scene.attach("parcel", rd.load_robot("panda"), start, link="panda
 problem = rd.Problem(robot, scene, start, goal)
 result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
-assert result.trajectory is not None
 front = PictureSettings(azimuth=0.5)
 write_picture(robot, scene, result.trajectory, "06_held_object.png", settings=front)
 

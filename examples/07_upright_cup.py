@@ -17,5 +17,4 @@ problem = rd.Problem(
 )
 result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
-assert result.trajectory is not None
 write_picture(robot, problem.scene, result.trajectory, "07_upright_cup.png")

@@ -3,13 +3,12 @@
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.core.transforms import rotation_from_rpy, transform
 from robotdiffuse.visualization.picture import PictureSettings, write_picture
 
 
 def hand_at(x: float, y: float, z: float) -> rd.PoseGoal:
     """The hand here, pointing down."""
-    return rd.PoseGoal("panda_hand", transform(np.array([x, y, z]), rotation_from_rpy(np.pi, 0.0, 0.0)))
+    return rd.PoseGoal("panda_hand", rd.pose([x, y, z], rpy=[np.pi, 0.0, 0.0]))
 
 
 problem = rd.Problem(
@@ -22,7 +21,6 @@ problem = rd.Problem(
 )
 result = rd.plan(problem, time_limit=20.0)
 print(result.status.value, result.reason)
-assert result.trajectory is not None
 print(f"{result.trajectory.duration:.2f} s")
 front = PictureSettings(azimuth=0.4)
 write_picture(problem.robot, problem.scene, result.trajectory, "08_waypoints.png", settings=front)

@@ -3,15 +3,14 @@
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.core.transforms import rotation_from_rpy, transform
 from robotdiffuse.visualization.picture import PictureSettings, write_picture
 
-down = rotation_from_rpy(np.pi, 0.0, 0.0)
+down = [np.pi, 0.0, 0.0]  # roll, pitch, yaw
 any_turn = [0.0, 0.0, np.pi]  # about the vertical
 goal = rd.PosesGoal(
     [
-        rd.PoseGoal("left_gripper", transform(np.array([0.7, 0.25, 0.3]), down), rpy_tolerance=any_turn),
-        rd.PoseGoal("right_gripper", transform(np.array([0.7, -0.25, 0.3]), down), rpy_tolerance=any_turn),
+        rd.PoseGoal("left_gripper", rd.pose([0.7, 0.25, 0.3], rpy=down), rpy_tolerance=any_turn),
+        rd.PoseGoal("right_gripper", rd.pose([0.7, -0.25, 0.3], rpy=down), rpy_tolerance=any_turn),
     ]
 )
 left = [0.27, -1.006, 0.689, 1.449, -0.366, 1.258, 0.209]
@@ -21,6 +20,5 @@ problem = rd.Problem(rd.load_robot("baxter"), rd.Scene([table]), left + right, g
 
 result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
-assert result.trajectory is not None
 front = PictureSettings(azimuth=0.3)
 write_picture(problem.robot, problem.scene, result.trajectory, "09_two_arms.png", settings=front)

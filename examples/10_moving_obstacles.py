@@ -19,7 +19,6 @@ problem = rd.Problem(
 )
 result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
-assert result.trajectory is not None
 print(f"{result.trajectory.duration:.2f} s")
 
 posts = [problem.moving[0].at(time) for time in np.arange(0.0, result.trajectory.duration, 0.5)]

@@ -10,5 +10,5 @@ problem = rd.Problem(
 )
 result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
-if result.trajectory is not None:
+if result.solved:
     result.trajectory.save("motion.csv")

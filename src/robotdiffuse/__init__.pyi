@@ -6,6 +6,7 @@ from .certificates.search import certify as certify
 from .core.errors import InputError as InputError
 from .core.results import PlanResult as PlanResult
 from .core.results import load_result as load_result
+from .core.transforms import pose as pose
 from .core.types import Path as Path
 from .core.types import Status as Status
 from .core.types import Trajectory as Trajectory
@@ -36,6 +37,7 @@ from .problems.goals import PosesGoal as PosesGoal
 from .problems.problem import Problem as Problem
 from .robots import load_robot as load_robot
 from .robots.inertias import Payload as Payload
+from .robots.robot import Robot as Robot
 from .scenes.height_map import HeightMap as HeightMap
 from .scenes.mesh import Mesh as Mesh
 from .scenes.moving_obstacles import MovingObstacle as MovingObstacle

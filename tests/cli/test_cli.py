@@ -43,7 +43,7 @@ BAD_CALL = {
     "missing folder": (["plan", "problem.json", "--out", "no/r.json"], "the folder no does not exist"),
     "index out of range": (["plan", "problem.json", "--index", "1"], "index is 1"),
     "unknown option": (["plan", "problem.json", "--fast"], "--fast"),
-    "not a result": (["view", "problem.json"], "is not a result file"),
+    "not a result": (["verify", "problem.json"], "is not a result file"),
     "unknown robot": (["robot", "info", "pandaa"], "pandaa"),
     "missing urdf": (["robot", "add", "missing.urdf"], "missing.urdf"),
     "no workers": (["data", "generate", "--out", "d", "--workers", "0"], "'0' is not an integer"),

@@ -3,6 +3,7 @@
 import json
 import os
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from robotdiffuse.cli.demo import shelf_problem
 from robotdiffuse.core.results import PlanResult, load_result
 from robotdiffuse.core.types import Path as Path_
 from robotdiffuse.core.types import Status
-from robotdiffuse.planning import planner_settings
+from robotdiffuse.planning import load_planner, planner_settings
+from robotdiffuse.problems.files import load_problem, problem_record
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.validation.validator import verify
 
@@ -116,8 +118,39 @@ def test_no_plan_is_status_1_with_the_reason(
     assert status in printed and named in printed
     saved = load_result("r.json")
     assert saved.result.status.value == status and saved.result.path is None
-    assert run("view", "r.json") == 2
+    assert run("export", "r.json", "--out", "r.csv") == 2
     assert f"its status is {status}" in capsys.readouterr().err
+
+
+def test_what_has_no_motion_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`view problem.yaml` was refused, and `plan --out bad.html` wrote nothing and said so neither."""
+    problem = write_problem(tmp_path, **NO_PLAN["goal in collision"][0])
+    outs = ("--out", "bad.html", "--out", "bad.png", "--out", "bad.json", "--out", "bad.csv")
+    assert run("plan", problem, "--planner", "rrt_connect", *outs) == 1
+    assert "not written: bad.csv: there is no motion" in capsys.readouterr().out
+    assert not (tmp_path / "bad.csv").exists()
+    assert "invalid goal" in (tmp_path / "bad.html").read_text() and (tmp_path / "bad.png").exists()
+    for file in ("bad.json", problem):
+        assert run("view", file, "--out", "again.html") == 0
+        assert "inside melon" in (tmp_path / "again.html").read_text()
+    assert run("view", "bad.json", problem, "--out", "both.png") == 2
+
+
+def test_a_result_saved_from_python_holds_its_problem(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = load_problem(write_problem(tmp_path))
+    result = load_planner("rrt_connect").plan(problem, 5.0)
+    result.save("r.json")
+    assert load_result("r.json").problem == problem_record(problem)
+    assert run("verify", "r.json") == 0
+    assert run("view", "r.json", "--out", "r.html") == 0
+    assert run("export", "r.json", "--out", "r.csv") == 0
+    unnamed = replace(problem, robot=replace(problem.robot, name="mine", source=None))
+    replace(result, problem=unnamed).save("unnamed.json")
+    capsys.readouterr()
+    assert run("view", "unnamed.json") == 2
+    assert "holds no problem (without its problem: robot 'mine' is neither" in capsys.readouterr().err
 
 
 BAD_PROBLEM = {
@@ -227,7 +260,7 @@ def test_files_of_the_wrong_kind_name_the_right_command(
     assert run("plan", "result.json") == 2
     assert "it is a result, not a problem; `robotdiffuse view` draws it" in capsys.readouterr().err
     for file in (problem, tmp_path / "problem.yaml"):
-        assert run("view", file) == 2
+        assert run("export", file, "--out", "r.csv") == 2
         assert "it is a problem; `robotdiffuse plan" in capsys.readouterr().err
 
 

@@ -1,10 +1,16 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from helpers.box_arm import box_arm
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import ROWS, Trajectory
+from robotdiffuse.planning import load_planner
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.rates import RateTolerances, rate_violations
+from robotdiffuse.validation.validator import verify
 
 
 def cubic(steps: int = 7) -> Trajectory:
@@ -83,6 +89,25 @@ def test_resampled_rates_still_keep_limits(rate):
     for motion in (smooth(), smooth(2), pulse()):
         assert rate_violations(box_arm(), motion, tolerances) == []
         assert rate_violations(box_arm(), motion.resample(rate), tolerances) == []
+
+
+@pytest.mark.parametrize("rate", [30, 125, 250, 500, 1000])
+@pytest.mark.parametrize("size", [1e-6, 1e-5, 1e-4, 3e-4, 1e-2])
+def test_short_motions_stay_valid_when_resampled(size, rate):
+    """Their accelerations swing within a row or two, and are 0 at both ends."""
+    start = np.array([0.1, 0.2, 0.3])
+    problem = Problem(box_arm(), Scene(), start, start + size * np.array([1.0, 0.7, -1.0]))
+    motion = load_planner("straight_line").plan(problem).trajectory
+    assert verify(problem, motion).valid
+    report = verify(problem, motion.resample(rate))
+    assert report.valid, report.violation
+
+
+def test_accelerations_of_0_are_not_those_of_a_motion():
+    tolerances = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
+    motion = smooth()
+    still = replace(motion, accelerations=0 * motion.accelerations)
+    assert [violation.kind for violation in rate_violations(box_arm(), still, tolerances)] == ["rates"]
 
 
 @pytest.mark.parametrize("rate", [0, -5, np.inf, np.nan, 1e12])

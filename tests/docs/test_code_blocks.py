@@ -1,5 +1,6 @@
 """Every code block of the README and of the documentation does what it says; see helpers/code_blocks.py."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -41,6 +42,16 @@ def test_a_page_that_starts_processes_runs_as_one_script(tmp_path: Path) -> None
         done = subprocess.run(command, cwd=tmp_path, env=paths, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         assert sum(line.startswith("solved ") for line in done.stdout.splitlines()) >= 2, done.stdout
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/quick_start.md", "docs/how_to/plan.md"])
+def test_code_of_a_page_passes_the_type_checker(name: str, tmp_path: Path) -> None:
+    (tmp_path / "page.py").write_text(script(ROOT / name), encoding="utf-8")
+    settings = {"extraPaths": [str(ROOT / "src")], "typeCheckingMode": "basic", "pythonVersion": "3.11"}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
+    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
 
 
 def script(page: Path) -> str:

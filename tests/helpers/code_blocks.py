@@ -105,6 +105,12 @@ def bench_arm(folder: Path) -> None:
         add_robot("arm.urdf", base="base", limits="joint_limits.yaml", settings=QUICK)
 
 
+def example_arm(folder: Path) -> None:
+    """The robot of examples/data/arm.urdf, with few, fat spheres."""
+    with coarse_grids():
+        add_robot("examples/data/arm.urdf", settings=QUICK)
+
+
 def shelf(folder: Path) -> None:
     """shelf.stl: a board."""
     import trimesh
@@ -120,6 +126,7 @@ def motion_bench_maker(folder: Path) -> None:
 PREPARED: dict[str, Callable[[Path], None]] = {
     "bench_arm": bench_arm,
     "cloud.ply": a_cloud,
+    "example_arm": example_arm,
     "motion_bench_maker": motion_bench_maker,
     "rop": rop_data,
     "shelf.stl": shelf,

@@ -8,7 +8,8 @@ import pytest
 
 from helpers.box_arm import box_arm
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.interop.recorded_motion import RecordedMotion, motion_of_robot
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.start_goal import images
 from robotdiffuse.problems.problem import PoseGoal, Problem
@@ -72,6 +73,26 @@ def test_a_pose_is_reached_across_half_a_turn() -> None:
     goal = PoseGoal("tip", link_pose(ARM, np.array([-2.9, 0.5, 0.2]), "tip"))
     path = planned("aorrtc", [2.9, 0.5, 0.2], goal, until="time_limit")
     assert path.length < 0.6
+
+
+def test_values_wrapped_to_half_a_turn_are_no_motion_but_those_of_a_file_are_unwrapped() -> None:
+    """A path was valid, the long way round; the same rows with times turned at 1571 rad/s."""
+    problem = Problem(ARM, Scene(), [3.0, 0.0, 0.0], [-3.0, 0.0, 0.0])
+    motion = load_planner("aorrtc").plan(problem).trajectory
+    assert motion is not None
+    wrapped = (motion.positions + np.pi) % (2 * np.pi) - np.pi
+    timed = replace(motion, positions=wrapped)
+    for rows in (Path(ARM.joint_names, wrapped), timed):
+        violation = verify(problem, rows).violation
+        assert violation is not None and violation.kind == "jump" and violation.subject == "j0"
+        assert "unwrap" in violation.message
+    for times in (None, motion.times):
+        velocities = None if times is None else motion.velocities
+        read = motion_of_robot(RecordedMotion(ARM.joint_names, wrapped, times, velocities), ARM)
+        assert isinstance(read.motion, Path if times is None else Trajectory)
+        assert read.notes[0] == "values of j0 jump by whole turns; they were unwrapped"
+        assert np.allclose(read.motion.positions, motion.positions)
+        assert verify(problem, read.motion).valid
 
 
 def test_images_of_a_goal() -> None:

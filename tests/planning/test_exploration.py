@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import islice, pairwise
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
 from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, hardly_seen, not_seen_free
 from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+from robotdiffuse.planning.exploration.steps import DONE
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.validation.validator import verify
 
@@ -56,6 +58,26 @@ def test_the_loop_ends_and_strict_motions_do_not_collide(policy: str) -> None:
     assert all(step.policy in policy for step in moved)
     stated = [step.confidence for step in moved if step.policy == "chance"]
     assert all(value is None or value >= 0.98 for value in stated)
+
+
+def test_a_view_of_another_thread_waits_for_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    arm = explorer()
+    arm.set_goal(RIGHT)
+    before = arm.map.unknown
+    view = camera_beside(replace(PROBLEM, scene=rd.Scene([FLOOR])), None, 0)
+    observer = Thread(target=arm.observe, args=(view,))
+    during = list[np.ndarray]()
+
+    def at_goal(*_: object) -> None:
+        observer.start()
+        observer.join(0.1)  # it would take less
+        during.append(arm.map.unknown)
+
+    monkeypatch.setattr("robotdiffuse.planning.exploration.explorer.goal_error", at_goal)
+    assert arm.next(LEFT).kind == DONE
+    observer.join()
+    assert np.array_equal(during[0], before)
+    assert not np.array_equal(arm.map.unknown, before)
 
 
 def test_an_arm_at_a_goal_pose_is_done() -> None:

@@ -35,6 +35,13 @@ def test_results_are_in_order_and_as_alone() -> None:
         assert np.array_equal(together.path.positions, one.path.positions)
 
 
+def test_settings_may_be_a_table() -> None:
+    problem = problems()[0]
+    [result] = rd.plan_many([problem], "aorrtc", {"range": 0.3}, workers=1, until="first", time_limit=5.0)
+    alone = rd.plan(problem, planner="aorrtc", settings={"range": 0.3}, until="first", time_limit=5.0)
+    assert np.array_equal(result.path.positions, alone.path.positions)
+
+
 def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = problems()[:3]
     deadly = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="deadly")])

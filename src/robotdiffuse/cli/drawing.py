@@ -18,11 +18,16 @@ if TYPE_CHECKING:
 ENDINGS = (".html", ".png")
 
 
-def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
-    """Draw the motion of a solved result in its scene, as the ending of the file says.
+def draw(problem: "Problem", result: "PlanResult | None", file: Path) -> None:
+    """Draw the motion of a result in its scene, as the ending of the file says; without a motion, the start,
+    the goal and the links that collide.
 
     For a problem with views and the policy `predicted`, the predicted obstacles are drawn too.
     """
+    if result is None or result.path is None:
+        from robotdiffuse.visualization.problem_drawing import write_problem
+
+        return write_problem(problem, file, result)
     if file.suffix.lower() == ".html":
         from robotdiffuse.visualization.replay_page import write_replay as write
     else:

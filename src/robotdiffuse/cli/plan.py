@@ -153,9 +153,9 @@ def run(arguments: argparse.Namespace) -> int:
     print_result(result, asked_clearance(problem, name, arguments.clearance))
     if arguments.next_view and result.path is not None:
         print_next_view(problem, result)
-    for file in written:
-        print(f"wrote {file}")
-    if arguments.view and result.trajectory is not None:
+    for file in outputs:
+        print(f"wrote {file}" if file in written else f"not written: {file}: there is no motion")
+    if arguments.view:
         show(outputs[-1])
     return SOLVED if result.solved else NO_PLAN
 
@@ -189,15 +189,14 @@ def _problem(arguments: argparse.Namespace) -> "Problem":
 def _write(problem: "Problem", result: "PlanResult", file: Path) -> bool:
     """Write a file by its ending; returns False for one that needs a motion if there is none."""
     from robotdiffuse.interop import write_motion
-    from robotdiffuse.problems.files import problem_record
 
     ending = file.suffix.lower()
     if ending == ".json":
-        result.save(file, problem_record(problem))
-    elif result.trajectory is None:
-        return False
+        result.save(file)
     elif ending in ENDINGS:
         draw(problem, result, file)
+    elif result.trajectory is None:
+        return False
     else:
         write_motion(problem, result.trajectory, file)
     return True

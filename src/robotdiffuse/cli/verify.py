@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     out = None if arguments.certificate is None else check_output(arguments.certificate, (".json",))
     problem, motions, notes = _read(arguments)
-    for note in (*notes, *contact_notes(problem.scene)):
+    for note in (*problem.notes, *notes, *contact_notes(problem.scene)):
         print(f"note: {note}")
     valid = all([_validated(problem, what, motion, arguments.all) for what, motion in motions.items()])
     if out is not None and valid:

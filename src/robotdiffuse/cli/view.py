@@ -1,6 +1,7 @@
 """The command `robotdiffuse view`."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,15 +17,17 @@ if TYPE_CHECKING:
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "view",
-        help="draw results as a replay (.html) or a picture (.png)",
-        description="Draw the motions of result files, of several in one picture. Without --out, write a "
-        "replay and open it in the browser.",
+        help="draw results and problems as a replay (.html) or a picture (.png)",
+        description="Draw the motions of result files, of several in one picture; of a problem, or a "
+        "result without a motion, the start, the goal and the links that collide. Without --out, write a "
+        "page and open it in the browser.",
     )
     parser.add_argument(
         "results",
         nargs="+",
         metavar="RESULT",
-        help="result file (.json) of `robotdiffuse plan --out`; several must be of one problem",
+        help="result file (.json) of `robotdiffuse plan --out`, or a problem file; several results must be "
+        "of one problem",
     )
     parser.add_argument(
         "--out",
@@ -43,44 +46,73 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.set_defaults(run=run)
 
 
-def read_solved(file: str) -> "tuple[PlanResult, Problem]":
-    """The solved result in a file, and its problem. Raises InputError if the file holds no motion or
-    problem."""
-    from robotdiffuse.core.results import load_result
+def read_result(file: str) -> "tuple[PlanResult, Problem]":
+    """The result in a file, and its problem. Raises InputError if the file holds no problem."""
+    from robotdiffuse.core.results import NO_PROBLEM, load_result
     from robotdiffuse.problems.files import problem_from_record
 
     saved = load_result(file)
-    if not saved.result.solved:
-        raise InputError(
-            f"{file} holds no motion: its status is {saved.result.status.value} ({saved.result.reason})"
-        )
     if saved.problem is None:
+        why = [f" ({note})" for note in saved.result.notes if note.startswith(NO_PROBLEM)]
         raise InputError(
-            f"{file} holds no problem; write it with `robotdiffuse plan PROBLEM --out FILE.json`"
+            f"{file} holds no problem{''.join(why)}; write it with `robotdiffuse plan PROBLEM --out "
+            "FILE.json`, or with `save` of a result of rd.plan"
         )
     return saved.result, problem_from_record(saved.problem)
 
 
+def read_solved(file: str) -> "tuple[PlanResult, Problem]":
+    """The solved result in a file, and its problem. Raises InputError if the file holds no motion or
+    problem."""
+    result, problem = read_result(file)
+    if not result.solved:
+        raise InputError(f"{file} holds no motion: its status is {result.status.value} ({result.reason})")
+    return result, problem
+
+
+def _read(file: str) -> "tuple[PlanResult | None, Problem]":
+    """The result in a file, and its problem; of a problem file, the problem alone."""
+    from robotdiffuse.core.input_files import read_json
+    from robotdiffuse.core.results import PROBLEM_ENDINGS
+    from robotdiffuse.problems.files import load_problem
+
+    ending = Path(file).suffix.lower()
+    record = read_json(file) if ending == ".json" else {}
+    is_problem = isinstance(record, dict) and "scene" in record and "status" not in record
+    if ending in PROBLEM_ENDINGS or is_problem:
+        return None, load_problem(file)
+    return read_result(file)
+
+
 def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
-    from robotdiffuse.problems.files import problem_record
 
-    names = [Path(file).stem for file in arguments.results]
-    files = arguments.out or [f"{names[0]}.html"]
+    files = arguments.out or [f"{Path(arguments.results[0]).stem}.html"]
     outputs = [check_output(file, ENDINGS) for file in files]
-    (result, problem), *others = map(read_solved, arguments.results)
-    if len(set(names)) < len(names):
-        raise InputError(f"results are {', '.join(arguments.results)}; two have the same name")
-    for name, (_, other) in zip(names[1:], others, strict=True):
-        if problem_record(other)["scene"] != problem_record(problem)["scene"] or other.robot != problem.robot:
-            raise InputError(f"{name} is of another robot or scene than {names[0]}; results must share both")
-    several = dict(zip(names, (result, *(one for one, _ in others)), strict=True))
+    if len(arguments.results) == 1:
+        result, problem = _read(arguments.results[0])
+        write = partial(draw, problem, result)
+    else:
+        problem, results = _read_several(arguments.results)
+        write = partial(draw_several, problem, results, shell=arguments.shell)
     for file in outputs:
-        if others:
-            draw_several(problem, several, file, arguments.shell)
-        else:
-            draw(problem, result, file)
+        write(file)
         print(f"wrote {file}")
     if not arguments.out:
         show(outputs[0])
     return 0
+
+
+def _read_several(files: list[str]) -> "tuple[Problem, dict[str, PlanResult]]":
+    """The solved results in several files, by name, and the problem of the first. Raises InputError for other
+    scenes and for equal names."""
+    from robotdiffuse.problems.files import problem_record
+
+    names = [Path(file).stem for file in files]
+    (result, problem), *others = map(read_solved, files)
+    if len(set(names)) < len(names):
+        raise InputError(f"results are {', '.join(files)}; two have the same name")
+    for name, (_, other) in zip(names[1:], others, strict=True):
+        if problem_record(other)["scene"] != problem_record(problem)["scene"] or other.robot != problem.robot:
+            raise InputError(f"{name} is of another robot or scene than {names[0]}; results must share both")
+    return problem, dict(zip(names, (result, *(one for one, _ in others)), strict=True))

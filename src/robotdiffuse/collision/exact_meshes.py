@@ -379,14 +379,23 @@ def warm_up(robot: Robot) -> None:
     explain_collision(robot, Scene([Sphere([0.0, 0.0, 100.0], 1.0)]), (robot.lower + robot.upper) / 2)
 
 
+def contacts_at(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> list[Distance]:
+    """The links that touch an obstacle or another link at a configuration, the deepest contact first."""
+    exact = ExactCollision(robot, scene)
+    checks = (*exact.link_distances(q), *exact.pair_distances(q))
+    return sorted((check for check in checks if check.distance <= 0), key=lambda check: check.distance)
+
+
 def explain_collision(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:
     """The deepest collision at a configuration in words: 'panda_link5 is 3.2 cm inside sphere_2'.
 
     None if the exact meshes are free of collision.
     """
-    exact = ExactCollision(robot, scene)
-    checks = (*exact.link_distances(q), *exact.pair_distances(q))
-    worst = min(checks, key=lambda check: check.distance, default=None)
-    if worst is None or worst.distance > 0:
-        return None
-    return describe_contact(worst.link, str(worst.other), -worst.distance, worst.other in robot.link_names)
+    contacts = contacts_at(robot, scene, q)
+    return contact_message(robot, contacts[0]) if contacts else None
+
+
+def contact_message(robot: Robot, contact: Distance) -> str:
+    """A contact in words."""
+    link, other, distance = contact
+    return describe_contact(link, str(other), -distance, other in robot.link_names)

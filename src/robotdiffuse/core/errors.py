@@ -35,6 +35,15 @@ def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: 
         raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
 
 
+def distinct(*values: float | int, digits: int = 6) -> list[str]:
+    """The numbers as texts, for messages that compare them: different numbers differ, if need be by more
+    digits than `digits`."""
+    texts = [f"{value:.{digits}g}" for value in values]
+    if len({*texts}) < len({*values}) and digits < 17:
+        return distinct(*values, digits=digits + 1)
+    return texts
+
+
 def shown(value: object) -> str:
     """The value as one short line, for error messages."""
     if isinstance(value, np.ndarray):

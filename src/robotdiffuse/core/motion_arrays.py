@@ -6,7 +6,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_DURATION, MAX_RATE, numbers, rows
-from robotdiffuse.core.errors import InputError, joined, shown
+from robotdiffuse.core.errors import InputError, distinct, joined, shown
 
 RATES = ("velocities", "accelerations")
 
@@ -44,9 +44,8 @@ def check_increasing(times: ndarray) -> None:
     backwards = np.flatnonzero(np.diff(times) <= 0)
     if len(backwards):
         i = int(backwards[0])
-        raise InputError(
-            f"times do not increase: {times[i]:g} s in row {i}, {times[i + 1]:g} s in row {i + 1}"
-        )
+        time, following = distinct(times[i], times[i + 1])
+        raise InputError(f"times do not increase: {time} s in row {i}, {following} s in row {i + 1}")
 
 
 def _times(name: str, value: object, count: int | None) -> ndarray:
@@ -59,5 +58,6 @@ def _times(name: str, value: object, count: int | None) -> ndarray:
     with np.errstate(over="ignore"):
         span = float(np.ptp(times))
     if not span <= MAX_DURATION:
-        raise InputError(f"{name} span {span:g} s; a motion must not last longer than {MAX_DURATION:g} s")
+        duration, limit = distinct(span, MAX_DURATION)
+        raise InputError(f"{name} span {duration} s; a motion must not last longer than {limit} s")
     return times

@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -15,13 +15,19 @@ from robotdiffuse.core.types import Path, Status, Trajectory, Tree
 
 PROBLEM_ENDINGS = (".yaml", ".yml", ".jsonl")
 """Endings of problem files that no result has."""
+NO_PROBLEM = "without its problem"
+"""How the note begins that says why a result was saved without its problem."""
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
 
 
 @dataclass(frozen=True, eq=False)
 class PlanResult:
     """The answer of a planner. `path` is set if and only if `status` is SOLVED, and then it passed
-    `verify`."""
+    `verify`.
+
+    What a result without a motion lacks is None; to type checkers it may be anything, so that code for
+    solved results needs no assertions.
+    """
 
     status: Status
     reason: str
@@ -33,13 +39,13 @@ class PlanResult:
     seed: int
     stage: str = ""
     """The part of the planner that produced the path, e.g. 'aorrtc', 'network', 'smooth_noise'."""
-    path: Path | None = None
-    trajectory: Trajectory | None = None
-    min_clearance: float | None = None
+    path: Path | Any = None
+    trajectory: Trajectory | Any = None
+    min_clearance: float | Any = None
     """Lower bound on all distances along the motion [m]: the smaller of the two below."""
-    scene_clearance: float | None = None
+    scene_clearance: float | Any = None
     """Lower bound on the distance to obstacles [m]."""
-    self_clearance: float | None = None
+    self_clearance: float | Any = None
     """Lower bound on the distance between links [m]."""
     notes: tuple[str, ...] = field(default=())
     """Input that was changed or ignored, e.g. a start clamped to a limit."""
@@ -70,7 +76,7 @@ class PlanResult:
     """Search trees from the start and from the goals, when the shortest path was found or time ran out. Only
     if the planner's setting `keep_trees` is true; files do not hold them."""
     problem: Any = field(default=None, repr=False)
-    """The `Problem`, for `rd.show`; None in results read from files."""
+    """The `Problem`, for files and `rd.show`; None in results read from files."""
 
     def __repr__(self) -> str:
         planned = f"{self.planner} in {1e3 * self.planning_time:.3g} ms"
@@ -84,27 +90,37 @@ class PlanResult:
         return self.status is Status.SOLVED
 
     @property
-    def path_length(self) -> float | None:
+    def path_length(self) -> float | Any:
         return None if self.path is None else self.path.length
 
     @property
-    def duration(self) -> float | None:
+    def duration(self) -> float | Any:
         """Duration of the motion [s]; None without a trajectory."""
         return None if self.trajectory is None else self.trajectory.duration
 
     @property
-    def stops(self) -> int | None:
+    def stops(self) -> int | Any:
         """Number of times that the arm rests between start and goal; None without a trajectory."""
         return None if self.trajectory is None else len(self.trajectory.stops)
 
     def save(self, file: str | FilePath, problem: dict[str, Any] | None = None) -> None:
-        """Write .json (everything, and the problem as in a problem file) or .csv (the trajectory alone).
+        """Write .json (everything, with the problem as in a problem file) or .csv (the trajectory alone).
+
+        problem: None: that of the result. A robot that is neither bundled nor read from a file cannot be
+        named; then the file holds no problem, and a note says so.
 
         Raises InputError for another ending, a file that cannot be written, or .csv without a trajectory.
         """
         path = check_output(file, (".json", ".csv"))
         if path.suffix.lower() == ".json":
-            write_atomically(path, json.dumps(self.record(problem), allow_nan=False) + "\n")
+            notes = self.notes
+            if problem is None and self.problem is not None:
+                try:
+                    problem = self.problem.record()
+                except InputError as error:
+                    notes = (*notes, f"{NO_PROBLEM}: {error}")
+            record = replace(self, notes=notes).record(problem)
+            write_atomically(path, json.dumps(record, allow_nan=False) + "\n")
         elif self.trajectory is None:
             raise InputError(f"{path}: there is no trajectory to write ({self.status.value}); use .json")
         else:

@@ -5,6 +5,10 @@ import math
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from numpy.typing import ArrayLike
+
+from robotdiffuse.core.bounds import unit_quaternion, vector
+from robotdiffuse.core.errors import InputError
 
 IDENTITY = np.eye(4)
 
@@ -108,6 +112,29 @@ def transform(
     if rotation is not None:
         T[:3, :3] = rotation
     return T
+
+
+def pose(
+    xyz: ArrayLike, *, wxyz: ArrayLike | None = None, rpy: ArrayLike | None = None
+) -> Float[ndarray, "4 4"]:
+    """The 4 x 4 matrix of a position and a rotation, as goals, bases, tools and cameras take it.
+
+    Args:
+        xyz: Position [m].
+        wxyz: Rotation as a quaternion, scalar first, of any length.
+        rpy: Rotation as roll, pitch and yaw in the order of URDFs [rad]; without both there is none.
+
+    Raises:
+        InputError: For both rotations, and for anything but finite numbers.
+    """
+    if wxyz is not None and rpy is not None:
+        raise InputError("pose has wxyz and rpy; give one of them")
+    rotation = None
+    if wxyz is not None:
+        rotation = rotation_from_quaternion(unit_quaternion("pose", wxyz))
+    if rpy is not None:
+        rotation = rotation_from_rpy(*vector("pose", "rpy", rpy, 3))
+    return transform(vector("pose", "xyz", xyz, 3), rotation)
 
 
 def pose_entry(T: Float[ndarray, "4 4"]) -> dict[str, list[float]]:

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import Value, numbers
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, distinct, shown
 from robotdiffuse.core.one_line import one_line
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.splines import spline_rows
@@ -157,7 +157,8 @@ class Trajectory(Value):
         outside = ~((asked >= -TIME_TOLERANCE) & (asked <= self.duration + TIME_TOLERANCE))
         if outside.any():
             wrong = float(asked[outside].flat[0])
-            raise InputError(f"time is {wrong:.9g} s; it must be in [0, {self.duration:.9g}]")
+            given, _, end = distinct(wrong, 0.0, self.duration)
+            raise InputError(f"time is {given} s; it must be in [0, {end}]")
         if len(self.times) == 1:
             rows = (
                 np.broadcast_to(getattr(self, name)[0], (*asked.shape, self.positions.shape[1]))

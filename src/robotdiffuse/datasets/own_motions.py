@@ -13,7 +13,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import numbers
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, distinct, shown
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, write_manifest
@@ -131,10 +131,9 @@ def _positions(robot: Robot, i: int, path: object) -> ndarray:
     beyond[:, robot.continuous] = 0
     if not np.isfinite(q).all() or beyond.max() > LIMIT_SLACK:
         row, j = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(q), beyond, np.inf))), q.shape)
-        limits = f"{robot.lower[j]:g} to {robot.upper[j]:g}"
-        raise InputError(
-            f"paths[{i}]: {robot.joint_names[j]} is {q[row, j]:g} in row {row}; its limits are {limits} [rad]"
-        )
+        value, lower, upper = distinct(q[row, j], robot.lower[j], robot.upper[j])
+        limits = f"its limits are {lower} to {upper} [rad]"
+        raise InputError(f"paths[{i}]: {robot.joint_names[j]} is {value} in row {row}; {limits}")
     return q
 
 

@@ -108,6 +108,11 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     if order != sorted(order):
         notes.append("joints were reordered by name")
     q = motion.positions[:, order]
+    turns = robot.wraps(q)
+    if turns.any():
+        q = q - np.concatenate([turns[:1] * 0, np.cumsum(turns, axis=0)])
+        wrapped = [robot.joint_names[j] for j in np.flatnonzero(turns.any(axis=0))]
+        notes.append(f"values of {joined(wrapped, MAX_NAMES)} jump by whole turns; they were unwrapped")
     if motion.times is None:
         return RobotMotion(Path(robot.joint_names, q), tuple(notes))
     v = None if motion.velocities is None else motion.velocities[:, order]

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.locked import locked
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
 from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, VoxelGrid, voxels_of
 from robotdiffuse.perception.depth_view import DepthView
@@ -63,6 +64,7 @@ class OccupancyMap:
         self._counts = np.empty(MAP.shape, np.int32)
         self._known: tuple[Bool[ndarray, "nx ny nz"], ...] | None = None
 
+    @locked
     def add(self, view: DepthView, stamp: float = 0.0) -> int:
         """Take a view into account; returns the number of voxels that nothing was known of before.
 
@@ -79,6 +81,7 @@ class OccupancyMap:
         carve_view(view, self.robot, q, self.settings.arm_margin, MAP.low, MAP.edge, *arrays)
         return self._update(stamp)
 
+    @locked
     def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
         or of `rd.PointCloud.from_file`. They say nothing about free space."""
@@ -88,6 +91,7 @@ class OccupancyMap:
         self._counts[tuple(at.T)] = 1
         self._update(stamp)
 
+    @locked
     def declare_free(self, zone: Corners) -> None:
         """Voxels inside a box count as seen free unless a view finds them occupied."""
         low, high = np.asarray(zone, np.float64)
@@ -112,6 +116,7 @@ class OccupancyMap:
         return self._of_evidence[2]
 
     @property
+    @locked
     def _of_evidence(self) -> tuple[Bool[ndarray, "nx ny nz"], ...]:
         """Occupied, free and unknown voxels, computed once after each change; read-only."""
         if self._known is None:

@@ -172,11 +172,12 @@ _planners: dict[tuple[str, str], "Planner"] = {}
 def _loaded(name: str, settings: Settings | None) -> "Planner":
     """The planner of a name and settings, loaded once; the oldest goes when there are too many."""
     key = name, repr(settings)
-    if key not in _planners:
+    planner = _planners.get(key)
+    if planner is None:
         while len(_planners) >= MAX_LOADED:
-            _planners.pop(next(iter(_planners)), None)
-        _planners[key] = load_planner(name, settings)
-    return _planners[key]
+            _planners.pop(next(iter(tuple(_planners))), None)
+        planner = _planners[key] = load_planner(name, settings)
+    return planner
 
 
 def plan(

@@ -2,7 +2,7 @@
 
 import os
 import queue
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
@@ -22,7 +22,7 @@ from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.robot import Robot
 
-PlannerArguments = tuple[str, Settings | None, str | None]
+PlannerArguments = tuple[str, Settings | Mapping[str, object] | None, str | None]
 """Of `load_planner`: name, settings, weights."""
 PROBLEMS_PER_TASK = 20
 """Problems that a node of a cluster plans with one loaded planner."""
@@ -31,7 +31,7 @@ PROBLEMS_PER_TASK = 20
 def plan_many(
     problems: Iterable[Problem],
     planner: str = DEFAULT_PLANNER,
-    settings: Settings | None = None,
+    settings: Settings | Mapping[str, object] | None = None,
     weights: str | None = None,
     workers: int | None = None,
     cluster: str | None = None,

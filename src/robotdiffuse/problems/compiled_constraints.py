@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, distinct
 from robotdiffuse.core.transforms import inverse, rotation_angle, rotation_z_to, transform
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.constraint_kernel import CONE, DISTANCE, ROLL_PITCH_YAW, TURN, Rows
@@ -78,7 +78,8 @@ class ConstraintViolation:
             return f"{name} cannot be proved: the motion comes within rounding error of its limit"
         if self.limit <= 0.0:
             return f"{name} is violated by {scale * self.excess:.3g} {unit}"
-        return f"{name} is exceeded: {scale * self.value:.4g} {unit}, of {scale * self.limit:.4g} allowed"
+        value, limit = distinct(scale * self.value, scale * self.limit, digits=4)
+        return f"{name} is exceeded: {value} {unit}, of {limit} allowed"
 
 
 class _Row(NamedTuple):
@@ -256,9 +257,10 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     way = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(way))
     if length < MIN_LINE_LENGTH:
+        given, least = distinct(1e3 * length, 1e3 * MIN_LINE_LENGTH, digits=2)
         raise InputError(
-            f"cartesian_line: {line.frame} is {1e3 * length:.2g} mm from its goal position; a line must be "
-            f"at least {1e3 * MIN_LINE_LENGTH:g} mm long"
+            f"cartesian_line: {line.frame} is {given} mm from its goal position; a line must be at least "
+            f"{least} mm long"
         )
     place = transform(T_start[:3, 3] + way / 2, rotation_z_to(way / length))
     half = np.array([0.0, 0.0, length / 2])

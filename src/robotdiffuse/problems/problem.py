@@ -31,6 +31,7 @@ from robotdiffuse.problems.problem_fields import (
     checked_configuration,
     checked_goal,
     checked_payload,
+    configuration,
     depth_views,
     moving_obstacles,
     path_constraints,
@@ -70,12 +71,25 @@ class ProblemOptions(TypedDict, total=False):
     clearance: float | None
     views: Sequence[DepthView]
     unknown: str | None
-    waypoints: Sequence[ArrayLike | Goal | Sequence[OneGoal]]
+    waypoints: Sequence[ArrayLike | Goal | Sequence[OneGoal | ArrayLike]]
     constraints: Sequence[Constraint]
     moving: Sequence[MovingObstacle]
     start_velocity: ArrayLike | None
     blend: ArrayLike
     payload: Payload | None
+
+
+@dataclass(frozen=True)
+class StateValidity:
+    """Whether a configuration is free: true in conditions if it is."""
+
+    reason: str = ""
+    """Why it is not: a joint out of limits, or the deepest contact."""
+    links: tuple[str, ...] = ()
+    """All links that touch an obstacle or another link, the deepest contact first."""
+
+    def __bool__(self) -> bool:
+        return not self.reason
 
 
 @no_type_check
@@ -147,7 +161,7 @@ class Problem(Value):
             "constraints": path_constraints(self.robot, self.constraints),
             "views": depth_views(self.robot, self.views),
             "moving": moving_obstacles(self.moving, self.scene),
-            "start_velocity": velocity_at_start(self.robot, self.start_velocity),
+            "start_velocity": velocity_at_start(self.robot, self.start_velocity, notes),
             "T_world_base": base_pose(self.T_world_base),
             "notes": tuple(notes),
         }
@@ -173,7 +187,7 @@ class Problem(Value):
             robot: Robot,
             scene: Scene,
             start: ArrayLike,
-            goal: ArrayLike | Goal | Sequence[OneGoal],
+            goal: ArrayLike | Goal | Sequence[OneGoal | ArrayLike],
             *,
             T_world_base: ArrayLike | None = None,
             **options: Unpack[ProblemOptions],
@@ -186,7 +200,7 @@ class Problem(Value):
         robot: Robot,
         scene: Scene,
         start: ArrayLike,
-        goal: "ArrayLike | Goal | Sequence[OneGoal]",
+        goal: "ArrayLike | Goal | Sequence[OneGoal | ArrayLike]",
         **options: Unpack[ProblemOptions],
     ) -> "Problem":
         """The problem of a robot whose base is at `T_world_base`, in the frame of the base.
@@ -227,6 +241,28 @@ class Problem(Value):
         least = each.min(axis=1, initial=1.0).astype(np.float64)
         return float(least[0]) if rows.ndim == 1 else least
 
+    def is_free(self, q: ArrayLike | str) -> "StateValidity":
+        """Whether the arm is within its limits and free of collision at a configuration or a named pose.
+
+        Decided by the exact meshes, as for starts and goals; moving obstacles and path constraints are
+        ignored. `if not (state := problem.is_free(q)): print(state.reason)`.
+
+        Raises InputError for q of the wrong shape and for an unknown name.
+        """
+        from robotdiffuse.collision.exact_meshes import contact_message, contacts_at  # compiled code
+
+        robot = self.robot
+        row = configuration(robot, "q", q)
+        try:
+            row = checked_configuration(robot, "q", row, [])
+        except InputError as error:
+            return StateValidity(str(error).removeprefix("q: "))
+        contacts = contacts_at(robot, self.scene, row)
+        if not contacts:
+            return StateValidity()
+        touching = [name for contact in contacts for name in contact[:2] if name in robot.link_names]
+        return StateValidity(contact_message(robot, contacts[0]), tuple(dict.fromkeys(map(str, touching))))
+
     @property
     def known_scene(self) -> Scene:
         """The scene as it was given: without the points that the views observed."""
@@ -235,6 +271,8 @@ class Problem(Value):
 
     load: ClassVar[Callable[..., "Problem"]]
     """`problems.files.load_problem`, assigned by the package: files import problems, not the reverse."""
+    record: ClassVar[Callable[..., dict[str, object]]]
+    """`problems.files.problem_record`, likewise."""
 
 
 def check_problem(problem: object, field: str = "problem") -> None:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, numbers, rigid_transform
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, distinct, shown, unknown_name
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, OneGoal, PoseGoal, PosesGoal
@@ -18,8 +18,10 @@ from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import ALL_LINKS, Scene
 
-LIMIT_SLACK = 1e-5
+LIMIT_SLACK = 1e-3
 """Configurations beyond a joint limit by at most this are clamped to it, with a note [rad] or [m]."""
+VELOCITY_SLACK = 1e-6
+"""The same of start velocities, as a share of the limit: float32 rounds by up to 6e-8."""
 MIN_BLEND, MAX_BLEND = 1e-3, 10.0
 """Bounds of a `Problem.blend` that is not 0 [rad] or [m]."""
 
@@ -114,8 +116,9 @@ def moving_obstacles(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]
     )
 
 
-def velocity_at_start(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
-    """A velocity within limits; None if it is zero, or nearly."""
+def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> Float[ndarray, "dof"] | None:
+    """A velocity, clamped where it is within VELOCITY_SLACK of the limits; `notes` says where. None if it is
+    zero, or nearly."""
     if value is None:
         return None
     velocity = numbers(value)
@@ -124,20 +127,26 @@ def velocity_at_start(robot: Robot, value: object) -> Float[ndarray, "dof"] | No
         raise InputError(
             f"start_velocity is {shown(value)}; it must be {robot.dof} finite numbers [rad/s]: {names}"
         )
-    beyond = np.flatnonzero((np.abs(velocity) > robot.velocity) & (robot.velocity > 0))
-    if len(beyond):
-        j = int(beyond[0])
-        raise InputError(
-            f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; its velocity limit is "
-            f"{robot.velocity[j]:g}"
-        )
+    within = np.clip(velocity, -robot.velocity, robot.velocity)
+    for j in np.flatnonzero((velocity != within) & (robot.velocity > 0)):
+        name, limit = robot.joint_names[j], robot.velocity[j]
+        if abs(velocity[j] - within[j]) > VELOCITY_SLACK * limit:
+            given, _, most = distinct(velocity[j], -limit, limit)
+            raise InputError(f"start_velocity: {name} is {given}; its velocity limit is {most}")
+        notes.append(f"start_velocity: {name} clamped from {velocity[j]!r} to its limit {within[j]!r}")
+        velocity[j] = within[j]
     return velocity if (np.abs(velocity) >= MIN_RATE).any() else None
 
 
 def checked_goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
     """The goal as an object of its class, with its configurations within limits."""
-    if isinstance(goal, list | tuple) and any(isinstance(one, OneGoal) for one in goal):
-        goal = AnyGoal(tuple(goal))
+    if isinstance(goal, list | tuple):
+        goal = [
+            named_pose(robot, f"{field}[{i}]", one) if isinstance(one, str) else one
+            for i, one in enumerate(goal)
+        ]
+        if any(isinstance(one, OneGoal) for one in goal):
+            goal = AnyGoal(tuple(one if isinstance(one, OneGoal) else JointGoal(one) for one in goal))
     if isinstance(goal, AnyGoal):
         fields = (f"{field}.goals[{i}]" for i in range(len(goal.goals)))
         each = [checked_goal(robot, *of, notes) for of in zip(fields, goal.goals, strict=True)]
@@ -169,15 +178,21 @@ def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
             )
 
 
-def checked_configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:
-    """The configuration, clamped where it is within LIMIT_SLACK of the limits; `notes` says where."""
+def configuration(robot: Robot, field: str, value: object) -> Float[ndarray, "dof"]:
+    """The value of each planned joint, of a list of numbers or the name of a pose."""
     q = numbers(named_pose(robot, field, value) if isinstance(value, str) else value)
     names = ", ".join(robot.joint_names)
     if q is None or q.ndim != 1:
         raise InputError(f"{field} is {shown(value)}; it must be a list of {robot.dof} numbers: {names}")
     if len(q) != robot.dof:
         raise InputError(f"{field} has {len(q)} values; {robot.name} has {robot.dof} planned joints: {names}")
-    return np.array([_position(field, *pair, notes) for pair in zip(robot.planned_joints, q, strict=True)])
+    return q
+
+
+def checked_configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:
+    """The configuration, clamped where it is within LIMIT_SLACK of the limits; `notes` says where."""
+    values = zip(robot.planned_joints, configuration(robot, field, value), strict=True)
+    return np.array([_position(field, joint, position, notes) for joint, position in values])
 
 
 def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float:
@@ -192,8 +207,8 @@ def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float
     within = float(np.clip(value, joint.lower, joint.upper))
     if abs(value - within) > LIMIT_SLACK:
         hint = " (angles are in radians)" if unit == "rad" and abs(value) > 2 * np.pi else ""
-        limits = f"{joint.lower:g} to {joint.upper:g}"
-        raise InputError(f"{field}: {joint.name} is {value:g} {unit}; its limits are {limits}{hint}")
+        given, lower, upper = distinct(value, joint.lower, joint.upper)
+        raise InputError(f"{field}: {joint.name} is {given} {unit}; its limits are {lower} to {upper}{hint}")
     if value != within:
         notes.append(f"{field}: {joint.name} clamped from {float(value)!r} to its limit {within!r} {unit}")
     return within

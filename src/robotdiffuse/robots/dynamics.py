@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, distinct
 from robotdiffuse.robots.inertias import Inertia, Payload
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.torque_bounds import Body, Stretches, second_derivative_bounds
@@ -90,8 +90,8 @@ class Dynamics:
     def torque_message(self, j: int, torque: float) -> str:
         """A message about a torque above its limit."""
         unit = "N" if self.robot.prismatic[j] else "N m"
-        name, limit = self.robot.joint_names[j], self.limits[j]
-        return f"{name} needs {torque:.3g} {unit}, its effort limit is {limit:.3g} {unit}"
+        needed, limit = distinct(torque, self.limits[j], digits=3)
+        return f"{self.robot.joint_names[j]} needs {needed} {unit}, its effort limit is {limit} {unit}"
 
 
 def check_dynamics(robot: Robot) -> None:

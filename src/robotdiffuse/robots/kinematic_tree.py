@@ -12,6 +12,10 @@ from robotdiffuse.core.transforms import inverse, rotation_z_to, transform
 from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 from robotdiffuse.robots.link_pair_tables import TURN
 
+MAX_WRAPPED_STEP = 0.5
+"""Largest distance of a step of a continuous joint from a whole turn at which its values count as wrapped
+[rad]."""
+
 
 class KinematicTree(Value):
     """Base of `Robot`, which has the fields and describes the frames."""
@@ -115,6 +119,13 @@ class KinematicTree(Value):
         if not self._any_continuous:
             return np.zeros_like(q)
         return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
+
+    def wraps(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+        """The whole turns in steps from row to row that are nearly whole turns, as where values of a
+        continuous joint are wrapped to [-pi, pi]; 0 in all others."""
+        steps = np.diff(q, axis=0)
+        turns = self.whole_turns(steps)
+        return np.where(np.abs(steps - turns) < MAX_WRAPPED_STEP, turns, 0.0)
 
     @cached_property
     def _any_continuous(self) -> bool:

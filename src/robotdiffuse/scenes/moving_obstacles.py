@@ -14,7 +14,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import Value, form, numbers, read_only, vector, within
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, distinct, shown
 from robotdiffuse.core.transforms import (
     inverse,
     quaternion_from_rotation,
@@ -110,9 +110,11 @@ class MovingObstacle(Value):
         jumps = np.flatnonzero(speeds > MAX_POINT_SPEED)
         if len(jumps):
             i = int(jumps[0])
+            begins, ends = distinct(times[i], times[i + 1])
+            speed, limit = distinct(speeds[i], MAX_POINT_SPEED, digits=3)
             raise InputError(
-                f"{self.name}.poses[{i + 1}] is a jump: from {times[i]:g} s to {times[i + 1]:g} s a point "
-                f"moves at {speeds[i]:.3g} m/s; the limit is {MAX_POINT_SPEED:g} m/s"
+                f"{self.name}.poses[{i + 1}] is a jump: from {begins} s to {ends} s a point moves at {speed} "
+                f"m/s; the limit is {limit} m/s"
             )
 
     @property
@@ -213,7 +215,8 @@ def _times(name: str, value: object) -> Float[ndarray, "k"]:
     backwards = np.flatnonzero(np.diff(times) <= 0)
     if len(backwards):
         i = int(backwards[0])
-        raise InputError(f"{name}.times[{i + 1}] is {times[i + 1]:g} after {times[i]:g}; times must increase")
+        time, before = distinct(times[i + 1], times[i])
+        raise InputError(f"{name}.times[{i + 1}] is {time} after {before}; times must increase")
     return times
 
 

@@ -1,6 +1,7 @@
 """What a validation returns."""
 
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -8,8 +9,8 @@ class Violation:
     """A requirement that a motion violates."""
 
     kind: str
-    """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, waypoint or
-    goal; for trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
+    """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, jump,
+    waypoint or goal; for trajectories also time, rest, velocity, acceleration, rates and speed."""
     time: float
     """Its place: for a path, waypoint index plus fraction of the segment; for a trajectory, time [s]."""
     message: str
@@ -28,7 +29,7 @@ class Report:
     """The result of a validation."""
 
     valid: bool
-    violation: Violation | None
+    violation: Violation | Any
     """The first violation; None if and only if the motion is valid."""
     scene_clearance: float | None
     """Certified lower bound on the distance of all moving links to all obstacles over the whole motion [m],

@@ -15,7 +15,7 @@ from numpy import ndarray
 from robotdiffuse.collision.convex_geometry import describe_contact
 from robotdiffuse.collision.motions import Contact, ContinuousCollision
 from robotdiffuse.core.bounds import MAX_COORDINATE, for_kernels, within
-from robotdiffuse.core.errors import InputError, check_type, joined, shown
+from robotdiffuse.core.errors import InputError, check_type, distinct, joined, shown
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
@@ -118,9 +118,8 @@ class Verifier:
             at = float(trajectory.times[0])
             return Report(False, Violation("time", at, f"times begin at {at:.6g} s, not at 0"), None, None)
         if trajectory.duration > MAX_DURATION:
-            message = (
-                f"the motion takes {trajectory.duration:.6g} s; at most {MAX_DURATION:g} s can be validated"
-            )
+            time, most = distinct(trajectory.duration, MAX_DURATION)
+            message = f"the motion takes {time} s; at most {most} s can be validated"
             return Report(False, Violation("time", 0.0, message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
@@ -220,7 +219,14 @@ class Verifier:
             return Report(False, Violation("not_finite", at, message), None, None)
         clock = np.arange(len(q), dtype=float) if times is None else times
         limits = self._limits(q, clock, "waypoint {:g}" if times is None else "{:.3f} s")
-        every = (self._start(q), limits, *found, self._twitch(q, clock), self._constrained(q, clock, along))
+        every = (
+            self._start(q),
+            self._wrapped(q, clock),
+            limits,
+            *found,
+            self._twitch(q, clock),
+            self._constrained(q, clock, along),
+        )
         found = [violation for violation in every if violation is not None]
         first = min(found, key=lambda violation: violation.time, default=None)
         last = len(q) - 1 if first is None else int(np.searchsorted(clock, first.time))
@@ -249,10 +255,24 @@ class Verifier:
             return None
         j = int(difference.argmax())
         name, excess = self.robot.joint_names[j], float(difference[j])
-        message = (
-            f"the motion begins at {name} = {q[0, j]:.6g}; the problem's start is {self.problem.start[j]:.6g}"
-        )
+        begins, start = distinct(q[0, j], self.problem.start[j])
+        message = f"the motion begins at {name} = {begins}; the problem's start is {start}"
         return Violation("start", 0.0, message, name, None, excess)
+
+    def _wrapped(self, q: ndarray, clock: ndarray) -> Violation | None:
+        """The first step of a continuous joint that is nearly a whole turn."""
+        turns = self.robot.wraps(q)
+        wrapped = np.flatnonzero(turns.any(axis=1))
+        if not len(wrapped):
+            return None
+        i = int(wrapped[0])
+        j = int(np.abs(turns[i]).argmax())
+        name, step = self.robot.joint_names[j], float(q[i + 1, j] - q[i, j])
+        message = (
+            f"{name} turns by {step:.4g} rad from row {i} to row {i + 1}, nearly a whole turn: unwrap values "
+            f"that were wrapped to ±pi, or add rows on the way"
+        )
+        return Violation("jump", float(clock[i]), message, name, None, abs(step))
 
     def _limits(self, q: ndarray, clock: ndarray, place: str) -> Violation | None:
         excess = np.maximum(self.robot.lower - q, q - self.robot.upper)
@@ -261,9 +281,9 @@ class Verifier:
         if not len(bad):
             return None
         i, j = int(bad[0]), int(excess[bad[0]].argmax())
-        name, low, high = self.robot.joint_names[j], self.robot.lower[j], self.robot.upper[j]
-        at = place.format(clock[i])
-        message = f"{name} is {q[i, j]:.6g} at {at}; its limits are {low:.6g} to {high:.6g}"
+        name, at = self.robot.joint_names[j], place.format(clock[i])
+        value, low, high = distinct(q[i, j], self.robot.lower[j], self.robot.upper[j])
+        message = f"{name} is {value} at {at}; its limits are {low} to {high}"
         return Violation("limits", float(clock[i]), message, name, None, float(excess[i, j]))
 
     def _constrained(
@@ -309,7 +329,8 @@ class Verifier:
             return []
         at = float(np.interp(beyond.place, np.arange(len(trajectory.times)), trajectory.times))
         one, most = self.constraints.speed_limited[beyond.joint], limits[beyond.joint]
-        message = f"{one.frame} moves at {beyond.torque:.4g} m/s; {one.kind} allows {most:.4g} m/s"
+        speed, limit = distinct(beyond.torque, most, digits=4)
+        message = f"{one.frame} moves at {speed} m/s; {one.kind} allows {limit} m/s"
         return [Violation("speed", at, message, one.frame, one.kind, beyond.excess)]
 
     def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> list[Violation]:

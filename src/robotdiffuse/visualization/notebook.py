@@ -9,6 +9,7 @@ from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult, ResultFile
 from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.problems.problem import Problem, check_problem
+from robotdiffuse.visualization.problem_drawing import write_problem
 from robotdiffuse.visualization.replay_page import write_replay
 
 
@@ -25,13 +26,13 @@ class Replay:
 
 
 def show(result: PlanResult | ResultFile, problem: Problem | None = None, height: int = 560) -> Replay:
-    """The replay of a solved result, for the last line of a notebook cell; elsewhere in a cell, use
-    `display(rd.show(result))`.
+    """The replay of a result, for the last line of a notebook cell; elsewhere in a cell, use
+    `display(rd.show(result))`. Without a motion: the start, the goal and the links that collide.
 
     problem: needed only if the result does not contain it; results of `plan`, and result files saved with
     their problem, do. height: of the cell [pixels].
 
-    Raises InputError outside a notebook, for a result without a motion, and if the problem is unknown.
+    Raises InputError outside a notebook, and if the problem is unknown.
     """
     check_type("result", result, (PlanResult, ResultFile), "a result, as of rd.plan or rd.load_result")
     if problem is not None:
@@ -41,9 +42,6 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
             problem = problem_from_record(result.problem)
         result = result.result
     problem = problem or result.problem
-    motion = result.trajectory or result.path
-    if motion is None:
-        raise InputError(f"there is no motion to show: {result.status.value} ({result.reason})")
     if problem is None:
         raise InputError("the result does not contain its problem; use rd.show(result, problem)")
     if not _in_notebook():
@@ -51,10 +49,13 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
             "rd.show is for notebooks; elsewhere save the result and use `robotdiffuse view`, or "
             "robotdiffuse.visualization.write_replay"
         )
-    robot, scene = problem.standing()
+    motion = result.trajectory or result.path
     with TemporaryDirectory() as folder:
         file = Path(folder) / "replay.html"
-        write_replay(robot, scene, motion, file, result=result)
+        if motion is None:
+            write_problem(problem, file, result)
+        else:
+            write_replay(*problem.standing(), motion, file, result=result)
         return Replay(file.read_text("utf-8"), height)
 
 

@@ -173,8 +173,7 @@ def _shape(shape: Shape, color: tuple[int, int, int]) -> dict[str, Any]:
         low, step, points = _quantised(style.thinned(shape.points))
         return record | {"radius": shape.point_radius, "low": low, "step": step, "points": points}
     if isinstance(shape, Triangulated):
-        surface = _packed(style.shape_surface(shape, color), colored=False)
-        return record | {"kind": "mesh", "surface": surface}
+        return page_surface(shape.name, style.shape_surface(shape, color), color)
     for name in ("center", "size", "wxyz"):
         if hasattr(shape, name):
             record[name] = _rounded(getattr(shape, name), 6)
@@ -182,6 +181,11 @@ def _shape(shape: Shape, color: tuple[int, int, int]) -> dict[str, Any]:
         if hasattr(shape, name):
             record[name] = round(getattr(shape, name), 6)
     return record
+
+
+def page_surface(name: str, surface: Surface, color: tuple[int, int, int]) -> dict[str, Any]:
+    """A surface in the base frame for the page, in one colour."""
+    return {"kind": "mesh", "name": name, "color": color, "surface": _packed(surface, colored=False)}
 
 
 def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:

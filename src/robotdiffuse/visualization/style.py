@@ -91,11 +91,19 @@ def creased(
 def robot_surfaces(robot: Robot) -> list[Surface]:
     """The surface of the links on each of the dof + 1 frames, in the coordinates of that frame."""
     by_frame: list[list[Surface]] = [[] for _ in range(robot.dof + 1)]
-    for link, meshes in load_visual(robot).items():
-        for mesh in meshes:
-            surface = creased(mesh.vertices, mesh.faces, mesh.colors / 255.0)
-            by_frame[robot.link_frame(link)].append(surface.moved(robot.T_frame_link(link)))
+    for link, surface in link_surfaces(robot).items():
+        by_frame[robot.link_frame(link)].append(surface)
     return [join(surfaces) for surfaces in by_frame]
+
+
+def link_surfaces(robot: Robot) -> dict[str, Surface]:
+    """The surface of each link, in the coordinates of its frame."""
+    return {
+        link: join([creased(mesh.vertices, mesh.faces, mesh.colors / 255.0) for mesh in meshes]).moved(
+            robot.T_frame_link(link)
+        )
+        for link, meshes in load_visual(robot).items()
+    }
 
 
 def frames(robot: Robot, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch frames 4 4"]:

@@ -61,6 +61,22 @@ def test_invalid_start_velocities_are_refused(velocity: list[float], message: st
         rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
 
 
+def test_a_start_velocity_in_float32_at_the_limit_is_clamped() -> None:
+    limit = np.nextafter(PANDA.velocity.astype(np.float32), np.float32(np.inf))
+    assert (limit > PANDA.velocity).all()
+    for sign in (1, -1):
+        task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=sign * limit)
+        assert task.start_velocity is not None and task.notes
+        assert (np.abs(task.start_velocity) <= PANDA.velocity).all()
+        assert all("clamped from" in note for note in task.notes)
+
+
+def test_a_message_has_the_digits_that_tell_a_velocity_from_its_limit() -> None:
+    velocity = 1.00001 * PANDA.velocity
+    with pytest.raises(InputError, match=r"panda_joint1 is 2\.17502; its velocity limit is 2\.175$"):
+        rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
+
+
 def test_start_velocity_into_a_limit() -> None:
     start = START.copy()
     start[0] = PANDA.upper[0] - 0.01

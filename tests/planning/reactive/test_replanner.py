@@ -1,5 +1,10 @@
 """The replanner: every motion ends at rest before an obstacle can reach the arm."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from itertools import count as counted
+from itertools import pairwise
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -97,6 +102,36 @@ def test_a_late_step_finds_the_arm_where_the_last_command_left_it() -> None:
     assert np.abs(command.motion.velocities[0]).max() > 0.5
     late = replanner.step({}, 15 * PERIOD + 3.0)
     assert np.allclose(late.motion.positions[0], command.motion.positions[-1], atol=1e-9)
+
+
+def test_steps_of_two_threads_follow_each_other() -> None:
+    replanner = loop(np.array([[0.5, 1.5, 0.5]]))
+    clock = counted(1)
+    commands, refused = list[Any](), list[str]()
+    reading = Lock()
+
+    def steps(_: int) -> None:
+        for _ in range(60):
+            with reading:
+                now = next(clock) * PERIOD
+            try:
+                commands.append(replanner.step({}, now))
+            except InputError as error:
+                refused.append(str(error))
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(2) as threads:
+            list(threads.map(steps, range(2)))
+    finally:
+        sys.setswitchinterval(interval)
+    commands.sort(key=lambda command: command.begins)
+    assert len(commands) + len(refused) == 120
+    assert all("time must go on" in message for message in refused)
+    for before, after in pairwise(commands):
+        then = before.motion.at(min(after.begins - before.begins, before.motion.duration))
+        assert np.allclose(after.motion.positions[0], then.positions, atol=1e-9)
 
 
 def test_unseen_obstacles_grow_with_time() -> None:

@@ -71,6 +71,13 @@ def test_a_hair_over_a_limit_is_clamped_and_said() -> None:
     )
 
 
+def test_a_start_is_clamped_up_to_a_milliradian_beyond_a_limit() -> None:
+    for beyond in (1e-5, float(np.float32(2 + 1e-5)) - 2, 9e-4):
+        assert problem([2 + beyond, 0, 0]).start[0] == 2.0
+    with pytest.raises(InputError, match=r"start: swing is 2.0011 rad; its limits are -1 to 2"):
+        problem([2.0011, 0, 0])
+
+
 @given(st.floats(-100, 100))
 def test_values_of_continuous_joints_are_kept(angle: float) -> None:
     made = problem([0, angle, 0])
@@ -99,7 +106,7 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
         ),
         (lambda: problem(goal=[0, 0, np.nan]), "goal: lift is nan"),
         (lambda: problem([2.1, 0, 0]), "start: swing is 2.1 rad; its limits are -1 to 2"),
-        (lambda: problem([2 + 2e-5, 0, 0]), "start: swing is 2.00002 rad"),
+        (lambda: problem([2.002, 0, 0]), "start: swing is 2.002 rad"),
         (
             lambda: problem(goal=[[0, 0, 0], [0, 0, 0.6]]),
             r"goal\[1\]: lift is 0.6 m; its limits are 0 to 0.5",

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, distinct
 from robotdiffuse.core.processes import Workers, in_order
 from robotdiffuse.core.types import Path
 from robotdiffuse.datasets.manifest import Manifest, read_manifest
@@ -294,11 +294,11 @@ def _limits(robot: Robot, q: Float[ndarray, "n dof"]) -> Iterator[tuple[str, str
     excess[:, robot.continuous] = 0.0
     if excess.max() > LIMIT_SLACK:
         i, j = np.unravel_index(excess.argmax(), excess.shape)
-        low, high = robot.lower[j], robot.upper[j]
-        message = (
-            f"{robot.joint_names[j]} is {q[i, j]:.6g} at waypoint {i}; its limits are {low:.6g} to {high:.6g}"
+        value, low, high = distinct(q[i, j], robot.lower[j], robot.upper[j])
+        yield (
+            "limits",
+            f"{robot.joint_names[j]} is {value} at waypoint {i}; its limits are {low} to {high}",
         )
-        yield "limits", message
 
 
 def _lengths(shard: Shard, row: int, path: Path) -> Iterator[tuple[str, str]]:

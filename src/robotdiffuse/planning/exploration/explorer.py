@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
+from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
 from robotdiffuse.perception.depth_view import DepthView
@@ -80,7 +81,10 @@ ARRIVED = VerifySettings(goal_tolerance=AT_GOAL)
 
 
 class Explorer:
-    """Takes an arm to goals through space that cameras see on the way; see the head of this file."""
+    """Takes an arm to goals through space that cameras see on the way; see the head of this file.
+
+    Threads may share an Explorer: one call waits for another.
+    """
 
     def __init__(
         self,
@@ -117,6 +121,7 @@ class Explorer:
         self._free = self.map.free
         """Voxels that were free then."""
 
+    @locked
     def set_goal(self, goal: ArrayLike | Goal) -> None:
         """The next goal: configurations, or poses as `rd.Problem` takes them. What was seen is kept."""
         middle = 0.5 * (self.robot.lower + self.robot.upper)
@@ -125,6 +130,7 @@ class Explorer:
         self._looked_for[:] = False
         self._goal_seen.forget()
 
+    @locked
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
         """Take a view into account; see `OccupancyMap.add`."""
         new_voxels = self.map.add(view, stamp)
@@ -132,6 +138,7 @@ class Explorer:
         self._goal_seen.observe(view)
         self._news.append(view)
 
+    @locked
     def next(self, configuration: ArrayLike) -> Step:
         """What the arm, at rest at a configuration, shall do next.
 
@@ -161,11 +168,13 @@ class Explorer:
             self._way_in = step.motion.path.positions
         return replace(step, seen=problem.scene)
 
+    @locked
     def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
         """The voxels that looks are to show: unknown ones that a tentative motion sweeps, and those of the
         goal that must be seen."""
         return swept_unseen(self.map, path) | self._goal_seen.wanted(path)
 
+    @locked
     def stop(self, motion: Trajectory, time: float) -> Stop | None:
         """How a motion under way ends early, if what was observed since `next` returned it is in its way;
         None if it is not. time: when a new command takes effect, on the motion's clock [s]. After the stop,
@@ -389,6 +398,7 @@ class Explorer:
         usable = usable_start_goal(PlanningContext(self._planner.name, problem, request))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 
+    @locked
     def predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
         """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
         network, and before the first view."""

@@ -1,7 +1,7 @@
 """Settings of an Explorer, and the steps that it asks for."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from jaxtyping import Bool
 from numpy import ndarray
@@ -61,7 +61,7 @@ class Step:
     reason: str
     policy: str = ""
     """The policy that the motion keeps, "strict" or "chance"."""
-    motion: PlanResult | None = None
+    motion: PlanResult | Any = None
     """Solved. A strict motion is certified against all that was not seen free; `motion.problem` holds these
     obstacles."""
     confidence: float | None = None

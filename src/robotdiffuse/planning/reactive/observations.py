@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.collision.moving_obstacles import MovingCollision
 from robotdiffuse.core.bounds import numbers, rigid_transform, within
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, distinct
 from robotdiffuse.core.transforms import inverse, rotation_angle, transform
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
@@ -48,9 +48,10 @@ class ObservedObstacle:
             moved = np.linalg.norm(T[:3, 3] - T_before[:3, 3])
             moved += self.obstacle.radius * rotation_angle(T_before[:3, :3].T @ T[:3, :3])
             if moved > most * passed + OBSERVATION_ERROR:
+                way, allowed = distinct(float(moved), most * passed, digits=3)
                 raise InputError(
-                    f"observation[{name!r}] is {moved:.3g} m from where it was {passed:.3g} s ago; its "
-                    f"maximum speed {most:g} m/s allows {most * passed:.3g} m"
+                    f"observation[{name!r}] is {way} m from where it was {passed:.3g} s ago; its "
+                    f"maximum speed {most:g} m/s allows {allowed} m"
                 )
             velocity = (T[:3, 3] - T_before[:3, 3]) / passed
         shape = self.obstacle.shape.moved(T @ inverse(T_before))

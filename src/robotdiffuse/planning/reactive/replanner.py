@@ -28,7 +28,8 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import numbers
-from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_type, distinct, shown, unknown_name
+from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.core.types import Trajectory
@@ -109,7 +110,8 @@ class Replanner:
     """Takes an arm to a goal among obstacles that move freely up to a maximum speed.
 
     `problem.moving` are the obstacles, each with its `max_speed` or the largest speed of its known motion.
-    The scene is static, and the arm is at rest at the start.
+    The scene is static, and the arm is at rest at the start. Threads may share a Replanner: one call waits
+    for another.
     """
 
     def __init__(
@@ -154,6 +156,7 @@ class Replanner:
         for k in range(2):
             rehearsal.step({}, k * self.settings.period)
 
+    @locked
     def set_goal(self, goal: ArrayLike | Goal) -> None:
         """Take the arm to another goal, from where its present motion ends.
 
@@ -171,6 +174,7 @@ class Replanner:
         self.problem, self._goals = problem, np.array(start_goal.goals)
         self._next, self._left = None, True
 
+    @locked
     def step(self, observation: Mapping[str, ArrayLike], now: float) -> Command:
         """The motion from one period after `now` [s], given the obstacles as observed at `now`.
 
@@ -185,7 +189,8 @@ class Replanner:
         if clock is None or clock.ndim != 0 or not np.isfinite(clock):
             raise InputError(f"now is {shown(now)}; it must be a finite number of seconds")
         if now <= self._now:
-            raise InputError(f"now is {now:g} s after {self._now:g} s; time must go on from step to step")
+            time, last = distinct(float(clock), self._now)
+            raise InputError(f"now is {time} s after {last} s; time must go on from step to step")
         self._observe(observation, float(now))
         begins = self._now + self.settings.period
         self._filter.advance(self._path, self._motion, self._since, begins)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, distinct, unknown_name
 from robotdiffuse.core.transforms import inverse, rotation_from_quaternion, transform
 from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
@@ -69,9 +69,8 @@ def resized(shape: Shape, dimension: str, value: float) -> Shape:
     if dimension not in known:
         raise unknown_name(f"dimension of {shape.name}:", dimension, known)
     if not MIN_DIMENSION <= value <= MAX_DIMENSION:
-        raise InputError(
-            f"{dimension} of {shape.name} is {value:g} m; it must be {MIN_DIMENSION:g} to {MAX_DIMENSION:g} m"
-        )
+        size, least, most = distinct(value, MIN_DIMENSION, MAX_DIMENSION)
+        raise InputError(f"{dimension} of {shape.name} is {size} m; it must be {least} to {most} m")
     if isinstance(shape, Box):
         size = np.array([value if name == dimension else old for name, old in known.items()])
         return replace(shape, size=size)

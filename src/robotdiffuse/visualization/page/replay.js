@@ -293,7 +293,8 @@ const traces = new THREE.Group();
   const points = [];
   for (let i = 0; i <= steps; i++) points.push(toolAt(configuration((duration * i) / Math.max(1, steps))).toArray());
   if (steps > 0) traces.add(trace(points, 0.005, (s) => startColor.clone().lerp(goalColor, s), 1));
-  for (const [at, c] of [[points[0], startColor], [points[points.length - 1], goalColor]]) {
+  const last = toolAt(data.positions[data.positions.length - 1]).toArray();
+  for (const [at, c] of [[points[0], startColor], [last, goalColor]]) {
     const dot = new THREE.Mesh(ball, new THREE.MeshStandardMaterial({ color: c, roughness: 0.5 }));
     dot.scale.setScalar(0.012);
     dot.position.set(...at);
@@ -491,3 +492,4 @@ function tick(now) {
 }
 requestAnimationFrame(tick);
 setPlaying(!location.hash.includes("at="));
+if (duration === 0) document.querySelector("footer").style.display = "none"; // nothing moves

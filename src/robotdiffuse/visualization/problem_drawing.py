@@ -1,0 +1,153 @@
+"""Draws a problem without a motion: the arm at the start and at the goal, and links that collide there."""
+
+from dataclasses import replace
+from pathlib import Path as FilePath
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import Image
+
+from robotdiffuse.core.errors import shortened
+from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.transforms import IDENTITY
+from robotdiffuse.core.types import Path
+from robotdiffuse.planning.pose_goals import pose_configurations
+from robotdiffuse.problems.goals import AnyGoal, JointGoal, poses_of
+from robotdiffuse.problems.problem import Problem, StateValidity
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.visualization import style
+from robotdiffuse.visualization.camera import view_of_motion
+from robotdiffuse.visualization.picture import (
+    MARGINS,
+    ClearSurface,
+    PictureSettings,
+    caption,
+    faded_below,
+    linear,
+    render,
+    save_png,
+    tube,
+)
+from robotdiffuse.visualization.replay_page import page_data, page_shapes, page_surface, write_page
+from robotdiffuse.visualization.style import START, Surface
+
+COLLIDING = (0xD0, 0x1F, 0x2B)
+"""sRGB colour of links that collide."""
+OFFSET = 0.0015
+"""Offset of these along their normals, so that they cover the arm in its own colours [m]."""
+START_ALPHA = 0.5
+AXES = ((0xC9, 0x3C, 0x3C), (0x3C, 0x9A, 0x4B), (0x3C, 0x64, 0xC9))
+"""sRGB colours of the axes of goal poses."""
+AXIS_LENGTH = 0.12
+"""[m]"""
+UNREACHED = StateValidity("no configuration within the joint limits")
+
+
+def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | None = None) -> None:
+    """Write a problem without a motion as .html or .png.
+
+    The arm is drawn at the start and at the goal; in pictures the start is see-through, on pages the goal.
+    Links that collide are red, and goal poses have axes. Of several goals, the first free one is drawn, or
+    else the first. Moving obstacles are where they begin. `result` says why there is no motion. Raises
+    InputError for another ending or a file that cannot be written.
+    """
+    target = check_output(file, (".html", ".htm", ".png"))
+    goal, validity = _goal_state(problem)
+    validities = {"start": problem.is_free(problem.start), "goal": validity}
+    states = np.stack([problem.start] if goal is None else [problem.start, goal])
+    scene = problem.scene.with_shapes([*problem.scene.shapes, *(moving.shape for moving in problem.moving)])
+    robot, scene = replace(problem, scene=scene, moving=()).standing()
+    T_world_poses = _goal_poses(problem)
+    near_poses = [Sphere(T[:3, 3], AXIS_LENGTH) for T in T_world_poses]
+    framed = scene.with_shapes([*scene.shapes, *near_poses])  # what the camera shows
+    marks = [*_colliding_links(robot, states, list(validities.values())), *_axes(T_world_poses)]
+    facts = [(what, state.reason or "free") for what, state in validities.items()]
+    if result is not None and all(validities.values()):
+        facts = [("reason", shortened(result.reason))]
+    status = "" if result is None else f" · {result.status.value.replace('_', ' ')}"
+    title = f"{robot.name}{status}"
+    if target.suffix.lower() == ".png":
+        image = _picture(robot, scene, framed, states, [surface for surface, _ in marks])
+        caption(image, title, facts)
+        return save_png(image, target)
+    data = page_data(robot, framed, Path(robot.joint_names, states))
+    data["scene"] = [*page_shapes(scene), *(page_surface("mark", *mark) for mark in marks)]
+    data["times"] = [0.0] * len(states)  # nothing moves
+    data["facts"] = facts
+    return write_page(target, title, data)
+
+
+def _goal_state(problem: Problem) -> tuple[Float[ndarray, "dof"] | None, StateValidity]:
+    """The first free configuration of the goal, or else the first one; None if none reaches it."""
+    goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+    rng = np.random.default_rng(0)
+    first = None
+    for goal in goals:
+        joints = isinstance(goal, JointGoal)
+        for q in goal.positions if joints else pose_configurations(problem, goal, None, rng):
+            validity = problem.is_free(q)
+            if validity:
+                return q, validity
+            first = first or (q, validity)
+    return first or (None, UNREACHED)
+
+
+def _colliding_links(
+    robot: Robot, states: Float[ndarray, "n dof"], validities: list[StateValidity]
+) -> list[tuple[Surface, tuple[int, int, int]]]:
+    """The surfaces of the links that collide in each state, and their colour."""
+    links = style.link_surfaces(robot)
+    marks = []
+    for q, validity in zip(states, validities, strict=False):  # there may be no goal state
+        T_base_frame = style.frames(robot, q)
+        for link in validity.links:
+            painted = _raised(links[link]).moved(T_base_frame[robot.link_frame(link)])
+            marks.append((painted, COLLIDING))
+    return marks
+
+
+def _raised(surface: Surface) -> Surface:
+    """The surface in the colour of collisions, a little larger."""
+    _, corner = np.unique(surface.vertices, axis=0, return_inverse=True)  # edges have a vertex on each side
+    corner = corner.reshape(-1)
+    normals = np.stack([np.bincount(corner, column) for column in surface.normals.T], axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    colors = np.tile(np.array(COLLIDING) / 255, (len(surface.colors), 1))
+    return replace(surface, vertices=surface.vertices + OFFSET * normals[corner], colors=colors)
+
+
+def _goal_poses(problem: Problem) -> list[Float[ndarray, "4 4"]]:
+    """All goal poses in the world's frame."""
+    goals = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+    T_world_base = IDENTITY if problem.T_world_base is None else problem.T_world_base
+    return [T_world_base @ pose.T_base_frame for goal in goals for pose in poses_of(goal)]
+
+
+def _axes(poses: list[Float[ndarray, "4 4"]]) -> list[tuple[Surface, tuple[int, int, int]]]:
+    """The axes of poses, and their colours."""
+    axes = []
+    for T in poses:
+        for axis, color in enumerate(AXES):
+            ends = np.stack([T[:3, 3], T[:3, 3] + AXIS_LENGTH * T[:3, axis]])
+            axes.append((tube(ends, color, color), color))
+    return axes
+
+
+def _picture(
+    robot: Robot, scene: Scene, framed: Scene, states: Float[ndarray, "n dof"], marks: list[Surface]
+) -> Image.Image:
+    """The picture without its caption."""
+    settings = PictureSettings()
+    surfaces = style.robot_surfaces(robot)
+    tool = style.tool_point(robot, surfaces)
+    size = (settings.width, settings.height)
+    camera = view_of_motion(robot, framed, surfaces, tool, states, *size, MARGINS)
+    start = style.posed(surfaces[1:], style.frames(robot, states[0])[1:])
+    ghost = [ClearSurface(start, linear(START), START_ALPHA)] if len(states) > 1 else []
+    end = Path(robot.joint_names, states[-1:])
+    pixels, _ = render(robot, scene, end, settings, camera, added=marks, clear=ghost)
+    return Image.fromarray(faded_below(pixels))

@@ -1,0 +1,68 @@
+"""Drawings of problems without a motion: start, goal, and the links that collide."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import robotdiffuse as rd
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.visualization.problem_drawing import COLLIDING, write_problem
+
+PANDA = rd.load_robot("panda")
+START = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
+END = START * [-1, 1, 1, 1, 1, 1, 1]
+AT_START = rd.Sphere(link_pose(PANDA, START, "panda_hand")[:3, 3], 0.05, "ball")
+FAR = np.eye(4)
+FAR[0, 3] = 1.5
+
+
+def page(problem: rd.Problem, file: Path) -> dict:
+    write_problem(problem, file)
+    found = re.search(r'id="data">(.*?)</script>', file.read_text("utf-8"), re.S)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def marks(data: dict, color: tuple[int, int, int]) -> list[dict]:
+    return [shape for shape in data["scene"] if tuple(shape["color"]) == color]
+
+
+def test_links_that_collide_are_red(tmp_path: Path) -> None:
+    problem = rd.Problem(PANDA, rd.Scene([AT_START]), START, END)
+    data = page(problem, tmp_path / "a.html")
+    assert len(marks(data, COLLIDING)) == len(problem.is_free(START).links) > 0
+    assert data["positions"] == [START.tolist(), END.tolist()] and data["times"] == [0.0, 0.0]
+    assert dict(data["facts"])["start"].endswith("inside ball") and dict(data["facts"])["goal"] == "free"
+    assert not marks(page(rd.Problem(PANDA, rd.Scene(), START, END), tmp_path / "b.html"), COLLIDING)
+
+
+def test_pictures_show_the_collision_where_the_arm_is(tmp_path: Path) -> None:
+    reds = []
+    for scene in (rd.Scene([AT_START]), rd.Scene()):
+        write_problem(rd.Problem(PANDA, scene, END, START), tmp_path / "a.png")
+        with Image.open(tmp_path / "a.png") as image:
+            pixels = np.asarray(image.convert("RGB")).astype(int)
+        reds.append(int(((pixels[..., 0] > 120) & (pixels[..., 1:] < 60).all(axis=-1)).sum()))
+    assert reds[0] > 1000 > 10 > reds[1]
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_goal_out_of_reach_has_axes(moved: bool, tmp_path: Path) -> None:
+    problem = rd.Problem(PANDA, rd.Scene(), START, rd.PoseGoal("panda_hand", FAR))
+    if moved:
+        T = np.eye(4)
+        T[:3, 3] = 1.0, 2.0, 0.5
+        problem = rd.Problem.in_world(T, PANDA, rd.Scene(), START, rd.PoseGoal("panda_hand", T @ FAR))
+    data = page(problem, tmp_path / "a.html")
+    assert data["positions"] == [START.tolist()]
+    assert len(data["scene"]) == 3
+    assert dict(data["facts"])["goal"] == "no configuration within the joint limits"
+
+
+def test_of_several_goals_a_free_one_is_drawn(tmp_path: Path) -> None:
+    problem = rd.Problem(PANDA, rd.Scene([AT_START]), END, [START, END])
+    assert page(problem, tmp_path / "a.html")["positions"][1] == END.tolist()
