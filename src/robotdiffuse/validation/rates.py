@@ -176,7 +176,7 @@ def _checks(
     )
     if len(a) > 1 and (off <= allowed).all():  # else the cubics are not those of the positions
         start, end = cubics.extremes.start, cubics.extremes.end
-        before, after = _padded(0 * a[:1], end), _padded(start, 0 * a[:1])  # the arm stands still outside
+        before, after = _padded(start[:1], end), _padded(start, end[-1:])
         low, high = np.minimum(before, after), np.maximum(before, after)
         outside = np.maximum(low - a, a - high)
         if begins.any():

@@ -41,7 +41,7 @@ class VerifySettings(Settings, name="verify"):
     ends at rest."""
     rate_agreement: NotNegative = 0.5
     """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the
-    accelerations of the cubics before and after the row; outside of the motion they are 0."""
+    accelerations of the cubics before and after the row."""
     jump: Positive = 1.5
     """A step of a trajectory is a jump if its mean velocity exceeds this times the velocity limit."""
     chord: Positive = 1e-3
