@@ -316,11 +316,13 @@ def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
 def test_readout_of_constant_codes(monkeypatch):
     monkeypatch.setattr(encoder_training, "READOUT_SCENES", 256)
     encoder = small("pointnet")
-    report = linear_readout(encoder, 4, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    report = linear_readout(encoder, random_scenes(768, 4, rng), rng)
     assert report["readout"] < report["readout_of_constant"]
     last = list(encoder.parameters())[-2]  # the matrix of the last layer
     torch.nn.init.zeros_(last)
-    report = linear_readout(encoder, 4, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    report = linear_readout(encoder, random_scenes(768, 4, rng), rng)
     assert report["readout"] == pytest.approx(report["readout_of_constant"])
 
 
