@@ -226,6 +226,8 @@ def run_planner(arguments: argparse.Namespace) -> int:
     if "denoiser" in given and config.get("denoiser_settings") is not None:
         # the config's settings are for its own denoiser; another one gets settings of the same size
         given["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
+    if {"denoiser", "objective", "waypoints"} & set(given):
+        given["progressive"] = False  # the stages are for the config's own parts
     if "encoder" in config:
         given.setdefault("encoder", config["encoder"])
     if arguments.config == "paper" and "encoder" not in given:

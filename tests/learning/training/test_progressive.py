@@ -82,5 +82,5 @@ def test_progressive_training_needs_white_noise_and_blocks_that_fit():
 def test_shift_of_the_signal_to_noise_ratio():
     plain = NoiseSchedule(ScheduleSettings(floor=1e-12))
     shifted = NoiseSchedule(ScheduleSettings(floor=1e-12, log_snr_shift=math.log(25)))
-    difference = 2 * (plain.half_log_snr - shifted.half_log_snr)[1:-1]
+    difference = 2 * (plain.half_log_snr[1:-1] - shifted.half_log_snr[1:-1])
     np.testing.assert_allclose(difference, math.log(25), rtol=1e-6)
