@@ -48,6 +48,7 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         sampler="ddim",
         target="residual",
         waypoints=64,
+        progressive=False,
         condition_drop=0.2,
         device="cpu",
     )
@@ -94,3 +95,10 @@ def test_the_encoder_of_the_config_is_that_of_an_arm_too(
     monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
     assert run("train", "planner", "--robot", "panda", "--out", "o", "--config", config) == 0
     assert trained[0].encoder == encoder and not Path("o", "encoder").exists()
+
+
+def test_config_paper_needs_its_encoder(capsys: pytest.CaptureFixture[str]) -> None:
+    command = ("train", "planner", "--config", "paper", "--out", "o")
+    for rest in (("--data", "d"), ("--robot", "panda")):
+        assert run(*command, *rest) == 2
+        assert "--config paper needs --encoder" in capsys.readouterr().err

@@ -210,7 +210,7 @@ def test_compression_autoencoder_has_the_papers_layers():
 
 def test_arranged_clouds():
     """Points are sorted like the ordered clouds of `surface_clouds`, and thinned or repeated evenly."""
-    encoder = CompressionAutoencoder(SMALL_CAE)
+    encoder = make_encoder("points", PointsSettings(code=120, cloud=40))
     scenes = random_scenes(20, 12, np.random.default_rng(0))
     clouds = partial(surface_clouds, scenes, region=encoder.settings.region)
     ordered = clouds(40, torch.Generator().manual_seed(0), ordered=True)
@@ -218,10 +218,21 @@ def test_arranged_clouds():
     torch.testing.assert_close(encoder.arrange(ordered), ordered, atol=1e-6, rtol=0)
     torch.testing.assert_close(encoder.arrange(loose), ordered, atol=1e-6, rtol=0)
     every = ordered[:, 1::4]  # of 40 for 10, the middle one of each four
-    few = CompressionAutoencoder(replace(SMALL_CAE, cloud=10))
+    few = make_encoder("points", PointsSettings(code=30, cloud=10))
     torch.testing.assert_close(few.arrange(loose)[:, :, 0], ordered[:, 2::4, 0], atol=1e-6, rtol=0)
     repeated = encoder.arrange(every)
     torch.testing.assert_close(repeated, every.repeat_interleave(4, 1), atol=1e-6, rtol=0)
+
+
+def test_clouds_along_a_curve():
+    """The order does not depend on that of the input, and neighbours are close to each other."""
+    encoder = CompressionAutoencoder(replace(SMALL_CAE, cloud=400))
+    loose = cloud(400, 5)
+    arranged = encoder.arrange(loose)
+    assert torch.equal(encoder.arrange(loose.flip(1)), arranged)
+    assert torch.equal(arranged.sum(1) != 0, loose.sum(1) != 0)
+    steps = [points.diff(dim=1).norm(dim=-1).mean() for points in (arranged, loose)]
+    assert steps[0] < 0.4 * steps[1]
 
 
 def test_compression_autoencoder_reconstructs_a_small_set():
@@ -316,11 +327,13 @@ def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
 def test_readout_of_constant_codes(monkeypatch):
     monkeypatch.setattr(encoder_training, "READOUT_SCENES", 256)
     encoder = small("pointnet")
-    report = linear_readout(encoder, 4, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    report = linear_readout(encoder, random_scenes(768, 4, rng), rng)
     assert report["readout"] < report["readout_of_constant"]
     last = list(encoder.parameters())[-2]  # the matrix of the last layer
     torch.nn.init.zeros_(last)
-    report = linear_readout(encoder, 4, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    report = linear_readout(encoder, random_scenes(768, 4, rng), rng)
     assert report["readout"] == pytest.approx(report["readout_of_constant"])
 
 

@@ -14,7 +14,7 @@ from robotdiffuse.learning.checkpoint import load_completion, load_network
 from robotdiffuse.learning.completion import exported_completion
 from robotdiffuse.learning.completion.samples import BITS
 from robotdiffuse.learning.encoders.compression_autoencoder import CompressionAutoencoder
-from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings, in_order
+from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weights_registry import BUNDLED
@@ -74,12 +74,11 @@ def test_every_bundled_file_is_small_and_has_no_path_in_it() -> None:
 
 
 def test_a_cloud_in_order_is_that_of_the_compression_autoencoder() -> None:
-    settings = CompressionAutoencoderSettings(cloud=40)
-    encoder = CompressionAutoencoder(settings)
+    encoder = CompressionAutoencoder(CompressionAutoencoderSettings(cloud=40))
     for points in (0, 1, 7, 40, 90):
         cloud = np.random.default_rng(points).uniform([-0.5, -0.5, 0.1], 0.8, (points, 3)).astype(np.float32)
         ours = encoder.arrange(torch.from_numpy(cloud)[None])[0].numpy()
-        np.testing.assert_allclose(in_order(cloud, 40), ours, atol=1e-6)
+        np.testing.assert_allclose(encoder.settings.prepared(cloud), ours, atol=1e-6)
 
 
 def test_units_of_joints_agree_for_arrays_and_tensors() -> None:

@@ -10,7 +10,10 @@ from robotdiffuse.cli.arguments import count, names, natural, positive, share
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.learning import need_packages
 
-TRAINING_OPTIONS = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
+TRAINING_OPTIONS = (
+    *("minutes", "samples", "seed", "batch", "learning_rate", "threads"),
+    "checkpoint_seconds",
+)
 MODEL_OPTIONS = (
     *("denoiser", "objective", "sampler", "sampling_steps", "target"),
     *("condition_drop", "waypoints"),
@@ -36,6 +39,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     encoder.add_argument(
         "--encoder", dest="name", metavar="NAME", help="encoder to train (default: point_autoencoder)"
+    )
+    encoder.add_argument(
+        "--scenes", metavar="NAME", help="training scenes: mixed (default), or rop, those of the paper's data"
     )
     _add_shared(encoder)
     _add_device(encoder)
@@ -164,6 +170,9 @@ def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> N
     parser.add_argument("--batch", type=count, metavar="N", help="samples per step")
     parser.add_argument("--learning-rate", type=positive, metavar="X", help="largest learning rate")
     parser.add_argument("--threads", type=count, metavar="N", help="number of PyTorch threads")
+    parser.add_argument(
+        "--checkpoint-seconds", type=positive, metavar="S", help="time between checkpoints [s] (default: 120)"
+    )
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
@@ -181,7 +190,7 @@ def run_encoder(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.config import EncoderTraining
     from robotdiffuse.learning.training.encoder import train_encoder
 
-    given = _given(arguments, ("name", "device", *TRAINING_OPTIONS))
+    given = _given(arguments, ("name", "scenes", "device", *TRAINING_OPTIONS))
     if "samples" in given:
         given["minutes"] = None
     settings = EncoderTraining(**given)  # type: ignore[arg-type]
@@ -217,8 +226,15 @@ def run_planner(arguments: argparse.Namespace) -> int:
     if "denoiser" in given and config.get("denoiser_settings") is not None:
         # the config's settings are for its own denoiser; another one gets settings of the same size
         given["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
+    if {"denoiser", "objective", "waypoints"} & set(given):
+        given["progressive"] = False  # the stages are for the config's own parts
     if "encoder" in config:
         given.setdefault("encoder", config["encoder"])
+    if arguments.config == "paper" and "encoder" not in given:
+        raise InputError(
+            "--config paper needs --encoder: a folder of "
+            "`robotdiffuse train encoder --encoder compression_autoencoder --scenes rop`, the paper's encoder"
+        )
     if arguments.data is None:
         return _run_for_robot(arguments, given)
     if arguments.out is None:

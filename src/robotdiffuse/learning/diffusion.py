@@ -31,6 +31,9 @@ class ScheduleSettings(Settings, name="schedule"):
     """The equation's s: it keeps the noise of the first levels from being too small."""
     floor: Annotated[float, Bound(above=0.0, below=1.0)] = 1e-4
     """Smallest alpha_bar: the share of the variance that is still signal at the last level."""
+    log_snr_shift: NotNegative = 0.0
+    """Subtracted from the logarithm of every level's signal-to-noise ratio (Hoogeboom et al. 2023). White
+    noise averages out over many waypoints: without a shift most levels hide nothing of a long motion."""
 
 
 class NoiseSchedule:
@@ -40,7 +43,9 @@ class NoiseSchedule:
         self.settings = settings
         t = np.arange(settings.steps + 1) / settings.steps
         curve = np.cos((t + settings.offset) / (1 + settings.offset) * np.pi / 2) ** 2
-        alpha_bar = np.maximum(curve / curve[0], settings.floor)
+        alpha_bar = curve / curve[0]
+        alpha_bar = alpha_bar / (alpha_bar + (1 - alpha_bar) * np.exp(settings.log_snr_shift))
+        alpha_bar = np.maximum(alpha_bar, settings.floor)
         self.signal: Float[ndarray, "levels"] = np.sqrt(alpha_bar)
         """Factor of the clean trajectory in x_t."""
         self.noise: Float[ndarray, "levels"] = np.sqrt(1 - alpha_bar)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,14 +13,44 @@ from torch import Tensor, nn
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import Denoiser
+from robotdiffuse.learning.denoisers.transformer import Transformer
 from robotdiffuse.learning.diffusion import noise_factor
 from robotdiffuse.learning.encoders import make_encoder
-from robotdiffuse.learning.encoders.base import Encoder
+from robotdiffuse.learning.encoders.base import Encoder, fp32
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
 from robotdiffuse.learning.network import Network
 from robotdiffuse.learning.onnx_export import exported
 from robotdiffuse.learning.representation import Statistics
 from robotdiffuse.learning.robot_identity import RobotIdentity
+
+
+class WaypointMeans(NamedTuple):
+    """Means of blocks of waypoints; the first and the last waypoint are alone."""
+
+    of_waypoints: Float[Tensor, "blocks waypoints"]
+    """The matrix of the means."""
+    interpolation: Float[Tensor, "waypoints blocks"]
+    """The matrix of linear interpolation between the middles of the blocks."""
+    centers: Float[ndarray, "blocks"]
+    """Middles of the blocks [waypoints]."""
+
+    @classmethod
+    def of_blocks(cls, waypoints: int, block: int) -> "WaypointMeans":
+        """Raises InputError unless blocks of that size divide the inner waypoints."""
+        if (waypoints - 2) % block:
+            raise InputError(
+                f"waypoints is {waypoints}; blocks of {block} must divide the {waypoints - 2} inner ones"
+            )
+        index = np.r_[0, 1 + np.arange(waypoints - 2) // block, 1 + (waypoints - 2) // block]
+        member = np.eye(index[-1] + 1)[:, index]
+        means = member / member.sum(1, keepdims=True)
+        at = np.arange(waypoints)
+        centers = means @ at
+        interpolation = np.stack([np.interp(at, centers, row) for row in np.eye(len(centers))], 1)
+        return cls(torch.from_numpy(means).float(), torch.from_numpy(interpolation).float(), centers)
+
+    def to(self, device: torch.device) -> "WaypointMeans":
+        return WaypointMeans(self.of_waypoints.to(device), self.interpolation.to(device), self.centers)
 
 
 class MotionNetwork(Network, MotionModel):
@@ -43,6 +74,9 @@ class MotionNetwork(Network, MotionModel):
         )
         sizes = self.waypoints, self.dof, self.feature_count, self.condition_count
         self.denoiser: Denoiser = DENOISERS.load(settings.denoiser)(settings.denoiser_settings, *sizes)
+        self.block = 1
+        """Waypoints whose mean the denoiser sees as one; see `coarsen`."""
+        self._means = WaypointMeans.of_blocks(self.waypoints, 1)
         null = nn.Parameter(torch.zeros(self.condition_count)) if settings.null_condition else None
         self.register_parameter("null_condition", null)
 
@@ -81,7 +115,27 @@ class MotionNetwork(Network, MotionModel):
             if self.null_condition is None:
                 raise InputError("null_condition of the model is False; its condition cannot be dropped")
             condition = torch.where(dropped[:, None], self.null_condition, condition)
-        return self.denoiser(features, level, condition)
+        if self.block == 1:
+            return self.denoiser(features, level, condition)
+        with fp32(features):
+            features = self._means.of_waypoints @ features
+        output = self.denoiser(features, level, condition)
+        with fp32(output):
+            return self._means.interpolation @ output
+
+    def coarsen(self, block: int) -> None:
+        """Have the denoiser see the means of blocks of `block` waypoints; 1: single waypoints.
+
+        For white noise and a transformer with a token per waypoint. The mean of white noise over a block is
+        white noise again, so that a token tells as much as all its waypoints. The denoiser's output is
+        interpolated to all waypoints.
+        """
+        if block == self.block:
+            return
+        assert isinstance(self.denoiser, Transformer)
+        self.block = block
+        self._means = WaypointMeans.of_blocks(self.waypoints, block).to(self.residual_scale.device)
+        self.denoiser.set_positions(self._means.centers)
 
     def denoised(
         self,

@@ -1,5 +1,6 @@
 """A transformer whose waypoints attend to points of the scene, in place of one vector for the whole scene."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -41,7 +42,7 @@ class CrossAttention(Denoiser):
         self.norm_points, self.norm = nn.LayerNorm(width), nn.LayerNorm(width)
         self.out = nn.Linear(width, settings.patch * dof)
         start_at_zero(self.out)
-        self.register_buffer("positions", positions(tokens, width), persistent=False)
+        self.register_buffer("positions", positions(np.arange(tokens), width), persistent=False)
 
     def forward(
         self,

@@ -1,5 +1,6 @@
 """A decoder-only transformer: each waypoint attends to z_tk and the waypoints before it (paper: Table 2)."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -39,7 +40,7 @@ class DecoderOnly(Denoiser):
         self.norm = nn.LayerNorm(width)
         self.out = nn.Linear(width, settings.patch * dof)
         start_at_zero(self.out)
-        self.register_buffer("positions", positions(1 + tokens, width), persistent=False)
+        self.register_buffer("positions", positions(np.arange(1 + tokens), width), persistent=False)
 
     def forward(
         self,

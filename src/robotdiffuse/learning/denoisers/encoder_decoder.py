@@ -1,5 +1,6 @@
 """An encoder-decoder transformer: the condition is encoded, the waypoints attend to it (paper: Table 2)."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -42,7 +43,7 @@ class EncoderDecoder(Denoiser):
         self.norm = nn.LayerNorm(width)
         self.out = nn.Linear(width, settings.patch * dof)
         start_at_zero(self.out)
-        self.register_buffer("positions", positions(tokens, width), persistent=False)
+        self.register_buffer("positions", positions(np.arange(tokens), width), persistent=False)
 
     def forward(
         self,

@@ -2,16 +2,16 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
+from numpy import ndarray
 from torch import Tensor, nn
 from torch.nn import functional
 
 MAX_UNFUSED_TOKENS = 96
-"""Up to this number of tokens, attention on a CPU does without the fused kernel. Measured with torch 2.13 on
-one thread, batch 16, 8 heads of 64 numbers, forward and backward, unfused against fused [ms]: 49 tokens 6.7
-and 6.7, 97 tokens 20 and 20, 128 tokens 42 and 29, 255 tokens 161 and 107; forward alone 1.7 and 1.9, 6.4 and
-5.7, 9.7 and 8.6, 68 and 34, on a busy machine. The fused kernel's backward pass in bf16 takes 23 ms at 49
-tokens."""
+"""Up to this number of tokens, attention in fp32 on a CPU does without the fused kernel; in bf16 always.
+Measured with torch 2.13 on one thread, forward and backward [ms], unfused in bf16, unfused in fp32, fused in
+fp32. Batch 64, 4 heads of 128 numbers: 31 tokens 13, 30 and 34; 66 tokens 29, 76 and 56; 97 tokens 49, 93 and
+121; 255 tokens 274, 813 and 480. Batch 128, 5 heads of 32 numbers: 13 tokens 4.5, 8.8 and 8.1."""
 
 
 def two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -35,20 +35,19 @@ class LevelEmbedding(nn.Sequential):
         return super().forward(torch.cat([angles.sin(), angles.cos()], -1))
 
 
-def positions(tokens: int, width: int) -> Float[Tensor, "tokens width"]:
-    """Sinusoidal positions (Vaswani et al. 2017)."""
-    angles = np.arange(tokens)[:, None] / 10_000 ** (np.arange(0, width, 2) / width)
+def positions(at: Real[ndarray, "tokens"], width: int) -> Float[Tensor, "tokens width"]:
+    """Sinusoidal codes of positions (Vaswani et al. 2017)."""
+    angles = at[:, None] / 10_000 ** (np.arange(0, width, 2) / width)
     return torch.from_numpy(
-        np.stack([np.sin(angles), np.cos(angles)], -1).reshape(tokens, -1)[:, :width]
+        np.stack([np.sin(angles), np.cos(angles)], -1).reshape(len(at), -1)[:, :width]
     ).float()
 
 
 def split_heads(x: Tensor, parts: int, heads: int) -> tuple[Tensor, ...]:
-    """[batch, tokens, parts * width] split into `parts` tensors [batch, heads, tokens, width / heads]; on a
-    CPU in fp32."""
+    """[batch, tokens, parts * width] split into `parts` tensors [batch, heads, tokens, width / heads]."""
     batch, tokens, _ = x.shape
     x = x.view(batch, tokens, parts, heads, -1).permute(2, 0, 3, 1, 4)
-    return (x if x.is_cuda else x.to(torch.float32, memory_format=torch.contiguous_format)).unbind(0)
+    return x.contiguous().unbind(0)
 
 
 def attend(
@@ -59,11 +58,12 @@ def attend(
 ) -> Float[Tensor, "batch tokens width"]:
     """Attention of tokens to others; causal: each token only to those up to itself.
 
-    Plain matrix products serve short sequences on a CPU, where the fused kernel gains little; the fused
-    kernel serves long ones and GPUs. In fp32 on a CPU: bf16 makes short sequences slower.
+    Plain matrix products serve bf16 and short sequences on a CPU, where the fused kernel is slower; the fused
+    kernel serves the others and GPUs.
     """
     batch, heads, tokens, size = q.shape
-    if q.is_cuda or k.shape[2] > MAX_UNFUSED_TOKENS:
+    plain = q.dtype == torch.bfloat16 or k.shape[2] <= MAX_UNFUSED_TOKENS
+    if q.is_cuda or not plain:
         mixed = functional.scaled_dot_product_attention(q, k, v, is_causal=causal)
     else:
         scores = (q * size**-0.5) @ k.transpose(-1, -2)

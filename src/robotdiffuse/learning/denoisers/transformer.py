@@ -1,7 +1,9 @@
 """The motion predictor: an encoder-only transformer that predicts the clean trajectory (paper: Method)."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.learning.denoisers.base import Denoiser
@@ -34,7 +36,11 @@ class Transformer(Denoiser):
         self.norm = nn.LayerNorm(width)
         self.out = nn.Linear(width, settings.patch * dof)
         start_at_zero(self.out)
-        self.register_buffer("positions", positions(tokens, width), persistent=False)
+        self.register_buffer("positions", positions(np.arange(tokens), width), persistent=False)
+
+    def set_positions(self, at: Float[ndarray, "tokens"]) -> None:
+        """Give the tokens other positions, in waypoints; there may be another number of them."""
+        self.positions = positions(at, self.settings.width).to(self.positions.device)
 
     def forward(
         self,
@@ -51,4 +57,4 @@ class Transformer(Denoiser):
         x = torch.cat([z_tk[:, None].to(tokens.dtype), tokens], 1)
         for block in self.blocks:
             x = block(x)
-        return self.out(self.norm(x[:, 1:])).float().reshape(batch, self.waypoints, self.dof)
+        return self.out(self.norm(x[:, 1:])).float().reshape(batch, -1, self.dof)

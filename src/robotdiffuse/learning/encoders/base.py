@@ -9,7 +9,7 @@ from numpy.random import Generator
 from torch import Tensor, nn
 
 from robotdiffuse.datasets.surface_clouds import sort_points
-from robotdiffuse.learning.encoders.settings import EncoderSettings
+from robotdiffuse.learning.encoders.settings import EncoderSettings, curve_keys
 from robotdiffuse.learning.max_pool import max_pool
 
 
@@ -43,19 +43,25 @@ class Encoder(nn.Module, ABC):
         return inside & (cloud[..., 2] > region.floor) & (cloud != 0).any(-1)
 
     def arrange(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch cloud 3"]:
-        """`settings.cloud` points, sorted by x, then y, then z.
+        """`settings.cloud` points, sorted by x, then y, then z, or along a curve.
 
         More points are thinned evenly in that order, fewer are repeated, and an empty cloud becomes zeros.
-        Clouds of that size by `surface_clouds(..., ordered=True)` stay as they are, up to rounding.
+        Without a curve, clouds of that size by `surface_clouds(..., ordered=True)` stay as they are, up to
+        rounding.
         """
         batch, points, _ = cloud.shape
         wanted = self.settings.cloud
         if points == 0:
             return cloud.new_zeros(batch, wanted, 3)
         near = self.near(cloud)
-        coordinates = list((cloud * near[..., None]).unbind(-1))
-        sort_points(coordinates)
-        ordered = torch.stack(coordinates, -1)
+        counted = cloud * near[..., None]
+        if self.settings.along_curve:
+            order = curve_keys(counted).argsort(stable=True, dim=1)
+            ordered = counted.gather(1, order[..., None].expand(-1, -1, 3))
+        else:
+            coordinates = list(counted.unbind(-1))
+            sort_points(coordinates)
+            ordered = torch.stack(coordinates, -1)
         # points that do not count are zeros now: move them behind the others, which keep their order
         filled = (ordered != 0).any(-1)
         ordered = ordered.gather(1, (~filled).byte().argsort(stable=True, dim=1)[..., None].expand(-1, -1, 3))

@@ -1,8 +1,10 @@
 """The paper's compression auto-encoder (section Condition embedding); its encoder is PointEnet.
 
 A perceptron on 1,400 points in a fixed order, 4200 -> 786 -> 512 -> 256 -> 60, and its mirror image. The
-paper states neither the order nor the activation. Here the points are sorted by x, then y, then z, and the
-activation is PReLU, as in MPNet (Qureshi et al. 2019), whose encoder has the same form and loss.
+paper states neither the order nor the activation. Here the points are sorted along a space-filling curve, so
+that a place in the order belongs to a small part of the surfaces. Sorted by x, then y, then z, its y and z
+could be those of any obstacle. The activation is PReLU, as in MPNet (Qureshi et al. 2019), whose encoder has
+the same form and loss.
 """
 
 from collections.abc import Iterable

@@ -1,7 +1,7 @@
 """Settings of the encoders; without PyTorch, so that planning can read them."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float32
@@ -20,6 +20,8 @@ class EncoderSettings(Settings, name="encoder"):
     """Whether clouds of any size work well; otherwise they should have about `cloud` points."""
     ordered: ClassVar[bool] = False
     """Whether clouds must have exactly `cloud` points, sorted as by `in_order`."""
+    along_curve: ClassVar[bool] = False
+    """Whether they are sorted along a space-filling curve; otherwise by x, then y, then z."""
     code: Count = 96
     """Size of z (paper: 60, for two obstacles)."""
     cloud: Count = 512
@@ -36,7 +38,7 @@ class EncoderSettings(Settings, name="encoder"):
     def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
         """Points within the region in the form that the exported encoder takes [m]."""
         if self.ordered:
-            return in_order(points, self.cloud)
+            return in_order(points, self.cloud, self.along_curve)
         # zeros count for nothing; the exported network needs a point, and exactly `cloud` unless any_size
         needed = 1 if self.any_size else self.cloud
         return np.pad(points, ((0, max(needed - len(points), 0)), (0, 0)))
@@ -46,18 +48,47 @@ ORDER_STEPS = 2**20 - 1
 """Coordinates are sorted in so many steps from zero to the largest one of a cloud."""
 
 
-def in_order(points: Float32[ndarray, "n 3"], count: int) -> Float32[ndarray, "{count} 3"]:
-    """`count` of the points, sorted by x, then y, then z: thinned evenly, or repeated if there are fewer.
+CURVE_STEP = 2.0**-16
+"""Coordinates are rounded to this before they are sorted along a curve [m]."""
+SPREADS = (
+    (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
+)  # fmt: skip
+"""Shifts and masks that spread the 21 low bits of an integer to every third bit."""
 
-    Coordinates are rounded to a millionth of the largest one. Zeros without any point. See also
-    `Encoder.arrange`, for batches of tensors.
+
+def curve_keys(points: Any) -> Any:
+    """Places of points [..., 3] in metres along the Z-order curve (Morton 1966), as 63-bit integers, of an
+    array or a tensor. Neighbours along the curve are close to each other."""
+    key = 0
+    for axis in range(3):
+        bits = (points[..., axis] / CURVE_STEP).round() + 2**20
+        bits = bits.astype(np.int64) if isinstance(bits, ndarray) else bits.long()
+        bits = bits.clip(0, 2**21 - 1)
+        for shift, mask in SPREADS:
+            bits = (bits | (bits << shift)) & mask
+        key = key | (bits << (2 - axis))
+    return key
+
+
+def in_order(
+    points: Float32[ndarray, "n 3"], count: int, along_curve: bool = False
+) -> Float32[ndarray, "{count} 3"]:
+    """`count` of the points, sorted by x, then y, then z, or along a curve: thinned evenly, or repeated if
+    there are fewer.
+
+    Sorted by x, y and z, coordinates are rounded to a millionth of the largest one. Zeros without any point.
+    See also `Encoder.arrange`, for batches of tensors.
     """
     if not len(points):
         return np.zeros((count, 3), np.float32)
+    thinned = (2 * np.arange(count) + 1) * len(points) // (2 * count)
+    if along_curve:
+        return points[np.argsort(curve_keys(points), kind="stable")[thinned]]
     scale = np.float32(ORDER_STEPS) / np.float32(max(np.abs(points).max(), 1e-12))
     steps = np.rint(points * scale)
     ordered = steps[np.lexsort(steps.T[::-1])] / scale
-    return ordered[(2 * np.arange(count) + 1) * len(points) // (2 * count)].astype(np.float32)
+    return ordered[thinned].astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -81,6 +112,7 @@ class CompressionAutoencoderSettings(EncoderSettings):
 
     any_size = False
     ordered = True
+    along_curve = True
     code: Count = 60
     """Size of z."""
     cloud: Count = 1400

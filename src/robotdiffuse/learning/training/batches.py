@@ -27,10 +27,13 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
 
 
-def random_scenes(count: int, max_obstacles: int, rng: np.random.Generator) -> PackedScenes:
+def random_scenes(
+    count: int, max_obstacles: int, rng: np.random.Generator, rop: bool = False
+) -> PackedScenes:
     """Random scenes for training an encoder. A third each: two large obstacles as in ROP; several of the
-    sizes of dense ROP; any number of boxes and spheres of any size and orientation."""
-    family = rng.integers(0, 3, count)
+    sizes of dense ROP; any number of boxes and spheres of any size and orientation. rop: only the first
+    third."""
+    family = rng.integers(0, 1 if rop else 3, count)
     number = np.where(family == 0, 2, rng.integers(0, max_obstacles + 1, count))
     shape = (count, max_obstacles)
     kinds = np.where(rng.random(shape) < 0.5, SPHERE, BOX).astype(np.int8)

@@ -1,7 +1,7 @@
 """Settings of training runs: the common ones, and those of encoders, the diffusion model and baselines."""
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import (
@@ -16,12 +16,31 @@ from robotdiffuse.core.settings import (
     Share,
 )
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.settings import DenoiserSettings
+from robotdiffuse.learning.denoisers.settings import DenoiserSettings, TransformerSettings
 from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.encoders.settings import EncoderSettings
 from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts, check_points
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.training.losses import LossSettings
+
+
+class Stage(NamedTuple):
+    """A part of a progressive training."""
+
+    end: float
+    """Share of the training at which it ends."""
+    block: int
+    """Waypoints in a block, whose mean is a token."""
+
+
+STAGES = (Stage(0.72, 9), Stage(0.90, 4), Stage(1.0, 1))
+"""The stages of a progressive training."""
+
+
+def block_at(fraction: float) -> int:
+    """Waypoints in a block when this fraction of a progressive training is done."""
+    return next((stage.block for stage in STAGES if fraction < stage.end), STAGES[-1].block)
+
 
 ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 DEVICES = ("cpu", "cuda")
@@ -41,6 +60,8 @@ class TrainingSettings(Settings):
     learning_rate: Positive = 1e-3
     """Peak learning rate of AdamW."""
     warmup_steps: Natural = 500
+    decay_share: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
+    """The learning rate falls in this last share of the run, along half a cosine."""
     weight_decay: NotNegative = 0.0
     gradient_norm: Positive = 1.0
     """Gradients are scaled down to this norm."""
@@ -77,8 +98,10 @@ class EncoderTraining(TrainingSettings):
     warmup_steps: Natural = 200
     average: ShareBelowOne = 0.999
     checkpoint_seconds: NotNegative = 60.0
+    scenes: Annotated[str, OneOf(("mixed", "rop"))] = "mixed"
+    """Training scenes: mixed, of every kind, or rop, two large obstacles each as in the paper's data."""
     max_obstacles: Natural = 12
-    """Most obstacles in a training scene."""
+    """Most obstacles in a mixed training scene."""
     points: Count = 256
     """Largest training cloud; each step takes between an eighth and all of these points. An encoder for
     clouds of one size gets that size."""
@@ -136,6 +159,9 @@ class PlannerTraining(MotionTraining, ModelParts):
     smooth_noise: bool = True
     """Whether the noise has the covariance of the trajectories over the waypoints; otherwise white (the
     paper's)."""
+    progressive: bool = False
+    """Whether the denoiser sees means of blocks of waypoints in most of the training, which take a fraction
+    of the time, and single waypoints at its end, see `STAGES`."""
     validation_problems: Natural = 32
     """Held-out problems that are sampled without guidance at every checkpoint."""
     encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = None
@@ -151,9 +177,25 @@ class PlannerTraining(MotionTraining, ModelParts):
         super().__post_init__()
         if self.target == "limits" and self.smooth_noise:
             raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
+        if self.progressive:
+            self._check_progressive()
         if self.encoder_settings is not None:
             ENCODERS.entry(self.encoder)  # a folder holds a trained encoder with its own settings
         check_points("encoder", self.encoder, self.denoiser)
+
+    def _check_progressive(self) -> None:
+        patch = getattr(self.denoiser_settings, "patch", TransformerSettings.patch)
+        if self.smooth_noise or self.denoiser != "transformer" or self.objective != "clean" or patch != 1:
+            raise InputError(
+                "progressive is True; it needs smooth_noise False, the denoiser transformer with patch 1, "
+                "and the objective clean"
+            )
+        for stage in STAGES:
+            if (self.waypoints - 2) % stage.block:
+                raise InputError(
+                    f"progressive is True and waypoints is {self.waypoints}; blocks of {stage.block} must "
+                    f"divide the {self.waypoints - 2} waypoints between start and goal"
+                )
 
     @property
     def jointly(self) -> bool:

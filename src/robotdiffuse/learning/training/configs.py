@@ -10,6 +10,7 @@ dominate the samples. Clearances are no inputs of these networks, as in the pape
 what an encoder loses.
 """
 
+import math
 from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, unknown_name
@@ -54,8 +55,13 @@ CONFIGS: dict[str, Config] = {
             "turned_copies": 0,
             "target": "absolute",
             "smooth_noise": False,
+            "progressive": True,
+            "decay_share": 0.2,
+            "average": 0.999,
+            "schedule": ScheduleSettings(log_snr_shift=math.log(25)),
             "sampler": "ddpm",
             "sampling_steps": None,
+            "validation_problems": 100,
             "denoiser_settings": TransformerSettings.paper_size(),
             **_TABLE2_ROW,
         },

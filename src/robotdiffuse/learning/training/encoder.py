@@ -17,6 +17,7 @@ from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.loop import Validation
 from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.task import TrainingTask, train
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 READOUT_SCENES, TEST_SCENES = 2048, 512
 """Scenes that a linear read-out is fitted to, and further ones that it is tested on."""
@@ -65,16 +66,20 @@ class _EncoderTask(TrainingTask):
     def finish(self) -> dict[str, float]:
         settings = self.settings
         rng = np.random.default_rng(settings.seed + 1)
-        scenes = random_scenes(READOUT_SCENES, settings.max_obstacles, rng)
+        scenes = self._scenes(READOUT_SCENES, rng)
         report = self._validation(512, settings.seed + 2)[1]
         trained = self._trained = on_cpu(self.module)
         with torch.no_grad():
             clouds = scene_clouds(trained, scenes, rng).split(256)
             trained.standardize(torch.cat([trained.encode(part) for part in clouds]))
-        return report | linear_readout(trained, settings.max_obstacles, rng)
+        return report | linear_readout(trained, self._scenes(READOUT_SCENES + TEST_SCENES, rng), rng)
 
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
         save_encoder(self._trained, folder, training)
+
+    def _scenes(self, count: int, rng: np.random.Generator) -> PackedScenes:
+        settings = self.settings
+        return random_scenes(count, settings.max_obstacles, rng, rop=settings.scenes == "rop")
 
     def _validation(self, count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
         with torch.no_grad():
@@ -83,20 +88,19 @@ class _EncoderTask(TrainingTask):
     def _reconstruction(
         self, count: int, points: int, rng: np.random.Generator
     ) -> tuple[Float[Tensor, ""], dict[str, float]]:
-        scenes = random_scenes(count, self.settings.max_obstacles, rng)
+        scenes = self._scenes(count, rng)
         cloud = scene_clouds(self.module, scenes, rng, points).to(self.processes.device)
         with self.processes.autocast():
             return self.module.loss(cloud, rng)
 
 
-def linear_readout(encoder: Encoder, max_obstacles: int, rng: np.random.Generator) -> dict[str, float]:
+def linear_readout(encoder: Encoder, scenes: PackedScenes, rng: np.random.Generator) -> dict[str, float]:
     """Errors of a linear read-out of z, the same measure for all encoders.
 
     A linear map from z to the signed distances of fixed positions around the arm to the obstacles is fitted
-    to random scenes and tested on others. `readout`: its mean error [m]; `readout_of_constant`: the error of
-    the mean distances, without z.
+    to the first READOUT_SCENES and tested on the others. `readout`: its mean error [m];
+    `readout_of_constant`: the error of the mean distances, without z.
     """
-    scenes = random_scenes(READOUT_SCENES + TEST_SCENES, max_obstacles, rng)
     with torch.no_grad():
         clouds = scene_clouds(encoder, scenes, rng).split(256)
         z = torch.cat([encoder(part) for part in clouds]).numpy().astype(np.float64)

@@ -184,7 +184,9 @@ class TrainingRun:
 
     def _lr(self) -> float:
         warmup = min(1.0, (self.at.step + 1) / max(1, self.settings.warmup_steps))
-        return warmup * 0.5 * (1 + math.cos(math.pi * self.fraction))
+        share = self.settings.decay_share
+        decay = max(0.0, (self.fraction - 1 + share) / share)
+        return warmup * 0.5 * (1 + math.cos(math.pi * decay))
 
     def _skip(self) -> None:
         self._bad += 1

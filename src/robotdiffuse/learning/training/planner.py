@@ -19,8 +19,8 @@ from robotdiffuse.learning.forward_kinematics import ForwardKinematics
 from robotdiffuse.learning.motion_model import ModelParts, MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData
-from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData, fast_bf16
+from robotdiffuse.learning.training.config import PlannerTraining, block_at
 from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.task import MotionTask, train
@@ -76,6 +76,8 @@ class PlannerTask(MotionTask):
         self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
     ) -> Float[Tensor, ""]:
         own = self.own
+        if own.progressive:
+            self.model.coarsen(block_at(fraction))
         batches = Batches(data, self._on_cpu, self.clearances, own.trivial_share, own.weight_limit)
         batch, dropped = batches.draw(own.batch, rng), None
         if own.condition_drop > 0 and not validating:
@@ -85,10 +87,12 @@ class PlannerTask(MotionTask):
     def success(self, rng: np.random.Generator) -> float:
         if self._on_cpu is not self.model:
             self._on_cpu.load_state_dict(self.model.state_dict())
+            self._on_cpu.coarsen(self.model.block)
         problems = self.own.validation_problems
-        return planning_success(
-            self._on_cpu, self.robot, self.validation_data, problems, VALIDATION_SAMPLES, rng
-        )
+        with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+            return planning_success(
+                self._on_cpu, self.robot, self.validation_data, problems, VALIDATION_SAMPLES, rng
+            )
 
     def about(self) -> dict[str, Any]:
         return super().about() | self._encoder_fingerprint("encoder")

@@ -1,0 +1,86 @@
+"""Training on means of blocks of waypoints, and attention in bf16."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.denoisers.layers import MAX_UNFUSED_TOKENS, attend
+from robotdiffuse.learning.denoisers.settings import TransformerSettings
+from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
+from robotdiffuse.learning.motion_model import MotionModelSettings
+from robotdiffuse.learning.motion_network import MotionNetwork, WaypointMeans
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.config import STAGES, PlannerTraining, block_at
+from robotdiffuse.robots import load_robot
+
+SMALL = TransformerSettings(32, 2, 2, 64, patch=1)
+PROGRESSIVE = {"data": "", "encoder": "pointnet", "waypoints": 38, "smooth_noise": False, "progressive": True}
+
+
+def test_gradients_of_attention_in_bf16_are_those_in_fp32():
+    tokens = MAX_UNFUSED_TOKENS + 30
+    inputs = torch.randn(3, 2, 4, tokens, 32, generator=torch.Generator().manual_seed(0))
+    target = torch.randn(2, tokens, 128, generator=torch.Generator().manual_seed(1))
+    gradients = []
+    for dtype in (torch.float32, torch.bfloat16):
+        parts = inputs.to(dtype, copy=True).requires_grad_()
+        (attend(*parts.unbind(0)).float() - target).square().mean().backward()
+        gradients.append(parts.grad.float())
+    assert (gradients[1] - gradients[0]).norm() < 1e-2 * gradients[0].norm()
+
+
+@pytest.mark.parametrize("block", [1, 4, 9])
+def test_means_of_blocks_keep_the_ends_and_straight_lines(block):
+    means = WaypointMeans.of_blocks(38, block)
+    line = torch.linspace(-1.0, 2.0, 38)[:, None]
+    blocks = means.of_waypoints @ line
+    assert blocks[0] == line[0] and blocks[-1] == line[-1]
+    torch.testing.assert_close(means.interpolation @ blocks, line)
+
+
+def test_means_of_white_noise_are_white():
+    block = 9
+    means = WaypointMeans.of_blocks(254, block).of_waypoints
+    covariance = (means @ means.T)[1:-1, 1:-1]
+    torch.testing.assert_close(covariance, torch.eye(len(covariance)) / block)
+
+
+def test_a_denoiser_on_blocks_learns_all_waypoints():
+    """The output has every waypoint, the gradient reaches the network, and single waypoints come back."""
+    settings = MotionModelSettings(
+        waypoints=38, target="absolute", clearance_features=False, denoiser_settings=SMALL
+    )
+    model = MotionNetwork(RobotIdentity.of(load_robot("panda")), settings)
+    torch.nn.init.normal_(model.denoiser.out.weight, std=0.1)
+    inputs = torch.randn(3, 38, model.feature_count), torch.ones(3), torch.zeros(3, model.condition_count)
+    fine = model.denoise(*inputs)
+    for stage in STAGES:
+        model.coarsen(stage.block)
+        output = model.denoise(*inputs)
+        assert output.shape == fine.shape
+        assert torch.equal(output, fine) == (stage.block == 1)
+
+
+def test_stages_end_on_single_waypoints():
+    assert block_at(0.0) > block_at(0.8) > block_at(0.95) == block_at(1.0) == 1
+
+
+def test_progressive_training_needs_white_noise_and_blocks_that_fit():
+    settings = {"target": "absolute", "denoiser_settings": SMALL, **PROGRESSIVE}
+    PlannerTraining(**settings)
+    with pytest.raises(InputError, match="blocks of 9 must divide the 35 waypoints"):
+        PlannerTraining(**settings | {"waypoints": 37})
+    with pytest.raises(InputError, match="smooth_noise False"):
+        PlannerTraining(**settings | {"smooth_noise": True})
+    with pytest.raises(InputError, match="patch 1"):
+        PlannerTraining(**settings | {"denoiser_settings": None})
+
+
+def test_shift_of_the_signal_to_noise_ratio():
+    plain = NoiseSchedule(ScheduleSettings(floor=1e-12))
+    shifted = NoiseSchedule(ScheduleSettings(floor=1e-12, log_snr_shift=math.log(25)))
+    difference = 2 * (plain.half_log_snr[1:-1] - shifted.half_log_snr[1:-1])
+    np.testing.assert_allclose(difference, math.log(25), rtol=1e-6)
