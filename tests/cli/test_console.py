@@ -1,8 +1,10 @@
 """Terminal output of commands."""
 
+import sys
 import time
 
 import pytest
+import rich.console
 
 from robotdiffuse.cli import console
 from robotdiffuse.core.loading import compiled
@@ -17,3 +19,20 @@ def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: py
         time.sleep(0.5)
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "planning: compiling, once on this machine; 1 functions so far (search)"
+
+
+def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plan of two seconds printed its result to standard error: rich had replaced sys.stdout for good."""
+    spinner = console.Spinner("planning")
+
+    class Terminal(rich.console.Console):
+        def __init__(self, **_: object) -> None:
+            spinner._ended.wait()
+            super().__init__(stderr=True, force_terminal=True)
+
+    monkeypatch.setattr(console, "SPINNER_DELAY", 0.0)
+    monkeypatch.setattr(rich.console, "Console", Terminal)
+    before = sys.stdout
+    with spinner:
+        time.sleep(0.1)
+    assert sys.stdout is before

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 from robotdiffuse.core.loading import compiled
 
 if TYPE_CHECKING:
-    from rich.status import Status
-
     from robotdiffuse.certificates.certificate import Certificate
     from robotdiffuse.core.results import PlanResult
     from robotdiffuse.problems.problem import Problem
@@ -33,7 +31,6 @@ class Spinner:
 
     def __init__(self, text: str) -> None:
         self.text = text
-        self._status: Status | None = None
         self._ended = Event()
         self._thread = Thread(target=self._show, daemon=True)
         self._compiled = len(compiled)
@@ -44,13 +41,11 @@ class Spinner:
 
     def __exit__(self, *_: object) -> None:
         self.stop()
-        self._thread.join()
 
     def stop(self) -> None:
         """Remove the spinner, if it has appeared."""
         self._ended.set()
-        if self._status is not None:
-            self._status.stop()
+        self._thread.join()
 
     def _show(self) -> None:
         if self._ended.wait(SPINNER_DELAY):
@@ -59,12 +54,12 @@ class Spinner:
 
         console = Console(stderr=True, highlight=False)
         if console.is_terminal:
-            self._status = console.status(self._line())
-            self._status.start()
-        while not self._ended.wait(STATUS_INTERVAL if self._status else LOG_INTERVAL):
-            if self._status is not None:
-                self._status.update(self._line())
-            elif len(compiled) > self._compiled:
+            with console.status(self._line()) as status:
+                while not self._ended.wait(STATUS_INTERVAL):
+                    status.update(self._line())
+            return
+        while not self._ended.wait(LOG_INTERVAL):
+            if len(compiled) > self._compiled:
                 console.print(self._line(), soft_wrap=True)
 
     def _line(self) -> str:

@@ -2,11 +2,12 @@
 
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from importlib import import_module
 from typing import Any
 
 from numba import njit
-from numba.core import event
+from numba.core import errors, event
 
 from robotdiffuse.core import loading
 
@@ -24,6 +25,10 @@ def _without_scipy(module: str) -> None:
 
 
 _without_scipy("numba.np.arraymath")  # SciPy would take a ninth of the time of a plan by search
+
+# For each error that type inference meets, thousands in a large function, Numba had colorama replace sys.stdout and
+# sys.stderr, and then restore what they were before: what another thread had set since, such as a notebook, was lost.
+errors.ColorShell = nullcontext  # type: ignore[misc]
 
 
 class _Listener(event.Listener):
