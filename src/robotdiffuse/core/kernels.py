@@ -29,8 +29,8 @@ def _without_scipy(module: str) -> None:
 
 _without_scipy("numba.np.arraymath")  # SciPy would take a ninth of the time of a plan by search
 
-# For each error that type inference meets, thousands in a large function, Numba had colorama replace sys.stdout and
-# sys.stderr, and then restore what they were before: what another thread had set since, such as a notebook, was lost.
+# For each error that type inference meets, thousands in a large function, Numba would let colorama replace
+# sys.stdout and sys.stderr and restore what they were, even if another thread has set others since.
 errors.ColorShell = nullcontext  # type: ignore[misc]
 
 
@@ -55,7 +55,7 @@ class _CacheFile(caching.IndexDataCacheFile):
 
 @contextmanager
 def _rebuild_damaged(cache: caching.Cache) -> Iterator[None]:
-    """Around reading and writing: a file that cannot be read is compiled anew, and a full disk only costs that."""
+    """Around reading and writing: what cannot be read is compiled anew; a full disk is no error."""
     try:
         yield
     except Exception:  # pickle raises errors of many kinds

@@ -16,7 +16,7 @@ def _import_pybullet() -> None:
     for stream in (1, 2):
         with suppress(OSError):  # it is closed
             saved[stream] = os.dup(stream)
-    printed = {stream: tempfile.TemporaryFile() for stream in saved}
+    printed = {stream: tempfile.TemporaryFile() for stream in saved}  # noqa: SIM115  (closed below)
     try:
         for stream, file in printed.items():
             os.dup2(file.fileno(), stream)
@@ -28,6 +28,7 @@ def _import_pybullet() -> None:
             with file, suppress(OSError):
                 file.seek(0)
                 os.write(stream, b"".join(line for line in file if not line.startswith(BUILD_TIME)))
+
 
 _import_pybullet()
 

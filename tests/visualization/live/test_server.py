@@ -12,7 +12,7 @@ from robotdiffuse.visualization.live import server
 def test_viser_is_silent_and_other_threads_print(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """While viser started or stopped, sys.stdout was replaced for all threads: a notebook's output was lost."""
+    """While viser started or stopped, sys.stdout was replaced for all threads: others' output was lost."""
     during = []
 
     class Server(server._Server):
