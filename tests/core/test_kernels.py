@@ -17,8 +17,8 @@ from robotdiffuse.core.kernels import kernel
 
 @pytest.mark.parametrize("name", ["stdout", "stderr"])
 def test_compiling_in_a_thread_leaves_the_streams_alone(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first run of the tests printed elsewhere: Numba let colorama replace both streams for each error that
-    type inference meets, and restore what they had been, though another thread had set others since."""
+    """Output of the tests went elsewhere: Numba let colorama replace both streams for each error that type
+    inference meets, and restore what they had been, though another thread had set others since."""
     streams: list[io.StringIO] = []
 
     class Stream(io.StringIO):

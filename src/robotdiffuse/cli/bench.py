@@ -86,6 +86,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     report.add_argument("--planners", metavar="NAME,...", help="planners to include (default: all)")
     report.add_argument("--out", metavar="OUT", help="folder to write to (default: FOLDER)")
     report.add_argument("--no-replays", action="store_true", help="do not write replays.html")
+    add_import_option(report)
     report.set_defaults(run=run_report)
     confirm = actions.add_parser(
         "confirm",
