@@ -36,3 +36,12 @@ def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest
     with spinner:
         time.sleep(0.1)
     assert sys.stdout is before
+
+
+def test_progress_without_a_terminal_is_a_line_at_once(capsys: pytest.CaptureFixture) -> None:
+    """`data check` of a few motions said nothing for 25 s."""
+    with console.progress("checking motions") as update:
+        update(0, 4)
+        assert capsys.readouterr().err == "checking motions: 0 of 4\n"
+        update(4, 4)
+    assert capsys.readouterr().err == ""
