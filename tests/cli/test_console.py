@@ -1,6 +1,7 @@
 """Terminal output of commands."""
 
 import sys
+import threading
 import time
 
 import pytest
@@ -23,18 +24,23 @@ def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plan of two seconds printed its result to standard error: rich had replaced sys.stdout for good."""
-    spinner = console.Spinner("planning")
+    ending, stop = threading.Event(), console.Spinner.stop
 
     class Terminal(rich.console.Console):
         def __init__(self, **_: object) -> None:
-            spinner._ended.wait()
+            ending.wait()
             super().__init__(stderr=True, force_terminal=True)
 
+    def begin_to_stop(spinner: console.Spinner) -> None:
+        ending.set()
+        stop(spinner)
+
+    monkeypatch.setattr(console.Spinner, "stop", begin_to_stop)
     monkeypatch.setattr(console, "SPINNER_DELAY", 0.0)
     monkeypatch.setattr(rich.console, "Console", Terminal)
     before = sys.stdout
-    with spinner:
-        time.sleep(0.1)
+    with console.Spinner("planning"):
+        pass
     assert sys.stdout is before
 
 

@@ -43,7 +43,8 @@ class AddedEntries(NamedTuple):
 
 _tables: dict[str, "Registry"] = {}
 _adopted: dict[str, dict[str, Entry]] = {}
-_imported: list[str] = []
+imported: list[str] = []
+"""Modules that `import_modules` has imported."""
 
 
 def added_entries() -> AddedEntries:
@@ -51,7 +52,7 @@ def added_entries() -> AddedEntries:
     processes."""
     found = {what: dict(table.items() - table.own.items()) for what, table in _tables.items()}
     tables = {what: entries for what, entries in found.items() if entries}
-    return AddedEntries(tables, tuple(_imported))
+    return AddedEntries(tables, tuple(imported))
 
 
 def adopt_entries(added: AddedEntries) -> None:
@@ -165,4 +166,4 @@ def import_modules(names: Iterable[str]) -> None:
         except Exception as error:  # an import may raise anything
             why = f"{type(error).__name__}: {shortened(str(error))}"
             raise InputError(f"module {name!r} cannot be imported: {why}") from None
-        _imported.append(name)
+        imported.append(name)

@@ -120,7 +120,7 @@ def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch:
         'METRICS["legs"] = Metric("legs", "", "less", ".0f", lambda motion: len(motion.path.positions) - 1)\n'
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(registry, "_imported", [])
+    monkeypatch.setattr(registry, "imported", [])
     try:
         registry.import_modules(["counted"])
         assert run_bench(settings(tmp_path / "run", "rrt_connect", count=1), quiet, quiet) == 1

@@ -1,10 +1,13 @@
 """The server of a page is silent, and what others print is theirs."""
 
 import sys
+from typing import Any
 
 import pytest
 
 pytest.importorskip("viser", reason="live needs viser: pip install 'robotdiffuse[live]'")
+
+import viser
 
 from robotdiffuse.visualization.live import server
 
@@ -14,17 +17,18 @@ def test_viser_is_silent_and_other_threads_print(
 ) -> None:
     """While viser started or stopped, sys.stdout was replaced for all threads: others' output was lost."""
     during = []
+    start, stop = viser.ViserServer.__init__, viser.ViserServer.stop
 
-    class Server(server._Server):
-        def __init__(self, *words: object, **options: object) -> None:
-            during.append(sys.stdout)
-            super().__init__(*words, **options)  # type: ignore[arg-type]
+    def watched_start(self: Any, *words: Any, **options: Any) -> None:
+        during.append(sys.stdout)
+        start(self, *words, **options)
 
-        def stop(self) -> None:
-            during.append(sys.stdout)
-            super().stop()
+    def watched_stop(self: Any) -> None:
+        during.append(sys.stdout)
+        stop(self)
 
-    monkeypatch.setattr(server, "_Server", Server)
+    monkeypatch.setattr(viser.ViserServer, "__init__", watched_start)
+    monkeypatch.setattr(viser.ViserServer, "stop", watched_stop)
     viser_server, _ = server.new_server()
     server.stop_server(viser_server)
     assert during == [sys.stdout, sys.stdout]
