@@ -44,7 +44,9 @@ def new_server() -> tuple[viser.ViserServer, str]:
 
 def stop_server(server: viser.ViserServer) -> None:
     """Stop a server without the message that its thread would print."""
-    server._websock_server._background_event_loop.call_soon_threadsafe(rich.get_console().begin_capture)
+    loop = server._websock_server._background_event_loop
+    assert loop is not None, "the server runs"
+    loop.call_soon_threadsafe(rich.get_console().begin_capture)
     server.stop()
 
 
