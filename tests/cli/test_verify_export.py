@@ -62,7 +62,6 @@ def test_a_certificate_is_written_and_checked(planned: Path, capsys: pytest.Capt
         "export {} --out m.rosbag2",
         "verify {} --certificate c.json",
         "view {} --out r.html",
-        "view {} --out r.png",
     ],
 )
 def test_a_full_disk_is_status_3(command: str, planned: Path, capsys: pytest.CaptureFixture[str]) -> None:

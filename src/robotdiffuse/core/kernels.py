@@ -1,6 +1,5 @@
 """Decorators of compiled functions, and the account of the time that Numba takes; see `loading.py`."""
 
-import pickle
 import sys
 import zlib
 from collections.abc import Callable, Iterator
@@ -50,7 +49,7 @@ class _CacheFile(caching.IndexDataCacheFile):
         data, marker, checksum = content.rpartition(CHECKSUM)
         if marker and zlib.crc32(data).to_bytes(4, "big") != checksum:
             raise ValueError(f"{name} is damaged")
-        return pickle.loads(content)
+        return super()._load_data(name)
 
 
 @contextmanager
