@@ -98,9 +98,7 @@ class Page:
         """Draw what has changed; only this task and the player draw."""
         state, selected = self.session.state, self._selected
         problem, robot = state.problem, state.problem.robot
-        start_pose = link_pose(
-            robot, problem.start, robot.tip
-        )  # may compile; within the block nothing is sent
+        Poses.of(robot, problem.start[None])  # compiles here, since nothing is sent within the block
         with self.server.atomic():
             self._panel.show(state, validity(state), selected)
             if self._new("robot", robot):
@@ -110,7 +108,7 @@ class Page:
                 names = [shape.name for shape in problem.known_scene.shapes]
                 T = self.session.obstacle_pose(selected) if selected in names else None
                 self._obstacle_gizmo.show(T)
-            self._start_gizmo.show(start_pose)
+            self._start_gizmo.show(link_pose(robot, problem.start, robot.tip))
             if self._new("start", problem.start) | self._new("motion start", state.motion):
                 self._ghost("start", None if _starts_at_start(state) else problem.start)
             if self._new("goal", state.goal_configuration):
