@@ -1,8 +1,11 @@
 """Terminal output of commands."""
 
+import sys
+import threading
 import time
 
 import pytest
+import rich.console
 
 from robotdiffuse.cli import console
 from robotdiffuse.core.loading import compiled
@@ -17,3 +20,34 @@ def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: py
         time.sleep(0.5)
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "planning: compiling, once on this machine; 1 functions so far (search)"
+
+
+def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plan of two seconds printed its result to standard error: rich had replaced sys.stdout for good."""
+    ending, stop = threading.Event(), console.Spinner.stop
+
+    class Terminal(rich.console.Console):
+        def __init__(self, **_: object) -> None:
+            ending.wait()
+            super().__init__(stderr=True, force_terminal=True)
+
+    def begin_to_stop(spinner: console.Spinner) -> None:
+        ending.set()
+        stop(spinner)
+
+    monkeypatch.setattr(console.Spinner, "stop", begin_to_stop)
+    monkeypatch.setattr(console, "SPINNER_DELAY", 0.0)
+    monkeypatch.setattr(rich.console, "Console", Terminal)
+    before = sys.stdout
+    with console.Spinner("planning"):
+        pass
+    assert sys.stdout is before
+
+
+def test_progress_without_a_terminal_is_a_line_at_once(capsys: pytest.CaptureFixture) -> None:
+    """`data check` of a few motions said nothing for 25 s."""
+    with console.progress("checking motions") as update:
+        update(0, 4)
+        assert capsys.readouterr().err == "checking motions: 0 of 4\n"
+        update(4, 4)
+    assert capsys.readouterr().err == ""

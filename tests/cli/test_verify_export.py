@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from helpers.commands import run
+from helpers.full_disk import full_disk
 
 START, GOAL = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 BALL = {"sphere": {"center": [0.5, 0.0, 0.5], "radius": 0.15, "name": "ball"}}
@@ -53,6 +54,24 @@ def test_a_certificate_is_written_and_checked(planned: Path, capsys: pytest.Capt
     assert "scene: new was added" in capsys.readouterr().out
     assert run("certificate", "check", planned / "r.json") == 2
     assert "is not a certificate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "export {} --out m.csv",
+        "export {} --out m.mcap",
+        "export {} --out m.rosbag2",
+        "verify {} --certificate c.json",
+        "view {} --out r.html",
+    ],
+)
+def test_a_full_disk_is_status_3(command: str, planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It was 2, as bad input, and scripts could not tell them apart."""
+    with full_disk():
+        assert run(*command.format(planned / "r.json").split()) == 3
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "cannot be written" in error
 
 
 def test_motions_from_other_programs(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.results import PlanResult, load_result
 from robotdiffuse.core.types import Path, Status, Trajectory
@@ -157,7 +157,7 @@ def test_a_failed_write_keeps_the_old_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(FilePath, "replace", full)
-    with pytest.raises(InputError, match="No space left on device"):
+    with pytest.raises(OutputError, match="No space left on device"):
         solved.save(file)
     assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
 

@@ -19,7 +19,7 @@ from helpers.factory_runs import (
     start,
     wait_for_shards,
 )
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.generation import GenerationSettings, factory, generate
 
 TRAJECTORIES, SHARD, WAYPOINTS = 54, 3, 16
@@ -87,10 +87,10 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
             resource.setrlimit(resource.RLIMIT_FSIZE, (1000, most[1]))
 
     try:
-        with pytest.raises(InputError, match=r"cannot write .*shard_00002\.zarr: File too large$"):
+        with pytest.raises(OutputError, match=r"shard_00002\.zarr cannot be written: File too large$"):
             generate(SETTINGS, tmp_path, progress=fill_up)
         assert shards(tmp_path) == 2 and len(list(tmp_path.iterdir())) == 3
-        with pytest.raises(InputError, match=r"manifest\.json.*: File too large$"):
+        with pytest.raises(OutputError, match=r"manifest\.json.*: File too large$"):
             generate(SETTINGS, tmp_path / "other")
         assert not list((tmp_path / "other").iterdir())
     finally:

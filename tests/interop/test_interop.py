@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +14,8 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from robotdiffuse.core.errors import InputError
+from helpers.full_disk import full_disk
+from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import READERS, TRAJECTORY_ENDINGS, WRITERS, read_motion, write_motion
 from robotdiffuse.interop.plain_messages import joint_trajectory, motion_from_record
@@ -178,13 +178,8 @@ def test_a_disk_that_fills_up_is_one_line(
 ) -> None:
     """ROS 2 bags and Rerun's recordings ended with tracebacks of SQLite and of Rerun."""
     problem, trajectory = planned
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))  # bytes of a file
-    try:
-        with pytest.raises(InputError, match=r"m\.\w+ cannot be written: ") as caught:
-            write_motion(problem, trajectory, tmp_path / f"m{ending}")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_disk(4096), pytest.raises(OutputError, match=r"m\.\w+ cannot be written: ") as caught:
+        write_motion(problem, trajectory, tmp_path / f"m{ending}")
     assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
 
 

@@ -27,7 +27,10 @@ def problems() -> list[rd.Problem]:
 
 
 def test_results_are_in_order_and_as_alone() -> None:
-    results = list(rd.plan_many(problems(), "rrt_connect", workers=2, time_limit=20.0, seed=3))
+    counts: list[tuple[int, int]] = []
+    request = {"time_limit": 20.0, "seed": 3, "progress": lambda done, total: counts.append((done, total))}
+    results = list(rd.plan_many(problems(), "rrt_connect", workers=2, **request))
+    assert counts == [(done, 6) for done in range(1, 7)]
     alone = [RRTConnect().plan(problem, 20.0, seed=3) for problem in problems()]
     assert [result.status for result in results] == [Status.SOLVED] * 5 + [Status.INVALID_START]
     for together, one in zip(results[:5], alone, strict=False):

@@ -67,9 +67,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         raise InputError(f"certificates prove nothing about {', '.join(unsupported)}, which the problem has")
     report = verify(problem, motion, settings)
     if report.violation is not None:
-        raise NotValidError(
-            f"the motion is not valid: {report.violation.message} (at {report.violation.time:.3f})"
-        )
+        raise NotValidError(f"the motion is not valid: {report.violation.line}")
     least = {
         SCENE: CLEARANCE_SHARE * (report.scene_clearance or 0.0),
         "": CLEARANCE_SHARE * (report.self_clearance or 0.0),

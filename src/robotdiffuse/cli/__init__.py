@@ -32,7 +32,7 @@ from robotdiffuse.cli import (
     view,
 )
 from robotdiffuse.cli.exit_status import BAD_INPUT, STOPPED, WRITE_FAILED
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.core.registry import import_modules
 
 COMMANDS = (
@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
     except InputError as error:
         print(f"robotdiffuse: error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return WRITE_FAILED if isinstance(error, OutputError) else BAD_INPUT
     except KeyboardInterrupt:
         print("robotdiffuse: stopped", file=sys.stderr)
         return STOPPED

@@ -16,8 +16,8 @@ def add_import_option(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="MODULE",
-        help="import a module first, of the current folder too, which may add planners, families or "
-        "costs to their tables; repeatable",
+        help="import a module first, of the current folder too, which may add planners, families, "
+        "costs or metrics to their tables; repeatable",
     )
 
 

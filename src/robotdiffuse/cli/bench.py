@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import add_import_option, count, positive
+from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.problems.families import FAMILIES
@@ -86,6 +87,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     report.add_argument("--planners", metavar="NAME,...", help="planners to include (default: all)")
     report.add_argument("--out", metavar="OUT", help="folder to write to (default: FOLDER)")
     report.add_argument("--no-replays", action="store_true", help="do not write replays.html")
+    add_import_option(report)
     report.set_defaults(run=run_report)
     confirm = actions.add_parser(
         "confirm",
@@ -233,9 +235,6 @@ def print_bench(bench: "Bench", parts: "list[Section]") -> None:
 def run_confirm(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
-    from rich.console import Console
-    from rich.progress import Progress
-
     from robotdiffuse.evaluation.tables import Table, show
 
     try:
@@ -243,14 +242,8 @@ def run_confirm(arguments: argparse.Namespace) -> int:
     except ImportError:
         raise InputError('PyBullet is not installed: pip install "robotdiffuse[sim]"') from None
 
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("problems")
-        found = confirm(
-            Path(arguments.folder),
-            arguments.count,
-            lambda done, total: bar.update(task, completed=done, total=total),
-        )
+    with progress("checking problems") as update:
+        found = confirm(Path(arguments.folder), arguments.count, update)
     rows = [(planner, of.checked, len(of.refuted)) for planner, of in found.items()]
     show(Table.of("", ("planner", "motions", "in collision (PyBullet)"), rows))
     refuted = [each for confirmation in found.values() for each in confirmation.refuted]

@@ -1,13 +1,15 @@
-"""Terminal output of commands: result tables, and a spinner for long waits."""
+"""Terminal output of commands: result tables, and a bar or a spinner for long waits."""
 
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from threading import Event, Thread
 from typing import TYPE_CHECKING
 
 from robotdiffuse.core.loading import compiled
 
 if TYPE_CHECKING:
-    from rich.status import Status
-
     from robotdiffuse.certificates.certificate import Certificate
     from robotdiffuse.core.results import PlanResult
     from robotdiffuse.problems.problem import Problem
@@ -20,6 +22,8 @@ STATUS_INTERVAL, LOG_INTERVAL = 0.2, 5.0
 """Time between two updates of the spinner, and between two lines where there is no terminal [s]."""
 CAP_TOLERANCE = 1e-4
 """A clearance this close to the largest one that is measured is printed as larger [m]."""
+COUNT_INTERVAL = 60.0
+"""Time between two lines of `progress` where there is no terminal [s]."""
 ASSUMPTION_TEXTS = {"as seen": "what was seen", "unknown is occupied": "all that was not seen free"}
 """How `print_result` words some assumptions about unknown space."""
 
@@ -33,7 +37,6 @@ class Spinner:
 
     def __init__(self, text: str) -> None:
         self.text = text
-        self._status: Status | None = None
         self._ended = Event()
         self._thread = Thread(target=self._show, daemon=True)
         self._compiled = len(compiled)
@@ -44,13 +47,11 @@ class Spinner:
 
     def __exit__(self, *_: object) -> None:
         self.stop()
-        self._thread.join()
 
     def stop(self) -> None:
         """Remove the spinner, if it has appeared."""
         self._ended.set()
-        if self._status is not None:
-            self._status.stop()
+        self._thread.join()
 
     def _show(self) -> None:
         if self._ended.wait(SPINNER_DELAY):
@@ -59,12 +60,12 @@ class Spinner:
 
         console = Console(stderr=True, highlight=False)
         if console.is_terminal:
-            self._status = console.status(self._line())
-            self._status.start()
-        while not self._ended.wait(STATUS_INTERVAL if self._status else LOG_INTERVAL):
-            if self._status is not None:
-                self._status.update(self._line())
-            elif len(compiled) > self._compiled:
+            with console.status(self._line()) as status:
+                while not self._ended.wait(STATUS_INTERVAL):
+                    status.update(self._line())
+            return
+        while not self._ended.wait(LOG_INTERVAL):
+            if len(compiled) > self._compiled:
                 console.print(self._line(), soft_wrap=True)
 
     def _line(self) -> str:
@@ -72,6 +73,31 @@ class Spinner:
         if count == 0:
             return self.text
         return f"{self.text}: compiling, once on this machine; {count} functions so far ({compiled[-1]})"
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A function of the numbers done and in all, which moves a bar on standard error or, where that is no
+    terminal, prints a line first and every COUNT_INTERVAL."""
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeElapsedColumn())
+    due = 0.0
+
+    def update(done: int, total: int) -> None:
+        nonlocal due
+        bar.update(task, completed=done, total=total)
+        if not console.is_terminal and time.monotonic() >= due:
+            due = time.monotonic() + COUNT_INTERVAL
+            print(f"{what}: {done:,} of {total:,}", file=sys.stderr, flush=True)
+
+    with Progress(
+        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(what, total=None)
+        yield update
 
 
 def clearances(motion: "PlanResult | Report | Certificate", asked: float | None = None) -> str:

@@ -17,13 +17,12 @@ from robotdiffuse.cli.arguments import (
     share,
     shares,
 )
+from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families import FAMILIES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from rich.progress import Progress
 
     from robotdiffuse.generation import GenerationSettings
     from robotdiffuse.robots.robot import Robot
@@ -205,17 +204,6 @@ def _robot(name: str | None) -> "Robot | None":
     return None if name is None else load_robot(name)
 
 
-def _bar() -> "Progress":
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(
-        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
-    )
-
-
 def run_generate(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
@@ -292,8 +280,7 @@ def run_check(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation.datasets.check import check_data
     from robotdiffuse.evaluation.tables import show
 
-    with _bar() as bar:
-        task = bar.add_task("motions", total=None)
+    with progress("checking motions") as update:
         check = check_data(
             arguments.folder,
             _robot(arguments.robot),
@@ -301,7 +288,7 @@ def run_check(arguments: argparse.Namespace) -> int:
             arguments.seed,
             arguments.workers,
             not arguments.no_pybullet,
-            lambda done, total: bar.update(task, completed=done, total=total),
+            update,
         )
     show(*check.tables)
     return CLEAN if check.clean else VIOLATIONS
@@ -322,11 +309,8 @@ def run_view(arguments: argparse.Namespace) -> int:
     entries = list(_gallery_entries(folder, robot, arguments.count, arguments.seed))
     if not entries:
         raise InputError(f"{folder} holds no motions yet; continue `robotdiffuse data generate` first")
-    with _bar() as bar:
-        task = bar.add_task("drawing", total=len(entries))
-        write_gallery(
-            robot, entries, out, folder.resolve().name, lambda done, _: bar.update(task, completed=done)
-        )
+    with progress("drawing motions") as update:
+        write_gallery(robot, entries, out, folder.resolve().name, update)
     print(f"wrote {out}")
     if not arguments.out:
         show(out)
@@ -364,14 +348,7 @@ def run_export(arguments: argparse.Namespace) -> int:
 def run_import(arguments: argparse.Namespace) -> int:
     from robotdiffuse.datasets.robot_npz import import_npz
 
-    with _bar() as bar:
-        task = bar.add_task("motions", total=None)
-        made = import_npz(
-            arguments.file,
-            arguments.out,
-            arguments.robot,
-            arguments.radius,
-            lambda done, total: bar.update(task, completed=done, total=total),
-        )
+    with progress("importing motions") as update:
+        made = import_npz(arguments.file, arguments.out, arguments.robot, arguments.radius, update)
     print(f"{made:,} motions in {arguments.out}; validate them with: robotdiffuse data check {arguments.out}")
     return 0

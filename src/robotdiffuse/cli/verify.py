@@ -92,7 +92,7 @@ def _validated(
 
         found = violations(problem, motion) or found
     for violation in found:
-        print(f"{what}: not valid: {violation.message} (at {violation.time:.3f})")
+        print(f"{what}: not valid: {violation.line}")
     return False
 
 

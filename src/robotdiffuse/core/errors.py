@@ -29,6 +29,10 @@ class InputError(ValueError):
         return type(self), (line, listed)
 
 
+class OutputError(InputError):
+    """Output that could not be written, as on a full disk. The command line exits with status 3."""
+
+
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
     """Raises InputError unless the value is of one of these types; `wanted` says what it must be."""
     if not isinstance(value, kind):

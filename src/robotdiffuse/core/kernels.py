@@ -1,12 +1,15 @@
 """Decorators of compiled functions, and the account of the time that Numba takes; see `loading.py`."""
 
 import sys
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from numba import njit
-from numba.core import event
+from numba.core import caching, errors, event
 
 from robotdiffuse.core import loading
 
@@ -24,6 +27,43 @@ def _without_scipy(module: str) -> None:
 
 
 _without_scipy("numba.np.arraymath")  # SciPy would take a ninth of the time of a plan by search
+
+# For each error that type inference meets, thousands in a large function, Numba would let colorama replace
+# sys.stdout and sys.stderr and restore what they were, even if another thread has set others since.
+errors.ColorShell = nullcontext  # type: ignore[misc]
+
+
+# before the checksum at the end of a file of compiled code, which Numba itself does not read
+CHECKSUM = b"crc32"
+
+
+class _CacheFile(caching.IndexDataCacheFile):
+    """Numba's files of compiled code with a checksum: damaged machine code would end the process."""
+
+    def _dump(self, obj: Any) -> bytes:
+        data = super()._dump(obj)
+        return data + CHECKSUM + zlib.crc32(data).to_bytes(4, "big")
+
+    def _load_data(self, name: str) -> Any:
+        content = Path(self._data_path(name)).read_bytes()
+        data, marker, checksum = content.rpartition(CHECKSUM)
+        if marker and zlib.crc32(data).to_bytes(4, "big") != checksum:
+            raise ValueError(f"{name} is damaged")
+        return super()._load_data(name)
+
+
+@contextmanager
+def _rebuild_damaged(cache: caching.Cache) -> Iterator[None]:
+    """Around reading and writing: what cannot be read is compiled anew; a full disk is no error."""
+    try:
+        yield
+    except Exception:  # pickle raises errors of many kinds
+        with suppress(OSError):
+            cache.flush()
+
+
+caching.IndexDataCacheFile = _CacheFile  # type: ignore[misc]
+caching.Cache._guard_against_spurious_io_errors = _rebuild_damaged  # type: ignore[method-assign]
 
 
 class _Listener(event.Listener):

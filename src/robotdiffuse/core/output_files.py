@@ -1,5 +1,6 @@
 """Atomic and line-by-line writing of files, and locks on output folders."""
 
+import errno
 import fcntl
 import json
 import os
@@ -9,15 +10,24 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, OutputError, shown
 from robotdiffuse.core.input_files import file_name
+
+# failures of a disk rather than of a file's name: it is full, over a quota or a limit, or broken
+DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+
+
+def write_error(file: Path, error: OSError) -> InputError:
+    """The error for a file or folder that could not be written."""
+    kind = OutputError if error.errno in DISK_FAILURES else InputError
+    return kind(f"{file} cannot be written: {error.strerror or error}")
 
 
 def write_atomically(file: Path, content: str | bytes, make_folder: bool = False) -> None:
     """Write a temporary file and rename it over `file`, so that no reader sees it half written.
 
     An interruption or a full disk leaves the old file, if there was one. Raises InputError if the file cannot
-    be written.
+    be written: OutputError if the disk is full.
     """
     temporary = file.with_name(f".{file.name}.{secrets.token_hex(8)}.tmp")
     try:
@@ -31,7 +41,7 @@ def write_atomically(file: Path, content: str | bytes, make_folder: bool = False
                 temporary.unlink()
             raise
     except OSError as error:
-        raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
+        raise write_error(file, error) from None
 
 
 def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:
@@ -114,9 +124,10 @@ def lock_folder(out: Path) -> Iterator[None]:
     try:
         out.mkdir(parents=True, exist_ok=True)
         folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    except FileExistsError:
+        raise InputError(f"cannot use the folder {out}: it is a file") from None
     except OSError as error:
-        why = "it is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise InputError(f"cannot use the folder {out}: {why}") from None
+        raise write_error(out, error) from None
     try:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)

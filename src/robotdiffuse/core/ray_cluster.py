@@ -71,7 +71,7 @@ def ray_cluster() -> Iterator[Any]:
         yield ray
     except RayTaskError as error:
         if isinstance(error.cause, InputError):
-            raise InputError(str(error.cause)) from None
+            raise type(error.cause)(str(error.cause)) from None
         if "No module named 'robotdiffuse'" in str(error):
             raise InputError(
                 f"a node of the Ray cluster cannot import robotdiffuse; install {__version__} on all"

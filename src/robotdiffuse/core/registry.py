@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, shortened, unknown_name
 
@@ -32,24 +32,35 @@ class Entry:
     """Features that not every entry of the registry supports, e.g. path constraints for planners."""
 
 
-AddedEntries = dict[str, dict[str, Entry]]
-"""Entries by the kind of their registry, then by name."""
+class AddedEntries(NamedTuple):
+    """What a program has added to the package's tables."""
+
+    tables: dict[str, dict[str, Entry]]
+    """Entries by the kind of their registry, then by name."""
+    modules: tuple[str, ...]
+    """Modules of `import_modules`, which may add to other tables too, such as that of metrics."""
+
+
 _tables: dict[str, "Registry"] = {}
-_adopted: AddedEntries = {}
+_adopted: dict[str, dict[str, Entry]] = {}
+imported: list[str] = []
+"""Modules that `import_modules` has imported."""
 
 
 def added_entries() -> AddedEntries:
     """The entries that this program has added to the package's own, for `adopt_entries` in worker
     processes."""
     found = {what: dict(table.items() - table.own.items()) for what, table in _tables.items()}
-    return {what: entries for what, entries in found.items() if entries}
+    tables = {what: entries for what, entries in found.items() if entries}
+    return AddedEntries(tables, tuple(imported))
 
 
-def adopt_entries(entries: AddedEntries) -> None:
-    """Add the entries of the parent process to all registries, including those created later."""
-    _adopted.update(entries)
-    for what in _tables.keys() & entries.keys():
-        _tables[what].update(entries[what])
+def adopt_entries(added: AddedEntries) -> None:
+    """Import the parent process's modules, and add its entries to all registries, those created later too."""
+    import_modules(added.modules)
+    _adopted.update(added.tables)
+    for what in _tables.keys() & added.tables.keys():
+        _tables[what].update(added.tables[what])
 
 
 class Registry(dict[str, Entry]):
@@ -155,3 +166,4 @@ def import_modules(names: Iterable[str]) -> None:
         except Exception as error:  # an import may raise anything
             why = f"{type(error).__name__}: {shortened(str(error))}"
             raise InputError(f"module {name!r} cannot be imported: {why}") from None
+        imported.append(name)

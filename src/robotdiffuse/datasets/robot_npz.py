@@ -17,7 +17,7 @@ from numpy import ndarray
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.input_files import input_file
-from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.output_files import lock_folder, write_error
 from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
 from robotdiffuse.datasets.motion_rows import Row
 from robotdiffuse.datasets.own_motions import measured_row
@@ -74,7 +74,7 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
             np.savez(stream, x_train=x_train, y_train=y_train)
         os.replace(fresh, file)
     except OSError as error:
-        raise InputError(f"cannot write {file}: {error.strerror or error}") from None
+        raise write_error(file, error) from None
     finally:
         fresh.unlink(missing_ok=True)
     return len(x_train), total - len(x_train)

@@ -27,6 +27,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import input_file
+from robotdiffuse.core.output_files import write_error
 from robotdiffuse.datasets.manifest import FORMAT, MANIFEST, Manifest, check_format
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
@@ -134,7 +135,7 @@ def write_shard(
     """Write a shard atomically, replacing one of the same number.
 
     `arrays` are all of ARRAYS, without `times` if the timing is "arc". Raises InputError if the arrays do not
-    match, or the shard cannot be written, as on a full disk.
+    match, or the shard cannot be written: OutputError if the disk is full.
     """
     zarr, target = _zarr(), shard_path(folder, index)
     wrong = {*arrays, "times"} ^ ARRAYS.keys()
@@ -175,7 +176,7 @@ def write_shard(
             target.rename(old)
         fresh.rename(target)
     except OSError as error:
-        raise InputError(f"cannot write {target}: {error.strerror or error}") from None
+        raise write_error(target, error) from None
     finally:
         if beside is not None:
             shutil.rmtree(beside, ignore_errors=True)

@@ -152,9 +152,14 @@ def make_figure(width: int, height: float) -> "Figure":
 
 
 def as_svg(figure: "Figure") -> str:
-    """The figure as an SVG element."""
+    """The figure as an SVG element, larger where a legend or a name needs it."""
+    from matplotlib.transforms import Bbox
+
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, dpi=220, metadata={"Date": None, "Creator": None})
+    figure.draw_without_rendering()  # places everything
+    bounds = Bbox.union([figure.bbox_inches, figure.get_tightbbox()])
+    about = {"Date": None, "Creator": None}
+    figure.savefig(buffer, format="svg", transparent=True, dpi=220, metadata=about, bbox_inches=bounds)
     text = buffer.getvalue()
     return text[text.index("<svg") :]
 

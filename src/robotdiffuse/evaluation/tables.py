@@ -48,6 +48,9 @@ class Figure(NamedTuple):
     text: str
     value: float
 
+    def __str__(self) -> str:
+        return self.text
+
 
 Cell = str | int | float | Figure | None
 Rows = Sequence[Sequence[Cell]]

@@ -6,8 +6,9 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.errors import InputError, OutputError, shortened
 from robotdiffuse.core.input_files import input_file
+from robotdiffuse.core.output_files import write_error
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop.plain_messages import joint_trajectory
 from robotdiffuse.interop.recorded_motion import RecordedMotion
@@ -52,9 +53,10 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
                     connection = writer.add_connection(topic, kind, typestore=typestore())
                     writer.write(connection, 0, typestore().serialize_cdr(to_message(kind, content), kind))
             _replace(file, new, old)
-    except (OSError, sqlite3.Error) as error:
-        why = getattr(error, "strerror", None) or error
-        raise InputError(f"{file} cannot be written: {why}") from None
+    except sqlite3.Error as error:
+        raise OutputError(f"{file} cannot be written: {error}") from None
+    except OSError as error:
+        raise write_error(file, error) from None
 
 
 def _replace(file: Path, new: Path, old: Path) -> None:

@@ -2,8 +2,8 @@
 
 import os
 import queue
-from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import fields, replace
@@ -11,7 +11,7 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.processes import NotStartedError, SingleWorker, check_not_importing
+from robotdiffuse.core.processes import NotStartedError, Results, SingleWorker, check_not_importing, in_order
 from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
@@ -35,6 +35,7 @@ def plan_many(
     weights: str | None = None,
     workers: int | None = None,
     cluster: str | None = None,
+    progress: Callable[[int, int], object] | None = None,
     **request: Any,
 ) -> Iterator[PlanResult]:
     """Yield the results of problems in their order, each as soon as those before it are there.
@@ -43,6 +44,7 @@ def plan_many(
     workers: number of processes; None: one for each core.
     cluster: "ray": the Ray cluster that RAY_ADDRESS names, or one started here, in place of processes;
         problems of a lost node are planned again on another.
+    progress: called after each problem, in whatever order they end, with the numbers done and in all.
     request: arguments of `Planner.plan`, the same for all problems: time_limit, seed, until, ...
 
     A problem that raises an error, or kills its process, has a result with status ERROR; the others continue.
@@ -72,14 +74,24 @@ def plan_many(
             raise unknown_name("cluster", cluster, CLUSTERS)
         if workers is not None:
             raise InputError(f"workers is {workers} and cluster is {cluster}; a cluster uses all its cores")
-        return _planned_on_cluster(problems, (planner, settings, weights), cluster, PlanRequest(**request))
-    count = min(workers or os.cpu_count() or 1, len(problems))
-    return _planned(problems, (planner, settings, weights), count, PlanRequest(**request))
+        results = _planned_on_cluster(problems, (planner, settings, weights), cluster, PlanRequest(**request))
+    else:
+        count = min(workers or os.cpu_count() or 1, len(problems))
+        results = _planned(problems, (planner, settings, weights), count, PlanRequest(**request))
+    return in_order(_reported(results, len(problems), progress))
+
+
+def _reported(results: Results, total: int, progress: Callable[[int, int], object] | None) -> Results:
+    with closing(results):
+        for done, result in enumerate(results, start=1):
+            if progress is not None:
+                progress(done, total)
+            yield result
 
 
 def _planned(
     problems: list[Problem], loaded: PlannerArguments, workers: int, request: PlanRequest
-) -> Iterator[PlanResult]:
+) -> Results:
     # each robot is sent to a process once, without its compiled arrays; the process keeps those it compiles
     robots = list(dict.fromkeys(problem.robot for problem in problems))
     number = {robot: i for i, robot in enumerate(robots)}
@@ -114,7 +126,9 @@ def _planned(
 
     threads = ThreadPoolExecutor(max(workers, 1))
     try:
-        yield from threads.map(one, problems)
+        number_of = {threads.submit(one, problem): i for i, problem in enumerate(problems)}
+        for future in as_completed(number_of):
+            yield number_of[future], future.result()
     finally:
         for worker in pool:
             worker.close()
@@ -123,21 +137,16 @@ def _planned(
 
 def _planned_on_cluster(
     problems: list[Problem], loaded: PlannerArguments, cluster: str, request: PlanRequest
-) -> Iterator[PlanResult]:
+) -> Results:
     bare = {robot: replace(robot) for robot in {problem.robot for problem in problems}}
     sent = [replace(problem, robot=bare[problem.robot]) for problem in problems]
     calls = [
         (loaded, request, sent[i : i + PROBLEMS_PER_TASK]) for i in range(0, len(sent), PROBLEMS_PER_TASK)
     ]
-    early: dict[int, list[PlanResult]] = {}
-    following, given = 0, iter(problems)
     with closing(CLUSTERS[cluster](_plan_on_node, calls)) as made:
         for number, results in made:
-            early[number] = results
-            while following in early:
-                for result in early.pop(following):
-                    yield replace(result, problem=next(given))
-                following += 1
+            for i, result in enumerate(results, start=number * PROBLEMS_PER_TASK):
+                yield i, replace(result, problem=problems[i])
 
 
 def _plan_on_node(

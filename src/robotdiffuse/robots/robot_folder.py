@@ -3,7 +3,6 @@ links graze each other, surfaces.npz."""
 
 import io
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, unit_quaternion, within
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import is_file, read_arrays, read_json
+from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.inertias import inertia_of
@@ -46,22 +46,14 @@ def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any])
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / SURFACE_FILE).unlink(missing_ok=True)  # it may belong to other meshes
-        _replace(folder / MESH_FILE, meshes.getvalue())
-        _replace(folder / ROBOT_FILE, text.encode())
+        write_atomically(folder / MESH_FILE, meshes.getvalue())
+        write_atomically(folder / ROBOT_FILE, text)
         if robot.grazing:
-            _replace(folder / SURFACE_FILE, pack_surfaces(robot.surfaces, robot.grazing, robot.meshes))
+            write_atomically(
+                folder / SURFACE_FILE, pack_surfaces(robot.surfaces, robot.grazing, robot.meshes)
+            )
     except OSError as error:
-        raise InputError(f"cannot write the robot folder {folder}: {error.strerror}") from None
-
-
-def _replace(file: Path, content: bytes) -> None:
-    """Write a file atomically."""
-    fresh = file.with_name(f".{file.name}.{os.getpid()}")
-    try:
-        fresh.write_bytes(content)
-        os.replace(fresh, file)
-    finally:
-        fresh.unlink(missing_ok=True)
+        raise write_error(folder, error) from None
 
 
 def read_robot_folder(folder: str | Path) -> Robot:

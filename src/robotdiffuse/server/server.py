@@ -84,8 +84,9 @@ async def _serve(
         if task.cancelled() or task.exception() is not None:
             server.should_exit = True
         else:
-            others = f"; {settings.workers - 1} more are starting" if settings.workers > 1 else ""
-            say(f"ready, with 1 worker{others}")
+            others = settings.workers - 1
+            starting_too = f"; {others} more {'is' if others == 1 else 'are'} starting" if others else ""
+            say(f"ready, with 1 worker{starting_too}")
 
     say(f"listening on {_address(listener)}; loading compiled code (about a minute on a new machine)")
     starting = asyncio.ensure_future(pool.start())

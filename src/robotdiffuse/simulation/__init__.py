@@ -2,25 +2,32 @@
 motions."""
 
 import os
+import tempfile
 from contextlib import suppress
+
+# how the line begins that PyBullet prints as it is imported
+BUILD_TIME = b"pybullet build time"
 
 
 def _import_pybullet() -> None:
-    """Import PyBullet without the build time that it prints directly to the file descriptors."""
+    """Import PyBullet without the build time that it prints directly to a file descriptor; what other threads
+    print meanwhile is printed afterwards."""
     saved: dict[int, int] = {}
     for stream in (1, 2):
         with suppress(OSError):  # it is closed
             saved[stream] = os.dup(stream)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    printed = {stream: tempfile.TemporaryFile() for stream in saved}  # noqa: SIM115  (closed below)
     try:
-        for stream in saved:
-            os.dup2(nowhere, stream)
+        for stream, file in printed.items():
+            os.dup2(file.fileno(), stream)
         import pybullet  # noqa: F401
     finally:
-        for stream, copy in saved.items():
-            os.dup2(copy, stream)
-            os.close(copy)
-        os.close(nowhere)
+        for stream, file in printed.items():
+            os.dup2(saved[stream], stream)
+            os.close(saved[stream])
+            with file, suppress(OSError):
+                file.seek(0)
+                os.write(stream, b"".join(line for line in file if not line.startswith(BUILD_TIME)))
 
 
 _import_pybullet()

@@ -23,6 +23,12 @@ class Violation:
     """Amount of the violation: the greatest depth until the contact ends [m], the greatest value of a
     constraint until it is kept again, or the excess over a limit or error at the goal in its unit."""
 
+    @property
+    def line(self) -> str:
+        """The message with the place, which some messages name."""
+        named = f" at {self.time:.3f} s" in self.message or " at waypoint " in self.message
+        return self.message if named else f"{self.message} (at {self.time:.3f})"
+
 
 @dataclass(frozen=True)
 class Report:

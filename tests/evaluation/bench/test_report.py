@@ -11,6 +11,7 @@ import pytest
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.evaluation import style
 from robotdiffuse.evaluation.bench import figures, page, plots, report
 from robotdiffuse.evaluation.bench.outcomes import GAVE_UP, LATER, RAN_OUT, deciding_record, outcome
 from robotdiffuse.evaluation.bench.run_folder import Bench, read_bench
@@ -418,6 +419,17 @@ def test_the_command_writes_everything(
         assert ElementTree.parse(out / f"{name}.svg").getroot().tag.endswith("svg")
 
 
+def test_no_legend_or_name_is_clipped() -> None:
+    """Names of planners with settings ended at the edge of a plot."""
+    pytest.importorskip("matplotlib")
+    with style.style():
+        figure = style.make_figure(6, 2.0)
+        text = figure.text(0.9, 0.5, "robotdiffuse:search.range=0.5+restarts")
+        svg = ElementTree.fromstring(style.as_svg(figure))
+    width, end = 72 * style.WIDTHS[6], text.get_window_extent().x1 * 72 / figure.dpi
+    assert end > width and float(svg.attrib["viewBox"].split()[2]) >= end
+
+
 def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     keep_problems(small, [f"rop/{i}" for i in range(4)])
     bench = read_bench(small)
@@ -431,6 +443,7 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     }
     captions = {motion.title: motion.caption for motion in shown}
     assert captions["mpnet fails · rop/2"].startswith("gave up before; shown: robotdiffuse")
+    assert not any("Figure(" in caption for caption in captions.values())
     assert len(shown) <= page.MAX_REPLAYS
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from helpers import faulty_planner
 from robotdiffuse.cli import main
+from robotdiffuse.core import registry
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.types import Path as Motion
@@ -22,6 +23,7 @@ from robotdiffuse.evaluation.bench import planner_process, runner
 from robotdiffuse.evaluation.bench.outcomes import LATE_SECONDS
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.bench.runner import BenchSettings, open_runs, run_bench
+from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.problem_sets import gather_cases, validator
 from robotdiffuse.evaluation.records import Record, RecordFile, read_records
 from robotdiffuse.evaluation.runs import Run
@@ -109,6 +111,23 @@ def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch:
     monkeypatch.setitem(PLANNERS, "mine", Entry("__main__:Mine", "for tests"))
     with pytest.raises(InputError, match="planner mine is in the program that was started"):
         run_bench(settings(tmp_path, "mine", count=1), quiet, quiet)
+
+
+def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`bench run --import` measured it in no planner's process."""
+    (tmp_path / "counted.py").write_text(
+        "from robotdiffuse.evaluation.metrics import METRICS, Metric\n"
+        'METRICS["legs"] = Metric("legs", "", "less", ".0f", lambda motion: len(motion.path.positions) - 1)\n'
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(registry, "imported", [])
+    try:
+        registry.import_modules(["counted"])
+        assert run_bench(settings(tmp_path / "run", "rrt_connect", count=1), quiet, quiet) == 1
+        (record,) = read_records(tmp_path / "run")["rrt_connect"]
+        assert record.measures["legs"] == len(record.waypoints) - 1
+    finally:
+        METRICS.pop("legs", None)
 
 
 def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -316,5 +316,5 @@ def test_add_refuses_what_cannot_work(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="robot name"):
         add_robot(urdf(tmp_path), name="../up")
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write"):
+    with pytest.raises(InputError, match="cannot be written"):
         write_robot_folder(read_urdf(urdf(tmp_path)), tmp_path / "file" / "robot", {})

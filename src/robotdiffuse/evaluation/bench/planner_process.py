@@ -18,7 +18,7 @@ from pathlib import Path as FilePath
 from typing import TextIO
 
 from robotdiffuse.core.line_process import LineProcess
-from robotdiffuse.core.registry import Entry, added_entries, adopt_entries
+from robotdiffuse.core.registry import AddedEntries, Entry, added_entries, adopt_entries
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.methods import measure_of, planner_calls
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN
@@ -45,9 +45,10 @@ class PlannerProcess:
 
     def __init__(self, spec: PlannerSpec, log: FilePath) -> None:
         """`log`: the process's output is appended to this file."""
-        entries = {what: {n: asdict(e) for n, e in table.items()} for what, table in added_entries().items()}
+        added = added_entries()
+        tables = {what: {n: asdict(e) for n, e in table.items()} for what, table in added.tables.items()}
         self._process = LineProcess(
-            [*COMMAND, spec.text, json.dumps([sys.path, entries], default=sorted)], log
+            [*COMMAND, spec.text, json.dumps([sys.path, tables, added.modules], default=sorted)], log
         )
 
     def warm(self, run: Run) -> None:
@@ -152,14 +153,13 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     os.environ["OMP_NUM_THREADS"] = "1"  # of PyTorch, which only planners with a network load
-    path, entries = json.loads(sys.argv[2])
+    path, tables, modules = json.loads(sys.argv[2])
     sys.path += [place for place in path if place not in sys.path]
-    adopt_entries(
-        {
-            what: {n: Entry(**(e | {"supports": frozenset(e["supports"])})) for n, e in table.items()}
-            for what, table in entries.items()
-        }
-    )
+    entries = {
+        what: {n: Entry(**(e | {"supports": frozenset(e["supports"])})) for n, e in table.items()}
+        for what, table in tables.items()
+    }
+    adopt_entries(AddedEntries(entries, tuple(modules)))
     spec = PlannerSpec.parse(sys.argv[1])
     serve(spec.load(), spec.request(), sys.stdin, answers)
 

@@ -3,6 +3,7 @@
 Problems are rebuilt from their rows alone; results of the generation are not trusted.
 """
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -141,7 +142,7 @@ def check_data(
 
     robot: that of the data; None: found by the name in the manifest.
     workers: processes; the motions and findings do not depend on them.
-    progress: called with the numbers of motions done and in all.
+    progress: called with the numbers of motions done and in all, first with 0.
 
     Raises InputError if there is no data set, for another robot than that of the data, and if PyBullet is
     asked for but not installed.
@@ -154,6 +155,8 @@ def check_data(
         _need_pybullet()
     indices = existing_shards(folder)
     task = _Task(str(folder), manifest, robot, pybullet)
+    motions = min(manifest.trajectories, sys.maxsize if count is None else count)
+    workers = min(workers, max(len(indices), -(-motions // MOTIONS_PER_TASK)))
     with Workers(workers if workers > 1 else 0) as processes:
         sizes = dict(zip(indices, in_order(processes.each(task.size, [(i,) for i in indices])), strict=True))
         found = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
@@ -164,6 +167,8 @@ def check_data(
             for i in range(0, len(picked), MOTIONS_PER_TASK)
         ]
         total, done, least = sum(len(part) for _, part in chosen), 0, np.inf
+        if progress is not None:
+            progress(done, total)
         for part in in_order(processes.each(task.validate, [(some,) for some in chosen])):
             found += part.findings
             done, least = done + part.motions, min(least, part.least_clearance)

@@ -15,7 +15,7 @@ import yaml
 from robotdiffuse.core.bounds import numbers
 from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
 from robotdiffuse.core.input_files import file_name, no_files, parse_json, parse_yaml, read_text, read_yaml
-from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
 from robotdiffuse.problems.files.constraints import constraint_entry, read_constraints
@@ -216,7 +216,7 @@ def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -
         with file.open("a", encoding="utf-8") as stream:
             stream.write(text + "\n")
     except OSError as error:
-        raise InputError(f"{file} cannot be written: {error.strerror}") from None
+        raise write_error(file, error) from None
 
 
 def _yaml(data: dict[str, object]) -> str:

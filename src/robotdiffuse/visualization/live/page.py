@@ -98,6 +98,7 @@ class Page:
         """Draw what has changed; only this task and the player draw."""
         state, selected = self.session.state, self._selected
         problem, robot = state.problem, state.problem.robot
+        Poses.of(robot, problem.start[None])  # compiles here, since nothing is sent within the block
         with self.server.atomic():
             self._panel.show(state, validity(state), selected)
             if self._new("robot", robot):

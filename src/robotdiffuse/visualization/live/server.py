@@ -1,10 +1,9 @@
 """The server of a page: viser behind an access proxy, with lights, a floor and a first view."""
 
-import contextlib
-import io
 import secrets
 
 import numpy as np
+import rich
 import viser
 from jaxtyping import Float
 from numpy import ndarray
@@ -37,16 +36,18 @@ class _Server(viser.ViserServer):
 def new_server() -> tuple[viser.ViserServer, str]:
     """A viser server on a local port, and the secret that its access proxy needs."""
     secret = secrets.token_urlsafe(32)
-    with contextlib.redirect_stdout(io.StringIO()):  # viser prints its own address
+    with rich.get_console().capture():  # viser prints its own address; other threads' output is left alone
         server = _Server("127.0.0.1", 0, verbose=False)
     _require_secret(secret, server)
     return server, secret
 
 
 def stop_server(server: viser.ViserServer) -> None:
-    """Stop a server without a message on stdout."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
+    """Stop a server without the message that its thread would print."""
+    loop = server._websock_server._background_event_loop
+    assert loop is not None, "the server runs"
+    loop.call_soon_threadsafe(rich.get_console().begin_capture)
+    server.stop()
 
 
 def add_stage(server: viser.ViserServer, reach: float) -> None:
