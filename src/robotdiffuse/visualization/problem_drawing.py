@@ -88,7 +88,7 @@ def _goal_state(problem: Problem) -> tuple[Float[ndarray, "dof"] | None, StateVa
     first = None
     for goal in goals:
         joints = isinstance(goal, JointGoal)
-        for q in goal.positions if joints else pose_configurations(problem, goal, None, rng):
+        for q in goal.positions if joints else pose_configurations(problem, goal, rng):
             validity = problem.is_free(q)
             if validity:
                 return q, validity
