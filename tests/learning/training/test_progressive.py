@@ -18,9 +18,7 @@ from robotdiffuse.learning.training.config import STAGES, PlannerTraining, block
 from robotdiffuse.robots import load_robot
 
 SMALL = TransformerSettings(32, 2, 2, 64, patch=1)
-PROGRESSIVE: dict[str, Any] = {"data": "", "encoder": "pointnet", "waypoints": 38, "smooth_noise": False} | {
-    "progressive": True
-}
+PROGRESSIVE: dict[str, Any] = {
     "data": "",
     "encoder": "pointnet",
     "waypoints": 38,
