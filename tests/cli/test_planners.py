@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from helpers.commands import run, write_problem
+from robotdiffuse.core import registry
 from robotdiffuse.planning import PLANNERS
 
 
@@ -37,6 +38,7 @@ def test_a_module_of_the_current_folder_adds_planners(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(registry, "imported", [])
     (tmp_path / "added_planners.py").write_text(
         "from dataclasses import replace\nfrom robotdiffuse.planning import PLANNERS\n"
         "PLANNERS['mine'] = replace(PLANNERS['aorrtc'], description='my own')\n"
