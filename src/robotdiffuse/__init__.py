@@ -6,8 +6,5 @@ take a second to load.
 
 import lazy_loader
 
-from robotdiffuse.core.compile_cache import ensure_cache
-
 __version__ = "0.1.0"
-ensure_cache()
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

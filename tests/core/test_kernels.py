@@ -1,7 +1,6 @@
 """Compiled code: what it leaves alone, and damaged files of it."""
 
 import io
-import shutil
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from numba.core import config
 from numba.core.errors import TypingError
 
+from robotdiffuse.core import kernels
 from robotdiffuse.core.kernels import kernel
 
 
@@ -30,7 +29,7 @@ def test_compiling_in_a_thread_leaves_the_streams_alone(name: str, monkeypatch: 
     streams.append(Stream())
     monkeypatch.setattr(sys, name, streams[-1])
     with ThreadPoolExecutor(1) as pool, pytest.raises(TypingError):
-        pool.submit(kernel(cache=False)(lambda number: number.nothing), 1.0).result()
+        pool.submit(kernel()(lambda number: number.nothing), 1.0).result()
     assert getattr(sys, name) is streams[-1]
 
 
@@ -52,7 +51,7 @@ def test_damaged_files_of_compiled_code_are_compiled_anew(
     damage: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A truncated file was a traceback in every run until somebody deleted it."""
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(kernels, "cache_folder", lambda: tmp_path)
 
     def hits() -> int:
         compiled: Any = kernel()(triple)
@@ -68,8 +67,7 @@ def test_damaged_files_of_compiled_code_are_compiled_anew(
 def test_compiled_code_runs_where_it_cannot_be_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A full disk ended a plan with an error."""
     folder = tmp_path / "folder"
-    monkeypatch.setattr(config, "CACHE_DIR", str(folder))
-    compiled: Any = kernel()(triple)
-    shutil.rmtree(folder)
     folder.write_text("this is no folder")
+    monkeypatch.setattr(kernels, "cache_folder", lambda: folder)
+    compiled: Any = kernel()(triple)
     assert compiled(1.0) == 3.0

@@ -171,7 +171,8 @@ class _Candidates:
 class ExactCollision:
     """Signed distances and collisions of a robot's exact meshes with a scene and with each other.
 
-    Links that no planned joint moves are checked only against moving links. Not thread-safe.
+    Links that no planned joint moves are checked only against moving links. Threads may share one: a call
+    changes nothing of it.
     """
 
     checks: tuple[Check, ...]

@@ -118,7 +118,7 @@ class Sweep(NamedTuple):
 
 
 class ContinuousCollision:
-    """Certifies whole motions of a robot in a scene. Not thread-safe."""
+    """Certifies whole motions of a robot in a scene. Threads may share one: a call changes nothing of it."""
 
     def __init__(self, robot: Robot, scene: Scene, contact: float, tightness: float) -> None:
         """Meshes nearer than `contact` [m] count as touching. Pieces are split until each certified clearance

@@ -61,7 +61,8 @@ class TimedSweep(NamedTuple):
 
 
 class MovingCollision:
-    """Certifies timed motions of a robot among moving obstacles. Not thread-safe."""
+    """Certifies timed motions of a robot among moving obstacles. Threads may share one: a call changes
+    nothing of it."""
 
     def __init__(
         self, robot: Robot, moving: Sequence[MovingObstacle], contact: float, tightness: float

@@ -1,12 +1,17 @@
 """Decorators of compiled functions, and the account of the time that Numba takes; see `loading.py`."""
 
+import os
+import re
 import sys
+import tempfile
+import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from numba import njit
 from numba.core import caching, errors, event
@@ -35,10 +40,68 @@ errors.ColorShell = nullcontext  # type: ignore[misc]
 
 # before the checksum at the end of a file of compiled code, which Numba itself does not read
 CHECKSUM = b"crc32"
+PACKAGE = Path(__file__).parents[1]
+MODULE = re.compile(rb"\b%s(?:\.\w+)+" % PACKAGE.name.encode())
+
+
+@cache
+def cache_folder() -> Path:
+    """The folder for compiled code: NUMBA_CACHE_DIR, or one in the user's cache, or a temporary one where
+    that cannot be written, as in a container without a home."""
+    # unlike Path.expanduser, this leaves ~ as it is for a user without a home
+    user = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(user, PACKAGE.name))
+    if is_writable(folder):
+        return folder
+    own = Path(tempfile.gettempdir()) / f"{PACKAGE.name}-{os.getuid()}"
+    try:
+        own.mkdir(mode=0o700, exist_ok=True)
+        if own.is_symlink() or own.stat().st_uid != os.getuid():
+            raise PermissionError(f"{own} belongs to another user")
+    except OSError:
+        own = Path(tempfile.mkdtemp(prefix=f"{PACKAGE.name}-"))
+    warnings.warn(
+        f"{folder} is not writable: compiled code is kept in {own}; set NUMBA_CACHE_DIR to choose another "
+        "folder",
+        stacklevel=2,
+    )
+    return own
+
+
+def is_writable(folder: Path) -> bool:
+    """Whether a file can be written in the folder; permissions alone do not show that a disk is read-only.
+    False for ~, a home that is not known."""
+    if folder.parts[:1] == ("~",):
+        return False
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):
+    """Numba's place for the compiled code of one module: a folder named by a hash of the module's path."""
+
+    def __init__(self, function: Callable, file: str) -> None:
+        self._py_file = file
+        self._lineno = function.__code__.co_firstlineno
+
+    @classmethod
+    def from_function(cls, py_func: Callable, py_file: str) -> "_Locator":
+        return cls(py_func, py_file)
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder() / self.get_suitable_cache_subpath(self._py_file))
+
+
+class _CacheImpl(caching.CompileResultCacheImpl):
+    _locator_classes: ClassVar[list] = [_Locator]
 
 
 class _CacheFile(caching.IndexDataCacheFile):
-    """Numba's files of compiled code with a checksum: damaged machine code would end the process."""
+    """Numba's files of compiled code with a checksum, for damaged machine code would end the process."""
 
     def _dump(self, obj: Any) -> bytes:
         data = super()._dump(obj)
@@ -51,19 +114,47 @@ class _CacheFile(caching.IndexDataCacheFile):
             raise ValueError(f"{name} is damaged")
         return super()._load_data(name)
 
+    def _load_index(self) -> dict:
+        """The index, or an empty one if it names a module that is missing or newer: Numba would fail where a
+        class in it has moved, and load code that was compiled for an older definition of a class."""
+        index = Path(self._index_path)
+        if not index.is_file():
+            return {}
+        written = index.stat().st_mtime
+        named = set(MODULE.findall(index.read_bytes()))
+        if any(_changed(name.decode()) > written for name in named):
+            return {}
+        return super()._load_index()
 
-@contextmanager
-def _rebuild_damaged(cache: caching.Cache) -> Iterator[None]:
-    """Around reading and writing: what cannot be read is compiled anew; a full disk is no error."""
-    try:
-        yield
-    except Exception:  # pickle raises errors of many kinds
+
+@cache
+def _changed(module: str) -> float:
+    """The time at which a module's file was changed; infinite if there is no such module."""
+    file = PACKAGE.parent.joinpath(*module.split("."))
+    for source in (file.with_suffix(".py"), file / "__init__.py"):
         with suppress(OSError):
-            cache.flush()
+            return source.stat().st_mtime
+    return float("inf")
 
 
-caching.IndexDataCacheFile = _CacheFile  # type: ignore[misc]
-caching.Cache._guard_against_spurious_io_errors = _rebuild_damaged  # type: ignore[method-assign]
+class _Cache(caching.FunctionCache):
+    """Compiled code of one function, in a folder of the package's own."""
+
+    _impl_class = _CacheImpl
+
+    def __init__(self, function: Callable) -> None:
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file = _CacheFile(self._cache_path, self._impl.filename_base, stamp)
+
+    @contextmanager
+    def _guard_against_spurious_io_errors(self) -> Iterator[None]:
+        """Around reading and writing: what cannot be read is compiled anew; a full disk is no error."""
+        try:
+            yield
+        except Exception:  # pickle raises errors of many kinds
+            with suppress(OSError):
+                self.flush()
 
 
 class _Listener(event.Listener):
@@ -88,8 +179,13 @@ for kind in (LOCK, COMPILE):
 
 def kernel(**options: Any) -> Callable[[Callable], Any]:
     """A decorator that compiles a function that Python calls; `options` are those of `numba.njit`."""
-    every: dict[str, Any] = {"cache": True, "no_cfunc_wrapper": True}
-    return njit(**every | options)
+
+    def compiled(function: Callable) -> Any:
+        dispatcher = njit(no_cfunc_wrapper=True, **options)(function)
+        dispatcher._cache = _Cache(function)
+        return dispatcher
+
+    return compiled
 
 
 def inner_kernel(**options: Any) -> Callable[[Callable], Any]:

@@ -1,8 +1,8 @@
 """Numba kernel of `surface_clouds`: samples whole surfaces of packed scenes on the CPU."""
 
 import numpy as np
-from numba import njit
 
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE
 
 _ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
@@ -10,7 +10,7 @@ _UNIT = np.float32(2.0**-24)
 _MASK = np.uint64(2**24 - 1)
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _next(x):
     """xorshift64 (G. Marsaglia 2003)."""
     x ^= x << np.uint64(13)
@@ -19,7 +19,7 @@ def _next(x):
     return x
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def fill_clouds(kinds, params, seeds, out):
     """Writes points that are uniform by area over the shapes of each scene to out[n, count, 3].
 
@@ -77,7 +77,7 @@ def fill_clouds(kinds, params, seeds, out):
                 out[i, p, r] = params[i, j, r] + turn[j, r, 0] * a + turn[j, r, 1] * b + turn[j, r, 2] * c
 
 
-@njit(cache=True)
+@kernel()
 def _prepare(kind, row, faces, turn):
     """Area of a shape [m^2]. For boxes, also writes the cumulative areas of face pairs and axes times
     sizes."""

@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.registry import Registry
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import make_work
@@ -45,7 +45,7 @@ def path_constraint_cost(constraints: PathConstraints, share: float) -> CostStep
     return step
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _steps(rows, limits, q, max_step):
     """Moves each configuration of q [n, dof] by a Gauss-Newton step down the cost, in place."""
     work = make_work(rows)

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
 from numpy import ndarray
 from torch import Tensor
+
+from robotdiffuse.core.kernels import kernel
 
 
 def max_pool(x: Float[Tensor, "groups rows width"]) -> Float[Tensor, "groups width"]:
@@ -41,7 +42,7 @@ def _bits(x: Tensor) -> ndarray:
     return x.detach().view(torch.int16 if x.dtype == torch.bfloat16 else torch.int32).numpy()
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _forward(values, best, which):
     """Writes the maximum over each group's rows of values [groups, rows, width] to best, its row to which.
 
@@ -70,7 +71,7 @@ def _forward(values, best, which):
             best[i, c] = key ^ ((key >> sign) & magnitude)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _backward(gradients, which, out):
     """Writes the gradient of `_forward` to out [groups, rows, width]: `gradients` [groups, width] at the
     maxima, 0 elsewhere, all as bits."""

@@ -1,13 +1,14 @@
 """Numba kernel of `depth_filter`: the median of neighbouring pixels."""
 
 import numpy as np
-from numba import njit
+
+from robotdiffuse.core.kernels import kernel
 
 MIN_RETURNS = 4
 """A pixel with fewer returns among its 3 x 3 counts as without a return."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def median_filter(depth):
     """Each pixel with a return as the median of the returns of its 3 x 3 pixels, the nearer one of two; 0
     elsewhere."""

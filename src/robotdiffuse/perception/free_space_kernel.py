@@ -4,8 +4,8 @@ Each voxel is projected into the image; rays are not followed through the voxels
 """
 
 import numpy as np
-from numba import njit
 
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.perception.ray_kernel import rectangle
 
 HIDDEN, FREE, BEHIND, SHADOW, OUT = 0, 1, 2, 3, 4
@@ -36,7 +36,7 @@ FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@kernel(fastmath=FASTMATH)
 def usable_depth(depth, focal):
     """The depths, with MAX_DEPTH for rays without an obstacle and NO_RETURN for missing returns and flying
     pixels."""
@@ -62,7 +62,7 @@ def usable_depth(depth, focal):
     return out
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@kernel(fastmath=FASTMATH)
 def _arm_pixels(depth, intrinsics, spheres):
     """Which pixels have points inside the spheres, [n, 4] x y z radius in the camera's frame."""
     h, w = depth.shape
@@ -81,7 +81,7 @@ def _arm_pixels(depth, intrinsics, spheres):
     return mask
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@kernel(fastmath=FASTMATH)
 def _min_pooled(depth, factor):
     """Minimum depth of blocks of pixels, and the summed-area table of missing returns."""
     h, w = (depth.shape[0] + factor - 1) // factor, (depth.shape[1] + factor - 1) // factor
@@ -105,7 +105,7 @@ def _min_pooled(depth, factor):
     return least, missing
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@kernel(fastmath=FASTMATH)
 def _minimum_table(least, levels):
     """Sparse table for range minima: minimum depth of the square of 2^k cells below and right of each
     cell."""
@@ -124,7 +124,7 @@ def _minimum_table(least, levels):
     return table
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@kernel(fastmath=FASTMATH)
 def _rectangle_minimum(table, v0, v1, u0, u1):
     """Minimum depth of the cells of a rectangle, whose bounds are inclusive."""
     k = 0
@@ -138,7 +138,7 @@ def _rectangle_minimum(table, v0, v1, u0, u1):
     return least
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@kernel(fastmath=FASTMATH)
 def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
     """Counts the points in each voxel, without those of the arm."""
     fx, fy, cx, cy = intrinsics
@@ -166,7 +166,7 @@ def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
                 flat[at[u]] += 1
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@kernel(fastmath=FASTMATH)
 def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
     """Writes the state of each voxel [nx ny nz], its depth behind a surface [m], and its number of points.
 
@@ -209,7 +209,7 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
                     )
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@kernel(fastmath=FASTMATH)
 def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missing):
     """OUT or FREE if all voxels of a block are so, by the rectangle that it covers in the image, else -1.
 
@@ -254,7 +254,7 @@ def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missi
     return FREE if _rectangle_minimum(table, v0, v1, u0, u1) > far + DEPTH_SLACK else -1
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@kernel(fastmath=FASTMATH)
 def _carve_block(
     first, end, raw, arm, intrinsics, T, low, voxel, factor, table, missing, state, behind, counts
 ):
@@ -317,7 +317,7 @@ def _carve_block(
                     behind[i, j, k] = z - front
 
 
-@njit(cache=True)
+@kernel()
 def add_evidence(state, counts, evidence, hit, miss, largest):
     """Add what a view shows to the evidence for each voxel [nx ny nz]; returns for how many there was none:
     `hit` for voxels with points, else -`miss` for those that are free. It stays within `largest`."""

@@ -2,7 +2,8 @@
 cover."""
 
 import numpy as np
-from numba import njit
+
+from robotdiffuse.core.kernels import kernel
 
 SPHERE, BOX, CYLINDER, CAPSULE = 0, 1, 2, 3
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
@@ -10,7 +11,7 @@ _NEAR = np.float32(0.02)
 _MISS = np.float32(1e9)
 
 
-@njit(cache=True)
+@kernel()
 def rectangle(x, y, z, r, intrinsics, h, w):
     """First and last row, first and last column of the pixels that a sphere in the camera's frame may
     cover."""
@@ -25,7 +26,7 @@ def rectangle(x, y, z, r, intrinsics, h, w):
     return int(v0), int(v1), int(u0), int(u1)
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _quadratic(a, b, c, last):
     """The smaller root, or with `last` the larger one, of a t^2 + 2 b t + c; _MISS if there is none."""
     under = b * b - a * c
@@ -35,13 +36,13 @@ def _quadratic(a, b, c, last):
     return (root - b if last else -root - b) / a
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _sphere(ox, oy, oz, dx, dy, dz, r):
     c = ox * ox + oy * oy + oz * oz - r * r
     return _quadratic(dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz, c, False)
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _slab(o, d, half):
     """The parameters at which a ray enters and leaves |x| < half."""
     if abs(d) < np.float32(1e-9):
@@ -50,7 +51,7 @@ def _slab(o, d, half):
     return min(a, b), max(a, b)
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _intersect(kind, ox, oy, oz, dx, dy, dz, a, b, c):
     """The parameter, in lengths of its direction, at which a ray enters a shape at the origin; or _MISS."""
     if kind == SPHERE:
@@ -75,7 +76,7 @@ def _intersect(kind, ox, oy, oz, dx, dy, dz, a, b, c):
     return min(side, _sphere(ox, oy, oz - b, dx, dy, dz, a), _sphere(ox, oy, oz + b, dx, dy, dz, a))
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
+@kernel(fastmath={"contract", "reassoc", "arcp", "nsz"})
 def render_depth(kinds, rows, intrinsics, T, depth):
     """Lowers each pixel of `depth` [h w] to the depth of the nearest shape.
 

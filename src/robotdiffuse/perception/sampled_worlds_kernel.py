@@ -1,13 +1,14 @@
 """Worlds in which a motion is free, in compiled code."""
 
 import numpy as np
-from numba import njit
+
+from robotdiffuse.core.kernels import kernel
 
 TILE = 64
 """Coarse voxels of the periodic field along each axis: a power of two, and more than the observed volume."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def highest_in_cells(probability, marked):
     """Coarse voxels with marked fine voxels that may be occupied: indices int64[n, 3], and the highest
     probability of these in each, float32[n], the highest first."""
@@ -26,7 +27,7 @@ def highest_in_cells(probability, marked):
     return cells[order], values[order]
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def count_free(field, shifts, cells, values):
     """The number of shifts of the field at which it is nowhere below the values of the cells.
 

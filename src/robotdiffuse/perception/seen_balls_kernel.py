@@ -1,8 +1,8 @@
 """Which small balls a depth image sees through, and which lie in given voxels, in compiled code."""
 
 import numpy as np
-from numba import njit
 
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.perception.free_space_kernel import MAX_DEPTH, usable_depth
 
 MAX_LOST_FRACTION = 0.2
@@ -10,7 +10,7 @@ MAX_LOST_FRACTION = 0.2
 _HALF, _ZERO = np.float32(0.5), np.float32(0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
     """Mark the balls that an image sees through: their projection lies within the image, and all returns of
     its pixels are behind the ball; a few pixels may have none.
@@ -42,7 +42,7 @@ def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
         seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), behind)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _all_behind(depth, v0, v1, u0, u1, least):
     """Whether all returns of a rectangle of pixels, whose bounds are inclusive, are deeper than `least`, and
     no more pixels than may are without one."""
@@ -57,7 +57,7 @@ def _all_behind(depth, v0, v1, u0, u1, least):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def within_voxels(balls, radius, marked, low, edge, within):
     """Mark the balls all of whose voxels are marked; arguments as above, marked bool[nx, ny, nz]."""
     nx, ny, nz = marked.shape

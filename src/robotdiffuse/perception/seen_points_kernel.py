@@ -1,9 +1,9 @@
 """Numba kernel of `seen_points`: reduces depth images and clouds to the mean points of grid cells."""
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.distance import scene_distance
+from robotdiffuse.core.kernels import kernel
 
 SAME_SURFACE_PIXELS, SAME_SURFACE_FRACTION = np.float32(4.0), np.float32(0.01)
 """Neighbouring pixels are on the same surface if their depths differ by less than this many widths of a pixel
@@ -13,7 +13,7 @@ MAX_DEPTH = np.float32(1e6)
 _ZERO = np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(nogil=True, inline="always")
 def _slot(keys, key):
     """Index of a key in an open-addressing hash table, or of the slot for it."""
     mask = len(keys) - 1
@@ -24,7 +24,7 @@ def _slot(keys, key):
     return at
 
 
-@njit(cache=True, nogil=True, fastmath=True, inline="never")
+@kernel(nogil=True, fastmath=True, inline="never")
 def _within(x, y, z, xs, ys, zs, radii):
     """Whether a point is inside one of the spheres."""
     inside = np.int32(0)
@@ -34,7 +34,7 @@ def _within(x, y, z, xs, ys, zs, radii):
     return inside != 0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(nogil=True, inline="always")
 def _key(x, y, z, voxel):
     """The key of a point's cell."""
     span = np.int64(1) << 20
@@ -42,7 +42,7 @@ def _key(x, y, z, voxel):
     return ((i + span) << 42) | ((j + span) << 21) | (k + span)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(nogil=True, inline="always")
 def _row(keys, cells, count, key):
     """The row of a cell in the sums, and the number of rows; a new cell gets a new row."""
     at = _slot(keys, key)
@@ -52,7 +52,7 @@ def _row(keys, cells, count, key):
     return cells[at], count
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(nogil=True, inline="always")
 def _add(sums, row, x, y, z):
     sums[row, 0] += x
     sums[row, 1] += y
@@ -60,7 +60,7 @@ def _add(sums, row, x, y, z):
     sums[row, 3] += np.float32(1.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def gather_cloud(points, reach, spheres, voxel, keys, cells, sums, count):
     """Adds a point cloud to the cells; arguments and result as in `gather_image`."""
     box, columns = _box(spheres), _columns(spheres)
@@ -81,7 +81,7 @@ def gather_cloud(points, reach, spheres, voxel, keys, cells, sums, count):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums, count):
     """Adds a depth image to cells `voxel` wide. Returns the number of cells; -1 if `sums` is too small.
 
@@ -118,7 +118,7 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
     """Computes the points of a row of pixels, their cells, and which of them to keep.
 
@@ -145,7 +145,7 @@ def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
         kept[u] = (alike > 2) & (d > _ZERO) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= most)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def supported(keys, cells, sums, count, least):
     """Which cells hold at least `least` points, or are next to one that does."""
     out = np.empty(count, np.bool_)
@@ -163,7 +163,7 @@ def supported(keys, cells, sums, count, least):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _box(spheres):
     """Lower and upper corner of a box around spheres, in one array."""
     box = np.zeros(6, np.float32)
@@ -175,18 +175,18 @@ def _box(spheres):
     return box
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _columns(spheres):
     """The columns of spheres [n, 4], each contiguous in memory."""
     return spheres[:, 0].copy(), spheres[:, 1].copy(), spheres[:, 2].copy(), spheres[:, 3].copy()
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(nogil=True, inline="always")
 def _in_box(box, x, y, z):
     return box[0] < x < box[3] and box[1] < y < box[4] and box[2] < z < box[5]
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def sphere_distances(points, spheres):
     """Signed distance of each point [n, 3] to the nearest sphere [m, 4]; infinite without spheres."""
     out = np.empty(len(points), np.float32)
@@ -197,7 +197,7 @@ def sphere_distances(points, spheres):
     return out
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nnan", "nsz"})
+@kernel(nogil=True, fastmath={"contract", "reassoc", "nnan", "nsz"})
 def _nearest(at, x, y, z, radii):
     least = np.float32(np.inf)
     for s in range(len(x)):
@@ -206,7 +206,7 @@ def _nearest(at, x, y, z, radii):
     return least
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def near_scene(scene, points, limit):
     """Whether each point [n, 3] is inside an obstacle of SceneArrays, or nearer to one than `limit` [m]."""
     out = np.empty(len(points), np.bool_)

@@ -1,9 +1,9 @@
 """The voxels that an arm sweeps, in compiled code."""
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.distance import frames_of, placed
+from robotdiffuse.core.kernels import kernel
 
 JOINT_STEP = np.float32(0.05)
 """Largest motion of a joint between two samples [rad], [m] for prismatic joints."""
@@ -11,7 +11,7 @@ MIN_MOVE = np.float32(0.1)
 """A sphere is marked again once it has moved by more than this, as a fraction of a voxel's edge."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def sweep(robot, path, margin, low, voxel, swept):
     """Mark the voxels with centres that the moving covering spheres, inflated by `margin` [m], pass over;
     `swept` is bool[nx, ny, nz].
@@ -41,14 +41,14 @@ def sweep(robot, path, margin, low, voxel, swept):
                     _mark(x, y, z, sphere[3] + margin, low, voxel, swept)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def mark(spheres, low, voxel, marked):
     """Mark the voxels with centres in one of the spheres [n, 4]."""
     for s in range(len(spheres)):
         _mark(spheres[s, 0], spheres[s, 1], spheres[s, 2], spheres[s, 3], low, voxel, marked)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def surface(marked):
     """Indices int64[n, 3] of the marked voxels that share a face with one that is not, in order."""
     nx, ny, nz = marked.shape
@@ -67,7 +67,7 @@ def surface(marked):
     return out[:count]
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _mark(x, y, z, radius, low, voxel, marked):
     nx, ny, nz = marked.shape
     half, one = np.float32(0.5), np.float32(1.0)
@@ -86,7 +86,7 @@ def _mark(x, y, z, radius, low, voxel, marked):
                 marked[i, j, k] = True
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(nogil=True, fastmath=True)
 def summed(weights, marked):
     """The sum of the weights of the marked voxels; both [nx, ny, nz]."""
     total, weight, mark = 0.0, weights.ravel(), marked.ravel()
@@ -95,7 +95,7 @@ def summed(weights, marked):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def heaviest_part(marked, weights):
     """Bounding box int64[2, 3] of the connected part of the marked voxels with the largest sum of weights:
     first voxel and one beyond the last. Voxels that share a face are connected."""
@@ -118,7 +118,7 @@ def heaviest_part(marked, weights):
     return best
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(nogil=True, inline="always")
 def _push(i, j, k, left, todo, count):
     """Move a voxel from `left` to the list `todo`; returns the length of the list."""
     nx, ny, nz = left.shape

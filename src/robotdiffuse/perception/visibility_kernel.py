@@ -1,9 +1,9 @@
 """Which voxels a camera would see past an arm and through voxels that may be occupied, in compiled code."""
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.distance import frames_of, placed
+from robotdiffuse.core.kernels import kernel
 
 OCCLUSION_START = np.float32(2.0)
 """Voxels nearer to a voxel than this do not hide it, in edges: its neighbours are as unknown as it is."""
@@ -13,7 +13,7 @@ CELL = 16
 """The arm hides cells of so many pixels by as many."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, weights, filled, low, edge):
     """For each camera the sum of the weights of the voxels, each times the probability that the camera sees
     it.
@@ -61,7 +61,7 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _arm_ahead(robot, q, T, intrinsics, margin, depth):
     """Set `depth` of each cell of an image to that of the arm's nearest covering sphere, inflated by
     `margin`, on the ray through the cell's middle [m]; infinite without one. Spheres around the camera are

@@ -1,14 +1,14 @@
 """Numba kernel of `ray_caster.voxels_within`: finds the voxels of a grid that lie in shapes."""
 
 import numpy as np
-from numba import njit
 
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.perception.ray_kernel import BOX, CYLINDER, SPHERE
 
 _ZERO, _HALF = np.float32(0.0), np.float32(0.5)
 
 
-@njit(cache=True)
+@kernel()
 def _squared_distance(kind, x, y, z, a, b, c):
     """Squared distance of a point to a shape at the origin; 0 inside it."""
     if kind == SPHERE:
@@ -25,7 +25,7 @@ def _squared_distance(kind, x, y, z, a, b, c):
     return out * out
 
 
-@njit(cache=True)
+@kernel()
 def fill_voxels(kinds, rows, low, voxel, margin, out):
     """Sets the voxels of out [nx ny nz] whose centre is in a shape, or at most `margin` [m] from it.
 

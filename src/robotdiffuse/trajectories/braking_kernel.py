@@ -6,8 +6,8 @@ in it.
 """
 
 import numpy as np
-from numba import njit
 
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.trajectories.timing_kernel import NEGLIGIBLE_DERIVATIVE
 
 MIN_INTERVAL = 1e-10
@@ -16,7 +16,7 @@ STILL_SPEED_SQUARED = 1e-12
 """A squared speed below this counts as rest."""
 
 
-@njit(cache=True)
+@kernel()
 def _acceleration_bounds(one, two, grid, i, s, x, most, acceleration):
     """Bounds of s̈ in interval i from s on, where ṡ² is x, such that ṡ² is at most `most` at the interval's
     end."""
@@ -31,7 +31,7 @@ def _acceleration_bounds(one, two, grid, i, s, x, most, acceleration):
     return low, max(high, low)
 
 
-@njit(cache=True)
+@kernel()
 def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
     """Values of s and speeds [n each] of a motion as fast as possible for some time [s], then braking to
     rest.
@@ -67,7 +67,7 @@ def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
     return out[0, : count + 1].copy(), out[1, : count + 1].copy()
 
 
-@njit(cache=True)
+@kernel()
 def state_after(ahead, speeds, time):
     """s and speed some time [s] after the beginning; at rest at the end once the motion is over."""
     left = time

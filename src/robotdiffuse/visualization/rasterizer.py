@@ -2,10 +2,11 @@
 machine."""
 
 import numpy as np
-from numba import njit
+
+from robotdiffuse.core.kernels import kernel
 
 
-@njit(cache=True)
+@kernel()
 def draw(near, ident, screen, faces):
     """Draw triangles into a z-buffer.
 
@@ -42,7 +43,7 @@ def draw(near, ident, screen, faces):
                         ident[row, column] = f
 
 
-@njit(cache=True)
+@kernel()
 def _corner_weights(screen, a, b, c, px, py):
     """Perspective-correct weights of the three corners at a pixel (nearness is 1/z)."""
     x0, y0, x1, y1, x2, y2 = (
@@ -56,7 +57,7 @@ def _corner_weights(screen, a, b, c, px, py):
     return u / total, v / total, t / total
 
 
-@njit(cache=True)
+@kernel()
 def _lit(maps, directions, scale, center, size, bias, x, y, z, nx, ny, nz, offset, stride):
     """Cosine-weighted fraction of directional lights that reach a point; uses every stride-th light.
 
@@ -82,7 +83,7 @@ def _lit(maps, directions, scale, center, size, bias, x, y, z, nx, ny, nz, offse
     return got / total
 
 
-@njit(cache=True)
+@kernel()
 def _grid(x, y, spacing, width, footprint):
     """Coverage of a pixel by the lines of a grid on the ground, softened by the pixel's footprint."""
     best = 0.0
@@ -93,7 +94,7 @@ def _grid(x, y, spacing, width, footprint):
     return best
 
 
-@njit(cache=True)
+@kernel()
 def _surface(row, column, near, ident, screen, faces, normals, camera, height):
     """The surface at a pixel: depth (0 for none), ray, normal towards the eye, corner weights, whether
     solid."""
@@ -118,7 +119,7 @@ def _surface(row, column, near, ident, screen, faces, normals, camera, height):
     return 1 / near[row, column], rx, ry, rz, nx / length, ny / length, nz / length, u, v, t, True
 
 
-@njit(cache=True)
+@kernel()
 def light_lattice(spacing, near, ident, screen, faces, normals, camera, height, sky, key):
     """Light at every `spacing`-th pixel, [rows, columns, 7]: depth, normal, sky, key, whether solid."""
     rows, columns = near.shape[0] // spacing, near.shape[1] // spacing
@@ -139,7 +140,7 @@ def light_lattice(spacing, near, ident, screen, faces, normals, camera, height, 
     return lattice
 
 
-@njit(cache=True)
+@kernel()
 def _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid):
     """Light interpolated from the surrounding lattice points that show the same smooth surface."""
     y, x = row / spacing, column / spacing
@@ -160,7 +161,7 @@ def _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid):
     return sky, key, total
 
 
-@njit(cache=True)
+@kernel()
 def shade(
     image,
     lattice,
@@ -233,7 +234,7 @@ def shade(
                 image[row, column, c] += mix * (own * lit + gloss - image[row, column, c])
 
 
-@njit(cache=True)
+@kernel()
 def blend_ghost(image, solid, near, ident, screen, faces, normals, colors, camera, toward, tint, alpha):
     """Blend one see-through arm over the image: its nearest surface, more opaque where it is seen edge-on."""
     h, w = near.shape

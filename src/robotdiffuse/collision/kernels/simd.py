@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit
 from numba.core import cgutils, types
 from numba.core.datamodel.models import PrimitiveModel
 from numba.core.datamodel.registry import register_default
@@ -20,6 +19,8 @@ from numba.core.imputils import lower_builtin, lower_cast
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic
 from numpy import ndarray
+
+from robotdiffuse.core.kernels import kernel
 
 W = 16
 """Number of lanes: of configurations per block, or of spheres or obstacles per row."""
@@ -243,7 +244,7 @@ def first_lane(_context: Any, mask: Any) -> Any:
     return (types.int64(mask), codegen) if mask == types.int64 else None
 
 
-@njit(cache=True)
+@kernel()
 def lanes_array(rows, parts):
     """Zeros [rows, parts * 16], aligned to cache lines, so that no load or store of lanes touches two of
     them."""

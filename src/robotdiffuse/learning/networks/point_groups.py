@@ -5,10 +5,11 @@ which are computed once.
 """
 
 import numpy as np
-from numba import njit
+
+from robotdiffuse.core.kernels import kernel
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(nogil=True, fastmath=True)
 def group_points(points, count, neighbours, radius):
     """Indices into points [n, m, 3] of centres [n, count], and of the points around each [n, count,
     neighbours].

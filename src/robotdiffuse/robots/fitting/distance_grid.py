@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 from numpy import ndarray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_hulls import planes_of
 
@@ -66,7 +66,7 @@ class DistanceGrid:
         return _farthest_inside(self.distance, self.origin, self.pitch, low, high, *planes_of(hull))
 
 
-@njit(cache=True)
+@kernel()
 def _mark(occupied, triangles, origin, pitch):
     """Mark the voxels that contain corners of triangles."""
     for t in range(len(triangles)):
@@ -76,7 +76,7 @@ def _mark(occupied, triangles, origin, pitch):
             occupied[i, j, int((triangles[t, k, 2] - origin[2]) / pitch)] = True
 
 
-@njit(cache=True)
+@kernel()
 def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
     """Largest value of `distance` among voxels whose centres are within the planes."""
     best = 0.0
@@ -104,7 +104,7 @@ def split(triangles: Float[ndarray, "n 3 3"], size: "float | Float[ndarray, 'n']
     return _split(np.ascontiguousarray(triangles, np.float64), sizes**2)
 
 
-@njit(cache=True)
+@kernel()
 def _split(triangles, squares):
     out, count = np.empty((4 * len(triangles) + 64, 3, 3)), 0
     open_ones = np.empty((MAX_SPLITS + 2, 3, 3))

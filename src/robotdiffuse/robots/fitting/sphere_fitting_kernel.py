@@ -7,7 +7,8 @@ centre. Without jaxtyping annotations, since Numba compiles these functions. Len
 import math
 
 import numpy as np
-from numba import njit
+
+from robotdiffuse.core.kernels import kernel
 
 INITIAL_STEP, MIN_INITIAL_STEP, STEP_SHRINKAGE = 0.004, 0.0005, 0.8
 """Initial step of the search for a centre [m]: in the first round, its lower bound, and its factor per
@@ -25,7 +26,7 @@ DIRECTIONS = np.array(
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
-@njit(cache=True)
+@kernel()
 def plane_depths(points, normals, offsets, starts):
     """Distance [n] from each point to the nearest face plane of the part in which it is deepest; negative
     outside.
@@ -47,7 +48,7 @@ def plane_depths(points, normals, offsets, starts):
     return depths
 
 
-@njit(cache=True)
+@kernel()
 def within(points, normals, offsets, starts, depth):
     """Whether each point is deeper than `depth` in a part."""
     found = np.zeros(len(points), np.bool_)
@@ -64,7 +65,7 @@ def within(points, normals, offsets, starts, depth):
     return found
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 def max_radius_at(x, y, z, grid, origin, spacing):
     """Grid value interpolated at a point; outside the grid, negative and decreasing with the distance."""
     u, v, w = (x - origin[0]) / spacing, (y - origin[1]) / spacing, (z - origin[2]) / spacing
@@ -82,7 +83,7 @@ def max_radius_at(x, y, z, grid, origin, spacing):
     return low * (1 - u) + high * u
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 def max_radii_at(centers, grid, origin, spacing):
     """Grid values [n] interpolated at centres [n, 3]."""
     radii = np.empty(len(centers))
@@ -91,14 +92,14 @@ def max_radii_at(centers, grid, origin, spacing):
     return radii
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 def squared_distance(a, i, b, j):
     """Squared distance between row i of a and row j of b."""
     x, y, z = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
     return x * x + y * y + z * z
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 def assign(points, corners, centers, depths, owner, least, heir, second):
     """Write for each cell the sphere that covers it with the least excess, that excess, and the second best.
 
@@ -122,7 +123,7 @@ def assign(points, corners, centers, depths, owner, least, heir, second):
         owner[c], least[c], heir[c], second[c] = mine, best, next_best, runner
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 def greedy_cover(points, corners, places, depths):
     """Indices of places at which spheres cover all cells, by a greedy choice.
 
@@ -157,7 +158,7 @@ def greedy_cover(points, corners, places, depths):
     return np.array(chosen)
 
 
-@njit(cache=True)
+@kernel()
 def enclosing(spheres):
     """Centre and radius of a ball that contains spheres."""
     center = np.array([0.5 * (spheres[:, k].min() + spheres[:, k].max()) for k in range(3)])
@@ -168,7 +169,7 @@ def enclosing(spheres):
     return center, radius
 
 
-@njit(cache=True)
+@kernel()
 def relative(A, B, T):
     """Write the pose [3, 4] of frame B in frame A into T; A and B are poses [4, 4]."""
     for i in range(3):
@@ -179,7 +180,7 @@ def relative(A, B, T):
             T[i, 3] += A[k, i] * (B[k, 3] - A[k, 3])
 
 
-@njit(cache=True)
+@kernel()
 def ball_distances(T_base_a, T_base_b, first, second):
     """Signed distances [a, b] between the balls of two sets, each set at its pose [4, 4] [m]."""
     T, found = np.empty((3, 4)), np.empty((len(first), len(second)))
@@ -195,7 +196,7 @@ def ball_distances(T_base_a, T_base_b, first, second):
     return found
 
 
-@njit(cache=True)
+@kernel()
 def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
     """Deepest overlap of two sets of spheres at each of n poses [m], negative if none overlap, and its
     middle.
@@ -240,7 +241,7 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
     return depth, middle
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 def gaps(points, spheres):
     """Signed distance of points from a union of spheres [m]; inside, only a bound."""
     out = np.empty(len(points))
@@ -255,7 +256,7 @@ def gaps(points, spheres):
     return out
 
 
-@njit(cache=True)
+@kernel()
 def held_by_one(triangles, spheres):
     """Whether a single sphere contains each triangle [t]; and whether each corner [3 t] is outside all
     spheres."""
@@ -277,7 +278,7 @@ def held_by_one(triangles, spheres):
     return held, bare
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 def excess_radius(x, y, z, own, count, grid, origin, spacing):
     """Excess radius of a sphere at a centre that contains the first `count` points of `own`."""
     far = 0.0
@@ -287,7 +288,7 @@ def excess_radius(x, y, z, own, count, grid, origin, spacing):
     return math.sqrt(far) - max_radius_at(x, y, z, grid, origin, spacing)
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 def move_center(center, own, count, step, grid, origin, spacing, directions):
     """Pattern search for the centre of least excess radius, in place."""
     least = excess_radius(center[0], center[1], center[2], own, count, grid, origin, spacing)
@@ -307,7 +308,7 @@ def move_center(center, own, count, step, grid, origin, spacing, directions):
             center += step * directions[way]
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing, directions):
     """Alternate between assigning cells to spheres and moving the spheres.
 

@@ -12,11 +12,10 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from robotdiffuse.collision.kernels.lane_collision import W, block_hits
 from robotdiffuse.collision.kernels.motions import Space, motion_free
-from robotdiffuse.core.kernels import allocation_free
+from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.planning.baselines.lattice.table import (
     BLOCKED,
     EXPANSIONS,
@@ -250,7 +249,7 @@ def _choose_parent(s, node):
                 table.rhs[node], table.parent[node] = cost, v
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def search(s, expansions):
     """ComputeShortestPath of D* Lite, for up to `expansions` expansions; returns an Outcome. Edges that
     cannot lower a node's cost are not checked."""
@@ -292,7 +291,7 @@ def search(s, expansions):
     return Outcome.GOING
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def update(s, distances, reaches):
     """Check again what changed shapes may affect, and update the nodes around it.
 

@@ -4,9 +4,8 @@ with the place of each node in it."""
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from robotdiffuse.core.kernels import allocation_free
+from robotdiffuse.core.kernels import allocation_free, kernel
 
 INFINITE = 1 << 60
 """Cost of nodes that are not reached."""
@@ -87,7 +86,7 @@ def find(table, key, add):
     return np.int64(table.slots[i]) - 1
 
 
-@njit(cache=True)
+@kernel()
 def add_nodes(table, keys):
     """The nodes of keys, added where they are new; -1 where memory is full."""
     return np.array([find(table, key, True) for key in keys])
