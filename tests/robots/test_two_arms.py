@@ -155,6 +155,7 @@ def test_a_pose_of_one_hand_leaves_the_other_arm_where_it_starts() -> None:
     np.testing.assert_array_equal(result.path.positions[-1][4:], start[4:])
 
 
+@pytest.mark.slow
 def test_certificates_prove_motions_of_both_arms() -> None:
     robot = two_arms()
     start, goal = _crossing(robot)

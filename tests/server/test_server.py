@@ -273,6 +273,7 @@ def test_a_worker_that_holds_too_much_memory_is_replaced_between_requests() -> N
         assert gauge(client, "workers_renewed_total") == 2 and gauge(client, "workers_lost_total") == 0
 
 
+@pytest.mark.slow
 def test_it_stops_gracefully_and_leaves_no_worker() -> None:
     with serving("--workers", "1") as (client, process), ThreadPoolExecutor(2) as threads:
         workers = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout

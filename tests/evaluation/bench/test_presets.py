@@ -28,6 +28,7 @@ def test_a_smaller_count_and_further_problems(tmp_path: Path) -> None:
     assert problems == ("rop_nontrivial", "rop_dense_nontrivial", "shelf")
 
 
+@pytest.mark.slow
 def test_the_command_runs_every_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stages = Stage(("rrt_connect",), 0.5, 2), Stage(("aorrtc",), 0.2, 5)
     monkeypatch.setitem(presets.PRESETS, "small", Preset("for tests", ("rop",), stages))

@@ -86,6 +86,7 @@ def test_a_pair_that_is_always_close_refuses_little() -> None:
     assert refused < 0.08 and wrong == 0
 
 
+@pytest.mark.slow
 def test_tables_are_kept_in_the_robots_folder(tmp_path: Path) -> None:
     robot = made().robot
     write_robot_folder(robot, tmp_path, {})
