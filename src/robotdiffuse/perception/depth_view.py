@@ -18,6 +18,8 @@ from robotdiffuse.scenes.shapes import PointCloud
 
 MIN_FOCAL_LENGTH = 1e-3
 """Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""
+MIN_RETURNS = 1e-3
+"""Share of the pixels with a return below which an image measures nothing."""
 INTRINSICS = ("fx", "fy", "cx", "cy")
 MAX_CLOUD_WIDTH, MAX_CLOUD_HEIGHT = 320, 240
 """Maximum size of the image that is made of a point cloud; sparse clouds get coarser images [pixels]."""
@@ -82,6 +84,12 @@ class DepthView(Value):
             cloud: Float[ndarray, "n 3"] | None = None,
             source: dict[str, str | float] | None = None,
         ) -> None: ...
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether hardly a pixel has a return: the camera is covered, broken, or faces nothing."""
+        returns = np.isfinite(self.depth) & (self.depth > 0)
+        return bool(returns.mean() < MIN_RETURNS)
 
     def points(self) -> Float[ndarray, "n 3"]:
         """The points in the base frame [m]: those of the cloud, or one for each pixel with a return, row by

@@ -103,6 +103,11 @@ class OccupancyMap:
         self._known = None
 
     @property
+    def is_blind(self) -> bool:
+        """Whether no view has told anything about a voxel."""
+        return not self._evidence.any()
+
+    @property
     def occupied(self) -> Bool[ndarray, "nx ny nz"]:
         return self._of_evidence[0]
 

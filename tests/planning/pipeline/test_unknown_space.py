@@ -174,6 +174,22 @@ def test_later_assumptions_have_fewer_voxels() -> None:
     assert all((b <= a).all() and b.sum() < a.sum() for a, b in pairwise(occupied))
 
 
+@pytest.mark.parametrize("depth", [0.0, np.nan, np.inf, -1.0])
+@pytest.mark.parametrize("unknown", ["optimistic", "padded", "predicted"])
+def test_images_without_returns_give_no_confidence(planner: Planner, unknown: str, depth: float) -> None:
+    """A covered lens got a confidence of 0.995, and no note."""
+    covered = replace(taken(DEEP), depth=np.full((60, 80), depth))
+    result = plan_with_unknown_space(planner, partial(unknown, covered), REQUEST)
+    assert result.solved and result.confidence is None
+    assert any("nothing was measured" in note for note in result.notes)
+
+
+def test_one_camera_that_sees_is_enough_for_a_confidence(planner: Planner) -> None:
+    covered = replace(taken(DEEP), depth=np.zeros((60, 80)))
+    result = plan_with_unknown_space(planner, partial("padded", covered, taken(DEEP)), REQUEST)
+    assert result.confidence is not None
+
+
 def test_result_files_keep_the_assumption_and_its_confidence(planner: Planner, tmp_path: Path) -> None:
     result = plan_with_unknown_space(planner, partial("predicted"), REQUEST, true_voxels())
     result.save(tmp_path / "result.json")

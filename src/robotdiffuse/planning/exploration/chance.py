@@ -45,13 +45,14 @@ def with_confidence(
     predicted: Float32[ndarray, "nx ny nz"] | None,
     to_goal: bool = True,
 ) -> PlanResult:
-    """The motion with the confidence that follows from the probability that it sweeps. The arm is taken to be
+    """The motion with the confidence that follows from the probability that it sweeps; None if the map holds
+    no measurement. The arm is taken to be
     free where a motion begins, and at the goal, but not where a look ends."""
     if motion.path is None or predicted is None:
         return motion
     ends = motion.path.positions[[0, -1] if to_goal else [0]]
     swept = _unknown(known, problem, ends, predicted).crossed(motion.path).risk
-    stated = None if swept is None else explored_confidence(swept)
+    stated = None if swept is None or known.is_blind else explored_confidence(swept)
     return replace(motion, swept_probability=swept, confidence=stated)
 
 

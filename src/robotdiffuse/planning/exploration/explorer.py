@@ -238,7 +238,11 @@ class Explorer:
         goal that does not keep to the policy."""
         why = self._goal_seen.missing(motion) or motion.reason
         if motion.solved and policy == CHANCE:
-            why = f"the motion's confidence is {motion.confidence:.2f}, below {self.settings.confidence:g}"
+            why = "the motion has no confidence, since nothing was measured"
+            if motion.confidence is not None:
+                why = (
+                    f"the motion's confidence is {motion.confidence:.2f}, below {self.settings.confidence:g}"
+                )
         if not self.cameras:
             return Step(STUCK, f"{why}; no camera is on the arm to look with", policy)
         if self._looks >= self.settings.max_looks:

@@ -61,6 +61,7 @@ MIN_TIME_FRACTION = 0.1
 PICTURE_THRESHOLD = 0.2
 """Pictures show voxels with a probability above this."""
 FREE_UNKNOWN_SPACE = "unknown space taken as free"
+BLIND = "views: hardly a pixel has a return, so nothing was measured and no confidence is stated"
 AS_SEEN = "as seen"
 """Name of the assumption without additional obstacles."""
 
@@ -97,6 +98,8 @@ def plan_with_unknown_space(
         predicted = predict(volume) if predict is not None else predicted
         unknown = unknown_space_of(problem, volume, predicted)
     prepared = context.elapsed
+    if problem.views and all(view.is_blind for view in problem.views):
+        context.notes.append(BLIND)
     attempts = _Attempts(solver, context, unknown)
     as_seen, limit = replace(problem, views=()), request.time_limit
     failed = list[str]()
@@ -153,6 +156,8 @@ def _lesser(failed: list[str], used: str) -> str:
 
 def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> PlanResult:
     """The result with the notes of the call, which an attempt does not have, and with more."""
+    if BLIND in context.notes:
+        result = replace(result, confidence=None)
     every = (*context.notes, *result.notes, *(note for note in notes if note))
     return replace(result, notes=tuple(dict.fromkeys(every)))
 
