@@ -13,7 +13,8 @@ from numpy import ndarray
 from trimesh.triangles import closest_point
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.input_files import read_triangles, read_yaml
+from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
 from robotdiffuse.scenes.height_map import HeightMap

@@ -9,7 +9,8 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.input_files import read_arrays, read_triangles
+from robotdiffuse.core.input_files import read_arrays
+from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
 from robotdiffuse.scenes.height_map import HeightMap
 from robotdiffuse.scenes.mesh import Mesh

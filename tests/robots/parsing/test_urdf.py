@@ -245,7 +245,7 @@ def test_limits_file(tmp_path: Path) -> None:
         "  turn: {has_velocity_limits: true, max_velocity: 2, has_jerk_limits: false, max_jerk: 1}\n"
         "  bend: {max_acceleration: 3.5, min_position: -1}\n"
     )
-    robot = with_limits(read_urdf(urdf(tmp_path)), read_limits(file))
+    robot = with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0])
     np.testing.assert_allclose(robot.velocity, [2, 1])
     np.testing.assert_allclose(robot.acceleration, [8, 3.5])
     np.testing.assert_allclose(robot.jerk, [80, 35])
@@ -264,7 +264,7 @@ def test_limits_file(tmp_path: Path) -> None:
     ):
         file.write_text(text)
         with pytest.raises(InputError) as error:
-            with_limits(read_urdf(urdf(tmp_path)), read_limits(file))
+            with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0])
         assert message in str(error.value)
 
 
