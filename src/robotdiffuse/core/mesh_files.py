@@ -90,7 +90,7 @@ def read_triangles(
         with np.errstate(all="ignore"):
             mesh = trimesh.load_mesh(io.BytesIO(content), ending[1:], process=merge, **options)
     except InputError as error:
-        raise InputError(f"mesh file {file}: {error}") from None
+        raise InputError(f"mesh file {file} cannot be read: {error}") from None
     except Exception as error:  # trimesh raises many kinds of errors for a damaged file
         raise InputError(f"mesh file {file} cannot be read: {shortened(str(error))}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:

@@ -10,10 +10,9 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 
-
 EXTERNAL_DATA = b"\x0a\x08location"
-"""How ONNX writes that a tensor is in another file: the key of an entry of `external_data`. ONNX Runtime would
-look for the file in the current folder."""
+"""How ONNX writes that a tensor is in another file: the key of an entry of `external_data`.
+ONNX Runtime would look for the file in the current folder."""
 
 
 class OnnxNetwork:

@@ -115,7 +115,7 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
 def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, ...]:
     """The arrays of FILE_CONTENT in a file."""
     if kind is Mesh:
-        return read_triangles(file)
+        return read_triangles(file, notes=notes)
     if kind is HeightMap:
         if Path(file).suffix.lower() not in (".npy", ".npz"):
             raise unknown_name(f"height map format of {file}:", Path(file).suffix, (".npy", ".npz"))
