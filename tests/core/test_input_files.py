@@ -29,8 +29,8 @@ from robotdiffuse.core.input_files import (
     parse_yaml,
     read_arrays,
     read_text,
-    read_triangles,
 )
+from robotdiffuse.core.mesh_files import read_triangles
 
 SOURCE = Path(__file__).parents[2] / "src" / "robotdiffuse"
 DEEP = 100_000

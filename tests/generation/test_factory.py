@@ -283,9 +283,10 @@ def test_unusable_folders_are_refused(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "shard_00000.zarr", tmp_path / "shard_00000.zarr")
     with pytest.raises(InputError, match="holds shards but no manifest"):
         generate(SETTINGS, tmp_path)
-    (tmp_path / "manifest.json").write_text("{")
-    with pytest.raises(InputError, match=r"manifest\.json is damaged"):
-        generate(SETTINGS, tmp_path)
+    for damaged in ("{", "[" * 100_000):
+        (tmp_path / "manifest.json").write_text(damaged)
+        with pytest.raises(InputError, match=r"manifest\.json is damaged"):
+            generate(SETTINGS, tmp_path)
 
 
 def test_two_cannot_fill_one_folder(tmp_path: Path) -> None:

@@ -171,6 +171,31 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         "has no triangle mesh",
     ),
     "a damaged mesh": (solid(b"this is no mesh", "part.dae"), "cannot be read"),
+    "two links of one name": (arm(ARM, link("j4_link")), "two links have the name 'j4_link'"),
+    "two joints of one name": (
+        arm(ARM, link("end"), joint("j4", "j4_link", "end")),
+        "two joints have the name 'j4'",
+    ),
+    "two rotations": (
+        text(robot(ARM).replace('<origin xyz="0 0 0.1"/>', '<origin rpy="0 0 0" quat_xyzw="0 0 0 1"/>')),
+        "must have one of them",
+    ),
+    "a finger with exchanged limits": (
+        arm(ARM, chain("j4_link", ["finger"], limits='lower="0" upper="-0.03"')),
+        "lower limit 0.0 is above upper -0.03; exchange them",
+    ),
+    "joints without a range": (
+        arm(chain("base", ["j"], limits='lower="0" upper="0"')),
+        "limits of j leave no",
+    ),
+    "a floating body": (
+        arm(ARM, link("ball"), joint("free", "base", "ball", "floating")),
+        "remove it with what it carries",
+    ),
+    "a hand in millimetres": (
+        solid(trimesh.creation.box([50, 100, 300])),
+        'link end is 300 m long; .* scale="0.001 0.001 0.001"',
+    ),
     "a name that is a path": (arm(ARM, name="../made"), "give --name NAME"),
     "a shape nobody knows": (
         text(robot(ARM).replace("<sphere radius", "<torus radius")),

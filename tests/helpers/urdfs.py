@@ -16,4 +16,4 @@ def read_urdf(
     srdf: Srdf | None = None,
     packages: dict[str, str | Path] | None = None,
 ) -> Robot:
-    return UrdfTree(Path(path), packages or {}).robot(base, tip, locked, group, srdf)
+    return UrdfTree(Path(path), packages or {}, compile_xacro=True).robot(base, tip, locked, group, srdf)

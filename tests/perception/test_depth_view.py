@@ -1,5 +1,6 @@
 """Depth views: points of pixels by hand, clouds as images, what is refused; files of images and clouds."""
 
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -144,3 +145,19 @@ def test_intrinsics_as_a_mapping_or_a_matrix() -> None:
         DepthView(np.ones((2, 2)), {"fx": 1.0}, np.eye(4))
     with pytest.raises(InputError, match="without skew"):
         DepthView(np.ones((2, 2)), [[460.0, 1, 319.5], *matrix[1:]], np.eye(4))
+
+
+def test_small_images_cannot_fill_the_memory(tmp_path: Path) -> None:
+    """A PNG of 350 kB unpacked to gigabytes, and an EXR image took 48 s."""
+    huge = np.zeros((4097, 4096), np.uint16)
+    Image.fromarray(huge).save(tmp_path / "huge.png")
+    np.savez_compressed(tmp_path / "huge.npz", huge)
+    endings = ["png", "npz"]
+    if importlib.util.find_spec("OpenEXR"):
+        import OpenEXR
+
+        OpenEXR.File({}, {"Z": huge.astype(np.float16)}).write(str(tmp_path / "huge.exr"))
+        endings.append("exr")
+    for ending in endings:
+        with pytest.raises(InputError, match="16,781,312 pixels; it must have at most 16,777,216"):
+            read_depth(tmp_path / f"huge.{ending}")

@@ -9,7 +9,7 @@ import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import problem_from_record, problem_record
-from robotdiffuse.scenes.octomap import TREE_DEPTH, occupied_voxels, read_octomap
+from robotdiffuse.scenes.octomap import TREE_DEPTH, _shell, occupied_voxels, read_octomap
 
 HALF = 2 ** (TREE_DEPTH - 1)
 Key = tuple[int, int, int]
@@ -109,3 +109,22 @@ def test_wrong_height_maps() -> None:
     ):
         with pytest.raises(InputError, match=message):
             rd.HeightMap(heights, 0.1)
+
+
+@pytest.mark.parametrize("line", ["id ", "id", "res"])
+def test_a_header_with_a_word_alone_is_one_line(line: str, tmp_path: Path) -> None:
+    file = written(tmp_path / "map.bt", {(0, 0, 0)})
+    named = line.strip().encode()
+    file.write_bytes(
+        b"\n".join(line.encode() if row.startswith(named) else row for row in file.read_bytes().split(b"\n"))
+    )
+    with pytest.raises(InputError, match=r"octomap .*map\.bt (holds|is damaged)"):
+        read_octomap(file)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2, 3])
+def test_the_shell_of_a_large_leaf_has_each_voxel_once(level: int) -> None:
+    """74 bytes took 26 s, which went into looking for voxels that come twice."""
+    edge = 2**level
+    shell = {tuple(voxel) for voxel in _shell(level)}
+    assert len(shell) == len(_shell(level)) == edge**3 - max(edge - 2, 0) ** 3

@@ -161,3 +161,9 @@ def test_allowed_contacts_come_back_from_files(tmp_path: Path) -> None:
     (tmp_path / "grasp.yaml").write_text(text.replace("ball: all", "bell: all"))
     with pytest.raises(InputError, match=r"grasp.yaml: unknown obstacle in allowed_contacts: 'bell'"):
         load_problem(tmp_path / "grasp.yaml")
+
+
+def test_a_scene_of_nothing_iterable_is_one_line() -> None:
+    for wrong in (None, 5):
+        with pytest.raises(InputError, match=f"scene is {wrong}; it must be a list of shapes"):
+            Scene(wrong)  # type: ignore[arg-type]

@@ -13,7 +13,8 @@ from numpy import ndarray
 from trimesh.triangles import closest_point
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.input_files import read_triangles, read_yaml
+from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
 from robotdiffuse.scenes.height_map import HeightMap
@@ -341,7 +342,8 @@ def test_mesh_files(ending: str, tmp_path: Path) -> None:
     trimesh.creation.box([1, 2, 3]).export(tmp_path / f"box.{ending}")
     vertices, faces = read_triangles(tmp_path / f"box.{ending}")
     assert len(faces) == 12
-    assert np.abs(vertices).max(axis=0) == pytest.approx([0.5, 1, 1.5])
+    extents = [0.5, 1.5, 1] if ending == "glb" else [0.5, 1, 1.5]  # glTF has y up
+    assert np.abs(vertices).max(axis=0) == pytest.approx(extents)
 
 
 @pytest.mark.parametrize(

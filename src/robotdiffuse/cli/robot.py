@@ -47,7 +47,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         "URDF, find the pairs of links that need no collision check, and write a folder that problems can "
         "name.",
     )
-    make.add_argument("urdf", metavar="URDF", help="URDF or xacro file of an arm")
+    make.add_argument(
+        "urdf", metavar="URDF", help="URDF of an arm, or xacro file, which is compiled: this runs code in it"
+    )
     make.add_argument("--name", metavar="NAME", help="name that problems use (default: the URDF's)")
     make.add_argument("--out", metavar="FOLDER", help="folder to write (default: one in the user's robots)")
     make.add_argument(

@@ -1,4 +1,4 @@
-"""Readers of untrusted files: JSON, YAML, XML, NumPy arrays and meshes, with bounds on size and nesting.
+"""Readers of untrusted files: JSON, YAML, XML and NumPy arrays, with bounds on size and nesting.
 
 For any content and any file name these functions return a value or raise InputError, in time that grows with
 the size of the file: devices and pipes are not opened, nesting is measured before parsing, and the values
@@ -6,7 +6,6 @@ that YAML aliases stand for are counted.
 """
 
 import json
-import logging
 import os
 import re
 import stat
@@ -22,11 +21,10 @@ import numpy as np
 import yaml
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.errors import InputError, shortened, shown
 
 MEGABYTE = 2**20
 MAX_FILE_SIZE = 256 * MEGABYTE
-MESH_FORMATS = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 MAX_YAML_SIZE = 16 * MEGABYTE
 """Parsing this much YAML takes ten seconds; the same JSON takes less than one [bytes]."""
 MAX_DEPTH = 64
@@ -37,9 +35,6 @@ MAX_SHOWN_NAME = 300
 """Longest file name that a message shows in full [characters]."""
 MAX_DIGITS = 30
 """Most digits of an integer."""
-
-# trimesh logs a traceback of each error that it raises; without a handler that goes to standard error
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 _STRING = re.compile(r'"(?:[^"\\]|\\.)*"?')
 _closed: ContextVar[bool] = ContextVar("closed", default=False)
@@ -116,46 +111,6 @@ def read_text(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) ->
     except UnicodeDecodeError as error:
         why = f"byte {error.start} is not UTF-8 text"
         raise InputError(f"{what} {file} cannot be read: {why}".strip()) from None
-
-
-def read_triangles(file: str | Path, merge: bool = False) -> tuple[ndarray, ndarray]:
-    """Vertices [v, 3] and faces [f, 3] of a mesh file, in the units of the file.
-
-    `merge` joins vertices at the same place. Raises InputError as `input_file` does, for other formats, and
-    for empty or damaged files.
-    """
-    import trimesh
-
-    path = input_file(file, "mesh file")
-    if path.suffix.lower() not in MESH_FORMATS:
-        raise unknown_name(f"mesh format of {file}:", path.suffix, MESH_FORMATS)
-    if path.stat().st_size == 0:
-        raise InputError(f"mesh file {file} is empty")
-    try:
-        with np.errstate(all="ignore"):
-            mesh = trimesh.load_mesh(path, process=merge, resolver=_beside(path))
-    except InputError as error:
-        raise InputError(f"mesh file {file}: {error}") from None
-    except Exception as error:  # trimesh raises many kinds of errors for a damaged file
-        raise InputError(f"mesh file {file} cannot be read: {shortened(str(error))}") from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"mesh file {file} holds no triangles")
-    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-
-
-def _beside(mesh: Path) -> Any:
-    """Opens for trimesh what a mesh file names, such as buffers and materials: regular files alone."""
-    from trimesh.resolvers import FilePathResolver
-
-    class RegularFiles(FilePathResolver):
-        def get(self, name: str) -> Any:
-            for place in (name.strip(), name.strip().lstrip("/"), Path(name).name):  # which trimesh tries
-                file = Path(self.parent, place)
-                if os.path.lexists(file):
-                    input_file(file)
-            return super().get(name)
-
-    return RegularFiles(str(mesh))
 
 
 def read_arrays(file: str | Path) -> dict[str, ndarray]:

@@ -1,12 +1,13 @@
 """The manifest of a data set: robot, scenes, settings and versions, in `manifest.json` in its folder."""
 
 import json
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.input_files import file_name, input_file
+from robotdiffuse.core.input_files import file_name, read_json
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.settings import Count, Natural, Settings
 from robotdiffuse.robots.fingerprint import robot_fingerprint
@@ -94,17 +95,11 @@ def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
 def read_manifest(folder: str | FilePath) -> Manifest:
     """Read manifest.json. Raises InputError if it is missing, damaged or of another version of the format."""
     file = file_name(folder, "folder") / MANIFEST
-    if file.exists():
-        input_file(file)
+    if not os.path.lexists(file):
+        raise InputError(f"no data set: there is no {file}; make one with: robotdiffuse data generate")
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            f"no data set: there is no {file}; make one with: robotdiffuse data generate"
-        ) from None
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror}") from None
-    except ValueError as error:
+        data = read_json(file)
+    except InputError as error:
         raise InputError(f"{file} is damaged: {error}") from None
     if not isinstance(data, dict) or "format" not in data:
         raise InputError(f"{file} is no manifest of a data set: it has no format")

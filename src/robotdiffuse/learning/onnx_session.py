@@ -10,12 +10,20 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 
+EXTERNAL_DATA = b"\x0a\x08location"
+"""How ONNX writes that a tensor is in another file: the key of an entry of `external_data`.
+ONNX Runtime would look for the file in the current folder."""
+
 
 class OnnxNetwork:
     """An exported network with one output."""
 
     def __init__(self, data: bytes, name: str) -> None:
         """data: of an .onnx file. name: of the file. Raises InputError if ONNX Runtime cannot run it."""
+        if EXTERNAL_DATA in data:
+            raise InputError(
+                f"{name} keeps weights in another file, which is not read; export it in one file"
+            )
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3  # errors only

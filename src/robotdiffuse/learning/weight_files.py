@@ -5,7 +5,7 @@ training reads, and NAME.onnx and others with that ending, the exported parts th
 """
 
 import hashlib
-import json
+import os
 import struct
 from collections.abc import Iterable
 from pathlib import Path as FilePath
@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.input_files import read_bytes, read_json
 
 FORMAT = 2
 
@@ -24,10 +25,10 @@ def read_description(folder: FilePath, name: str) -> dict[str, Any]:
     """The contents of NAME.json. Raises InputError if it is missing or damaged."""
     file = folder / f"{name}.json"
     try:
-        about = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{folder} holds no trained model: {file.name} is missing") from None
-    except (OSError, ValueError, RecursionError) as error:
+        about = read_json(file)
+    except InputError as error:
+        if not os.path.lexists(file):
+            raise InputError(f"{folder} holds no trained model: {file.name} is missing") from None
         raise InputError(f"{file} is damaged: {error}") from None
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise InputError(f"{file} is not a model description of format {FORMAT}")
@@ -37,10 +38,7 @@ def read_description(folder: FilePath, name: str) -> dict[str, Any]:
 def checked_bytes(file: FilePath, digest: object, description: str) -> bytes:
     """The contents of a file. Raises InputError if it cannot be read or its SHA-256 is not that of the
     description."""
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror}") from None
+    data = read_bytes(file, "weight file")
     if hashlib.sha256(data).hexdigest() != digest:
         raise InputError(f"{file} is damaged or does not belong to {description}: its SHA-256 differs")
     return data

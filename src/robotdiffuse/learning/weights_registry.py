@@ -1,12 +1,11 @@
 """Finds trained weights for a robot without loading them or PyTorch."""
 
-import json
 import os
 from functools import lru_cache
 from pathlib import Path as FilePath
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.input_files import is_file
+from robotdiffuse.core.input_files import is_file, read_json
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.robots.robot import Robot
@@ -44,8 +43,8 @@ def weights_for(name: str, robot: Robot) -> FilePath | None:
 @lru_cache
 def _identity(file: FilePath, _changed: int) -> RobotIdentity:
     try:
-        about = json.loads(file.read_text(encoding="utf-8"))["robot"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        about = read_json(file)["robot"]
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file} is damaged: {type(error).__name__}: {error}") from None
     return RobotIdentity.from_json(about, f"{file}: robot")
 

@@ -4,6 +4,7 @@
 - {cloud: shelf.ply, camera: {...}, configuration: [...]}
 """
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
 
 DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
+MAX_PIXELS = 2**24
+"""Most pixels of a depth image, in all its channels: a small file can unpack to a huge image."""
 INTEGER_SCALE = 0.001
 """Metres per unit of integer depth images, unless a scale is given."""
 
@@ -40,6 +43,7 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
         raise
     except Exception as error:  # the libraries raise many kinds of errors for damaged files
         raise InputError(f"depth image {file} cannot be read: {shortened(str(error))}") from None
+    _check_size(file, image.size)
     if image.ndim != 2 or image.dtype.kind not in "uif":
         form = " x ".join(map(str, image.shape))
         raise InputError(
@@ -53,12 +57,18 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
 def _read_png(file: Path) -> ndarray:
     from PIL import Image
 
-    with Image.open(file) as image:
+    with warnings.catch_warnings(action="ignore"), Image.open(file) as image:  # warns of large images
         if image.mode not in ("I;16", "I;16B", "I"):
             raise InputError(
                 f"depth image {file} has the mode {image.mode}; it must be greyscale with 16 bits"
             )
+        _check_size(file, image.width * image.height)
         return np.asarray(image).astype(np.int64)
+
+
+def _check_size(file: Path, pixels: int) -> None:
+    if pixels > MAX_PIXELS:
+        raise InputError(f"depth image {file} has {pixels:,} pixels; it must have at most {MAX_PIXELS:,}")
 
 
 def _read_npz(file: Path) -> ndarray:
@@ -75,6 +85,8 @@ def _read_exr(file: Path) -> ndarray:
         raise InputError(
             f"depth image {file} needs the package OpenEXR: pip install 'robotdiffuse[exr]'"
         ) from None
+    parts = [part.header for part in OpenEXR.File(str(file), header_only=True).parts]
+    _check_size(file, sum(len(part["channels"]) * _area(*part["dataWindow"]) for part in parts))
     channels = OpenEXR.File(str(file)).channels()
     for name in ("Z", "Y", "depth", "R"):
         if name in channels:
@@ -82,6 +94,12 @@ def _read_exr(file: Path) -> ndarray:
     if len(channels) == 1:
         return np.asarray(next(iter(channels.values())).pixels)
     raise InputError(f"depth image {file} has the channels {', '.join(channels)}; one must be named Z")
+
+
+def _area(first: ndarray, last: ndarray) -> int:
+    """Pixels from the first to the last corner, both included."""
+    width, height = (last.astype(np.int64) - first + 1).tolist()
+    return width * height
 
 
 _READERS = {

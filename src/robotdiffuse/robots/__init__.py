@@ -1,5 +1,6 @@
 """Robots: joints, limits, kinematics and collision models, loaded by bundled name or from a URDF."""
 
+import json
 from dataclasses import replace
 from functools import lru_cache
 from os import PathLike
@@ -8,6 +9,7 @@ from pathlib import Path
 from robotdiffuse.core.errors import InputError, check_type, unknown_name
 from robotdiffuse.core.input_files import is_file
 from robotdiffuse.robots.bodies import ConvexMesh
+from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.joints import Joint
 from robotdiffuse.robots.kinematic_methods import fk, ik, jacobian
 from robotdiffuse.robots.robot import Robot
@@ -28,12 +30,12 @@ ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}"))
 def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robot:
     """Load a robot by its bundled name, a name given to `robotdiffuse robot add`, its folder, or its URDF.
 
-    A URDF is looked up by content among the added robots. A new or changed one is prepared first, which takes
-    about a minute, and stored. As long as its files are unchanged, the same robot is returned as the same
-    object.
+    A URDF is looked up by content among the added robots, and refused if several that differ were made from
+    it. A new or changed one is prepared first, which takes about a minute, and stored. As long as its files
+    are unchanged, the same robot is returned as the same object.
 
     Args:
-        name: Name, robot folder, or URDF or xacro file.
+        name: Name, robot folder, or URDF. Only `robot add` compiles xacro, since that runs code in it.
         locked: Values at which joints are locked [rad] or [m] (see `Robot.with_locked`).
 
     Raises:
@@ -118,10 +120,10 @@ def _from_urdf(urdf: Path) -> Robot:
                 made[name] = _read(folder, source)
         except InputError:
             continue  # the damaged folder of another robot must not matter here
-    if len({(robot.base, robot.joint_names) for robot in made.values()}) > 1:
+    if len({(robot_fingerprint(robot), json.dumps(robot.poses)) for robot in made.values()}) > 1:
         raise InputError(
-            f"{urdf} was added as {', '.join(made)}, which plan different joints; "
-            f"use one of these names instead"
+            f"{urdf} was added as {', '.join(made)}, which differ in joints, limits, spheres, allowed pairs "
+            f"or poses; use one of these names instead, or delete the others in {user_robots()}"
         )
     if made:
         return next(iter(made.values()))

@@ -9,7 +9,8 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.input_files import read_arrays, read_triangles
+from robotdiffuse.core.input_files import read_arrays
+from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
 from robotdiffuse.scenes.height_map import HeightMap
 from robotdiffuse.scenes.mesh import Mesh
@@ -114,7 +115,7 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
 def _content(kind: type[Shape], file: str, notes: list[str]) -> tuple[ndarray, ...]:
     """The arrays of FILE_CONTENT in a file."""
     if kind is Mesh:
-        return read_triangles(file)
+        return read_triangles(file, notes=notes)
     if kind is HeightMap:
         if Path(file).suffix.lower() not in (".npy", ".npz"):
             raise unknown_name(f"height map format of {file}:", Path(file).suffix, (".npy", ".npz"))

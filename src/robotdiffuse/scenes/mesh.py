@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import form, numbers, points, positive, read_only, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.input_files import read_triangles
+from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.shapes import IDENTITY, Shape, set_fields

@@ -34,7 +34,9 @@ def read_octomap(file: str | Path) -> tuple[Float[ndarray, "n 3"], float]:
     if not content.startswith(FIRST_LINE) or not found:
         raise InputError(f"octomap {file} is no binary OctoMap file (.bt), as octomap_saver writes it")
     fields = dict(
-        line.split(maxsplit=1) for line in header.decode("ascii", "replace").split("\n") if " " in line
+        line.split(maxsplit=1)
+        for line in header.decode("ascii", "replace").split("\n")
+        if len(line.split()) > 1
     )
     if fields.get("id") != "OcTree":
         raise InputError(f"octomap {file} holds {shown(fields.get('id'))}; it must be an OcTree")
@@ -91,10 +93,7 @@ def _shell(level: int) -> Float[ndarray, "n 3"]:
     n = 2**level
     if 6 * n**2 > MAX_VOXELS:
         raise InputError(f"the tree has more than {MAX_VOXELS:,} occupied voxels")
-    if n <= 2:
-        at = np.arange(n) - (n - 1) / 2
-        return np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
     at = np.arange(n) - (n - 1) / 2
-    grid = np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1).reshape(-1, 2)
-    faces = [np.insert(grid, axis, end, axis=1) for axis in range(3) for end in (at[0], at[-1])]
-    return np.unique(np.concatenate(faces), axis=0)
+    ends, inner = np.unique(at[[0, -1]]), at[1:-1]
+    blocks = [(ends, at, at), (inner, ends, at), (inner, inner, ends)]
+    return np.concatenate([np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3) for axes in blocks])

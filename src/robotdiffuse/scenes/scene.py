@@ -46,6 +46,8 @@ class Scene(Value):
     ) -> None:
         named: list[Shape] = []
         taken, last, given = set[str](), dict[str, int](), dict[str, list[str]]()
+        if not isinstance(shapes, Iterable):
+            raise InputError(f"scene is {shown(shapes)}; it must be a list of shapes, e.g. [rd.Sphere(...)]")
         for i, shape in enumerate(shapes):
             if not isinstance(shape, Shape):
                 raise InputError(

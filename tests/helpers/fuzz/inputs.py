@@ -185,7 +185,7 @@ def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         tree = UrdfTree(files["two.urdf"], {})
         robot = tree.robot(None, "lower", None, None, srdf)
         assert tree.digest
-        with_limits(robot, read_limits(files["limits.yaml"]))
+        with_limits(robot, read_limits(files["limits.yaml"])[0])
 
     return read
 

@@ -9,7 +9,8 @@ import trimesh
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_hulls import convex_hull, planes_of
-from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_parts, simplified
+from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, _Part, convex_parts, simplified
+from robotdiffuse.robots.fitting.distance_grid import DistanceGrid
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:
@@ -124,3 +125,13 @@ def test_most_parts_are_a_bound() -> None:
 def test_settings_out_of_range(bad: dict) -> None:
     with pytest.raises(InputError, match="convex parts"):
         PartSettings(**bad)
+
+
+def test_a_part_of_a_thin_sheet_without_points_can_be_cut() -> None:
+    """The points on the other side of a sheet stood for both sides: a zero-size array."""
+    corners = np.array([[0, 0, 0], [0.3, 0, 0], [0.3, 0.3, 0.1], [0, 0.3, 0]])
+    triangles = corners[[[0, 1, 2], [0, 2, 3]]]
+    settings = PartSettings(voxels=5_000)
+    space = DistanceGrid.around([triangles], settings.voxels, settings.finest)
+    part = _Part.of(triangles, np.zeros((0, 3)), space, settings)
+    assert len(part.halves(space, settings)) == 2

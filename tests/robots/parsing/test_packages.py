@@ -10,6 +10,7 @@ import trimesh
 from helpers.made_arms import BALL, chain, joint, link, row, written
 from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 
 NAME = "package://some_arm/meshes/box.stl"
@@ -64,9 +65,9 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
     file = xacro(tmp_path / "top", content)
     robot = read_urdf(file)
     assert robot.joint_names == ("j1", "j2", "j3", "j4") and "end" in robot.meshes
-    digest = UrdfTree(file, {}).digest
+    digest = UrdfTree(file, {}, compile_xacro=True).digest
     xacro(part / "urdf", macro.replace("0.04", "0.05"), "solid.xacro")
-    assert UrdfTree(file, {}).digest != digest  # of the compiled URDF, not of the file
+    assert UrdfTree(file, {}, compile_xacro=True).digest != digest  # of the compiled URDF, not of the file
 
 
 def test_xacro_does_not_wait_for_a_pipe(tmp_path: Path) -> None:
@@ -110,3 +111,40 @@ def test_xacro_that_cannot_be_compiled_says_what_helps(
     monkeypatch.setitem(sys.modules, "xacrodoc", None)
     with pytest.raises(InputError, match=r"pip install 'robotdiffuse\[xacro\]'"):
         read_urdf(xacro(tmp_path, PARTS))
+
+
+def test_only_robot_add_compiles_xacro(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A problem, a result or a certificate that names a URDF ran the code in its expressions."""
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    namespace = "http://www.ros.org/wiki/xacro"
+    property_ = f'<x:property xmlns:x="{namespace}" name="a" value="1"/>'
+    for name, content in (
+        ("named.urdf.xacro", PARTS),
+        ("arm.XACRO.xml", PARTS),
+        ("prefix.urdf", '<xacro:property name="a" value="1"/>' + PARTS),
+        ("namespace.urdf", property_ + PARTS),
+        ("expression.urdf", PARTS.replace('name="j1"', 'name="${[].clear()}"')),
+        ("argument.urdf", PARTS.replace('name="j1"', 'name="$(arg prefix)"')),
+    ):
+        file = xacro(tmp_path, link("base") + content, name)
+        with pytest.raises(InputError, match="is a xacro file.* robotdiffuse robot add .*--name") as error:
+            load_robot(file)
+        assert "\n" not in str(error.value)
+
+
+def test_a_urdf_that_xacro_wrote_is_no_xacro(tmp_path: Path) -> None:
+    """It still declares the namespace."""
+    mesh(tmp_path)
+    file = xacro(tmp_path, link("base") + PARTS, "made.urdf")
+    assert UrdfTree(file, {}).robot().dof == 4
+
+
+def test_compiled_xacro_is_noted(tmp_path: Path) -> None:
+    pytest.importorskip("xacrodoc")
+    assert "runs the code" in read_urdf(xacro(tmp_path, link("base") + chain("base", row("j", 3)))).notes[0]
+
+
+def test_blanks_of_file_names_may_be_escaped(tmp_path: Path) -> None:
+    trimesh.creation.box([0.1, 0.1, 0.1]).export(tmp_path / "my box.stl")
+    for name in ("my%20box.stl", "file://my%20box.stl", "package://some_arm/my%20box.stl"):
+        assert "end" in read_urdf(written(tmp_path, PARTS.replace(NAME, name))).meshes

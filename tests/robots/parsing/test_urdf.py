@@ -10,10 +10,11 @@ import trimesh
 
 import robotdiffuse.robots as robots
 from helpers.example_robots import AWKWARD
-from helpers.quick_preparation import coarse_grids
+from helpers.made_arms import chain, joint, link, row, written
+from helpers.quick_preparation import QUICK, coarse_grids
 from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import rotation_from_rpy
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.fitting.add import add_robot
 from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
@@ -245,7 +246,7 @@ def test_limits_file(tmp_path: Path) -> None:
         "  turn: {has_velocity_limits: true, max_velocity: 2, has_jerk_limits: false, max_jerk: 1}\n"
         "  bend: {max_acceleration: 3.5, min_position: -1}\n"
     )
-    robot = with_limits(read_urdf(urdf(tmp_path)), read_limits(file))
+    robot = with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0])
     np.testing.assert_allclose(robot.velocity, [2, 1])
     np.testing.assert_allclose(robot.acceleration, [8, 3.5])
     np.testing.assert_allclose(robot.jerk, [80, 35])
@@ -264,7 +265,7 @@ def test_limits_file(tmp_path: Path) -> None:
     ):
         file.write_text(text)
         with pytest.raises(InputError) as error:
-            with_limits(read_urdf(urdf(tmp_path)), read_limits(file))
+            with_limits(read_urdf(urdf(tmp_path)), read_limits(file)[0])
         assert message in str(error.value)
 
 
@@ -318,3 +319,63 @@ def test_add_refuses_what_cannot_work(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
         write_robot_folder(read_urdf(urdf(tmp_path)), tmp_path / "file" / "robot", {})
+
+
+def test_quaternions_of_joints_turn_what_follows(tmp_path: Path) -> None:
+    """`quat_xyzw` was ignored."""
+    w, x, y, z = quaternion_from_rotation(rotation_from_rpy(0.3, -0.4, 0.5))
+    turned = {}
+    for how in ('rpy="0.3 -0.4 0.5"', f'quat_xyzw="{" ".join(map(str, XYZW))}"'):
+        file = written(tmp_path, chain("base", ["j"]))
+        file.write_text(file.read_text().replace('<origin xyz="0 0 0.1"/>', f'<origin xyz="0 0 0.1" {how}/>'))
+        turned[how] = read_urdf(file).joints[0].T_parent_joint
+    first, second = turned.values()
+    np.testing.assert_allclose(first, second, atol=1e-12)
+
+
+def test_soft_limits_are_noted(tmp_path: Path) -> None:
+    soft = '<safety_controller k_velocity="20" soft_lower_limit="-1" soft_upper_limit="1"/>'
+    [note] = read_urdf(written(tmp_path, chain("base", ["j"], more=soft))).notes
+    assert note.startswith("joint j: the soft limits") and "lower -1, upper 1" in note
+
+
+def test_scaling_factors_of_a_limits_file_are_noted(tmp_path: Path) -> None:
+    file = tmp_path / "limits.yaml"
+    file.write_text("default_velocity_scaling_factor: 0.1\njoint_limits: {j: {max_velocity: 1}}\n")
+    assert read_limits(file) == (
+        {"j": {"velocity": 1.0}},
+        ("limits.yaml: default_velocity_scaling_factor 0.1 is ignored; plan with velocity_scaling=0.1",),
+    )
+
+
+def test_a_mesh_without_volume_is_noted(tmp_path: Path) -> None:
+    trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]], [[0, 1, 2], [1, 3, 2]]).export(
+        tmp_path / "plate.stl"
+    )
+    plate = '<collision><geometry><mesh filename="plate.stl"/></geometry></collision>'
+    robot = read_urdf(
+        written(tmp_path, chain("base", ["j"]), link("end", plate), joint("k", "j_link", "end"))
+    )
+    assert "link end has collision geometry without volume, made 1 mm thick" in robot.notes
+
+
+def test_a_large_hall_below_the_arm_is_noted(tmp_path: Path) -> None:
+    hall = '<collision><geometry><box size="30 30 0.1"/></geometry></collision>'
+    file = written(tmp_path, chain("base", ["j"]), link("hall", hall), joint("f", "base", "hall", "fixed"))
+    assert any("link hall is 30 m long" in note for note in read_urdf(file).notes)
+
+
+def test_preparations_of_one_urdf_that_differ_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first in the alphabet counted: a motion through the arm itself was called valid."""
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    file = written(tmp_path, chain("base", row("j", 3)))
+    with coarse_grids():
+        for name in ("plain", "same"):
+            add_robot(file, name=name, settings=QUICK)
+        assert load_robot(file).joint_names == ("j1", "j2", "j3")
+        add_robot(file, name="allowing", allow=[("base", "j3_link")], settings=QUICK)
+    with pytest.raises(InputError, match="was added as allowing, plain, same, which differ") as error:
+        load_robot(file)
+    assert "\n" not in str(error.value)

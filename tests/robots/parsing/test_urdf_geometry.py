@@ -15,7 +15,7 @@ from robotdiffuse.robots.parsing.urdf_geometry import link_surfaces
 
 def surfaces(file: Path, shape: str, origin: str = "") -> tuple[Surface, ...]:
     link = f'<link name="arm"><collision>{origin}<geometry>{shape}</geometry></collision></link>'
-    return link_surfaces(file, ET.fromstring(link), "collision", Packages(file, {}))
+    return link_surfaces(file, ET.fromstring(link), "collision", Packages(file, {}), [])
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def add_robot(
     """Read a URDF, prepare the robot (see `prepare`) and write the robot folder.
 
     Args:
-        urdf: URDF or xacro file.
+        urdf: URDF or xacro file. Compiling xacro runs the code in its expressions.
         name: Name of the robot; by default the URDF's.
         base: See `UrdfTree.robot`, also for `tip`, `locked` and `group`.
         limits: Joint limits, a file in the form of MoveIt's joint_limits.yaml.
@@ -158,7 +158,7 @@ def add_robot(
         InputError: For bad input, and for a robot that always collides with itself.
     """
     begin = time.process_time()
-    tree = UrdfTree(Path(urdf), packages or {})
+    tree = UrdfTree(Path(urdf), packages or {}, compile_xacro=True)
     found = srdf_beside(urdf, tree.name) if srdf is None else Path(srdf)
     semantics = None if found is None else read_srdf(found)
     robot = tree.robot(base, tip, locked, group, semantics)
@@ -169,7 +169,8 @@ def add_robot(
         raise InputError(f"robot name is {name!r}; it must be a valid folder name: give --name NAME")
     robot = replace(robot, name=name)
     if limits is not None:
-        robot = with_limits(robot, read_limits(limits))
+        changed, notes = read_limits(limits)
+        robot = replace(with_limits(robot, changed), notes=(*robot.notes, *notes))
     if not robot.meshes:
         raise InputError(
             f"{urdf}: no link has collision or visual geometry, so collisions cannot be checked; add "

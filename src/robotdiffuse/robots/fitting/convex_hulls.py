@@ -14,7 +14,7 @@ MIN_THICKNESS = 1e-3
 def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
     """Convex hull with outward faces; a point set thinner than `MIN_THICKNESS` in a direction is thickened to
     it."""
-    points = _thickened(points)
+    points = thickened(points)
     hull = ConvexHull(points)
     used, index = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = points[used], index.reshape(hull.simplices.shape)
@@ -24,7 +24,7 @@ def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
     return ConvexMesh(vertices, faces)
 
 
-def _thickened(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+def thickened(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
     """The points, or copies shifted to both sides along the principal axes in which the set is too thin."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     for axis in axes[np.ptp(points @ axes.T, axis=0) < MIN_THICKNESS]:

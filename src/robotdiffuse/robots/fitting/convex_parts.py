@@ -148,6 +148,8 @@ class _Part:
     @staticmethod
     def of(triangles: ndarray, points: ndarray, space: DistanceGrid, settings: PartSettings) -> "_Part":
         hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
+        if not len(points):  # the other side of a thin sheet has them
+            points = _spread(triangles, space.pitch)
         return _Part(triangles, points, hull, space.concavity(hull))
 
     def halves(self, space: DistanceGrid, settings: PartSettings) -> list["_Part"]:

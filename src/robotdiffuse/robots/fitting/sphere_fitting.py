@@ -42,6 +42,9 @@ EXCESS_TOLERANCE = 0.1
 COARSE_CELLS, FINE_CELLS = (5.0, 60_000), (8.0, 150_000)
 """Cell sizes for choosing spheres and for the final fit: cells per radius of the disc that a sphere covers,
 and the largest number of cells."""
+MAX_CROWD = 10
+"""If a surface has room for so many times the cells that are allowed, they are not made: they would not fit
+into memory."""
 SMALLEST_TRIANGLE = 2e-6
 """Smaller pieces of the surface that no single sphere contains count as uncovered [m]."""
 ADDED_SPACING = 0.02
@@ -165,12 +168,17 @@ class _Cells:
         Edges are at most 1 / `cut` of the radius of the largest disc that a sphere within bounds can cover;
         longer if there would be more than `most` cells.
         """
+        size = _disc(bounds.tolerance, solid.depth) / cut
+        corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in solid.meshes])
+        area = np.linalg.norm(np.cross(*np.diff(corners, axis=1).swapaxes(0, 1)), axis=1).sum() / 2
+        crowd = area / size**2 / most
+        if crowd > MAX_CROWD:
+            return _Cells.of(solid, bounds, cut / np.sqrt(crowd), most)
         soup, vertices, left_out = [], [], False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
         boxes = [(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh in solid.meshes]
         for k, mesh in enumerate(solid.meshes):
             triangles = mesh.vertices[mesh.faces]
-            size = _disc(bounds.tolerance, solid.depth) / cut
             triangles = split(triangles, size)
             hidden = np.zeros(len(triangles), dtype=bool)
             low, high = triangles.min(1), triangles.max(1)

@@ -18,6 +18,7 @@ FIELDS = {
     "max_acceleration": "acceleration",
     "max_jerk": "jerk",
 }
+FACTORS = ("default_velocity_scaling_factor", "default_acceleration_scaling_factor")
 FLAGS = (
     "has_position_limits",
     "has_velocity_limits",
@@ -26,12 +27,13 @@ FLAGS = (
 )
 
 
-def read_limits(file: str | Path) -> dict[str, dict[str, float]]:
-    """Read limits from a YAML or JSON file: values by joint, and by field of `Joint`.
+def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[str, ...]]:
+    """Read limits from a YAML or JSON file: values by joint and by field of `Joint`, and notes.
 
     The file has the form joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position,
     max_position, max_velocity, max_acceleration and max_jerk. A field is ignored if MoveIt's flag
-    has_..._limits for it is false. Raises InputError that names the joint and the field.
+    has_..._limits for it is false. Other fields of the file, such as MoveIt's default scaling factors, are
+    ignored, with a note. Raises InputError that names the joint and the field.
     """
     data = read_yaml(file, "joint limits")
     joints = data.get("joint_limits") if isinstance(data, dict) else None
@@ -39,7 +41,17 @@ def read_limits(file: str | Path) -> dict[str, dict[str, float]]:
         raise InputError(
             f"{file} has no joint_limits; it must contain joint_limits: {{JOINT: {{max_velocity: ...}}}}"
         )
-    return {str(name): _fields(str(file), str(name), entry) for name, entry in joints.items()}
+    notes = tuple(
+        f"{Path(file).name}: {name} {shown(value)} is ignored"
+        + (
+            f"; plan with {name.removeprefix('default_').removesuffix('_factor')}={value}"
+            if name in FACTORS
+            else ""
+        )
+        for name, value in data.items()
+        if name != "joint_limits"
+    )
+    return {str(name): _fields(str(file), str(name), entry) for name, entry in joints.items()}, notes
 
 
 def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:

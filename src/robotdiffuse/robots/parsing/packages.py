@@ -2,12 +2,14 @@
 
 import os
 import re
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
+from urllib.parse import unquote
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.input_files import input_file, is_file, read_bytes
+from robotdiffuse.core.input_files import input_file, is_file
 
 MAX_PACKAGES = 32
 """Largest number of packages that a xacro file may refer to."""
@@ -46,20 +48,29 @@ class Packages:
         return next((folder for folder in candidates if folder.is_dir()), None)
 
     def file(self, filename: str) -> Path:
-        """The path of a package://, file:// or relative file name; raises InputError if there is no such
-        file."""
+        """The path of a package://, file:// or relative file name, also with %20 for a blank.
+
+        Raises InputError if there is no such file.
+        """
         start = self.urdf.resolve().parent
         if not filename.startswith("package://"):
-            found = start / filename.removeprefix("file://")
-            if is_file(found):
-                return found
+            name = filename.removeprefix("file://")
+            for found in (start / name, start / unquote(name)):
+                if is_file(found):
+                    return found
             raise InputError(
                 f"{self.urdf}: mesh file {shown(filename)} does not exist; add it, or remove its element"
             )
         package, _, rest = filename.removeprefix("package://").partition("/")
         folder = self.folder(package)
-        upwards = [up / tail for up in (start, *start.parents) for tail in (f"{package}/{rest}", rest)]
-        candidates = [*([] if folder is None else [folder / rest]), *upwards]
+        upwards = [
+            up / tail
+            for up in (start, *start.parents)
+            for name in (rest, unquote(rest))
+            for tail in (f"{package}/{name}", name)
+        ]
+        inside = [] if folder is None else [folder / rest, folder / unquote(rest)]
+        candidates = [*inside, *upwards]
         for candidate in candidates:
             if is_file(candidate):
                 return candidate
@@ -73,19 +84,16 @@ def _folders(variable: str) -> list[Path]:
     return [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
 
 
-def urdf_text(path: Path, packages: Packages) -> bytes:
-    """The text of a URDF file, or of a xacro file compiled by xacrodoc.
-
-    Raises InputError if the file cannot be read or compiled, or if it is a xacro file and xacrodoc is not
-    installed.
-    """
-    text = read_bytes(path, "URDF")
-    if path.suffix == ".xacro" or b"<xacro:" in text:
-        text = _compiled(path, packages)
-    return _with_prefixes(text)
+def is_xacro(file: Path, root: ET.Element) -> bool:
+    """Whether a URDF must be compiled by xacro: by its file name, its elements, or an expression in it."""
+    return ".xacro" in file.name.lower() or any(
+        "xacro" in element.tag.rpartition("}")[0]
+        or any("${" in value or "$(" in value for value in element.attrib.values())
+        for element in root.iter()
+    )
 
 
-def _with_prefixes(text: bytes) -> bytes:
+def with_prefixes(text: bytes) -> bytes:
     """The XML with undeclared namespace prefixes declared, which simulators' elements such as <drake:member>
     often lack."""
     used = {found for pair in NAMESPACE_PREFIX.findall(text) for found in pair if found}
@@ -94,7 +102,11 @@ def _with_prefixes(text: bytes) -> bytes:
     return text.replace(b"<robot", b"<robot" + declared, 1) if missing else text
 
 
-def _compiled(path: Path, packages: Packages) -> bytes:
+def compiled_xacro(path: Path, packages: Packages) -> bytes:
+    """The URDF that xacrodoc compiles from a xacro file. This runs the code in its expressions.
+
+    Raises InputError if the file cannot be compiled, or if xacrodoc is not installed.
+    """
     try:
         import xacro
         from xacrodoc import packages as known  # importing it makes xacro use its package look-up

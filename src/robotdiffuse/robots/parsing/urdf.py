@@ -10,26 +10,31 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, MIN_RATE
-from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.input_files import parse_xml
+from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
+from robotdiffuse.core.input_files import parse_xml, read_bytes
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fitting.convex_hulls import convex_hull
+from robotdiffuse.robots.fitting.convex_hulls import MIN_THICKNESS, convex_hull, thickened
 from robotdiffuse.robots.fitting.convex_parts import Surface
 from robotdiffuse.robots.inertias import Inertia, inertia_of
 from robotdiffuse.robots.joints import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
 from robotdiffuse.robots.parsing.joint_groups import passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.parsing.mobile_bases import moves_in_a_plane
-from robotdiffuse.robots.parsing.packages import Packages, urdf_text
+from robotdiffuse.robots.parsing.packages import Packages, compiled_xacro, is_xacro, with_prefixes
 from robotdiffuse.robots.parsing.srdf import Srdf
 from robotdiffuse.robots.parsing.urdf_geometry import link_surfaces
 from robotdiffuse.robots.parsing.urdf_values import numbers_of, origin_of
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.scaling import reach
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 KINDS = (*MOVING_KINDS, "fixed")
 MAX_LINKS = 500
 """Largest number of links of a robot; humanoids with hands have about 100."""
+MAX_LINK_SIZE = 10.0
+"""A larger link gets a note [m]."""
+MAX_SIZE_PER_REACH = 10.0
+"""A moving link that is larger than the arm's reach by this factor is refused."""
 DEFAULT_VELOCITY = 1.0
 """Velocity limit of movable joints for which the URDF gives none [rad/s] or [m/s]."""
 ACCELERATION_PER_VELOCITY = 4.0
@@ -46,26 +51,39 @@ class UrdfTree:
     path: Path
     folders: dict[str, str | Path]
     """Folders of ROS packages by name."""
+    compile_xacro: bool = False
+    """Whether a xacro file is compiled, which runs code in it; otherwise it raises InputError."""
     notes: list[str] = field(default_factory=list)
     _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.packages = Packages(self.path, self.folders)
-        self.text = urdf_text(self.path, self.packages)
+        self.text = with_prefixes(read_bytes(self.path, "URDF"))
         root = parse_xml(self.text, str(self.path))
+        if is_xacro(self.path, root):
+            if not self.compile_xacro:
+                raise InputError(
+                    f"{self.path} is a xacro file, and compiling it would run code in it; if you trust it, "
+                    f"prepare it first: robotdiffuse robot add {self.path} --name NAME, and use that name"
+                )
+            self.text = with_prefixes(compiled_xacro(self.path, self.packages))
+            self.notes.append(
+                f"{self.path.name} was compiled by xacro, which runs the code in its expressions"
+            )
+            root = parse_xml(self.text, str(self.path))
         if root.tag != "robot":
             raise InputError(
                 f"{self.path} is not a URDF: its root element is <{root.tag}>, not <robot>; "
                 f"convert other formats to URDF first"
             )
         self.name = root.get("name") or self.path.stem
-        self.links = {self._name(link, "link"): link for link in root.findall("link")}
+        self.links = self._named(root, "link")
         if len(self.links) > MAX_LINKS:
             raise InputError(f"{self.path} has {len(self.links)} links; at most {MAX_LINKS} are supported")
         solid = any(link.find("collision") is not None for link in self.links.values())
         self.kind = "collision" if solid else "visual"
         """Elements of links that are read as collision geometry."""
-        self.elements = {self._name(joint, "joint"): joint for joint in root.findall("joint")}
+        self.elements = self._named(root, "joint")
         self.parents: dict[str, str] = {}
         """Parent joint of each link except the root."""
         self.children: dict[str, list[str]] = {}
@@ -135,7 +153,7 @@ class UrdfTree:
             other_tips=tuple(ends[1:]),
             joints=tuple(joints),
             meshes={link: parts for link, parts in meshes.items() if parts},
-            notes=(*self.notes, *passive_notes(srdf, joints)),
+            notes=tuple(dict.fromkeys((*self.notes, *passive_notes(srdf, joints)))),
             root=self.carried(base),
             above=self.above(base),
             poses={} if srdf is None else dict(srdf.poses),
@@ -149,11 +167,35 @@ class UrdfTree:
         }
         robot = replace(robot, locked=with_mimics(robot.joints, rest)).with_locked(locked or {})
         if robot.dof == 0:
+            held = [
+                joint.name for joint in joints if joint.kind in MOVING_KINDS and joint.lower == joint.upper
+            ]
             raise InputError(
-                f"{self.path}: no movable joint between {base} and {ends[0]}; choose another --base or --tip"
+                f"{self.path}: no movable joint between {base} and {ends[0]}; "
+                + (
+                    f"the limits of {joined(held)} leave no range"
+                    if held
+                    else "choose another --base or --tip"
+                )
             )
         refuse_linkages(self.path, robot)
-        return robot
+        return replace(robot, notes=(*robot.notes, *self._size_notes(robot)))
+
+    def _size_notes(self, robot: Robot) -> list[str]:
+        """Notes on very large links. Raises InputError for a moving one that dwarfs the arm."""
+        notes = []
+        for link, parts in robot.meshes.items():
+            size = float(np.ptp(np.concatenate([part.vertices for part in parts]), axis=0).max())
+            if size <= MAX_LINK_SIZE:
+                continue
+            note = (
+                f"check the units: link {link} is {size:.4g} m long; lengths are in metres, and a mesh in "
+                f'millimetres needs scale="0.001 0.001 0.001"'
+            )
+            if robot.link_frame(link) > 0 and size > MAX_SIZE_PER_REACH * reach(robot):
+                raise InputError(f"{self.path}: {note}")
+            notes.append(note)
+        return notes
 
     @property
     def digest(self) -> str:
@@ -162,14 +204,25 @@ class UrdfTree:
         digest = hashlib.sha256(self.text)
         for element in self.links.values():
             for mesh in element.findall(f"{self.kind}/geometry/mesh"):
-                digest.update(self.packages.file(mesh.get("filename", "")).read_bytes())
+                file = self.packages.file(mesh.get("filename", ""))
+                digest.update(read_bytes(file, "mesh file"))
+                if file.suffix.lower() in (".dae", ".glb", ".gltf"):
+                    digest.update(b"in metres, z up")  # robots made before these were converted differ
         return digest.hexdigest()
 
-    def _name(self, element: ET.Element, what: str) -> str:
-        name = element.get("name")
-        if not name:
-            raise InputError(f"{self.path}: a <{what}> has no name")
-        return name
+    def _named(self, root: ET.Element, what: str) -> dict[str, ET.Element]:
+        """The links or joints by name."""
+        elements: dict[str, ET.Element] = {}
+        for element in root.findall(what):
+            name = element.get("name")
+            if not name:
+                raise InputError(f"{self.path}: a <{what}> has no name")
+            if name in elements:
+                raise InputError(
+                    f"{self.path}: two {what}s have the name {shown(name)}; rename or remove one"
+                )
+            elements[name] = element
+        return elements
 
     def _end(self, name: str, element: ET.Element, what: str) -> str:
         end = element.find(what)
@@ -229,8 +282,8 @@ class UrdfTree:
         if kind not in KINDS:
             child = self._end(name, element, "child")
             raise InputError(
-                f"{self.path}: {what} has type {shown(kind)}; supported: {', '.join(KINDS)}; "
-                f"use --base {child} to plan for the part above it"
+                f"{self.path}: {what} has type {shown(kind)}; supported: {', '.join(KINDS)}; remove it with "
+                f"what it carries, or use --base {child} to plan for what it carries alone"
             )
         axis_element = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0])
@@ -248,7 +301,20 @@ class UrdfTree:
             axis=axis,
             mimic=None if kind == "fixed" else self._mimic(name, element),
         )
-        return joint if kind == "fixed" else self._with_limits(joint, element.find("limit"))
+        if kind == "fixed":
+            return joint
+        joint = self._with_limits(joint, element.find("limit"))
+        safety = element.find("safety_controller")
+        soft = {} if safety is None else safety.attrib
+        given = [
+            f"{end} {soft[f'soft_{end}_limit']}" for end in ("lower", "upper") if f"soft_{end}_limit" in soft
+        ]
+        if given:
+            self.notes.append(
+                f"{what}: the soft limits of its safety_controller ({', '.join(given)}) are ignored; "
+                f"set limits with --limits"
+            )
+        return joint
 
     def _mimic(self, name: str, element: ET.Element) -> Mimic | None:
         followed = element.find("mimic")
@@ -287,7 +353,9 @@ class UrdfTree:
             )
         lower, upper = given.get("lower", 0.0), given.get("upper", 0.0)
         if lower > upper:
-            raise InputError(f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}")
+            raise InputError(
+                f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}; exchange them"
+            )
         velocity = given.get("velocity", 0.0)
         if 0 < velocity < MIN_RATE:
             raise InputError(
@@ -352,6 +420,11 @@ class UrdfTree:
         parts = {
             link: tuple(convex_hull(surface.vertices) for surface in self.surfaces(link)) for link in links
         }
+        self.notes += [
+            f"link {link} has {self.kind} geometry without volume, made {1e3 * MIN_THICKNESS:g} mm thick"
+            for link in links
+            if any(len(thickened(part.vertices)) > len(part.vertices) for part in self.surfaces(link))
+        ]
         if self.kind == "visual" and any(parts.values()):
             self.notes.append("no link has collision geometry; the visual geometry is used")
         elif any(parts.values()):
@@ -366,5 +439,5 @@ class UrdfTree:
         """The link's collision elements as triangle meshes, in the link's frame."""
         if link not in self._surfaces:
             element = self.links[link]
-            self._surfaces[link] = link_surfaces(self.path, element, self.kind, self.packages)
+            self._surfaces[link] = link_surfaces(self.path, element, self.kind, self.packages, self.notes)
         return self._surfaces[link]

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import MIN_SIZE, points
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.input_files import read_triangles
+from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.robots.fitting.convex_hulls import convex_hull
 from robotdiffuse.robots.fitting.convex_parts import Surface
 from robotdiffuse.robots.parsing.packages import Packages
@@ -19,10 +19,13 @@ from robotdiffuse.robots.parsing.urdf_values import numbers_of, origin_of
 PRIMITIVES = ("box", "capsule", "cylinder", "sphere")
 
 
-def link_surfaces(path: Path, link: ET.Element, kind: str, packages: Packages) -> tuple[Surface, ...]:
+def link_surfaces(
+    path: Path, link: ET.Element, kind: str, packages: Packages, notes: list[str]
+) -> tuple[Surface, ...]:
     """The elements `kind` (collision or visual) of a link as triangle meshes, in the link's frame.
 
-    Raises InputError for elements without geometry, unknown shapes and damaged meshes.
+    `notes` receives a note on each mesh file that is turned or scaled. Raises InputError for elements without
+    geometry, unknown shapes and damaged meshes.
     """
     parts, name = [], link.get("name", "")
     for element in link.findall(kind):
@@ -31,7 +34,7 @@ def link_surfaces(path: Path, link: ET.Element, kind: str, packages: Packages) -
         if shape is None:
             raise InputError(f"{path}: link {name}: a <{kind}> has no geometry")
         if shape.tag == "mesh":
-            surface = _mesh(path, shape, name, packages)
+            surface = _mesh(path, shape, name, packages, notes)
         elif shape.tag in PRIMITIVES:
             hull = convex_hull(_primitive(path, shape, name))
             surface = Surface(hull.vertices, hull.faces)
@@ -70,14 +73,14 @@ def _primitive(path: Path, shape: ET.Element, link: str) -> Float[ndarray, "n 3"
     return np.concatenate([end + np.array([0, 0, z]) for z in (-half, half)])
 
 
-def _mesh(path: Path, shape: ET.Element, link: str, packages: Packages) -> Surface:
+def _mesh(path: Path, shape: ET.Element, link: str, packages: Packages, notes: list[str]) -> Surface:
     file = packages.file(shape.get("filename", ""))
     where = f"link {link}: mesh"
     scale = numbers_of(path, shape.get("scale", "1 1 1"), 3, f"{where} scale")
     if (np.abs(scale) < MIN_SIZE).any():
         raise InputError(f"{path}: {where} scale is {shown(shape.get('scale'))}; its numbers must not be 0")
     try:
-        vertices, faces = read_triangles(file, merge=True)
+        vertices, faces = read_triangles(file, merge=True, notes=notes)
         vertices = points(where, "vertices", vertices * scale)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

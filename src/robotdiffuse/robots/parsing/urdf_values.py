@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, within
+from robotdiffuse.core.bounds import MAX_COORDINATE, unit_quaternion, within
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.transforms import rotation_from_rpy, transform
+from robotdiffuse.core.transforms import rotation_from_quaternion, rotation_from_rpy, transform
 
 
 def numbers_of(
@@ -32,6 +32,13 @@ def origin_of(path: Path, element: ET.Element, what: str) -> Float[ndarray, "4 4
     origin = element.find("origin")
     if origin is None:
         return np.eye(4)
-    rpy = numbers_of(path, origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
     xyz = numbers_of(path, origin.get("xyz", "0 0 0"), 3, f"{what}: origin xyz")
-    return transform(xyz, rotation_from_rpy(*map(float, rpy)))
+    turned = origin.get("quat_xyzw")
+    if turned is None:
+        rpy = numbers_of(path, origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
+        return transform(xyz, rotation_from_rpy(*map(float, rpy)))
+    if "rpy" in origin.attrib:
+        raise InputError(f"{path}: {what}: origin has rpy and quat_xyzw; it must have one of them")
+    where = f"{what}: origin quat_xyzw"
+    x, y, z, w = unit_quaternion(f"{path}: {what}", numbers_of(path, turned, 4, where), "origin quat_xyzw")
+    return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))

@@ -13,6 +13,7 @@ from robotdiffuse.problems.files import (
     load_motion_bench_maker,
     load_problem,
 )
+from robotdiffuse.problems.files.moveit.joints import scene_robot_notes
 from robotdiffuse.problems.files.moveit.scene import read_moveit_scene
 from robotdiffuse.robots import load_robot
 
@@ -100,3 +101,17 @@ def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Pat
     (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(request))
     [entry] = load_motion_bench_maker(tmp_path, robot)
     assert entry.load().notes == ("start_state: follow is 0.01; planned at 0.03, which grip implies",)
+
+
+def test_padding_and_scale_of_links_are_noted() -> None:
+    data = {
+        "link_padding": [
+            {"link_name": "panda_hand", "padding": 0.02},
+            {"link_name": "other", "padding": 0.0},
+        ],
+        "link_scale": [{"link_name": "panda_hand", "scale": 1.1}, {"link_name": "other", "scale": 1.0}],
+    }
+    assert scene_robot_notes(data, load_robot("panda")) == (
+        "the scene's link_padding of panda_hand is ignored",
+        "the scene's link_scale of panda_hand is ignored",
+    )

@@ -101,6 +101,13 @@ def test_scaling_factors_are_noted() -> None:
     )
 
 
+def test_the_velocity_of_a_start_state_is_noted() -> None:
+    asked = request_data()
+    asked["start_state"]["joint_state"]["velocity"] = [0.0, 0.3]
+    [note] = moveit_request(asked, moveit_frames({}, load_robot("panda"))).notes
+    assert note == "start_state.joint_state.velocity [0.0, 0.3] is ignored: the motion begins at rest"
+
+
 WRONG_REQUESTS: dict[str, tuple[object, str]] = {
     "number": (3, "a motion plan request is 3"),
     "no goal": (request_data() | {"goal_constraints": []}, "goal_constraints is empty"),

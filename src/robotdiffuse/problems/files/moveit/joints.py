@@ -2,7 +2,7 @@
 
 from robotdiffuse.core.errors import InputError, joined, shortened
 from robotdiffuse.problems.files.moveit.request import MoveItRequest
-from robotdiffuse.problems.files.moveit.values import joint_state, mapping_of
+from robotdiffuse.problems.files.moveit.values import joint_state, list_of, mapping_of
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 
 
@@ -18,6 +18,13 @@ def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -
     values = joint_state("robot_state.joint_state", state.get("joint_state"))
     model = moveit_model(data)
     notes = joint_notes("robot_state.joint_state", values, robot, model, ignore_joints)
+    for name, neutral in (("padding", 0), ("scale", 1)):
+        entries = [
+            mapping_of(f"link_{name}", entry) for entry in list_of(f"link_{name}", data.get(f"link_{name}"))
+        ]
+        changed = [str(entry.get("link_name")) for entry in entries if entry.get(name, neutral) != neutral]
+        if changed:
+            notes = (*notes, f"the scene's link_{name} of {joined(changed)} is ignored")
     if model not in ("", robot.name):
         notes = (f"the scene's robot_model_name is {shortened(model)}; planned for {robot.name}", *notes)
     return notes

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.core.input_files import read_triangles
+from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.problems.files.moveit.frames import MoveItFrames
 from robotdiffuse.problems.files.moveit.shapes import cone, plane

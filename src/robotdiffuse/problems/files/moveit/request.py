@@ -70,6 +70,12 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     held = list_of("attached_collision_objects", state.get("attached_collision_objects"))
     attached = tuple(_attached(i, entry, frames, folder) for i, entry in enumerate(held))
     start = joint_state("start_state.joint_state", state.get("joint_state"))
+    velocity = list_of("velocity", mapping_of("joint_state", state.get("joint_state")).get("velocity"))
+    if any(velocity):
+        notes = (
+            *notes,
+            f"start_state.joint_state.velocity {shown(velocity)} is ignored: the motion begins at rest",
+        )
     goals = list_of("goal_constraints", data.get("goal_constraints"))
     if not goals:
         raise InputError("goal_constraints is empty; it must hold at least one goal")

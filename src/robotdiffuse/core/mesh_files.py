@@ -1,0 +1,200 @@
+"""Reads triangle meshes from files, with z up and, where the format has a unit, in metres."""
+
+import io
+import logging
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.input_files import (
+    MAX_DEPTH,
+    MAX_FILE_SIZE,
+    input_file,
+    parse_json,
+    parse_xml,
+    read_bytes,
+)
+
+MESH_FORMATS = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+R_UP = {
+    "X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+    "Y_UP": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "Z_UP": np.eye(3),
+}
+"""Rotations to z up, by the <up_axis> of Collada. glTF has y up."""
+LFS_POINTER = b"version https://git-lfs"
+NO_GEOMETRY = frozenset(
+    f"{kind}_{what}"
+    for kind, things in (
+        ("library", ("animations", "cameras", "effects", "images", "lights", "materials")),
+        ("instance", ("camera", "light")),
+        ("bind", ("material",)),
+    )
+    for what in things
+)
+"""Elements of Collada without geometry: a damaged one would lose the geometry beside it."""
+BYTES_PER_USE = 30_000
+"""What each use of a part of a geometry in a Collada scene counts as, besides its indices [bytes]."""
+MAX_ACCESSED = 20_000_000
+"""Most elements of all accessors of a glTF file, since those without a buffer take no bytes of the file."""
+
+# trimesh logs a traceback of each error that it raises; without a handler that goes to standard error
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
+
+def read_triangles(
+    file: str | Path, merge: bool = False, notes: list[str] | None = None
+) -> tuple[ndarray, ndarray]:
+    """Vertices [v, 3] and faces [f, 3] of a mesh file, with z up.
+
+    Collada is read in metres by its <unit>, other formats in the units of the file. Collada with another
+    <up_axis>, and glTF, which has y up, are turned.
+
+    Args:
+        file: Of a format in MESH_FORMATS. Materials and images are not read.
+        merge: Whether vertices at the same place are joined.
+        notes: Receives a note if the file is turned or scaled.
+
+    Raises:
+        InputError: As `input_file` does, for other formats, and for empty or damaged files.
+    """
+    import trimesh
+
+    path = input_file(file, "mesh file")
+    ending = path.suffix.lower()
+    if ending not in MESH_FORMATS:
+        raise unknown_name(f"mesh format of {file}:", path.suffix, MESH_FORMATS)
+    content = read_bytes(path, "mesh file")
+    if not content:
+        raise InputError(f"mesh file {file} is empty")
+    if content.startswith(LFS_POINTER):
+        raise InputError(f"mesh file {file} is a pointer of Git LFS; get the file itself: git lfs pull")
+    options: dict[str, Any] = {}
+    up, metres = "Z_UP", 1.0
+    try:
+        if ending == ".dae":
+            content, up, metres = _collada(content)
+            options = {"ignore_broken": False}
+        elif ending in (".glb", ".gltf"):
+            up = "Y_UP"
+            _check_accessors(content)
+            options = {"resolver": _beside(path)}
+        if ending in (".glb", ".gltf", ".obj"):
+            options["skip_materials"] = True
+        with np.errstate(all="ignore"):
+            mesh = trimesh.load_mesh(io.BytesIO(content), ending[1:], process=merge, **options)
+    except InputError as error:
+        raise InputError(f"mesh file {file} cannot be read: {error}") from None
+    except Exception as error:  # trimesh raises many kinds of errors for a damaged file
+        raise InputError(f"mesh file {file} cannot be read: {shortened(str(error))}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise InputError(f"mesh file {file} holds no triangles")
+    if notes is not None and up != "Z_UP":
+        notes.append(f"{path.name} has {up[0].lower()} up; it is turned to z up")
+    if notes is not None and metres != 1:
+        notes.append(f"{path.name} is in units of {metres:g} m; it is read in metres")
+    vertices = metres * np.asarray(mesh.vertices, np.float64)
+    return vertices @ R_UP[up].T, np.asarray(mesh.faces, np.int64)
+
+
+def _collada(content: bytes) -> tuple[bytes, str, float]:
+    """A Collada file without materials and images, its up axis, and its unit [m].
+
+    Raises InputError if its scene uses geometries so often that it would not fit into memory.
+    """
+    root = parse_xml(content, "it")
+    for element in root.iter():
+        element.tag = str(element.tag).rpartition("}")[2]
+    for parent in [*root.iter()]:
+        for child in [child for child in parent if child.tag in NO_GEOMETRY]:
+            parent.remove(child)
+    up = (root.findtext("asset/up_axis") or "Y_UP").strip()
+    unit = root.find("asset/unit")
+    given = "1" if unit is None else unit.get("meter", "1")
+    try:
+        metres = float(given)
+    except ValueError:
+        metres = 0.0
+    if up not in R_UP:
+        raise InputError(f"its up_axis is {shown(up)}; it must be one of {', '.join(R_UP)}")
+    if not 1e-9 < metres < 1e9:
+        raise InputError(f"its unit is {shown(given)} m; it must be a positive number")
+    if any(sum(map(int, (count.text or "").split())) > len(content) for count in root.iter("vcount")):
+        raise InputError("a polygon has more corners than the file has bytes")
+    weights = {
+        f"#{geometry.get('id')}": sum(len(part.text or "") + BYTES_PER_USE for part in geometry.iter("p"))
+        for geometry in root.iter("geometry")
+    }
+    nodes = {f"#{node.get('id')}": node for node in root.iter("node")}
+    if sum(_weight(scene, nodes, weights, {}, 0) for scene in root.iter("visual_scene")) > MAX_FILE_SIZE:
+        raise InputError("its scene uses geometries too often to fit into memory")
+    root.set("xmlns", "http://www.collada.org/2005/11/COLLADASchema")
+    return ET.tostring(root), up, metres
+
+
+def _weight(
+    node: ET.Element,
+    nodes: Mapping[str, ET.Element],
+    weights: Mapping[str, int],
+    known: dict[str, int | None],
+    depth: int,
+) -> int:
+    """Length of the indices of the geometries that a Collada node and those below it use, in characters.
+
+    known: results by node; None while one is being computed.
+    """
+    if depth > MAX_DEPTH:
+        raise InputError(f"its nodes are nested more than {MAX_DEPTH} levels deep")
+    total = 0
+    for child in node:
+        url = child.get("url", "")
+        if child.tag == "node":
+            total += _weight(child, nodes, weights, known, depth + 1)
+        elif child.tag == "instance_geometry":
+            total += weights.get(url, 0)
+        elif child.tag == "instance_node" and url in nodes:
+            if url not in known:
+                known[url] = None
+                known[url] = _weight(nodes[url], nodes, weights, known, depth + 1)
+            weight = known[url]
+            if weight is None:
+                raise InputError(f"its node {shown(url)} contains itself")
+            total += weight
+    return total
+
+
+def _check_accessors(content: bytes) -> None:
+    """Raises InputError if the accessors of a glTF file would not fit into memory."""
+    binary = content.startswith(b"glTF")
+    text = content[20 : 20 + int.from_bytes(content[12:16], "little")] if binary else content
+    header = parse_json(text.decode("utf-8", "replace"), "its header")
+    accessors = header.get("accessors", ()) if isinstance(header, dict) else ()
+    if sum(int(accessor["count"]) for accessor in accessors) > MAX_ACCESSED:
+        raise InputError(f"its accessors hold more than {MAX_ACCESSED:,} elements")
+
+
+def _beside(mesh: Path) -> Any:
+    """Opens for trimesh the buffers that a glTF file names: regular files alone."""
+    from trimesh.resolvers import FilePathResolver
+
+    class RegularFiles(FilePathResolver):
+        size = 0
+
+        def get(self, name: str) -> Any:
+            for place in (name.strip(), name.strip().lstrip("/"), Path(name).name):  # which trimesh tries
+                file = Path(self.parent, place)
+                if os.path.lexists(file):
+                    input_file(file)
+            data = super().get(name)
+            self.size += len(data)
+            if self.size > MAX_FILE_SIZE:
+                raise InputError(f"its buffers are larger than {MAX_FILE_SIZE // 2**20} MB together")
+            return data
+
+    return RegularFiles(str(mesh))
