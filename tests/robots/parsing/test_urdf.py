@@ -166,12 +166,12 @@ def same(a: Robot, b: Robot) -> None:
     ]
     np.testing.assert_allclose(a.frame_offsets, b.frame_offsets, atol=1e-12)
     assert a.meshes.keys() == b.meshes.keys() and a.spheres.keys() == b.spheres.keys()
-    for link in a.meshes:
-        for first, second in zip(a.meshes[link], b.meshes[link], strict=True):
+    for name in a.meshes:
+        for first, second in zip(a.meshes[name], b.meshes[name], strict=True):
             np.testing.assert_array_equal(first.vertices, second.vertices)
             np.testing.assert_array_equal(first.faces, second.faces)
-    for link in a.spheres:
-        np.testing.assert_allclose(a.spheres[link], b.spheres[link], atol=1e-6)
+    for name in a.spheres:
+        np.testing.assert_allclose(a.spheres[name], b.spheres[name], atol=1e-6)
 
 
 def test_robot_folder_round_trip(tmp_path: Path) -> None:
@@ -288,9 +288,9 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
         )
     assert report.folder == tmp_path / "robots" / "tiny"
     assert steps[0] == (0, 7) and steps[-1] == (7, 7)
-    for link in report.links:
-        assert link.covered and link.stick_out <= 0.0151
-        assert covered(report.robot.meshes[link.link], report.robot.spheres[link.link])
+    for fitted in report.links:
+        assert fitted.covered and fitted.stick_out <= 0.0151
+        assert covered(report.robot.meshes[fitted.link], report.robot.spheres[fitted.link])
     assert {pair.links: pair.reason for pair in report.pairs}["base", "upper"] == "adjacent"
     for key in ("tiny", str(file), file, str(report.folder)):
         same(load_robot(key), report.robot)
@@ -323,9 +323,10 @@ def test_add_refuses_what_cannot_work(tmp_path: Path) -> None:
 
 def test_quaternions_of_joints_turn_what_follows(tmp_path: Path) -> None:
     """`quat_xyzw` was ignored."""
-    w, x, y, z = quaternion_from_rotation(rotation_from_rpy(0.3, -0.4, 0.5))
+    wxyz = quaternion_from_rotation(rotation_from_rpy(0.3, -0.4, 0.5))
+    xyzw = " ".join(map(str, np.roll(wxyz, -1)))
     turned = {}
-    for how in ('rpy="0.3 -0.4 0.5"', f'quat_xyzw="{" ".join(map(str, XYZW))}"'):
+    for how in ('rpy="0.3 -0.4 0.5"', f'quat_xyzw="{xyzw}"'):
         file = written(tmp_path, chain("base", ["j"]))
         file.write_text(file.read_text().replace('<origin xyz="0 0 0.1"/>', f'<origin xyz="0 0 0.1" {how}/>'))
         turned[how] = read_urdf(file).joints[0].T_parent_joint
@@ -375,7 +376,7 @@ def test_preparations_of_one_urdf_that_differ_are_refused(
         for name in ("plain", "same"):
             add_robot(file, name=name, settings=QUICK)
         assert load_robot(file).joint_names == ("j1", "j2", "j3")
-        add_robot(file, name="allowing", allow=[("base", "j3_link")], settings=QUICK)
-    with pytest.raises(InputError, match="was added as allowing, plain, same, which differ") as error:
+        add_robot(file, name="locking", locked={"j2": 0.1}, settings=QUICK)
+    with pytest.raises(InputError, match="was added as locking, plain, same, which differ") as error:
         load_robot(file)
     assert "\n" not in str(error.value)
