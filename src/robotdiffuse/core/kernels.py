@@ -180,8 +180,10 @@ for kind in (LOCK, COMPILE):
 def kernel(**options: Any) -> Callable[[Callable], Any]:
     """A decorator that compiles a function that Python calls; `options` are those of `numba.njit`."""
 
+    compiler: Any = njit  # its type stubs lack the options of Numba's targets
+
     def compiled(function: Callable) -> Any:
-        dispatcher = njit(no_cfunc_wrapper=True, **options)(function)
+        dispatcher = compiler(no_cfunc_wrapper=True, **options)(function)
         dispatcher._cache = _Cache(function)
         return dispatcher
 
