@@ -48,5 +48,5 @@ def test_a_network_reads_no_other_file(tmp_path: Path, monkeypatch: pytest.Monke
     model.graph.initializer[0].ClearField("raw_data")
     (tmp_path / "w.bin").write_bytes(np.ones(4, np.float32).tobytes())
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="outside.onnx keeps weights in another file"):
+    with pytest.raises(InputError, match=r"outside\.onnx keeps weights in another file"):
         OnnxNetwork(model.SerializeToString(), "outside.onnx")

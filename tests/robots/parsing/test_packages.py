@@ -127,7 +127,7 @@ def test_only_robot_add_compiles_xacro(tmp_path: Path, monkeypatch: pytest.Monke
         ("argument.urdf", PARTS.replace('name="j1"', 'name="$(arg prefix)"')),
     ):
         file = xacro(tmp_path, link("base") + content, name)
-        with pytest.raises(InputError, match="is a xacro file.* robotdiffuse robot add .*--name") as error:
+        with pytest.raises(InputError, match=r"is a xacro file.* robotdiffuse robot add .*--name") as error:
             load_robot(file)
         assert "\n" not in str(error.value)
 

@@ -107,7 +107,7 @@ def test_padding_and_scale_of_links_are_noted() -> None:
     data = {
         "link_padding": [
             {"link_name": "panda_hand", "padding": 0.02},
-            {"link_name": "other", "padding": 0.0},
+            {"link_name": "b", "padding": 0.0},
         ],
         "link_scale": [{"link_name": "panda_hand", "scale": 1.1}, {"link_name": "other", "scale": 1.0}],
     }
