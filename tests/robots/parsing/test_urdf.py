@@ -353,7 +353,6 @@ def test_a_mesh_without_volume_is_noted(tmp_path: Path) -> None:
     trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]], [[0, 1, 2], [1, 3, 2]]).export(
         tmp_path / "plate.stl"
     )
-    arm = chain("base", ["j"])
     plate = '<collision><geometry><mesh filename="plate.stl"/></geometry></collision>'
     robot = read_urdf(
         written(tmp_path, chain("base", ["j"]), made_arms.link("end", plate), joint("k", "j_link", "end"))
