@@ -106,10 +106,10 @@ def _described(folder: Path, change: dict) -> None:
     ("case", "message"),
     [
         ("truncated", r"model\.onnx is damaged"),
-        ("missing", r"cannot read .*model\.encoder\.onnx"),
+        ("missing", r"weight file .*model\.encoder\.onnx does not exist"),
         ("none", "without the ONNX files that planning runs; write them: robotdiffuse train export"),
         ("other size", r"model\.json does not fit its ONNX files"),
-        ("no statistics", r"cannot read .*model\.safetensors"),
+        ("no statistics", r"weight file .*model\.safetensors does not exist"),
     ],
 )
 def test_damaged_files_give_one_line(folder: Path, tmp_path: Path, case: str, message: str) -> None:
