@@ -52,7 +52,7 @@ def no_files() -> Iterator[None]:
 
 
 def file_name(file: object, what: str = "file") -> Path:
-    """The path that a name stands for; InputError for what is neither text nor a path, and if it is too long."""
+    """The path that a name stands for; InputError for what is neither text nor a path or is too long."""
     if not isinstance(file, str | os.PathLike):
         raise InputError(f"{what} is {shown(file)}; it must be the name of a file, a text or a pathlib.Path")
     path = Path(file)
