@@ -5,6 +5,7 @@ the size of the file: devices and pipes are not opened, nesting is measured befo
 that YAML aliases stand for are counted.
 """
 
+import errno
 import json
 import os
 import re
@@ -51,10 +52,18 @@ def no_files() -> Iterator[None]:
 
 
 def file_name(file: object, what: str = "file") -> Path:
-    """The path that a name stands for; InputError for what is neither text nor a path."""
+    """The path that a name stands for; InputError for what is neither text nor a path or is too long."""
     if not isinstance(file, str | os.PathLike):
         raise InputError(f"{what} is {shown(file)}; it must be the name of a file, a text or a pathlib.Path")
-    return Path(file)
+    path = Path(file)
+    try:
+        os.lstat(path)
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:  # pathlib would raise it where it looks for the file
+            raise InputError(f"{what} {path}: {error.strerror}") from None
+    except ValueError:  # such a name is refused where the file is read
+        pass
+    return path
 
 
 def is_file(file: str | Path) -> bool:

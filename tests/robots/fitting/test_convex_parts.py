@@ -9,7 +9,7 @@ import trimesh
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.robots.fitting.convex_hulls import convex_hull, planes_of
-from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, _Part, convex_parts, simplified
+from robotdiffuse.robots.fitting.convex_parts import Part, PartSettings, Surface, convex_parts, simplified
 from robotdiffuse.robots.fitting.distance_grid import DistanceGrid
 
 
@@ -133,5 +133,5 @@ def test_a_part_of_a_thin_sheet_without_points_can_be_cut() -> None:
     triangles = corners[[[0, 1, 2], [0, 2, 3]]]
     settings = PartSettings(voxels=5_000)
     space = DistanceGrid.around([triangles], settings.voxels, settings.finest)
-    part = _Part.of(triangles, np.zeros((0, 3)), space, settings)
+    part = Part.of(triangles, np.zeros((0, 3)), space, settings)
     assert len(part.halves(space, settings)) == 2

@@ -9,7 +9,7 @@ from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fitting.convex_hulls import convex_hull
 from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours, neighbours
-from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings, _Cells, covered, fit_spheres, stick_out
+from robotdiffuse.robots.fitting.sphere_fitting import Cells, SphereSettings, covered, fit_spheres, stick_out
 from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Solid
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 
@@ -197,5 +197,5 @@ def test_contradictory_settings(bad: dict) -> None:
 def test_a_large_thin_plate_does_not_fill_the_memory() -> None:
     """A plate of 1 m, 1 mm thick, was cut into 20 million cells before their number was looked at."""
     plate = convex_hull(np.array(trimesh.creation.box([3.0, 3.0, 1e-3]).vertices))
-    cells = _Cells.of(Solid.of((plate,), 1e-3), Bounds(1e-3), 8.0, 5_000)
+    cells = Cells.of(Solid.of((plate,), 1e-3), Bounds(1e-3), 8.0, 5_000)
     assert 500 < len(cells.corners) <= 5_000

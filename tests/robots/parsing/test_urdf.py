@@ -9,8 +9,9 @@ import pytest
 import trimesh
 
 import robotdiffuse.robots as robots
+from helpers import made_arms
 from helpers.example_robots import AWKWARD
-from helpers.made_arms import chain, joint, link, row, written
+from helpers.made_arms import chain, joint, row, written
 from helpers.quick_preparation import QUICK, coarse_grids
 from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
@@ -355,14 +356,16 @@ def test_a_mesh_without_volume_is_noted(tmp_path: Path) -> None:
     )
     plate = '<collision><geometry><mesh filename="plate.stl"/></geometry></collision>'
     robot = read_urdf(
-        written(tmp_path, chain("base", ["j"]), link("end", plate), joint("k", "j_link", "end"))
+        written(tmp_path, chain("base", ["j"]), made_arms.link("end", plate), joint("k", "j_link", "end"))
     )
     assert "link end has collision geometry without volume, made 1 mm thick" in robot.notes
 
 
 def test_a_large_hall_below_the_arm_is_noted(tmp_path: Path) -> None:
     hall = '<collision><geometry><box size="30 30 0.1"/></geometry></collision>'
-    file = written(tmp_path, chain("base", ["j"]), link("hall", hall), joint("f", "base", "hall", "fixed"))
+    file = written(
+        tmp_path, chain("base", ["j"]), made_arms.link("hall", hall), joint("f", "base", "hall", "fixed")
+    )
     assert any("link hall is 30 m long" in note for note in read_urdf(file).notes)
 
 
@@ -376,7 +379,9 @@ def test_preparations_of_one_urdf_that_differ_are_refused(
         for name in ("plain", "same"):
             add_robot(file, name=name, settings=QUICK)
         assert load_robot(file).joint_names == ("j1", "j2", "j3")
-        add_robot(file, name="locking", locked={"j2": 0.1}, settings=QUICK)
-    with pytest.raises(InputError, match="was added as locking, plain, same, which differ") as error:
+        limits = tmp_path / "limits.yaml"
+        limits.write_text("joint_limits: {j1: {max_velocity: 1}}")
+        add_robot(file, name="limited", limits=limits, settings=QUICK)
+    with pytest.raises(InputError, match="was added as limited, plain, same, which differ") as error:
         load_robot(file)
     assert "\n" not in str(error.value)

@@ -84,7 +84,7 @@ def convex_parts(
     soups = [surface.vertices[surface.faces] for surface in surfaces]
     grid = settings if tight is None else settings.finer()
     space = DistanceGrid.around(soups, grid.voxels, grid.finest)
-    parts = [_Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
+    parts = [Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
     parts = _cut(parts, space, settings, max(settings.most, 2 * len(parts)))
     if tight is not None:
         tight_only, space = space.near_tight(tight, settings.concavity)
@@ -93,7 +93,7 @@ def convex_parts(
     return tuple(_without_contained(_merged([part.hull for part in parts], space, settings)))
 
 
-def _cut(parts: list["_Part"], space: DistanceGrid, settings: PartSettings, most: int) -> list["_Part"]:
+def _cut(parts: list["Part"], space: DistanceGrid, settings: PartSettings, most: int) -> list["Part"]:
     """Parts cut in two, the most concave first, until all are within `settings.concavity` or there are
     `most`."""
     parts = list(parts)
@@ -138,7 +138,7 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: 
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class Part:
     triangles: Float[ndarray, "n 3 3"]
     points: Float[ndarray, "m 3"]
     """Points spread over the triangles, for choosing cuts."""
@@ -146,13 +146,13 @@ class _Part:
     concavity: float
 
     @staticmethod
-    def of(triangles: ndarray, points: ndarray, space: DistanceGrid, settings: PartSettings) -> "_Part":
+    def of(triangles: ndarray, points: ndarray, space: DistanceGrid, settings: PartSettings) -> "Part":
         hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
         if not len(points):  # the other side of a thin sheet has them
             points = _spread(triangles, space.pitch)
-        return _Part(triangles, points, hull, space.concavity(hull))
+        return Part(triangles, points, hull, space.concavity(hull))
 
-    def halves(self, space: DistanceGrid, settings: PartSettings) -> list["_Part"]:
+    def halves(self, space: DistanceGrid, settings: PartSettings) -> list["Part"]:
         """The two parts on the sides of the plane that gives hulls of least volume; the part itself if too
         small to cut."""
         low, size = self.hull.vertices.min(0), np.ptp(self.hull.vertices, axis=0)
@@ -173,7 +173,7 @@ class _Part:
             return [replace(self, concavity=0.0)]
         low_points = self.points[:, best[0]] <= best[1]
         points = (self.points[low_points], self.points[~low_points])
-        return [_Part.of(side, near, space, settings) for side, near in zip(halves, points, strict=True)]
+        return [Part.of(side, near, space, settings) for side, near in zip(halves, points, strict=True)]
 
 
 def _wall_cuts(heights: Float[ndarray, "n"], pitch: float) -> list[float]:

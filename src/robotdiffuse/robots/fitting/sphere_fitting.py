@@ -107,7 +107,7 @@ def fit_spheres(
     sizes = solid.sphere_sizes(bounds)
     inside = solid.inside
     # a sphere that sticks out of a flat face by e covers a disc of radius sqrt(2 r e); cells are much smaller
-    coarse, fine = (_Cells.of(solid, bounds, *size) for size in (COARSE_CELLS, FINE_CELLS))
+    coarse, fine = (Cells.of(solid, bounds, *size) for size in (COARSE_CELLS, FINE_CELLS))
     covers = []
     for _ in range(settings.starts):
         places = rng.permutation(inside)[: settings.candidates] + rng.uniform(-0.5, 0.5, 3) * solid.spacing
@@ -152,7 +152,7 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> b
 
 
 @dataclass(frozen=True, eq=False)
-class _Cells:
+class Cells:
     """Small triangles on the surface of the union of meshes."""
 
     points: Float[ndarray, "p 3"]
@@ -162,7 +162,7 @@ class _Cells:
     """Whether a point is a vertex of a mesh; all others lie between neighbours on a face or an edge."""
 
     @staticmethod
-    def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "_Cells":
+    def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "Cells":
         """Cells of a solid without triangles inside another mesh.
 
         Edges are at most 1 / `cut` of the radius of the largest disc that a sphere within bounds can cover;
@@ -173,7 +173,7 @@ class _Cells:
         area = np.linalg.norm(np.cross(*np.diff(corners, axis=1).swapaxes(0, 1)), axis=1).sum() / 2
         crowd = area / size**2 / most
         if crowd > MAX_CROWD:
-            return _Cells.of(solid, bounds, cut / np.sqrt(crowd), most)
+            return Cells.of(solid, bounds, cut / np.sqrt(crowd), most)
         soup, vertices, left_out = [], [], False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
         boxes = [(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh in solid.meshes]
@@ -197,7 +197,7 @@ class _Cells:
         corners = np.concatenate(soup).reshape(-1, 3)
         crowd = len(corners) / 3 / most
         if crowd > 1:
-            return _Cells.of(solid, bounds, cut / np.sqrt(1.1 * crowd), most)
+            return Cells.of(solid, bounds, cut / np.sqrt(1.1 * crowd), most)
         points = np.concatenate([*vertices, corners])
         lattice = np.round((points - points.min(0)) * (2**20 / np.ptp(points, axis=0).max())).astype(np.int64)
         _, first, index = np.unique(lattice @ (1, 2**21, 2**42), return_index=True, return_inverse=True)
@@ -207,7 +207,7 @@ class _Cells:
         sharp[index.ravel()[:count]] = True
         # where triangles were left out, any point may be a corner of the remaining surface
         sharp |= left_out
-        return _Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
+        return Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
 
     def assigned(self, sizes: SphereSizeGrid, centers: Float[ndarray, "n 3"]) -> "_Assignment":
         count = len(self.corners)
@@ -225,13 +225,13 @@ class _Cells:
         )
         return _Assignment(owner, owner_excess, runner_up, second_excess)
 
-    def part(self, mine: Bool[ndarray, "c"]) -> "_Cells":
+    def part(self, mine: Bool[ndarray, "c"]) -> "Cells":
         """A subset of the cells; points on its border count as vertices, since other cells need them
         covered."""
         outside = np.zeros(len(self.points), dtype=bool)
         outside[self.corners[~mine]] = True
         used, index = np.unique(self.corners[mine], return_inverse=True)
-        return _Cells(self.points[used], index.reshape(-1, 3), (self.sharp | outside)[used])
+        return Cells(self.points[used], index.reshape(-1, 3), (self.sharp | outside)[used])
 
 
 class _Assignment(NamedTuple):
@@ -248,14 +248,14 @@ class _Assignment(NamedTuple):
 
 
 def _relax(
-    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
+    sizes: SphereSizeGrid, cells: Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
 ) -> tuple[Float[ndarray, "n 3"], float]:
     """Improved centres and the largest excess radius [m]; ends early at `enough`."""
     return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *sizes.arrays, DIRECTIONS)
 
 
 def _first_cover(
-    sizes: SphereSizeGrid, cells: _Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
+    sizes: SphereSizeGrid, cells: Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "k 3"]:
     """Centres from a greedy set cover of the cells."""
     chosen = greedy_cover(cells.points, cells.corners, places, sizes.at(places))
@@ -263,7 +263,7 @@ def _first_cover(
 
 
 def _with_enough_spheres(
-    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
+    sizes: SphereSizeGrid, cells: Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "m 3"]:
     """Improved centres, with spheres added until none exceeds its largest radius, or there are
     `settings.most`."""
@@ -289,7 +289,7 @@ def _farthest_apart(
 
 
 def _thin_out(
-    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
+    sizes: SphereSizeGrid, cells: Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "m 3"]:
     """Centres without the spheres whose cells the others can cover; the least needed ones are dropped first.
 
@@ -327,9 +327,7 @@ def _thin_out(
     return centers
 
 
-def _with_radii(
-    sizes: SphereSizeGrid, cells: _Cells, centers: Float[ndarray, "n 3"]
-) -> Float[ndarray, "m 4"]:
+def _with_radii(sizes: SphereSizeGrid, cells: Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "m 4"]:
     """Spheres with the smallest radii that cover the cells assigned to them; spheres without cells are
     dropped."""
     owner = cells.assigned(sizes, centers).owner

@@ -13,7 +13,9 @@ from robotdiffuse.problems.files import (
     load_motion_bench_maker,
     load_problem,
 )
+from robotdiffuse.problems.files.moveit.frames import moveit_frames
 from robotdiffuse.problems.files.moveit.joints import scene_robot_notes
+from robotdiffuse.problems.files.moveit.objects import object_shapes
 from robotdiffuse.problems.files.moveit.scene import read_moveit_scene
 from robotdiffuse.robots import load_robot
 
@@ -107,7 +109,7 @@ def test_padding_and_scale_of_links_are_noted() -> None:
     data = {
         "link_padding": [
             {"link_name": "panda_hand", "padding": 0.02},
-            {"link_name": "other", "padding": 0.0},
+            {"link_name": "b", "padding": 0.0},
         ],
         "link_scale": [{"link_name": "panda_hand", "scale": 1.1}, {"link_name": "other", "scale": 1.0}],
     }
@@ -115,3 +117,9 @@ def test_padding_and_scale_of_links_are_noted() -> None:
         "the scene's link_padding of panda_hand is ignored",
         "the scene's link_scale of panda_hand is ignored",
     )
+
+
+def test_an_object_of_too_many_planes_is_one_line() -> None:
+    planes = [{"coef": [0, 0, 1, 1]}] * 400_000
+    with pytest.raises(InputError, match="has 400,000 planes; at most 1,000"):
+        object_shapes({"id": "a", "planes": planes}, moveit_frames({}), Path())

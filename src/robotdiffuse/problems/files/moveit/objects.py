@@ -27,6 +27,8 @@ PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shap
 """For each type, the number of its dimensions and the shape (of cylinders and cones height and radius)."""
 TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
 """Numbers of the types in messages (shape_msgs/SolidPrimitive)."""
+MAX_PLANES = 1000
+"""Most planes of a collision object; each is a box of its own."""
 NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
 
 
@@ -58,6 +60,8 @@ def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> 
     name = str(entry.get("id") or "object")
     planes = list_of("planes", entry.get("planes"))
     poses = list_of("plane_poses", entry.get("plane_poses")) or [NO_POSE] * len(planes)
+    if len(planes) > MAX_PLANES:
+        raise InputError(f"has {len(planes):,} planes; at most {MAX_PLANES:,} are read")
     if len(poses) != len(planes):
         raise InputError(f"has {len(planes)} planes and {len(poses)} plane_poses; it must be one for each")
     shapes: list[Shape] = []
