@@ -1,5 +1,6 @@
 """InputError, the exception for bad input, and helpers that quote values in its message."""
 
+from collections import Counter
 from collections.abc import Iterable
 
 import numpy as np
@@ -72,6 +73,11 @@ def joined(names: Iterable[object], most: int = MAX_NAMES) -> str:
     short = [shortened(str(name)) for name in names]
     more = f" and {len(short) - most} more" if len(short) > most else ""
     return ", ".join(short[:most]) + more
+
+
+def repeated(names: Iterable[str]) -> list[str]:
+    """The names that appear more than once, in order."""
+    return [name for name, count in Counter(names).items() if count > 1]
 
 
 def unknown_name(what: str, name: object, known: Iterable[object]) -> InputError:

@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, shortened, shown
+from robotdiffuse.core.errors import InputError, repeated, shortened, shown
 
 MEGABYTE = 2**20
 MAX_FILE_SIZE = 256 * MEGABYTE
@@ -317,8 +317,7 @@ def _reason(error: yaml.YAMLError) -> str:
 def _object(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
+        twice = repeated(name for name, _ in pairs)[0]
         raise InputError(f"{where} is not valid JSON: {shortened(twice)} appears twice")
     return found
 

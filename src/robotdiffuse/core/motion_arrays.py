@@ -6,7 +6,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_DURATION, MAX_RATE, numbers, rows
-from robotdiffuse.core.errors import InputError, distinct, joined, shown
+from robotdiffuse.core.errors import InputError, distinct, joined, repeated, shown
 
 RATES = ("velocities", "accelerations")
 
@@ -24,7 +24,7 @@ def check_motion_arrays(
     names = joint_names
     if not isinstance(names, list | tuple) or not names or not all(isinstance(n, str) and n for n in names):
         raise InputError(f"{where}joint_names is {shown(names)}; it must be a list of names, not empty")
-    twice = sorted({name for name in names if names.count(name) > 1})
+    twice = repeated(names)
     if twice:
         raise InputError(f"{where}joint_names has {joined(twice)} more than once")
     checked: dict[str, ndarray] = {}

@@ -7,7 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path as FilePath
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, repeated
 from robotdiffuse.core.input_files import read_bytes, read_json
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import LENGTH, Path
@@ -74,8 +74,7 @@ def gather_cases(names: list[str], count: int | None, out: FilePath, report: Rep
     to them. `report` is called with lines on the progress. Raises InputError for unknown names and empty
     sets.
     """
-    sets = [problem_set_name(text) for text in names]
-    twice = {name for name in sets if sets.count(name) > 1}
+    twice = repeated(problem_set_name(text) for text in names)
     if twice:
         raise InputError(f"problems name {', '.join(sorted(twice))} twice; rename a file or folder")
     return [case for text in names for case in _set(text, count, out / "problems", report)]

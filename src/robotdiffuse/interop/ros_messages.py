@@ -28,7 +28,8 @@ def motion_from_messages(kind: str, messages: list[tuple[int, Any]], where: str)
     for i, state in enumerate(states):
         if sorted(state["name"]) != sorted(names):
             raise InputError(f"{where}: joint state {i} has other joints than the first")
-        order = [state["name"].index(name) for name in names]
+        column_of = {name: k for k, name in enumerate(state["name"])}
+        order = [column_of[name] for name in names]
         for what, column in rows.items():
             column.append([state[what][k] for k in order] if len(state[what]) == len(names) else [])
     velocities = rows["velocity"] if all(rows["velocity"]) else None

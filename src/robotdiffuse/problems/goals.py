@@ -13,7 +13,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import Value, numbers, rigid_transform
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, repeated, shown
 
 
 @no_type_check
@@ -100,10 +100,9 @@ class PosesGoal(Value):
         poses = self.poses if isinstance(self.poses, list | tuple) else ()
         if not poses or not all(isinstance(pose, PoseGoal) for pose in poses):
             raise InputError(f"goal.poses is {shown(self.poses)}; it must be a list of rd.PoseGoal")
-        frames = [pose.frame for pose in poses]
-        twice = next((frame for frame in frames if frames.count(frame) > 1), None)
-        if twice is not None:
-            raise InputError(f"goal.poses names {twice!r} twice; each link has one pose")
+        twice = repeated(pose.frame for pose in poses)
+        if twice:
+            raise InputError(f"goal.poses names {twice[0]!r} twice; each link has one pose")
         object.__setattr__(self, "poses", tuple(poses))
 
     if TYPE_CHECKING:

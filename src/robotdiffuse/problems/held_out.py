@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, repeated
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.types import Path
 from robotdiffuse.problems.families import FAMILIES, load_family
@@ -117,8 +117,7 @@ class CaseFile:
 
     def fill(self, cases: list[Case]) -> None:
         """Replaces all cases atomically. Raises InputError if two have the same name."""
-        names = [case.name for case in cases]
-        twice = [name for name in names if names.count(name) > 1]
+        twice = repeated(case.name for case in cases)
         if twice:
             raise InputError(f"two problems are called {twice[0]}; rename the file of one")
         self._lines.replace([_row(case) for case in cases])

@@ -99,9 +99,10 @@ def _check_planned_joint_moves(robot: Robot, field: str, frame: str) -> None:
 
 def check_contacts(robot: Robot, scene: Scene) -> None:
     """Raises InputError for allowed contacts of links that the robot lacks."""
+    known = {*robot.link_names}
     for obstacle, links in scene.allowed_contacts:
         for link in () if links == ALL_LINKS else links:
-            if link not in robot.link_names:
+            if link not in known:
                 raise unknown_name(f"link in allowed_contacts of {obstacle}:", link, robot.link_names)
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
+from functools import cached_property
 from typing import no_type_check
 
 import numpy as np
@@ -20,6 +21,8 @@ SHOWN_NAMES = 5
 """Names of shapes in the text of a scene."""
 ALL_LINKS = "all"
 """Stands for all links of a robot in `Scene.allowed_contacts`."""
+MAX_CONTACT_LINKS = 1000
+"""Most links that `Scene.allowed_contacts` may name for one obstacle."""
 
 
 @no_type_check
@@ -84,10 +87,12 @@ class Scene(Value):
 
     def may_touch(self, link: str, obstacle: str) -> bool:
         """Whether contact of this link with this obstacle is allowed."""
-        return any(
-            name == obstacle and (links == ALL_LINKS or link in links)
-            for name, links in self.allowed_contacts
-        )
+        links = self._links_that_touch.get(obstacle, ())
+        return links == ALL_LINKS or link in links
+
+    @cached_property
+    def _links_that_touch(self) -> dict[str, tuple[str, ...] | str]:
+        return dict(self.allowed_contacts)
 
     def attach(
         self,
@@ -139,7 +144,7 @@ def _contacts(
         raise InputError(
             f"allowed_contacts is {shown(allowed)}; it must map obstacles to lists of links or to {ALL_LINKS}"
         ) from None
-    found: dict[str, tuple[str, ...] | str] = {}
+    allowed_links: dict[str, dict[str | None, None]] = {}  # None stands for all links
     for obstacle, links in entries:
         if not isinstance(obstacle, str) or (obstacle not in given and obstacle not in names):
             raise unknown_name("obstacle in allowed_contacts:", obstacle, names)
@@ -149,9 +154,18 @@ def _contacts(
                     f"allowed_contacts: {obstacle} has {shown(links)}; it must be a list of links, or "
                     f"{ALL_LINKS}"
                 )
-            links = tuple(dict.fromkeys(links))
+        touching = allowed_links.setdefault(obstacle, {})
+        touching.update(dict.fromkeys((None,) if links == ALL_LINKS else links))
+        if len(touching) > MAX_CONTACT_LINKS:
+            raise InputError(
+                f"allowed_contacts: {shown(obstacle)} has more than {MAX_CONTACT_LINKS} links; write {ALL_LINKS}"
+            )
+    by_name: dict[str, dict[str | None, None]] = {}
+    for obstacle, touching in allowed_links.items():
         for name in given.get(obstacle, [obstacle]):
-            before = found.get(name, ())
-            both = ALL_LINKS in (before, links)
-            found[name] = ALL_LINKS if both else tuple(dict.fromkeys((*before, *links)))
-    return tuple((name, links) for name, links in found.items() if links)
+            by_name[name] = by_name[name] | touching if name in by_name else touching
+    return tuple(
+        (name, ALL_LINKS if None in touching else tuple(touching))  # type: ignore[arg-type]
+        for name, touching in by_name.items()
+        if touching
+    )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 
-from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, repeated, unknown_name
 from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 from robotdiffuse.robots.parsing.srdf import Srdf
 from robotdiffuse.robots.robot import Robot
@@ -226,8 +226,8 @@ def _together(arms: list[Arm]) -> str:
 
 def _names_of(arms: list[Arm]) -> list[str]:
     """The names of arms, or their tips if two have the same name."""
-    names = [arm.name for arm in arms]
-    return [arm.tip if names.count(arm.name) > 1 else arm.name for arm in arms]
+    twice = repeated(arm.name for arm in arms)
+    return [arm.tip if arm.name in twice else arm.name for arm in arms]
 
 
 def _listed(arms: list[Arm]) -> str:

@@ -1,0 +1,65 @@
+"""Readers of names from requests and files compare each name a few times, however many there are."""
+
+from typing import ClassVar
+
+import pytest
+
+from robotdiffuse.core.errors import InputError, repeated
+from robotdiffuse.core.input_files import parse_json
+from robotdiffuse.core.motion_arrays import check_motion_arrays
+from robotdiffuse.scenes.scene import MAX_CONTACT_LINKS, Scene
+from robotdiffuse.scenes.shapes import Box
+
+COUNT = 2000
+
+
+class Name(str):
+    """A text that counts how often it is compared."""
+
+    compared: ClassVar[int] = 0
+
+    def __eq__(self, other: object) -> bool:
+        Name.compared += 1
+        return str.__eq__(self, str(other))
+
+    __hash__ = str.__hash__
+
+
+@pytest.fixture
+def names(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.setattr(Name, "compared", 0)
+    return [Name(f"j{i}") for i in range(COUNT)]
+
+
+def test_repeated_names_in_order() -> None:
+    assert repeated(["b", "a", "b", "c", "a"]) == ["b", "a"]
+    assert repeated("abc") == []
+
+
+def test_joint_names_are_compared_a_few_times_each(names: list[str]) -> None:
+    with pytest.raises(InputError, match="joint_names has j7 more than once"):
+        check_motion_arrays([*names, Name("j7")], {"positions": [[0.0]]})
+    assert Name.compared < 5 * COUNT
+
+
+def test_the_last_key_of_many_is_found_to_be_the_first_again() -> None:
+    keys = ", ".join(f'"k{i}": 0' for i in range(100_000))
+    with pytest.raises(InputError, match="k0 appears twice"):
+        parse_json(f'{{{keys}, "k0": 1}}', "the request")
+
+
+def test_links_that_may_touch_an_obstacle_are_compared_a_few_times_each(names: list[str]) -> None:
+    few = names[:MAX_CONTACT_LINKS]
+    scene = Scene([Box([1, 0, 0], [0.1, 0.1, 0.1])], [("box", [name]) for name in few])
+    assert Name.compared < 5 * COUNT
+    assert scene.allowed_contacts == (("box", tuple(few)),)
+    with pytest.raises(InputError, match=f"'box' has more than {MAX_CONTACT_LINKS} links; write all"):
+        Scene(scene.shapes, [("box", names)])
+
+
+def test_contacts_of_a_name_and_of_one_of_its_shapes_are_joined() -> None:
+    boxes = [Box([1, 0, 0], [0.1, 0.1, 0.1])] * 3
+    scene = Scene(boxes, [("box", ["a"]), ("box_2", ["b", "a"]), ("box_3", "all")])
+    assert scene.allowed_contacts == (("box", ("a",)), ("box_2", ("a", "b")), ("box_3", "all"))
+    assert scene.may_touch("b", "box_2") and scene.may_touch("x", "box_3")
+    assert not scene.may_touch("b", "box") and not scene.may_touch("a", "wall")
