@@ -33,7 +33,7 @@ def draw(problem: "Problem", result: "PlanResult | None", file: Path) -> None:
     else:
         from robotdiffuse.visualization.picture import write_picture as write
     robot, scene = _shown(problem)
-    write(robot, scene, _motion(result), file, result=result)
+    write(robot, scene, _motion(result), file, result=result, moving=problem.moving_in_world)
 
 
 def draw_several(problem: "Problem", results: "Mapping[str, PlanResult]", file: Path, shell: float) -> None:
@@ -47,12 +47,16 @@ def draw_several(problem: "Problem", results: "Mapping[str, PlanResult]", file: 
     if file.suffix.lower() == ".html":
         from robotdiffuse.visualization.gallery import GalleryEntry, write_gallery
 
-        entries = [GalleryEntry(name, results[name].planner, scene, m) for name, m in motions.items()]
+        entries = [
+            GalleryEntry(name, results[name].planner, scene, motion, problem.moving_in_world)
+            for name, motion in motions.items()
+        ]
         write_gallery(robot, entries, file, robot.name)
     else:
         from robotdiffuse.visualization.picture import PictureSettings, write_comparison
 
-        write_comparison(robot, scene, motions, file, settings=PictureSettings(shell=shell))
+        settings = PictureSettings(shell=shell)
+        write_comparison(robot, scene, motions, file, settings=settings, moving=problem.moving_in_world)
 
 
 def _motion(result: "PlanResult") -> "PathOfJoints | Trajectory":

@@ -49,7 +49,9 @@ def run(arguments: argparse.Namespace) -> int:
     if result.trajectory is None:
         raise InputError(f"{arguments.result} holds a path without times; a replay needs a trajectory")
     robot, scene = problem.standing()
-    done = replay(robot, scene, result.trajectory)
+    done = replay(robot, scene, result.trajectory, moving=problem.moving_in_world)
+    for name in (one.name for one in problem.moving if not one.known):
+        print(f"note: the motion of {name} is not known; it stands still here")
     print_replay(problem.robot.name, result.trajectory.duration, done)
     for file in outputs:
         write = write_gif if file.suffix.lower() == ".gif" else write_png

@@ -222,6 +222,12 @@ class Problem(Value):
         T = self.T_world_base
         return (self.robot, self.scene) if T is None else (self.robot.placed_in_world(T), self.scene.moved(T))
 
+    @property
+    def moving_in_world(self) -> tuple[MovingObstacle, ...]:
+        """The moving obstacles in the world's frame, for pictures and simulators."""
+        T = self.T_world_base
+        return self.moving if T is None else tuple(one.moved(T) for one in self.moving)
+
     def clearance_at(self, q: ArrayLike) -> float | Float[ndarray, "n"]:
         """Lower bound on the distance of the arm to obstacles and between its links [m], at most 1 m.
 

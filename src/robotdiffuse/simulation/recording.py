@@ -75,9 +75,9 @@ def write_png(
     """
     from PIL import Image
 
-    with World(robot, scene, visuals=True) as world:
+    with World(robot, scene, visuals=True, moving=run.moving) as world:
         camera = _prepare(world, run, settings)
-        *ghosts, picture = [_shot(world, q, camera) for q in _at(run, PICTURE_TIMES)]
+        *ghosts, picture = [_shot(world, run, share, camera) for share in PICTURE_TIMES]
     pixels, nearest = picture.rgb.astype(np.float64), picture.depth
     for ghost in reversed(ghosts):
         over = (ghost.bodies == world.body) & (ghost.depth < nearest)
@@ -101,11 +101,11 @@ def write_gif(
     # GIF delays are in hundredths of a second
     delay = max(round(100 / settings.rate), int(np.ceil(100 * duration / (settings.max_frames - 1))))
     shares = np.append(np.arange(0, 100 * duration, delay) / (100 * duration), 1.0)
-    with World(robot, scene, visuals=True) as world:
+    with World(robot, scene, visuals=True, moving=run.moving) as world:
         camera = _prepare(world, run, settings)
         shots = [
-            Image.fromarray(_reduced(_shot(world, q, camera).rgb, settings.oversampling))
-            for q in _at(run, shares)
+            Image.fromarray(_reduced(_shot(world, run, share, camera).rgb, settings.oversampling))
+            for share in shares
         ]
     strip = Image.fromarray(np.concatenate([np.asarray(shots[i]) for i in (0, len(shots) // 2, -1)]))
     palette = strip.quantize(settings.colors, method=Image.Quantize.MEDIANCUT)
@@ -121,8 +121,10 @@ def _at(run: Replay, shares: "Float[ndarray, 'n'] | tuple[float, ...]") -> Float
     return run.positions[np.rint(np.multiply(shares, len(run.times) - 1)).astype(np.int64)]
 
 
-def _shot(world: World, q: Float[ndarray, "dof"], camera: DepthCamera) -> RawImage:
-    world.place(q)
+def _shot(world: World, run: Replay, share: float, camera: DepthCamera) -> RawImage:
+    """The image at a fraction of the duration."""
+    world.place(_at(run, (share,))[0])
+    world.move(share * float(run.times[-1]))
     return capture(world, camera, LIGHT)
 
 

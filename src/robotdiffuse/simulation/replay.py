@@ -9,6 +9,7 @@ Bullet's meshes are 1 mm too large. A motion that passes an obstacle at less tha
 links) has a contact here.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -21,6 +22,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import DENSITY, World
 
@@ -84,6 +86,8 @@ class Replay:
     """Distance of the robot's tip from its reference position [m]."""
     contacts: tuple[ReplayContact, ...]
     """Contacts in order of their first time."""
+    moving: tuple[MovingObstacle, ...] = ()
+    """The moving obstacles."""
 
     @property
     def free(self) -> bool:
@@ -101,10 +105,17 @@ class Replay:
         return np.sqrt(((self.positions - self.reference) ** 2).mean(axis=0))
 
 
-def replay(robot: Robot, scene: Scene, trajectory: Trajectory, settings: ReplaySettings = DEFAULT) -> Replay:
+def replay(
+    robot: Robot,
+    scene: Scene,
+    trajectory: Trajectory,
+    settings: ReplaySettings = DEFAULT,
+    moving: Sequence[MovingObstacle] = (),
+) -> Replay:
     """Simulate a trajectory, and then `settings.settle` seconds of rest.
 
-    An obstacle that the arm hits blocks it; the simulation continues to the end. Raises InputError for a
+    An obstacle that the arm hits blocks it; the simulation continues to the end. Moving obstacles move until
+    the trajectory ends; those of unknown motion stand still. Raises InputError for a
     trajectory of other joints.
     """
     if trajectory.joint_names != robot.joint_names:
@@ -115,10 +126,10 @@ def replay(robot: Robot, scene: Scene, trajectory: Trajectory, settings: ReplayS
     count = int(np.ceil((trajectory.duration + settings.settle) / settings.time_step))
     times = settings.time_step * np.arange(count + 1)
     reference = trajectory.at(np.minimum(times, trajectory.duration)).positions
-    with World(robot, scene, density=settings.density) as world:
-        positions, contacts = _simulate(world, times, reference, settings)
+    with World(robot, scene, density=settings.density, moving=moving) as world:
+        positions, contacts = _simulate(world, np.minimum(times, trajectory.duration), reference, settings)
         tip_errors = np.linalg.norm(_tips(world, positions) - _tips(world, reference), axis=1)
-    return Replay(robot.joint_names, times, positions, reference, tip_errors, contacts)
+    return Replay(robot.joint_names, times, positions, reference, tip_errors, contacts, tuple(moving))
 
 
 def _simulate(
@@ -162,6 +173,7 @@ def _simulate(
             targetVelocities=velocities[k - 1].tolist(),
             **gains,
         )
+        world.move(times[k - 1])
         pybullet.stepSimulation(physicsClientId=client)
         states = pybullet.getJointStates(body, world.joints, physicsClientId=client)
         positions[k] = [state[0] for state in states]

@@ -1,5 +1,6 @@
 """World: a robot and obstacles in a PyBullet simulation without a window."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -10,6 +11,7 @@ from numpy import ndarray
 
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.mesh import Mesh, Triangulated
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 from robotdiffuse.simulation.model import write_obj, write_points_urdf, write_shaded, write_urdf
@@ -34,11 +36,20 @@ class World:
     against obstacles that they may not touch, and links on different frames unless they may touch.
     """
 
-    def __init__(self, robot: Robot, scene: Scene, visuals: bool = False, density: float = DENSITY) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        scene: Scene,
+        visuals: bool = False,
+        density: float = DENSITY,
+        moving: Sequence[MovingObstacle] = (),
+    ) -> None:
         """visuals: add coloured surfaces for cameras and pictures, which takes longer to load. density: of
-        all links [kg/m^3]."""
+        all links [kg/m^3]. moving: further obstacles, where they are at time 0 until `move`."""
         self.robot = robot
         self.visuals = visuals
+        self._moving = tuple(moving)
+        scene = scene.with_shapes([*scene.shapes, *(one.shape for one in moving)]) if moving else scene
         self.client = pybullet.connect(pybullet.DIRECT)
         self._folder = TemporaryDirectory()
         try:
@@ -123,6 +134,14 @@ class World:
             self.body, self.joints, q[:, None].tolist(), physicsClientId=self.client
         )
 
+    def move(self, time: float) -> None:
+        """Place the moving obstacles where they are at a time [s]; one of unknown motion stays."""
+        for one in self._moving:
+            xyz, wxyz = _pose(one.at(time))
+            pybullet.resetBasePositionAndOrientation(
+                self.obstacles[one.name], xyz.tolist(), [*wxyz[1:], wxyz[0]], physicsClientId=self.client
+            )
+
     def touching(self) -> list[tuple[str, str, float]]:
         """Contacts of the last step: link, obstacle or other link, signed distance [m]."""
         links = {index: link for link, index in self.links.items()}
@@ -157,19 +176,14 @@ class World:
         if isinstance(shape, PointCloud):
             return self._add_points(shape, color)
         what: dict[str, object] = {}
-        if isinstance(shape, Triangulated):
-            xyz, wxyz = shape.mesh.xyz, shape.mesh.wxyz
-        elif isinstance(shape, Sphere):
+        if isinstance(shape, Sphere):
             what = {"shapeType": pybullet.GEOM_SPHERE, "radius": shape.radius}
-            xyz, wxyz = shape.center, IDENTITY
         elif isinstance(shape, Box):
             what = {"shapeType": pybullet.GEOM_BOX, "halfExtents": (shape.size / 2).tolist()}
-            xyz, wxyz = shape.center, shape.wxyz
-        else:
-            assert isinstance(shape, Cylinder | Capsule)
+        elif isinstance(shape, Cylinder | Capsule):
             kind = pybullet.GEOM_CYLINDER if isinstance(shape, Cylinder) else pybullet.GEOM_CAPSULE
             what = {"shapeType": kind, "radius": shape.radius, "height": shape.height}
-            xyz, wxyz = shape.center, shape.wxyz
+        xyz, wxyz = _pose(shape)
         visual = -1
         if self.visuals:
             # PyBullet's own spheres and cylinders are too coarse
@@ -236,6 +250,16 @@ class World:
             rgbaColor=[*(channel / 255 for channel in color), 1.0],
             physicsClientId=self.client,
         )
+
+
+def _pose(shape: Shape) -> tuple[Float[ndarray, "3"], Float[ndarray, "4"]]:
+    """Position and quaternion of the body of a shape that is no point cloud."""
+    if isinstance(shape, Triangulated):
+        return shape.mesh.xyz, shape.mesh.wxyz
+    if isinstance(shape, Sphere):
+        return shape.center, IDENTITY
+    assert isinstance(shape, Box | Cylinder | Capsule)
+    return shape.center, shape.wxyz
 
 
 def _surface(shape: Shape) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:

@@ -15,6 +15,7 @@ from PIL import Image
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization.picture import PictureSettings, render
 from robotdiffuse.visualization.replay_page import write_replay
@@ -87,6 +88,7 @@ class GalleryEntry:
     """One line below the title."""
     scene: Scene
     motion: Path | Trajectory
+    moving: tuple[MovingObstacle, ...] = ()
 
 
 def write_gallery(
@@ -127,13 +129,13 @@ def _shared(pages: list[str]) -> dict[str, list]:
 def _replay(robot: Robot, entry: GalleryEntry) -> str:
     with TemporaryDirectory() as folder:
         file = FilePath(folder) / "replay.html"
-        write_replay(robot, entry.scene, entry.motion, file, title=entry.title)
+        write_replay(robot, entry.scene, entry.motion, file, title=entry.title, moving=entry.moving)
         return file.read_text("utf-8")
 
 
 def _thumbnail(robot: Robot, entry: GalleryEntry) -> str:
     """A small JPEG in base64."""
-    pixels, _ = render(robot, entry.scene, entry.motion, THUMBNAIL)
+    pixels, _ = render(robot, entry.scene, entry.motion, THUMBNAIL, moving=entry.moving)
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "JPEG", quality=88)
     return base64.b64encode(buffer.getvalue()).decode("ascii")

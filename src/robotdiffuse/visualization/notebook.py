@@ -55,7 +55,7 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
         if motion is None:
             write_problem(problem, file, result)
         else:
-            write_replay(*problem.standing(), motion, file, result=result)
+            write_replay(*problem.standing(), motion, file, result=result, moving=problem.moving_in_world)
         return Replay(file.read_text("utf-8"), height)
 
 

@@ -15,6 +15,7 @@ from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.camera import Camera, best_view
@@ -42,6 +43,8 @@ CAPTION_COLOR = (0xF2, 0xF4, 0xF6)
 """Colour to which the picture fades behind the caption."""
 COMPARED = ((0xE3, 0xA8, 0x12), (0xCF, 0x33, 0x3B), (0x2F, 0x6F, 0xD0), (0x8B, 0x55, 0xB8))
 """sRGB colours of the traces of several motions in one picture."""
+MOVED_ALPHA = 0.22
+"""Of moving obstacles along their way."""
 SHELL_COLOR, SHELL_ALPHA = (0x35, 0xB8, 0x5C), 0.2
 MARGINS = (0.05, 0.11)
 """Fractions of the height left free above the arm, and below it for the caption."""
@@ -93,15 +96,17 @@ def write_picture(
     result: PlanResult | None = None,
     title: str | None = None,
     settings: PictureSettings | None = None,
+    moving: Sequence[MovingObstacle] = (),
 ) -> None:
     """Write a picture of a motion as .png.
 
-    The arm at the goal is solid, earlier poses are see-through, and a tube follows the tool. `result` adds
+    The arm at the goal is solid, earlier poses are see-through, and a tube follows the tool. Of `moving`
+    obstacles, the pose at the start is solid, and later ones are see-through. `result` adds
     its figures to the caption. Raises InputError for another ending or a file that cannot be written.
     """
     path = check_output(file, (".png",))
     settings = settings or PictureSettings()
-    pixels, _ = render(robot, scene, motion, settings)
+    pixels, _ = render(robot, scene, motion, settings, moving=moving)
     image = Image.fromarray(faded_below(pixels))
     caption(image, title or robot.name, style.facts(motion, result, robot))
     save_png(image, path)
@@ -115,6 +120,7 @@ def write_comparison(
     *,
     title: str | None = None,
     settings: PictureSettings | None = None,
+    moving: Sequence[MovingObstacle] = (),
 ) -> None:
     """Write a picture of several motions by name, of one arm in one scene, as .png.
 
@@ -125,7 +131,7 @@ def write_comparison(
     if not 0 < len(motions) <= len(COMPARED):
         raise InputError(f"{len(motions)} motions; a picture shows 1 to {len(COMPARED)}")
     first, *others = motions.values()
-    pixels, _ = render(robot, scene, first, settings or PictureSettings(), others=others)
+    pixels, _ = render(robot, scene, first, settings or PictureSettings(), others=others, moving=moving)
     image = Image.fromarray(faded_below(pixels))
     figures = [", ".join(v for k, v in style.facts(m, None) if v != "untimed") for m in motions.values()]
     caption(image, title or robot.name, list(zip(motions, figures, strict=True)), COMPARED)
@@ -148,13 +154,16 @@ def render(
     others: Sequence[Path | Trajectory] = (),
     added: Sequence[Surface] = (),
     clear: Sequence[ClearSurface] = (),
+    moving: Sequence[MovingObstacle] = (),
 ) -> tuple[np.ndarray, Camera]:
     """The picture without its caption, uint8 [height, width, 3], and the camera that took it.
 
     camera: where to look from; without one, from where most of the motion can be seen.
     others: further motions, of which the trace is drawn; all traces then have the colours COMPARED.
     added, clear: further surfaces in the base frame, solid and see-through.
+    moving: obstacles that are solid where they are at the start, and see-through later.
     """
+    scene = scene.with_shapes([*scene.shapes, *(one.shape for one in moving)])
     surfaces = style.robot_surfaces(robot)
     q = style.dense(motion.positions, 240)
     poses = style.frames(robot, q)
@@ -178,6 +187,13 @@ def render(
         ClearSurface(ghost, _mixed(START, GOAL, share), 0.50 if share == 0 else 0.26)
         for ghost, share in ghosts
     ]
+    if isinstance(motion, Trajectory):
+        times = np.linspace(0.0, motion.duration, settings.ghosts + 1)[1:]
+        for one, color in zip(
+            moving, style.obstacle_colors(scene)[len(scene.shapes) - len(moving) :], strict=True
+        ):
+            places = [style.shape_surface(one.at(time), color) for time in times] if one.known else []
+            over = [*(ClearSurface(place, linear(color), MOVED_ALPHA) for place in places), *over]
     if settings.shell:
         over.append(ClearSurface(_shell(robot, poses[-1], settings.shell), linear(SHELL_COLOR), SHELL_ALPHA))
     image = _paint(big, join([goal, obstacles, *tubes, *added]), [*clear, *over])

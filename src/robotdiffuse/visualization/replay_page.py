@@ -15,9 +15,11 @@ from numpy import ndarray
 
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.mesh import Triangulated
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape
 from robotdiffuse.visualization import style
@@ -26,6 +28,8 @@ from robotdiffuse.visualization.style import GOAL, START, Surface
 
 MAX_ROW_RATE = 60.0
 """Most rows of the motion per second; the page interpolates between them."""
+TRACK_RATE = 30.0
+"""Poses of moving obstacles per second."""
 MAX_ROWS = 3000
 """Most rows of the motion."""
 VIEW_SIZE = (1600, 1000)
@@ -43,16 +47,18 @@ def write_replay(
     result: PlanResult | None = None,
     title: str | None = None,
     candidates: Sequence[Path] = (),
+    moving: Sequence[MovingObstacle] = (),
 ) -> None:
     """Write a replay of a motion as a self-contained .html file.
 
     `result` adds its figures to the header. For `candidates`, other paths of the same robot, the traces of
-    the tool are shown. A path without times plays at constant speed in joint space. Raises InputError for
-    another ending or a file that cannot be written.
+    the tool are shown. `moving` obstacles move along with a timed motion. A path without times plays at
+    constant speed in joint space. Raises InputError for another ending or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
-    title = title or f"{robot.name} · {len(scene.shapes)} obstacle{'' if len(scene.shapes) == 1 else 's'}"
-    write_page(target, title, page_data(robot, scene, motion, result, candidates))
+    count = len(scene.shapes) + len(moving)
+    title = title or f"{robot.name} · {count} obstacle{'' if count == 1 else 's'}"
+    write_page(target, title, page_data(robot, scene, motion, result, candidates, moving))
 
 
 def write_page(target: FilePath, title: str, data: dict[str, Any], script: str = "") -> None:
@@ -78,8 +84,11 @@ def page_data(
     motion: Path | Trajectory,
     result: PlanResult | None = None,
     candidates: Sequence[Path] = (),
+    moving: Sequence[MovingObstacle] = (),
 ) -> dict[str, Any]:
     """What the page reads; see `write_replay`."""
+    static = scene
+    scene = scene.with_shapes([*scene.shapes, *(one.shape for one in moving)])
     surfaces = style.robot_surfaces(robot)
     frame, point = tool = style.tool_point(robot, surfaces)
     times, positions = _thinned(*style.timed(motion))
@@ -95,7 +104,11 @@ def page_data(
             "spheres": _spheres(robot),
             "tool": {"frame": frame, "point": _rounded(point, 5)},
         },
-        "scene": page_shapes(scene),
+        "scene": page_shapes(scene)[: len(static.shapes)],
+        "moving": [
+            {"shape": shape, "track": _track(one, motion)}
+            for shape, one in zip(page_shapes(scene)[len(static.shapes) :], moving, strict=True)
+        ],
         "ground": _ground(scene, colors),
         "timed": isinstance(motion, Trajectory),
         "times": _rounded(times, 4),
@@ -117,6 +130,20 @@ def _thinned(
         return times, positions
     at = np.linspace(0, times[-1], most)
     return at, np.stack([np.interp(at, times, positions[:, j]) for j in range(positions.shape[1])], axis=1)
+
+
+def _track(obstacle: MovingObstacle, motion: Path | Trajectory) -> list[list[float]]:
+    """How the obstacle has moved from its first pose at equal steps of the motion's time: x y z, and the
+    quaternion wxyz."""
+    if not isinstance(motion, Trajectory):
+        return [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]
+    count = int(min(MAX_ROWS, np.ceil(TRACK_RATE * motion.duration) + 1))
+    T_shape_base = inverse(obstacle.shape.T_base_shape)
+    rows = []
+    for time in np.linspace(0.0, motion.duration, count):
+        T = obstacle.pose(time) @ T_shape_base
+        rows.append(_rounded(np.concatenate([T[:3, 3], quaternion_from_rotation(T[:3, :3])]), 6))
+    return rows
 
 
 def _spheres(robot: Robot) -> list[list[float | int]]:

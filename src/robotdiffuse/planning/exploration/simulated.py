@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
@@ -38,6 +39,10 @@ FLOOR = "floor"
 """Shapes of this name are known without being seen."""
 FREE_ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
 """The space around the base that is declared free [m]."""
+UNSUPPORTED = (
+    "waypoints", "constraints", "moving", "payload", "start_velocity", "views", "unknown", "clearance"
+)  # fmt: skip
+"""Fields of problems that an Explorer does not take into account."""
 IMAGE_PERIOD, MAX_IMAGES = 0.25, 8
 """Time between images during a motion [s], and the most images of a motion, that at its end included."""
 
@@ -77,7 +82,14 @@ def simulated_explorer(
     problem: Problem, settings: ExplorerSettings, noise: DepthNoise | None, seed: int
 ) -> RecordedExplorer:
     """An explorer with a camera at the arm's tip that knows the floor, and one image of a camera beside the
-    arm."""
+    arm.
+
+    Raises InputError for a problem with fields that exploring would ignore.
+    """
+    ignored = [name for name in UNSUPPORTED if getattr(problem, name) not in (None, ())]
+    if ignored:
+        names = ", ".join(ignored)
+        raise InputError(f"the problem has {names}, which explore does not support: remove {names}")
     known = Scene([shape for shape in problem.scene.shapes if shape.name == FLOOR])
     cameras = [wrist_camera(problem.robot)]
     explorer = RecordedExplorer(problem.robot, cameras, known, FREE_ZONE, settings, seed)

@@ -15,6 +15,8 @@ from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
+from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.report import Violation
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.live.access import AccessProxy
@@ -53,6 +55,7 @@ class Page:
         callbacks = PanelCallbacks(self.select, self._seek, self._set_playing)
         self._panel = Panel(self.server, session, callbacks)
         self._obstacles = Obstacles(self.server, self.select)
+        self._moving = Obstacles(self.server, lambda _: None)
         self._arms: dict[str, Arm] = {}
         self._poses: Poses | None = None
         self._lock = threading.Lock()
@@ -108,6 +111,8 @@ class Page:
                 names = [shape.name for shape in problem.known_scene.shapes]
                 T = self.session.obstacle_pose(selected) if selected in names else None
                 self._obstacle_gizmo.show(T)
+            if self._new("moving", problem.moving):
+                self._show_moving(problem.moving, 0.0)
             self._start_gizmo.show(link_pose(robot, problem.start, robot.tip))
             if self._new("start", problem.start) | self._new("motion start", state.motion):
                 self._ghost("start", None if _starts_at_start(state) else problem.start)
@@ -190,7 +195,13 @@ class Page:
                 return
             row = min(round(at * POSE_RATE), len(self._poses.xyz) - 1)
             self._arms["arm"].show(self._poses, row)
+        self._show_moving(self.session.state.problem.moving, at)
         self._panel.show_time(at, self.player.duration)
+
+    def _show_moving(self, moving: tuple[MovingObstacle, ...], at: float) -> None:
+        """Show the moving obstacles where they are at a time of the motion [s]."""
+        with self._lock:
+            self._moving.show(Scene([one.at(at) for one in moving]), "")
 
     def _seek(self, at: float) -> None:
         self._set_playing(False)

@@ -248,6 +248,21 @@ function obstacle(shape) {
 }
 const obstacles = new THREE.Group();
 for (const shape of data.scene) obstacles.add(obstacle(shape));
+const movers = data.moving.map(({ shape, track }) => {
+  const group = new THREE.Group();
+  group.add(obstacle(shape));
+  obstacles.add(group);
+  return { group, track };
+});
+function moveObstacles(share) {
+  for (const { group, track } of movers) {
+    const at = share * (track.length - 1), row = Math.min(Math.floor(at), Math.max(0, track.length - 2));
+    const a = track[row], b = track[Math.min(row + 1, track.length - 1)];
+    const turn = (p) => new THREE.Quaternion(p[4], p[5], p[6], p[3]);
+    group.position.set(...a).lerp(new THREE.Vector3(...b), at - row);
+    group.quaternion.copy(turn(a)).slerp(turn(b), at - row);
+  }
+}
 scene.add(obstacles);
 
 // --- Traces
@@ -330,7 +345,7 @@ toggle("Goal", [goalArm.group]);
 toggle("Trace", [traces]);
 if (data.candidates.length) toggle("Candidates", [candidates]);
 if (data.robot.spheres.length) toggle("Spheres", [spheres]);
-if (data.scene.length) toggle("Obstacles", [obstacles]);
+if (obstacles.children.length) toggle("Obstacles", [obstacles]);
 {
   const button = document.createElement("button");
   button.textContent = "Reset view";
@@ -428,6 +443,7 @@ function setTime(t) {
     holder.matrixWorldNeedsUpdate = true;
   }
   const share = duration > 0 ? time / duration : 0;
+  moveObstacles(share);
   $("slider").value = share;
   $("slider").style.setProperty("--at", `${100 * share}%`);
   $("clock").innerHTML = data.timed ? `<b>${time.toFixed(2)}</b> / ${duration.toFixed(2)} s`
