@@ -24,7 +24,12 @@ from robotdiffuse.planning.exploration.looks import best_looks
 from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
 from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, hardly_seen, not_seen_free
-from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+from robotdiffuse.planning.exploration.simulated import (
+    camera_beside,
+    explore,
+    simulated_explorer,
+    wrist_camera,
+)
 from robotdiffuse.planning.exploration.steps import DONE
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.validation.validator import verify
@@ -298,3 +303,11 @@ def test_a_thing_at_the_surface_of_a_goal_is_seen_as_free_by_no_view() -> None:
 def test_a_goal_is_seen_by_strict_alone() -> None:
     with pytest.raises(InputError, match=r"explorer.see_goal is true and explorer.policy 'chance'"):
         ExplorerSettings(policy="chance", see_goal=True)
+
+
+@pytest.mark.parametrize("name", ["waypoints", "moving"])
+def test_fields_that_exploring_would_ignore_are_refused(name: str) -> None:
+    ball = rd.MovingObstacle(rd.Sphere([0.9, 0.0, 0.9], 0.05, name="ball"), velocity=[0.1, 0, 0])
+    fields = {"waypoints": [PROBLEM.start], "moving": [ball]}
+    with pytest.raises(rd.InputError, match=f"the problem has {name}, which explore does not support"):
+        simulated_explorer(replace(PROBLEM, **{name: fields[name]}), ExplorerSettings(), None, 0)

@@ -22,6 +22,7 @@ from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.simulation import (
@@ -31,6 +32,7 @@ from robotdiffuse.simulation import (
     world,
 )
 from robotdiffuse.trajectories.timing import time_parameterize
+from robotdiffuse.validation.validator import verify_trajectory
 
 pytestmark = pytest.mark.sim
 
@@ -187,3 +189,21 @@ def test_command_without_pybullet(
     monkeypatch.setitem(sys.modules, "pybullet", None)
     assert main(["simulate", file]) == 2
     assert "pip install 'robotdiffuse[sim]'" in capsys.readouterr().err
+
+
+def test_moving_obstacles_are_contacts_where_the_validator_refuses_the_motion() -> None:
+    """`simulate` called a motion free that runs into one."""
+    robot = load_robot("panda")
+    end = PANDA_START * [-1, 1, 1, 1, 1, 1, 1]
+    trajectory = motion(robot, PANDA_START, end)
+    free = []
+    for side in (1, -1):  # meets the arm, and keeps away from it
+        ball = MovingObstacle(Sphere([0.55, side * 0.45, 0.5], 0.12, name="ball"), velocity=[0, -0.3, 0])
+        problem = Problem(robot, Scene(), PANDA_START, end, moving=[ball])
+        report = verify_trajectory(problem, trajectory)
+        run = replay(robot, Scene(), trajectory, moving=problem.moving)
+        assert run.free == report.valid
+        if report.violation is not None:
+            assert abs(run.contacts[0].time - report.violation.time) < 0.05
+        free.append(run.free)
+    assert free[0] is False

@@ -125,3 +125,15 @@ def test_names_of_obstacles_stay_text_in_a_replay(tmp_path) -> None:
     assert "<script>alert" not in text
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
     assert found is not None and name in json.dumps(json.loads(found.group(1)), ensure_ascii=False)
+
+
+def test_moving_obstacles_are_on_the_page_and_in_the_picture(arm, motion, tmp_path):
+    ball = rd.MovingObstacle(rd.Sphere([0.5, 0.2, 0.3], 0.1, name="ball"), velocity=[0.0, -0.3, 0.0])
+    write_replay(arm, Scene(), motion, tmp_path / "replay.html", moving=[ball])
+    [mover] = page_data((tmp_path / "replay.html").read_text("utf-8"))["moving"]
+    assert mover["shape"]["name"] == "ball"
+    np.testing.assert_allclose(mover["track"][0], [0, 0, 0, 1, 0, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(mover["track"][-1][1], -0.3 * motion.duration, atol=1e-5)
+    for name, moving in (("with", [ball]), ("without", [])):
+        write_picture(arm, Scene(), motion, tmp_path / f"{name}.png", settings=SMALL, moving=moving)
+    assert (tmp_path / "with.png").read_bytes() != (tmp_path / "without.png").read_bytes()

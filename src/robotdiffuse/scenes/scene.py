@@ -148,17 +148,16 @@ def _contacts(
     for obstacle, links in entries:
         if not isinstance(obstacle, str) or (obstacle not in given and obstacle not in names):
             raise unknown_name("obstacle in allowed_contacts:", obstacle, names)
-        if links != ALL_LINKS:
-            if not isinstance(links, list | tuple) or not all(isinstance(link, str) for link in links):
-                raise InputError(
-                    f"allowed_contacts: {obstacle} has {shown(links)}; it must be a list of links, or "
-                    f"{ALL_LINKS}"
-                )
+        named = isinstance(links, list | tuple) and all(isinstance(link, str) for link in links)
+        if links != ALL_LINKS and not named:
+            raise InputError(
+                f"allowed_contacts: {obstacle} has {shown(links)}; it must be a list of links, or {ALL_LINKS}"
+            )
         touching = allowed_links.setdefault(obstacle, {})
         touching.update(dict.fromkeys((None,) if links == ALL_LINKS else links))
         if len(touching) > MAX_CONTACT_LINKS:
             raise InputError(
-                f"allowed_contacts: {shown(obstacle)} has more than {MAX_CONTACT_LINKS} links; write {ALL_LINKS}"
+                f"allowed_contacts: {shown(obstacle)} has over {MAX_CONTACT_LINKS} links; write {ALL_LINKS}"
             )
     by_name: dict[str, dict[str | None, None]] = {}
     for obstacle, touching in allowed_links.items():
