@@ -257,7 +257,7 @@ def _pose(shape: Shape) -> tuple[Float[ndarray, "3"], Float[ndarray, "4"]]:
     if isinstance(shape, Triangulated):
         return shape.mesh.xyz, shape.mesh.wxyz
     if isinstance(shape, Sphere):
-        return shape.center, IDENTITY
+        return shape.center, np.array(IDENTITY)
     assert isinstance(shape, Box | Cylinder | Capsule)
     return shape.center, shape.wxyz
 
