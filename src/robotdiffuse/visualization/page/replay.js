@@ -258,7 +258,7 @@ function moveObstacles(share) {
   for (const { group, track } of movers) {
     const at = share * (track.length - 1), row = Math.min(Math.floor(at), Math.max(0, track.length - 2));
     const a = track[row], b = track[Math.min(row + 1, track.length - 1)];
-    const turn = (p) => new THREE.Quaternion(p[4], p[5], p[6], p[3]);
+    const turn = (p) => group.quaternion.clone().set(p[4], p[5], p[6], p[3]); // three.min.js exports no Quaternion
     group.position.set(...a).lerp(new THREE.Vector3(...b), at - row);
     group.quaternion.copy(turn(a)).slerp(turn(b), at - row);
   }
