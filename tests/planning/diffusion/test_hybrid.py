@@ -19,8 +19,7 @@ from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettin
 from robotdiffuse.planning.diffusion.hybrid import BATCH_WORK, RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.anytime_search import AnytimeSearch
-from robotdiffuse.planning.search.aorrtc import AORRTCSettings
+from robotdiffuse.planning.search.rrt import AnytimeSearch, AORRTCSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -210,14 +209,14 @@ def noise_at(monkeypatch):
     drawn, searches = [], []
 
     def search(*arguments):
-        searches.append(AnytimeSearch(*arguments))
+        searches.append(AnytimeSearch.of(*arguments))
         return searches[-1]
 
     def noise(*arguments):
         drawn.append((searches[-1].work, searches[-1].best is not None))
         return smooth_noise(*arguments)
 
-    monkeypatch.setattr(hybrid, "AnytimeSearch", search)
+    monkeypatch.setattr(hybrid.AnytimeSearch, "of", search)
     monkeypatch.setattr(hybrid, "smooth_noise", noise)
     return drawn
 

@@ -8,6 +8,7 @@ timed, and the call returns the fastest of these motions.
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy import ndarray
@@ -15,9 +16,11 @@ from numpy import ndarray
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, TIME, TIME_LIMIT
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.search.anytime_search import AnytimeSearch
 from robotdiffuse.planning.search.time_optimization import Candidate, TimeOptimization
 from robotdiffuse.problems.goals import AnyGoal, JointGoal
+
+if TYPE_CHECKING:
+    from robotdiffuse.planning.search.rrt import AnytimeSearch
 
 VALIDATION_INTERVAL = 4_000
 """Iterations between two validations of shorter paths. Validating only at the end could lose everything found
@@ -40,7 +43,7 @@ FINAL_CANDIDATES = 2
 class _Validation:
     """The best validated result of a search, and which of its paths was validated when."""
 
-    def __init__(self, context: PlanningContext, search: AnytimeSearch) -> None:
+    def __init__(self, context: PlanningContext, search: "AnytimeSearch") -> None:
         self.context, self.search = context, search
         self.best: PlanResult | None = None
         self._by_time = context.request.objective == TIME
@@ -140,9 +143,16 @@ class _Validation:
 
     def _finished(self, path: ndarray, stage: str, deviations: ndarray | None) -> PlanResult | None:
         """Validate and time a path, and keep its result."""
-        search = self.search
+        search, wanted = self.search, self.context.clearance
         keeps = search.keeps_clearance
-        result = self.context.finish(path, stage, notes=search.notes, keeps=keeps, deviations=deviations)
+        notes = ()
+        if search.clearance < wanted:
+            kept, asked = 100 * search.clearance, 100 * wanted
+            notes = (
+                f"searched with a clearance of {kept:.2g} cm, not {asked:.2g} cm: "
+                "no path was found with that",
+            )
+        result = self.context.finish(path, stage, notes=notes, keeps=keeps, deviations=deviations)
         self._keep(result)
         return result
 
@@ -158,7 +168,7 @@ def _duration(result: PlanResult | None) -> float:
 
 def anytime(
     context: PlanningContext,
-    search: AnytimeSearch,
+    search: "AnytimeSearch",
     improves: Callable[[], bool],
     improve: Callable[[], None],
     fallback: Callable[[], None] | None = None,
@@ -194,7 +204,7 @@ def anytime(
         return not (searches() or optimizes())
 
     validation = _Validation(context, search)
-    while search.first(context.search_until, fallback):
+    while search.first(fallback):
         done = ended()
         if done and motions is not None and validation.best is not None:
             break

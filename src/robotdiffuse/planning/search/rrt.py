@@ -1,8 +1,13 @@
-"""A search that goes on after its first path: rounds of two trees, at falling clearances and below the length
-of the best path."""
+"""RRT-Connect and AORRTC: rounds of two trees at falling clearances, each below the length of the best path.
+
+Each round of AORRTC grows new trees with paths little longer than the best one known. The path that a round
+finds is simplified and tightened; if it is the shortest, it bounds the next round. RRT-Connect restarts
+without a bound.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -12,10 +17,15 @@ from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.bounds import for_kernels
-from robotdiffuse.core.settings import Count, Natural, Positive, Settings
+from robotdiffuse.core.loading import loading
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
 from robotdiffuse.core.types import Tree
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import DEFAULT_CLEARANCE, PlanningContext
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.search.anytime import anytime
 from robotdiffuse.planning.search.time_optimization import TimeOptimization, still_improves
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.simplification import simplify, tighten
@@ -32,8 +42,8 @@ FALLBACK_INTERVAL = 8_000
 BOUND_FACTOR = 1.15
 """The length bound of a round is this factor of the best length: unsimplified tree paths are longer than
 simplified ones, so with a tight bound the trees would miss shorter ways than a long detour."""
-CLOCK_INTERVAL = 100
-"""Iterations between two readings of the clock."""
+IMPROVEMENT_STEP = 1_000
+"""Iterations of AORRTC between two checks whether to search on."""
 TIGHTENING_FACTOR = 1.05
 """Paths longer than this factor of the best length are not tightened: tightening shortens by less."""
 OPTIMALITY_TOLERANCE = 1e-4
@@ -62,34 +72,41 @@ class SearchSettings(Settings):
 
 
 class AnytimeSearch:
-    """Rounds of RRT-Connect between the start and the goals of a call, and the best path so far.
+    """Rounds of RRT-Connect between a start and goals, and the best path so far.
 
-    The same seed gives the same rounds; the clock only ends them.
+    The same seed gives the same rounds; `stop` only ends them.
     """
+
+    clock_interval = 100
+    """Iterations between two calls of `stop`."""
+    spare_nodes = 0
+    """Nodes that an iteration may add to a tree besides one."""
+    limits: tuple | None = None
+    """Path constraints that the edges of trees keep."""
 
     def __init__(
         self,
-        context: PlanningContext,
         start_goal: StartGoal,
         settings: SearchSettings,
         name: str,
+        seed: int,
+        clearances: Sequence[float],
         bounded: bool = True,
-        clearances: Sequence[float] = (),
         tries: int = ITERATIONS_PER_CLEARANCE,
+        stop: Callable[[], bool] = lambda: False,
+        improved: Callable[[float], None] = lambda length: None,
     ) -> None:
         """
         name: the stage that results name for paths found here.
+        clearances: clearances to try, falling [m].
         bounded: whether rounds search below a bound on length (AORRTC); False: they are restarts.
-        clearances: clearances to try, falling, in place of the call's and fractions of it [m].
         tries: iterations without a path before the next clearance is tried.
+        improved: called with the length [rad] of each path that is the best so far.
         """
-        self.context, self.start_goal, self.settings, self.name, self.bounded = (
-            context,
-            start_goal,
-            settings,
-            name,
-            bounded,
-        )
+        self.start_goal = start_goal
+        self.settings = settings
+        self.name = name
+        self.bounded = bounded
         self.start, self.goals = start_goal.rows()
         self.best: Float[ndarray, "n dof"] | None = None
         """The shortest path so far, free at the resolution of the search."""
@@ -98,8 +115,6 @@ class AnytimeSearch:
         """The stage that it comes from."""
         self.work = 0
         """Iterations so far."""
-        self.first_at = np.inf
-        """When the first path was found [s since the call]."""
         self.found = 0
         """Number of paths that the search found."""
         self.history = list[tuple[ndarray, str]]()
@@ -109,13 +124,38 @@ class AnytimeSearch:
         self._lengths = list[tuple[int, float]]()
         self._untightened = False
         """Whether the best path is not tightened yet: the first one is, once there is time to improve it."""
-        self._state = random_state(context.request.seed)
-        self._round: _Round | None = None
+        self._state = random_state(seed)
+        self._trees: rrt_kernel.Trees | None = None
+        self._round_end = 0
+        """The work at which the trees are given up."""
         self._grown: rrt_kernel.Trees | None = None
         """The trees that found the shortest path of the search; those that grow until there is one."""
-        usual = usual_clearances(context.clearance)
-        self._clearances, self._tries = [*clearances] or usual, tries
+        self._clearances = clearances
+        self._tries = tries
+        self._stop = stop
+        self._improved = improved
         self._set_level(0)
+
+    @classmethod
+    def of(
+        cls,
+        context: PlanningContext,
+        start_goal: StartGoal,
+        settings: SearchSettings,
+        name: str,
+        bounded: bool = True,
+    ) -> "AnytimeSearch":
+        """The search of a call of a planner, which ends with the call's time."""
+        return cls(
+            start_goal,
+            settings,
+            name,
+            context.request.seed,
+            usual_clearances(context.clearance),
+            bounded,
+            stop=lambda: context.remaining <= 0,
+            improved=context.improved,
+        )
 
     @property
     def clearance(self) -> float:
@@ -123,20 +163,14 @@ class AnytimeSearch:
         return self._clearances[self._level]
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes for the result on the clearance."""
-        if self.clearance >= self.context.clearance:
-            return ()
-        kept, asked = 100 * self.clearance, 100 * self.context.clearance
-        return (
-            f"searched with a clearance of {kept:.2g} cm, not {asked:.2g} cm: no path was found with that",
-        )
-
-    @property
     def shortest(self) -> bool:
         """Whether no path to any goal can be shorter."""
+        return self._near_straight(OPTIMALITY_TOLERANCE)
+
+    def _near_straight(self, part: float) -> bool:
+        """Whether the best path exceeds the straight line by no more than this part."""
         straight = np.linalg.norm(self.goals - self.start, axis=1).min()
-        return bool(self.length <= straight * (1 + OPTIMALITY_TOLERANCE))
+        return bool(self.length <= straight * (1 + part))
 
     @property
     def trees(self) -> tuple[Tree, ...]:
@@ -148,27 +182,27 @@ class AnytimeSearch:
             Tree(grown.nodes[i, :n].copy(), grown.parents[i, :n].copy()) for i, n in enumerate(grown.sizes)
         )
 
-    def first(self, until: float, fallback: Callable[[], None] | None = None, work: float = np.inf) -> bool:
-        """Search for a first path until `until` [s since the call], for at most `work` more iterations.
+    def first(self, fallback: Callable[[], None] | None = None, work: float = np.inf) -> bool:
+        """Search for a first path, for at most `work` more iterations; returns whether there is a path.
 
-        Returns whether there is a path. `fallback` is called each time that all clearances failed.
+        fallback: called each time that all clearances failed.
         """
-        self._try_straight_lines()
+        if self.best is None:
+            self._try_straight_lines()
         enough = self.work + work
-        while self.best is None and self.context.elapsed < until and self.work < enough:
+        while self.best is None and self.work < enough and not self._stop():
             self._iterate()
             if self.best is None and self._tried >= self._tries:
                 self._lower_clearance(fallback)
         return self.best is not None
 
-    def improve(self, until: float, work: float = np.inf) -> None:
-        """Search for shorter paths until `until` [s since the call], for at most `work` more iterations, or
-        until the path is optimal."""
+    def improve(self, work: float) -> None:
+        """Search for shorter paths, for at most `work` more iterations, or until the path is optimal."""
         enough = self.work + work
         if self._untightened and self.best is not None:
             self.offer(self.best, self.stage)
             self._untightened = False
-        while not self.shortest and self.context.elapsed < until and self.work < enough:
+        while not self.shortest and self.work < enough and not self._stop():
             self._iterate()
 
     def improves(self, gain: float, patience: int) -> bool:
@@ -194,13 +228,11 @@ class AnytimeSearch:
 
     def _take(self, path: Float[ndarray, "n dof"], length: float, stage: str) -> bool:
         """Make a path the best one."""
-        if self.best is None:
-            self.first_at = self.context.elapsed
         self.best, self.length, self.stage = path, np.float32(length), stage
         self.history.append((path, stage))
         self._lengths.append((self.work, length))
-        self._round = None
-        self.context.improved(length)
+        self._trees = None
+        self._improved(length)
         return True
 
     def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
@@ -214,7 +246,7 @@ class AnytimeSearch:
         self.settings = replace(self.settings, resolution=finer_resolution(self.settings.resolution))
         self.best = accepted
         self.length = np.float32(np.inf if accepted is None else path_length(accepted))
-        self._round = None
+        self._trees = None
         self._set_level(self._level)
 
     def _set_level(self, level: int) -> None:
@@ -234,34 +266,37 @@ class AnytimeSearch:
 
     def _try_straight_lines(self) -> None:
         for goal in sorted(self.goals, key=lambda goal: float(np.linalg.norm(goal - self.start))):
-            line = np.stack([self.start, goal])
-            if motions_free(self.space, line).all() and self.offer(line, "straight_line"):
+            path = self._line(goal)
+            if len(path) and self.offer(path, "straight_line"):
+                self.found += 1
                 return
+
+    def _line(self, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+        """The edge from the start to a goal; without rows if there is none."""
+        path = np.stack([self.start, goal])
+        return path if motions_free(self.space, path).all() else path[:0]
 
     def _iterate(self) -> None:
         """Run some iterations of a round, and offer the path that they find."""
-        settings = self.settings
-        now = self._round
-        if now is None or now.left <= 0 or now.trees.sizes.max() >= now.trees.nodes.shape[1]:
-            trees = rrt_kernel.make_trees(self.start, self.goals, settings.iterations + len(self.goals))
-            now = self._round = _Round(trees, settings.iterations)
+        most, trees = self.settings.iterations, self._trees
+        capacity = most + len(self.goals) + 2 * self.spare_nodes
+        if trees is None or self.work >= self._round_end or trees.sizes.max() + self.spare_nodes >= capacity:
+            trees = self._trees = rrt_kernel.make_trees(self.start, self.goals, capacity)
+            self._round_end = self.work + most
         bound = np.float32(BOUND_FACTOR * self.length if self.bounded else np.inf)
-        longest = np.float32(settings.range)
+        longest = np.float32(self.settings.range)
         path = rrt_kernel.search(
-            self.space, now.trees, self.goals, bound, longest, CLOCK_INTERVAL, self._state
+            self.space, self.limits, trees, bound, longest, self.clock_interval, self._state
         )
-        self.work, self._tried, now.left = (
-            self.work + CLOCK_INTERVAL,
-            self._tried + CLOCK_INTERVAL,
-            now.left - CLOCK_INTERVAL,
-        )
+        self.work += self.clock_interval
+        self._tried += self.clock_interval
         if self.best is None:
-            self._grown = now.trees
+            self._grown = trees
         if len(path):
             self.found += 1
-            self._round = None
+            self._trees = None
             if self.offer(path, self.name):
-                self._grown = now.trees
+                self._grown = trees
 
 
 def usual_clearances(wanted: float) -> list[float]:
@@ -270,13 +305,76 @@ def usual_clearances(wanted: float) -> list[float]:
     falling = [share * wanted for share in FALLING_FRACTIONS]
     if wanted > DEFAULT_CLEARANCE:
         usual = [share * DEFAULT_CLEARANCE for share in FALLING_FRACTIONS]
-        falling = [*(kept for kept in falling if kept > DEFAULT_CLEARANCE), *usual]
-    return [*(kept for kept in falling if kept > MIN_CLEARANCE), MIN_CLEARANCE, 0.0]
+        falling = [*(clearance for clearance in falling if clearance > DEFAULT_CLEARANCE), *usual]
+    return [*(clearance for clearance in falling if clearance > MIN_CLEARANCE), MIN_CLEARANCE, 0.0]
 
 
-@dataclass
-class _Round:
-    """The trees of a round, and the iterations left for them."""
+@dataclass(frozen=True)
+class AORRTCSettings(SearchSettings, name="aorrtc"):
+    gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.0025
+    """With until "converged", the search ends when doubling its work shortened the path by less than this
+    part ..."""
+    patience: Natural = 16_000
+    """... but not before this many iterations."""
 
-    trees: rrt_kernel.Trees
-    left: int
+
+@dataclass(frozen=True)
+class RRTConnectSettings(SearchSettings, name="rrt_connect"):
+    searches: Count = 2
+    """With until "converged": number of paths to find; the shortest is returned."""
+    optimize_time: NotNegative = 0.0
+    """With until "converged": time for restarts after the first path [s]."""
+
+
+class AORRTC(Planner[AORRTCSettings]):
+    """Asymptotically optimal RRT-Connect (T. Wilson et al., 2025), anytime."""
+
+    name = "aorrtc"
+    settings_class = AORRTCSettings
+    supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
+
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        settings = self.settings
+        if context.problem.constraints:
+            return plan_constrained(context, start_goal, settings)
+        search = AnytimeSearch.of(context, start_goal, settings, self.name)
+        return anytime(
+            context,
+            search,
+            lambda: search.improves(settings.gain, settings.patience),
+            lambda: search.improve(IMPROVEMENT_STEP),
+        )
+
+
+class RRTConnect(Planner[RRTConnectSettings]):
+    """Two trees grown towards each other (Kuffner and LaValle, 2000), simplified; restarts while time is
+    left."""
+
+    name = "rrt_connect"
+    settings_class = RRTConnectSettings
+    supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
+
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        settings = self.settings
+        if context.problem.constraints:
+            return plan_constrained(context, start_goal, settings)
+        search = AnytimeSearch.of(context, start_goal, settings, self.name, bounded=False)
+
+        def improves() -> bool:
+            restarts_end = context.first_path_at + settings.optimize_time
+            return search.found < settings.searches or context.elapsed < restarts_end
+
+        return anytime(context, search, improves, lambda: search.improve(search.clock_interval))
+
+
+def plan_constrained(context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> PlanResult:
+    """Plan for a problem with path constraints."""
+    with loading():
+        from robotdiffuse.planning.search.constrained import PATHS_TO_FIND, ConstrainedSearch
+
+    search = ConstrainedSearch(context, start_goal, settings)
+    return anytime(
+        context, search, lambda: search.found < PATHS_TO_FIND, lambda: search.improve(search.clock_interval)
+    )
