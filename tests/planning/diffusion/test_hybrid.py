@@ -19,7 +19,8 @@ from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettin
 from robotdiffuse.planning.diffusion.hybrid import BATCH_WORK, RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.rrt import AnytimeSearch, AORRTCSettings
+from robotdiffuse.planning.search.anytime import AnytimeSearch
+from robotdiffuse.planning.search.rrt import AORRTCSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -206,10 +207,10 @@ STRANGER = Problem(replace(PANDA, name="stranger"), Scene([BALL]), LEFT, JointGo
 @pytest.fixture
 def noise_at(monkeypatch):
     """The iterations of search before each batch of smooth noise, and whether there was a path."""
-    drawn, searches = [], []
+    drawn, searches, search_of = [], [], AnytimeSearch.of
 
     def search(*arguments):
-        searches.append(AnytimeSearch.of(*arguments))
+        searches.append(search_of(*arguments))
         return searches[-1]
 
     def noise(*arguments):

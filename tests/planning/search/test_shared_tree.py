@@ -96,7 +96,10 @@ def test_rrt_star_alone_converges_to_the_optimum(planar) -> None:
     assert optimum > 1.1 * np.linalg.norm(goal - start), "the straight line must not do"
     space = search_space(checker, 0.01)
     start = start.astype(np.float32)
-    trees, goals = rrt_kernel.make_trees(start, np.empty((0, 2), np.float32), 60_000), make_goals(start, goal[None])
+    trees, goals = (
+        rrt_kernel.make_trees(start, np.empty((0, 2), np.float32), 60_000),
+        make_goals(start, goal[None]),
+    )
     state, costs = random_state(0), []
     for iterations in (500, 3_000, 30_000):
         grow(space, trees, goals, np.float32(0.5), iterations, state)

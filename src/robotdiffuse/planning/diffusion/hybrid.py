@@ -37,14 +37,8 @@ from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.diffusion.diffusion import GuidedSamplingSettings, ModelSampler, encode
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.learned import nearest_goals
-from robotdiffuse.planning.search.anytime import anytime
-from robotdiffuse.planning.search.rrt import (
-    AORRTC,
-    IMPROVEMENT_STEP,
-    AnytimeSearch,
-    AORRTCSettings,
-    plan_constrained,
-)
+from robotdiffuse.planning.search.anytime import AnytimeSearch, anytime
+from robotdiffuse.planning.search.rrt import AORRTC, IMPROVEMENT_STEP, AORRTCSettings, plan_constrained
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
 

@@ -37,7 +37,7 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.reactive.jerk_filter import JerkFilter
 from robotdiffuse.planning.reactive.observations import ObservedObstacle, PredictedObstacles
 from robotdiffuse.planning.reactive.timed_path import MIN_LENGTH, SpeedProfile, TimedPath
-from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
+from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.goals import Goal
 from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem

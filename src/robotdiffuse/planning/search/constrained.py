@@ -22,7 +22,7 @@ from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.types import LENGTH
 from robotdiffuse.planning.context import TOLERANCE_FRACTION, PlanningContext
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings, usual_clearances
+from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, usual_clearances
 from robotdiffuse.planning.search.time_optimization import estimated_duration
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.constraint_kernel import evaluate, make_work, proved
