@@ -27,7 +27,7 @@ from robotdiffuse.collision.kernels.motions import Space, motion_free
 from robotdiffuse.collision.kernels.simd import W, lanes_array
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.search.rrt_connect import RRTConnectSettings
+from robotdiffuse.planning.search.rrt import RRTConnectSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP

@@ -45,7 +45,7 @@ from robotdiffuse.evaluation.tables import Figure
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
-from robotdiffuse.planning.search.aorrtc import AORRTC
+from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import Problem

@@ -64,7 +64,7 @@ from robotdiffuse.learning.training.planner import PlannerTask, model_settings
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.task import train
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
-from robotdiffuse.planning.search.aorrtc import AORRTC
+from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.held_out import Case, goal_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot

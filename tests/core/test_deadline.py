@@ -11,7 +11,7 @@ from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_t
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning.pipeline import start_velocity
 from robotdiffuse.planning.planner import one_of_each
-from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.trajectories import speed_limits
 

@@ -12,7 +12,7 @@ from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation.methods import planned, restarted, sampled
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.runs import Fields, Run, run_all
-from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot

@@ -6,7 +6,7 @@ import signal
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.search.rrt_connect import RRTConnect, RRTConnectSettings
+from robotdiffuse.planning.search.rrt import RRTConnect, RRTConnectSettings
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
 

@@ -8,7 +8,7 @@ import time
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning import Entry
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.problems.problem import Problem
 
 SOLVES, RAISES, DIES, HANGS, TALKS, SEARCHES, EXITS = range(7)

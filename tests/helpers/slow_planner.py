@@ -3,7 +3,7 @@
 import threading
 
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.planning.search.aorrtc import AORRTC
+from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.problem import Problem
 
 MAX_WAIT = 300.0

@@ -12,7 +12,7 @@ from robotdiffuse.core.deadline import TIMING, OutOfTimeError
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.search.shared_tree.planner import SharedTreeRRTStar, SharedTreeSettings
+from robotdiffuse.planning.search.shared_tree import SharedTreeRRTStar, SharedTreeSettings
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
@@ -94,7 +94,7 @@ def test_a_limit_that_runs_out_says_what_took_the_time(monkeypatch: pytest.Monke
     context = context_for(Scene([]))
     with context.deadline():
         clock.now += 0.7
-        context.prepared = context.elapsed
+        context.begin_search()
         clock.now += 100.0
         context.improved(1.0)
         late = context.out_of_time(OutOfTimeError("the fastest speeds", TIMING))

@@ -12,7 +12,7 @@ import robotdiffuse as rd
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS, SEARCH
-from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.planning.search.rrt import RRTConnect
 
 PANDA = rd.load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])

@@ -11,7 +11,7 @@ from robotdiffuse.core.errors import InputError, repeated
 from robotdiffuse.core.input_files import read_bytes, read_json
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import LENGTH, Path
-from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
+from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import load_problems
 from robotdiffuse.problems.held_out import Case, CaseFile, Report, line_length

@@ -7,7 +7,6 @@ It is lowered in steps if no path is found.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import inf
 from typing import Annotated
 
 import numpy as np
@@ -16,25 +15,18 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
-from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.search.anytime_search import AnytimeSearch, SearchSettings
-from robotdiffuse.planning.start_goal import END_MARGIN, StartGoal
-from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
+from robotdiffuse.planning.start_goal import StartGoal, falling_clearances
 from robotdiffuse.robots.link_pair_tables import TURN
 
 ITERATIONS_PER_STEP = 500
 """Between two checks whether to stop."""
-NO_TIME_LIMIT = 1e9
-"""[s]; the search counts iterations instead."""
 
 
 @dataclass(frozen=True)
 class AORRTCSearchSettings(Settings, name="aorrtc"):
     safety_distance: NotNegative = 0.05
     """Distance to obstacles that paths keep [m]; the default follows from the authors' scenes."""
-    steps: Natural = 5
-    """Steps in which the distance is lowered to zero if no path is found. The clearances of the start and of
-    the goal farthest from obstacles are tried too."""
     tries: Count = 1_500
     """Iterations without a path before the distance is lowered; at the last step the search ends after three
     times as many."""
@@ -60,20 +52,19 @@ class AORRTCSearch:
         state: ndarray,
     ) -> None:
         """Start and goals must be free of collision. `state` is one of `random_state`."""
-        self.settings, self.goals = settings, goals.astype(np.float32)
+        self.settings = settings
+        self.goals = goals.astype(np.float32)
         self._robot = checker.robot
         self._ends = StartGoal(checker, start.astype(np.float64), goals.astype(np.float64))
-        problem = Problem(
-            checker.robot, checker.scene, start.astype(np.float64), JointGoal(goals.astype(np.float64))
-        )
-        context = PlanningContext(
-            "aorrtc", problem, PlanRequest(NO_TIME_LIMIT, int(state[0] >> np.uint64(32)))
-        )
-        has = checker.link_clearances(np.stack([start, *goals]).astype(np.float32)).min(axis=1, initial=1.0)
-        self._distances = _descending_distances(settings, (float(has[0]), float(has[1:].max())))
-        search = SearchSettings(range=settings.range, resolution=settings.resolution)
+        states = np.stack([start, *goals]).astype(np.float32)
+        self._distances = falling_clearances(settings.safety_distance, checker, states)
         self._search = AnytimeSearch(
-            context, self._ends, search, "aorrtc", clearances=self._distances, tries=settings.tries
+            self._ends,
+            SearchSettings(range=settings.range, resolution=settings.resolution),
+            "aorrtc",
+            int(state[0] >> np.uint64(32)),
+            self._distances,
+            tries=settings.tries,
         )
         self.best_goal = -1
         """Index of the goal that the path leads to; -1 without a path."""
@@ -84,11 +75,11 @@ class AORRTCSearch:
         settings, search = self.settings, self._search
         most = settings.tries * (len(self._distances) + 2)
         while search.best is None and search.work < most and not stop():
-            search.first(inf, work=ITERATIONS_PER_STEP)
+            search.first(work=ITERATIONS_PER_STEP)
         while search.best is not None and not (search.shortest or stop()):
             if not search.improves(settings.gain, settings.patience):
                 break
-            search.improve(inf, ITERATIONS_PER_STEP)
+            search.improve(ITERATIONS_PER_STEP)
         if search.best is not None:
             self._arrive(search.best)
 
@@ -122,13 +113,3 @@ class AORRTCSearch:
         """Waypoints of the best path; None without one."""
         best = self._search.best
         return None if best is None else self._ends.complete(best).astype(np.float32)
-
-
-def _descending_distances(settings: AORRTCSearchSettings, start_goal: tuple[float, float]) -> list[float]:
-    """The safety distances that are tried, in descending order [m].
-
-    start_goal: clearances of the start and of the goal farthest from obstacles [m].
-    """
-    most, steps = settings.safety_distance, max(settings.steps, 1)
-    between = {max(has - END_MARGIN, 0.0) for has in start_goal if has < most}
-    return sorted({most * step / steps for step in range(steps + 1)} | between, reverse=True)

@@ -7,7 +7,7 @@ from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.solvers import SEARCHES
-from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSettings
+from robotdiffuse.planning.search.shared_tree import SharedTreeSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import POSE, POSITION, Family
 from robotdiffuse.problems.families.scaled import family_for

@@ -18,7 +18,7 @@ from robotdiffuse.datasets.rows import resample
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearch
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.solvers import SEARCHES
-from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSearch
+from robotdiffuse.planning.search.shared_tree import SharedTreeSearch
 from robotdiffuse.problems.families.family import SampledProblem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot

@@ -6,7 +6,7 @@ SEARCHES = Registry(
     "planner of data",
     {
         "shared_tree_rrt_star": Entry(
-            "robotdiffuse.planning.search.shared_tree.planner:SharedTreeSearch",
+            "robotdiffuse.planning.search.shared_tree:SharedTreeSearch",
             "the paper's: one tree towards all goals of a target, with the cost of each",
             "SharedTreeSettings",
         ),

@@ -48,7 +48,7 @@ PLANNERS = Registry(
             PATH_CONSTRAINTS,
         ),
         "aorrtc": _entry(
-            "search.aorrtc:AORRTC",
+            "search.rrt:AORRTC",
             "AORRTCSettings",
             SEARCH,
             "two trees below a falling bound on path length: the shortest paths for the time",
@@ -56,7 +56,7 @@ PLANNERS = Registry(
             CLEARANCE,
         ),
         "rrt_connect": _entry(
-            "search.rrt_connect:RRTConnect",
+            "search.rrt:RRTConnect",
             "RRTConnectSettings",
             SEARCH,
             "two trees grown towards each other, then simplification; restarts while time is left",
@@ -64,7 +64,7 @@ PLANNERS = Registry(
             CLEARANCE,
         ),
         "shared_tree_rrt_star": _entry(
-            "search.shared_tree.planner:SharedTreeRRTStar",
+            "search.shared_tree:SharedTreeRRTStar",
             "SharedTreeSettings",
             SEARCH,
             "the paper's planner for data: one tree, all goals, near-optimal, 5 cm away from obstacles",

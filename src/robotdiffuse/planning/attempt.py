@@ -29,7 +29,7 @@ def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResul
             start_goal = usable_start_goal(context)
             if isinstance(start_goal, PlanResult):
                 return start_goal
-            context.prepared = context.elapsed
+            context.begin_search()
             return solver.solve(context, start_goal)
         except OutOfTimeError as error:
             return context.out_of_time(error)

@@ -39,10 +39,12 @@ CONSTRAINED_SAMPLE_TIME = 0.002
 together."""
 EARLY_VALIDATION_FACTOR = 5.0
 """The first path is validated at once if at least this many validations still fit in the time left."""
+TOLERANCE_FRACTION = 0.95
+"""Planners keep this part of each tolerance of path constraints."""
 MAX_RESERVED_FRACTION = 0.5
 """Largest part of the time limit that is reserved for validation and timing."""
-_validation_seconds: dict[str, float] = {}
-"""Running mean of the time that validating and timing a path takes, by robot name [s]."""
+EXPECTED_VALIDATION_TIME = 0.003
+"""Time that is reserved for validating and timing a path before the call has done so once [s]."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def requested_clearance(problem: Problem, clearance: float | None) -> float:
 
 @lru_cache
 def _timing(
-    velocity_scaling: float, acceleration_scaling: float, jerk: float | None, constrained: bool
+    velocity_scaling: float, acceleration_scaling: float, jerk: float | None, constrained: bool, segments: int
 ) -> TimingSettings:
     """The timing settings of a request, cached because checking them takes longer than using them."""
     return TimingSettings(
@@ -76,6 +78,7 @@ def _timing(
         velocity_scale=velocity_scaling,
         acceleration_scale=acceleration_scaling,
         jerk=jerk,
+        line_intervals=segments * DEFAULT.line_intervals,
     )
 
 
@@ -86,21 +89,27 @@ class PlanningContext:
     `finish` for a path or of `unsolved` without one.
     """
 
-    def __init__(self, planner_name: str, problem: Problem, request: PlanRequest = PlanRequest()) -> None:
-        """Starts the clock. Raises InputError if `problem` is not a Problem."""
+    def __init__(
+        self, planner_name: str, problem: Problem, request: PlanRequest = PlanRequest(), segments: int = 1
+    ) -> None:
+        """Starts the clock.
+
+        segments: number of paths that the motion joins; timing takes as many times the usual intervals.
+
+        Raises InputError if `problem` is not a Problem.
+        """
         self.started = time.perf_counter() - loading_seconds()
         check_problem(problem)
         self.planner_name, self.problem, self.request = planner_name, problem, request
         self.clearance = requested_clearance(problem, request.clearance)
         """Distance to obstacles that paths keep where they can [m]."""
         scalings = request.velocity_scaling, request.acceleration_scaling
-        self.timing = _timing(*scalings, request.jerk, constrained=bool(problem.constraints))
-        expected = _validation_seconds.get(problem.robot.name, 0.0)
-        self._reserved = min(expected, MAX_RESERVED_FRACTION * request.time_limit)
+        self.timing = _timing(*scalings, request.jerk, bool(problem.constraints), segments)
+        self._reserved = min(EXPECTED_VALIDATION_TIME, MAX_RESERVED_FRACTION * request.time_limit)
         self.validator = verifier(problem)
-        self.notes = [*unit_notes(problem), *contact_notes(problem.scene), *problem.notes]
-        """Notes of the result, on what was changed or ignored; planners may add to them."""
-        self.prepared = 0.0
+        self.notes = (*unit_notes(problem), *contact_notes(problem.scene), *problem.notes)
+        """Notes of the result, on what was changed or ignored."""
+        self._prepared = 0.0
         """When the search began [s since the call]."""
         self._progress: list[tuple[float, float]] = []
         self._refused = ""
@@ -110,6 +119,28 @@ class PlanningContext:
     def rng(self) -> np.random.Generator:
         """The random generator of this call, for code that is not compiled."""
         return np.random.default_rng(self.request.seed)
+
+    def begin_search(self) -> None:
+        """Note that start and goal states are known and the search begins."""
+        self._prepared = self.elapsed
+
+    def note(self, text: str) -> None:
+        """Add a note to the result."""
+        self.notes = (*self.notes, text)
+
+    def keeps_constraints(self, q: Float[ndarray, "n dof"]) -> bool:
+        """Whether the polyline through configurations, such as a rounded corner, keeps the path constraints
+        as closely as planners do."""
+        constraints = self.validator.constraints
+        rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
+        return constraints is None or not constraints.first_violation(
+            rows, tolerance_fraction=TOLERANCE_FRACTION
+        )
+
+    @property
+    def first_path_at(self) -> float:
+        """When the first path was found [s since the call]; infinite without one."""
+        return self._progress[0][0] if self._progress else np.inf
 
     def improved(self, length: float) -> None:
         """Note the joint-space length [rad] of a path that was just found; ignored unless it is the
@@ -133,7 +164,7 @@ class PlanningContext:
         """Whether there is time to validate paths while the search goes on."""
         if self.problem.constraints:  # each of their few paths is timed
             return self.remaining > self._reserved
-        return self._reserved > 0 and self.remaining > EARLY_VALIDATION_FACTOR * self._reserved
+        return self.remaining > EARLY_VALIDATION_FACTOR * self._reserved
 
     @property
     def remaining(self) -> float:
@@ -150,7 +181,7 @@ class PlanningContext:
             robot=self.problem.robot.name,
             planning_time=self.elapsed,
             seed=self.request.seed,
-            notes=tuple(self.notes),
+            notes=self.notes,
             refused=self._refused,
         )
 
@@ -178,9 +209,9 @@ class PlanningContext:
     def _too_short(self, error: OutOfTimeError) -> str:
         limit = f"the time limit of {self.request.time_limit:g} s is too short {error.what}"
         before = (
-            f"the search began after {self.prepared:.2f} s" if self.prepared else "before the search began"
+            f"the search began after {self._prepared:.2f} s" if self._prepared else "before the search began"
         )
-        found = f", its first path came after {self._progress[0][0]:.2f} s" if self._progress else ""
+        found = f", its first path came after {self.first_path_at:.2f} s" if self._progress else ""
         return f"{limit}: there was no time for {error} after {self.elapsed:.2f} s; {before}{found}"
 
     @property
@@ -210,10 +241,7 @@ class PlanningContext:
         except OutOfTimeError as error:
             self._ended = Status.TIMEOUT, self._too_short(error)
             return None
-        took = self.elapsed - began
-        before = _validation_seconds.get(self.problem.robot.name, took)
-        _validation_seconds[self.problem.robot.name] = before + 0.5 * (took - before)
-        self._reserved = max(self._reserved, took)
+        self._reserved = max(self._reserved, self.elapsed - began)
         return result
 
     def _finished(

@@ -37,6 +37,8 @@ number of those that become goals."""
 END_MARGIN = 0.0005
 """Near a start or goal with less than the requested clearance, paths keep its clearance less this margin
 [m]."""
+CLEARANCE_STEPS = 5
+"""Steps of `falling_clearances`."""
 RETREAT_STEP = 0.01
 """Step length out of contact of the covering spheres [rad]."""
 RETREAT_STEPS = 100
@@ -92,12 +94,7 @@ class StartGoal:
         """
         start, goals = self.rows()
         states = np.concatenate([start[None], goals])
-        if clearance <= 0:
-            return self._within(search_space(self.checker, resolution), states)
-        has = self.checker.link_clearances(states).min(axis=1, initial=1.0)
-        close = has < clearance + END_MARGIN
-        near = np.column_stack([states[close], np.maximum(has[close] - END_MARGIN, 0.0)])
-        return self._within(search_space(self.checker, resolution, clearance, near), states)
+        return self._within(padded_space(self.checker, states, resolution, clearance), states)
 
     def _within(self, space: Space, states: Float[ndarray, "k dof"]) -> Space:
         """The space with continuous joints limited to MAX_OVERTURN beyond the range of start and goals."""
@@ -119,6 +116,30 @@ class StartGoal:
         if not direct and not np.array_equal(self.start_lead, self.start):
             rows.insert(1, self.start_lead[None])
         return np.concatenate(rows) + self._turns if self._turns.any() else np.concatenate(rows)
+
+
+def padded_space(
+    checker: CollisionChecker, states: Float[ndarray, "k dof"], resolution: float, clearance: float
+) -> Space:
+    """The space for motions that keep a clearance [m], except near a start or goal that is closer."""
+    if clearance <= 0:
+        return search_space(checker, resolution)
+    has = checker.link_clearances(states).min(axis=1, initial=1.0)
+    close = has < clearance + END_MARGIN
+    near = np.column_stack([states[close], np.maximum(has[close] - END_MARGIN, 0.0)])
+    return search_space(checker, resolution, clearance, near)
+
+
+def falling_clearances(
+    most: float, checker: CollisionChecker, states: Float[ndarray, "k dof"]
+) -> list[float]:
+    """Clearances for a search to try, falling to zero in CLEARANCE_STEPS steps [m]; those of the start,
+    states[0], and of the goal farthest from obstacles are two more."""
+    has = checker.link_clearances(states).min(axis=1, initial=1.0)
+    at_ends = {max(float(end) - END_MARGIN, 0.0) for end in (has[0], has[1:].max()) if end < most}
+    return sorted(
+        {most * step / CLEARANCE_STEPS for step in range(CLEARANCE_STEPS + 1)} | at_ends, reverse=True
+    )
 
 
 def images(
@@ -208,7 +229,8 @@ def _usable_goals(
         collision = _explained(robot, scene, start)
         if collision is not None:
             note = arm_in_cloud_note(robot, scene, start)
-            context.notes[:0] = [note] if note else []
+            if note:
+                context.note(note)
             return context.fail(Status.INVALID_START, f"the start is in collision: {collision}")
     constraints = context.validator.constraints
     wrong = None if constraints is None else constraints.worst_violation(start)
@@ -346,7 +368,8 @@ def _pose_goals(
     if len(rejected):
         found = np.concatenate([_free_meshes(robot, scene, rejected)[:MAX_GRAZING_GOALS], found])
     if len(found):
-        context.notes += [note] if note else []
+        if note:
+            context.note(note)
         return _with_turns(context, found)
     places = [", ".join(f"{value:.3f}" for value in pose.T_base_frame[:3, 3]) for pose in poses_of(goal)]
     named = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}

@@ -8,7 +8,7 @@ import pytest
 from robotdiffuse.cli import main
 from robotdiffuse.evaluation.problem_sets import gather_cases
 from robotdiffuse.evaluation.records import Record, RecordFile, record_path
-from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.problems.problem import JointGoal
 
 pytest.importorskip("pybullet", reason="the extra `sim` (pybullet) is not installed")

@@ -31,8 +31,7 @@ from robotdiffuse.learning.weights_registry import BUNDLED
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.diffusion.diffusion import Diffusion
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
-from robotdiffuse.planning.search.aorrtc import AORRTCSettings
-from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.planning.search.rrt import AORRTCSettings, RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length
 from robotdiffuse.validation.validator import verify

@@ -19,8 +19,8 @@ from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettin
 from robotdiffuse.planning.diffusion.hybrid import BATCH_WORK, RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.anytime_search import AnytimeSearch
-from robotdiffuse.planning.search.aorrtc import AORRTCSettings
+from robotdiffuse.planning.search.anytime import AnytimeSearch
+from robotdiffuse.planning.search.rrt import AORRTCSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -207,17 +207,17 @@ STRANGER = Problem(replace(PANDA, name="stranger"), Scene([BALL]), LEFT, JointGo
 @pytest.fixture
 def noise_at(monkeypatch):
     """The iterations of search before each batch of smooth noise, and whether there was a path."""
-    drawn, searches = [], []
+    drawn, searches, search_of = [], [], AnytimeSearch.of
 
     def search(*arguments):
-        searches.append(AnytimeSearch(*arguments))
+        searches.append(search_of(*arguments))
         return searches[-1]
 
     def noise(*arguments):
         drawn.append((searches[-1].work, searches[-1].best is not None))
         return smooth_noise(*arguments)
 
-    monkeypatch.setattr(hybrid, "AnytimeSearch", search)
+    monkeypatch.setattr(hybrid.AnytimeSearch, "of", search)
     monkeypatch.setattr(hybrid, "smooth_noise", noise)
     return drawn
 

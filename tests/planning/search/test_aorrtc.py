@@ -16,9 +16,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status, Trajectory
 from robotdiffuse.planning import context
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.anytime_search import usual_clearances
-from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
-from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.planning.search.anytime import usual_clearances
+from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings, RRTConnect
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -46,7 +45,7 @@ def test_paths_are_below_the_bound_and_join_the_ends() -> None:
     state = random_state(0)
     for _ in range(20):
         trees = rrt_kernel.make_trees(start, goals, 20_000)
-        path = rrt_kernel.search(space, trees, goals, bound, longest, 5_000, state)
+        path = rrt_kernel.search(space, None, trees, bound, longest, 5_000, state)
         if not len(path):
             break
         assert path_length(path) <= bound + 1e-4
@@ -99,10 +98,12 @@ def test_samples_are_in_the_spheroid_of_a_goal() -> None:
     bound = np.float32(1.3 * np.linalg.norm(goals[0] - start))
     far = np.full(7, 10.0, np.float32)
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)._replace(lower=-far, upper=far)
-    shares, state, q = rrt_kernel.goal_shares(start, goals, bound), random_state(3), np.empty(7, np.float32)
+    state, q = random_state(3), np.empty(7, np.float32)
+    shares = rrt_kernel.goal_shares(start, goals, bound)
+    assert 0 < shares[0] < shares[1] == 1
     near = np.zeros(2)
-    for _ in range(2_000):
-        rrt_kernel.sample_within(space, start, goals, shares, bound, q, state)
+    for k in range(2_000):
+        rrt_kernel.sample_within(space, start, goals[k % 2], bound, q, state)
         through = np.linalg.norm(q - start) + np.linalg.norm(q - goals, axis=1)
         assert through.min() <= bound + 1e-4
         near += through <= bound
@@ -235,7 +236,7 @@ def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)
     for seed in range(5):
         state, trees = random_state(seed), rrt_kernel.make_trees(*ends(), 5_000)
-        path = rrt_kernel.connect(space, trees, np.float32(1.0), 100_000, state)
+        path = rrt_kernel.search(space, None, trees, rrt_kernel.INFINITE, np.float32(1.0), 100_000, state)
         for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300)):
             short = tighten(space, simplify(space, path, rounds), tries, state)
             assert np.array_equal(short[[0, -1]], path[[0, -1]])

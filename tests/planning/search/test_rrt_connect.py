@@ -14,7 +14,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import start_goal
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.rrt_connect import RRTConnect, RRTConnectSettings
+from robotdiffuse.planning.search.rrt import RRTConnect, RRTConnectSettings
 from robotdiffuse.planning.start_goal import retreat
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
@@ -91,7 +91,7 @@ def test_shortcuts_keep_ends_and_freedom_and_do_not_lengthen():
     for seed in range(5):
         state = random_state(seed)
         trees = rrt_kernel.make_trees(LEFT.astype(np.float32), RIGHT[None].astype(np.float32), 5000)
-        path = rrt_kernel.connect(space, trees, np.float32(1.0), 100_000, state)
+        path = rrt_kernel.search(space, None, trees, rrt_kernel.INFINITE, np.float32(1.0), 100_000, state)
         short = shortcut(space, path, 50, state)
         assert np.array_equal(short[[0, -1]], path[[0, -1]])
         assert path_length(short) <= path_length(path) + 1e-4
@@ -105,7 +105,7 @@ def test_search_can_be_continued():
     trees = rrt_kernel.make_trees(LEFT.astype(np.float32), RIGHT[None].astype(np.float32), 5000)
     state, sizes = random_state(1), []
     for _ in range(1000):
-        if len(rrt_kernel.connect(space, trees, np.float32(0.3), 1, state)):
+        if len(rrt_kernel.search(space, None, trees, rrt_kernel.INFINITE, np.float32(0.3), 1, state)):
             break
         sizes.append(trees.sizes.sum())
     assert len(sizes) > 1 and (np.diff(sizes) >= 0).all() and sizes[-1] > sizes[0]

@@ -6,6 +6,8 @@ from math import gcd
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -16,13 +18,14 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.search.shared_tree import kernel
-from robotdiffuse.planning.search.shared_tree.planner import (
+from robotdiffuse.planning.search import rrt_kernel, shared_tree
+from robotdiffuse.planning.search.shared_tree import (
     SharedTreeRRTStar,
     SharedTreeSearch,
     SharedTreeSettings,
+    grow,
+    make_goals,
 )
-from robotdiffuse.planning.search.shared_tree.tree import best_cost, make_tree
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
@@ -92,12 +95,15 @@ def test_rrt_star_alone_converges_to_the_optimum(planar) -> None:
     checker, start, goal, optimum = planar
     assert optimum > 1.1 * np.linalg.norm(goal - start), "the straight line must not do"
     space = search_space(checker, 0.01)
-    goals = goal[None].astype(np.float32)
-    tree = make_tree(start.astype(np.float32), goals, 60_000)
+    start = start.astype(np.float32)
+    trees, goals = (
+        rrt_kernel.make_trees(start, np.empty((0, 2), np.float32), 60_000),
+        make_goals(start, goal[None]),
+    )
     state, costs = random_state(0), []
     for iterations in (500, 3_000, 30_000):
-        kernel.grow(space, tree, np.float32(0.5), np.float32(0.1), iterations, state)
-        costs.append(float(best_cost(tree)) / optimum)
+        grow(space, trees, goals, np.float32(0.5), iterations, state)
+        costs.append(float(trees.costs[0, goals.node[0]]) / optimum)
     assert costs[0] > costs[1] > costs[2]
     # the grid's own error: 0.4 % of direction, and cells of 0.02 rad at the obstacle's edge
     assert 0.985 < costs[2] < 1.01
@@ -113,29 +119,29 @@ def test_rounds_reach_the_optimum_quickly(planar) -> None:
     assert all(a >= b for a, b in pairwise(search.costs))
 
 
-def consistent(tree) -> None:
+def consistent(trees: rrt_kernel.Trees) -> None:
     """Parents, children and costs agree."""
-    n = int(tree.size[0])
-    for node in range(1, n):
-        parent = int(tree.parent[node])
-        gap = np.linalg.norm(tree.nodes[node].astype(float) - tree.nodes[parent])
-        assert abs(tree.cost[node] - tree.cost[parent] - gap) < 1e-3
-        siblings, child = [], int(tree.child[parent])
+    for node in range(1, int(trees.sizes[0])):
+        parent = int(trees.parents[0, node])
+        gap = np.linalg.norm(trees.nodes[0, node].astype(float) - trees.nodes[0, parent])
+        assert abs(trees.costs[0, node] - trees.costs[0, parent] - gap) < 1e-3
+        siblings, child = [], int(trees.children[0, parent])
         while child >= 0:
             siblings.append(child)
-            child = int(tree.sibling[child])
+            child = int(trees.siblings[0, child])
         assert siblings.count(node) == 1
 
 
-def test_the_tree_stays_a_tree() -> None:
-    """With goals reached, rewired, grafted, and room made anew."""
+@pytest.mark.parametrize("capacity", [1_000, 200])
+def test_the_tree_stays_a_tree(capacity: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With goals reached, rewired and grafted; also where the tree is full."""
+    monkeypatch.setattr(shared_tree, "CAPACITY", capacity)
     checker = CollisionChecker(PANDA, WALL)
     goals = RIGHT + np.pad([[0.0, 0.0, 0.0], [0.2, 0.2, 0.0], [0.1, -0.3, 0.3]], ((0, 0), (0, 4)))
-    settings = replace(TOUCHING, capacity=64, growth=200)
-    search = SharedTreeSearch(checker, LEFT, goals, settings, random_state(2))
+    search = SharedTreeSearch(checker, LEFT, goals, replace(TOUCHING, growth=200), random_state(2))
     for _ in range(4):
         search.round()
-    assert search.nodes > 64
+    assert 64 < search.tree.sizes[0] <= capacity
     consistent(search.tree)
     for g, cost in enumerate(search.goal_costs):
         path = search.path(g)
@@ -144,16 +150,32 @@ def test_the_tree_stays_a_tree() -> None:
             np.testing.assert_array_equal(path[[0, -1]], np.stack([LEFT, goals[g]]).astype(np.float32))
 
 
+@given(st.integers(1, 400), st.integers(1, 7), st.integers(1, 40), st.integers(0, 2**31))
+def test_nearest_nodes_are_those_of_brute_force(count: int, dof: int, most: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # rounded: many equal coordinates, and copies
+    points = rng.normal(size=(count, dof)).round(int(rng.integers(1, 6))).astype(np.float32)
+    trees = rrt_kernel.make_trees(points[0], points, count)
+    index, squares = np.empty(most, np.int32), np.empty(most, np.float32)
+    for q in rng.normal(size=(5, dof)).astype(np.float32):
+        found = rrt_kernel.nearest_few(trees, 1, q, index, squares)
+        assert found == min(most, count) == len(set(index[:found].tolist()))
+        expected = ((points - q) ** 2).sum(axis=1)
+        np.testing.assert_allclose(squares[:found], expected[index[:found]], rtol=1e-5, atol=1e-10)
+        np.testing.assert_allclose(squares[:found], np.sort(expected)[:found], rtol=1e-5, atol=1e-10)
+
+
 def test_samples_fill_the_hyperspheroid_evenly() -> None:
     """Every sample could lie on a shorter path; and the share in a smaller spheroid is that of its volume."""
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 4)).astype(np.float32)
     wide = np.full(4, 100, np.float32)
+    space = search_space(CollisionChecker(PANDA, WALL), 0.04)._replace(lower=-wide, upper=wide)
     gap, state = np.float32(np.linalg.norm(b - a)), random_state(0)
-    length, inner = 1.5 * gap, 1.2 * gap
+    length, inner = np.float32(1.5) * gap, np.float32(1.2) * gap
     out, sums = np.empty(4, np.float32), []
     for _ in range(20_000):
-        kernel.sample_hyperspheroid(a, b, length, -wide, wide, state, out)
+        rrt_kernel.sample_within(space, a, b, length, out, state)
         sums.append(np.linalg.norm(out - a) + np.linalg.norm(out - b))
     assert max(sums) <= length * 1.0001
     volume = [c * (c**2 - gap**2) ** 1.5 for c in (inner, length)]
@@ -268,7 +290,7 @@ def test_no_way_ends_at_the_time_limit_or_when_it_was_searched_for_at_every_dist
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("range", 0.0), ("safety_distance", -0.1), ("goal_bias", 1.0), ("patience", 0), ("growth", 0)],
+    [("range", 0.0), ("safety_distance", -0.1), ("patience", 0), ("growth", 0)],
 )
 def test_bad_settings_are_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"shared_tree_rrt_star.{name} is {value}"):

@@ -220,7 +220,9 @@ class NeuralPlanning:
         trees = rrt_kernel.make_trees(a, b[None], SEARCH_CAPACITY)
         while self.context.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
             longest = np.float32(self.settings.hybrid_range)
-            path = rrt_kernel.connect(self.space, trees, longest, SEARCH_ITERATIONS, self.state)
+            path = rrt_kernel.search(
+                self.space, None, trees, rrt_kernel.INFINITE, longest, SEARCH_ITERATIONS, self.state
+            )
             if len(path):
                 return path
         return np.stack([a, b])

@@ -17,7 +17,6 @@ network runs without guidance.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, TypeVar
 
@@ -34,9 +33,8 @@ from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.weights_registry import weights_for
 from robotdiffuse.planning import PATH_CONSTRAINTS
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import TOLERANCE_FRACTION, PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
-from robotdiffuse.planning.search.constrained import TOLERANCE_FRACTION, corner_kept
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.robots.robot import Robot
@@ -188,7 +186,7 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         # with it
         for path in sorted(valid or every[-1:], key=lambda path: path.length):
             how = f"solved by network: {reason}"
-            result = context.finish(path.positions, "network", how, keeps=partial(corner_kept, constraints))
+            result = context.finish(path.positions, "network", how, keeps=context.keeps_constraints)
             if result is not None:
                 return result
         return context.unsolved(reason)

@@ -29,7 +29,6 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
-from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural
 from robotdiffuse.learning.guidance import CollisionGuidance
@@ -38,9 +37,8 @@ from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.diffusion.diffusion import GuidedSamplingSettings, ModelSampler, encode
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.learned import nearest_goals
-from robotdiffuse.planning.search.anytime import anytime
-from robotdiffuse.planning.search.anytime_search import AnytimeSearch
-from robotdiffuse.planning.search.aorrtc import AORRTC, IMPROVEMENT_STEP, AORRTCSettings
+from robotdiffuse.planning.search.anytime import AnytimeSearch, anytime
+from robotdiffuse.planning.search.rrt import AORRTC, IMPROVEMENT_STEP, AORRTCSettings, plan_constrained
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
 
@@ -84,12 +82,6 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
     settings_class = RobotDiffuseSettings
     supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
 
-    def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
-        """Raises InputError if the folder that the settings name holds no weights."""
-        super().__init__(settings)
-        self.seconds = {"batch": BATCH_SECONDS, "refinement": BATCH_SECONDS}
-        """Expected times [s]: that of the last one, or more if those before it took longer."""
-
     def prepare(self, robot: Robot) -> None:
         """Load the weights for the robot, if there are any."""
         self.model(robot)
@@ -98,11 +90,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         """See `planning.planner.Planner`."""
         settings, robot = self.settings, context.problem.robot
         if context.problem.constraints:
-            with loading():
-                from robotdiffuse.planning.search.constrained import plan_constrained
-
             return plan_constrained(context, start_goal, settings.search)
-        search = AnytimeSearch(context, start_goal, settings.search, AORRTC.name)
+        search = AnytimeSearch.of(context, start_goal, settings.search, AORRTC.name)
         model, fallback = self.model(robot), None
         if model is not None:
             batches = _NetworkBatches(self, context, start_goal, search, model)
@@ -114,7 +103,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             if batches.due:
                 batches.offer()
             else:
-                search.improve(context.search_until, IMPROVEMENT_STEP)
+                search.improve(IMPROVEMENT_STEP)
 
         result = anytime(
             context,
@@ -156,6 +145,8 @@ class _Batches:
     ) -> None:
         self.planner, self.context, self.start_goal, self.search = planner, context, start_goal, search
         self._spent = 0
+        self._seconds = {"batch": BATCH_SECONDS, "refinement": BATCH_SECONDS}
+        """Expected times [s]: that of the last one, or more if those before it took longer."""
 
     @property
     def due(self) -> bool:
@@ -178,7 +169,7 @@ class _Batches:
         return self._time_for("batch")
 
     def _time_for(self, part: str) -> bool:
-        return self.context.remaining > BATCH_TIME_FACTOR * self.planner.seconds[part]
+        return self.context.remaining > BATCH_TIME_FACTOR * self._seconds[part]
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:
@@ -186,7 +177,7 @@ class _Batches:
         began = self.context.elapsed
         yield
         took, self._spent = self.context.elapsed - began, self._spent + BATCH_WORK
-        self.planner.seconds[part] = max(took, 0.5 * (self.planner.seconds[part] + took))
+        self._seconds[part] = max(took, 0.5 * (self._seconds[part] + took))
 
     def _draw(self) -> None:
         planner, checker, count = self.planner, self.start_goal.checker, self.planner.settings.samples

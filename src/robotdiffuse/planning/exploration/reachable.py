@@ -46,6 +46,7 @@ class ReachableTree:
 
         longest: the longest extension towards each [rad, joint-space L2].
         """
+        targets = np.clip(targets, self._space.lower, self._space.upper)
         extend(self._space, self._trees, targets.astype(np.float32), longest.astype(np.float32))
 
     def way(self, number: int) -> Float[ndarray, "m dof"]:

@@ -14,7 +14,6 @@ may go back to an earlier waypoint.
 """
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy import ndarray
@@ -28,7 +27,6 @@ from robotdiffuse.planning.attempt import Solver, attempt
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.pipeline.moving_obstacles_kernel import earliest
 from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
-from robotdiffuse.planning.search.constrained import corner_kept
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.stops import MIN_DISTANCE, SPEED_FACTORS, StopGraph
 from robotdiffuse.trajectories.timing import time_parameterize
@@ -60,7 +58,7 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
         return context.fail(
             Status.INVALID_START, f"the start is in collision: {first.link} touches {first.obstacle}"
         )
-    context.prepared = context.elapsed
+    context.begin_search()
     rng, attempts, tried = np.random.default_rng(request.seed), 0, 0
     horizon, reason = 0.0, ""
     while attempts == 0 or context.remaining > 0:
@@ -150,7 +148,7 @@ def _timed(
         validator.collision_free,
         context.timing,
         GRID_STEP,
-        partial(corner_kept, validator.constraints),
+        context.keeps_constraints,
         context.beside,
         None if found.corner_deviations is None else np.array(found.corner_deviations),
         _stops(problem, path),

@@ -101,8 +101,8 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
         notes=(),
     )
     left = max(context.remaining, MIN_TIME_LIMIT)
-    whole = PlanningContext(context.planner_name, part, replace(context.request, time_limit=left))
-    whole.timing = replace(whole.timing, line_intervals=len(segments) * whole.timing.line_intervals)
+    request = replace(context.request, time_limit=left)
+    whole = PlanningContext(context.planner_name, part, request, len(segments))
     corners, deviations = _corners(segments, whole.timing.corner_deviation)
     for row, goal, radius in zip(corners, part.waypoints, blend, strict=True):
         deviations[row] = _deviation(part, path, int(row), goal, radius)

@@ -37,7 +37,7 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.reactive.jerk_filter import JerkFilter
 from robotdiffuse.planning.reactive.observations import ObservedObstacle, PredictedObstacles
 from robotdiffuse.planning.reactive.timed_path import MIN_LENGTH, SpeedProfile, TimedPath
-from robotdiffuse.planning.search.anytime_search import AnytimeSearch, SearchSettings
+from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.goals import Goal
 from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem
@@ -230,8 +230,8 @@ class Replanner:
         start_goal = usable_start_goal(context)
         if isinstance(start_goal, PlanResult):
             raise InputError(f"the replanner cannot begin: {start_goal.reason}")
-        search = AnytimeSearch(context, start_goal, SearchSettings(), "replanner", bounded=False)
-        while search.first(context.search_until) and search.best is not None:
+        search = AnytimeSearch.of(context, start_goal, SearchSettings(), "replanner", bounded=False)
+        while search.first() and search.best is not None:
             path = self._certified(start_goal.complete(search.best), True)
             if path is not None:
                 return path, np.array(start_goal.goals), search_space(start_goal.checker, COARSE_RESOLUTION)
@@ -320,10 +320,10 @@ class Replanner:
         clearance = min(float(predicted.margin.min()) + settings.clearance, MAX_CLEARANCE)
         request = PlanRequest(SEARCH_TIME_LIMIT, self.seed + self._searches, clearance=clearance)
         context = PlanningContext("replanner", self._still, request)
-        search = AnytimeSearch(
+        search = AnytimeSearch.of(
             context, StartGoal(checker, start, chosen), SearchSettings(), "replanner", bounded=False
         )
-        if not search.first(SEARCH_TIME_LIMIT, work=settings.iterations) or search.best is None:
+        if not search.first(work=settings.iterations) or search.best is None:
             return None
         path = search.start_goal.complete(search.best)
         end = int(np.abs(np.array(roots) - path[-1]).max(axis=1).argmin())

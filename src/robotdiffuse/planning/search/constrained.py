@@ -1,133 +1,332 @@
 """Search under path constraints: RRT-Connect with projected nodes, and simplification, in the anytime loop.
 
+D. Berenson, S. Srinivasa and J. Kuffner, "Task Space Regions: A framework for pose-constrained
+manipulation planning", IJRR 2011 (CBiRRT2), for trees with projected steps. Edges are proved, not sampled: a
+straight piece is accepted where the constraints are proved along it; else its middle is projected, and both
+halves are treated alike.
+
 The planners aorrtc, rrt_connect and robotdiffuse use it for problems with constraints. The search keeps a
 little more than the tolerances, which rounding of corners and numbers needs; the validator proves the result.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
+from numba.extending import overload
 from numpy import ndarray
 
-from robotdiffuse.core.results import PlanResult
+from robotdiffuse.collision.kernels.compiled import random
+from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
+from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.types import LENGTH
-from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.search import constrained_kernel
-from robotdiffuse.planning.search.anytime import anytime
-from robotdiffuse.planning.search.anytime_search import AnytimeSearch, SearchSettings
+from robotdiffuse.planning.context import TOLERANCE_FRACTION, PlanningContext
+from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, usual_clearances
 from robotdiffuse.planning.search.time_optimization import estimated_duration
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.problems.compiled_constraints import PathConstraints
+from robotdiffuse.problems.constraint_kernel import evaluate, make_work, proved
+from robotdiffuse.problems.projection_kernel import project
 from robotdiffuse.trajectories.speed_limits import scaled_limits
+
+MAX_DEPTH = 9
+"""A motion is halved at most this many times."""
+MIN_PIECE = 0.004
+"""Shortest piece [rad]."""
+MAX_PIECES = 512
+MAX_GROWTH = 0.2
+"""Along a straight piece a row's value may exceed those at its ends by this part of the row's tolerance."""
+MIN_PROOF_PIECE = 1 / 16
+"""The proof of a piece splits it down to this part of its length."""
+MAX_DRIFT = 0.85
+"""A projected middle is no further from either end than this part of the piece's length."""
+MIN_APPROACH = 0.95
+"""A step must bring the distance to its target down to this part or less."""
+MAX_STEP_FACTOR = 2.0
+"""A step is at most this many times as long as the straight line that it replaces."""
+SHORTCUT_GAIN, MAX_FAILED_SHORTCUTS = 0.99, 20
+"""A shortcut counts if it leaves at most this part of the length; after this many in a row that do not, no
+more are tried."""
+MIN_CORNER_MOVE = 0.005
+"""Smoothing leaves corners that it would move by less than this [rad]."""
+MAX_INITIAL_PIECE = 0.15
+"""Pieces of a path are split down to this length before simplification [rad]."""
+
 
 STAGE = "constrained_rrt_connect"
 CLOCK_INTERVAL = 20
 """Iterations between two readings of the clock; they take longer than those without constraints."""
-TOLERANCE_FRACTION, END_MARGIN = 0.95, 1e-6
-"""The search keeps this part of each tolerance; or the value at the start or a goal, plus the margin, if
-larger."""
+END_MARGIN = 1e-6
+"""Tolerances are widened to the values at the start and the goals, plus this margin."""
 PATHS_TO_FIND = 2
 """With until "converged": number of paths to find; the best is returned."""
-STRAIGHT_FACTOR = 1.02
-"""A path is the shortest if it is longer than the straight line by no more than this factor."""
+STRAIGHT_EXCESS = 0.02
+"""A path is the shortest if it exceeds the straight line by no more than this part."""
 SHORTCUTS = 60
 """Shortcuts that are tried on each path found."""
 
 
-def plan_constrained(context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> PlanResult:
-    """Plan for a problem with path constraints."""
-    search = ConstrainedSearch(context, start_goal, settings)
+class Limits(NamedTuple):
+    """What every edge of the search keeps, and working memory."""
 
-    def improve() -> None:
-        search.improve(context.search_until, CLOCK_INTERVAL)
+    rows: tuple
+    """`problems.constraint_kernel.Rows`"""
+    kept: np.ndarray
+    """[m] limits of the rows, a little within those of the validator."""
+    work: tuple
+    growing: np.ndarray
+    """[m] limits along one piece."""
+    stack: np.ndarray
+    out: np.ndarray
+    """[MAX_PIECES, dof] the motion that `between` found."""
+    here: np.ndarray
 
-    return anytime(context, search, lambda: search.found < PATHS_TO_FIND, improve)
+
+@kernel()
+def make_limits(rows, kept):
+    dof = len(rows.lower)
+    return Limits(
+        rows,
+        kept,
+        make_work(rows),
+        np.empty(len(kept)),
+        np.empty((MAX_DEPTH, dof)),
+        np.empty((MAX_PIECES, dof)),
+        np.empty(dof),
+    )
+
+
+@overload(rrt_kernel.keep)
+def _keep(limits, q):
+    return lambda limits, q: project(limits.rows, limits.kept, q, limits.work)
+
+
+@overload(rrt_kernel.extended)
+def _extended(space, limits, trees, tree, near, q, longest, scratch):
+    def extended(space, limits, trees, tree, near, q, longest, scratch):
+        origin, end = trees.nodes[tree, near], scratch.end
+        gap = distance(origin, q)
+        if gap <= longest:
+            end[:] = q
+        else:
+            end[:] = origin + longest / gap * (q - origin)
+            if not project(limits.rows, limits.kept, end, limits.work):
+                return -1
+            if distance(end, q) > max(MIN_APPROACH * gap, gap - 0.5 * longest):
+                return -1
+        if trees.sizes[tree] + MAX_PIECES > trees.nodes.shape[1]:
+            return -1
+        count = between(space, limits, origin, end, MAX_STEP_FACTOR * min(gap, longest), scratch)
+        here = near
+        for i in range(count):
+            cost = trees.costs[tree, here] + distance(trees.nodes[tree, here], limits.out[i])
+            here = rrt_kernel.add(trees, tree, limits.out[i], cost, here)
+        return here if count else -1
+
+    return extended
+
+
+@inner_kernel()
+def _straight(limits, a, b):
+    """Whether the straight piece between two configurations is proved to keep the constraints, with values
+    little above those at its ends."""
+    rows, work = limits.rows, limits.work
+    evaluate(rows, a, 0, work)
+    evaluate(rows, b, 1, work)
+    for m in range(len(limits.kept)):
+        most = max(work.values[0, m], work.values[1, m]) + MAX_GROWTH * rows.tolerance[m]
+        limits.growing[m] = min(limits.kept[m], most)
+    return proved(rows, limits.growing, a, b, MIN_PROOF_PIECE, work)[1] < 0
+
+
+@inner_kernel()
+def _usable(space, limits, a, b, scratch):
+    return _straight(limits, a, b) and motion_free(space, a, b, scratch.block, scratch.work)
+
+
+@inner_kernel()
+def between(space, limits, a, b, most, scratch):
+    """Find a motion from a to b, which keep the constraints, as straight pieces; write their ends to
+    limits.out.
+
+    Returns their number; 0 if none was found, or it is longer than `most` [rad].
+    """
+    stack, here = limits.stack, limits.here
+    stack[0] = b
+    here[:] = a
+    top, count, done = 1, 0, 0.0
+    while top > 0:
+        target = stack[top - 1]
+        gap = distance(here, target)
+        if done + gap > most:
+            return 0
+        if _straight(limits, here, target):
+            if count == MAX_PIECES or not motion_free(space, here, target, scratch.block, scratch.work):
+                return 0
+            limits.out[count] = target
+            here[:] = target
+            top, count, done = top - 1, count + 1, done + gap
+            continue
+        if top == MAX_DEPTH or gap < MIN_PIECE:
+            return 0
+        middle = stack[top]
+        middle[:] = 0.5 * (here + target)
+        if not project(limits.rows, limits.kept, middle, limits.work):
+            return 0
+        if max(distance(here, middle), distance(middle, target)) > MAX_DRIFT * gap:
+            return 0
+        top += 1
+    return count
+
+
+@kernel(nogil=True)
+def line(space, limits, a, b):
+    """The waypoints [n, dof] of `between`, with a; n = 0 if there is none."""
+    trees = rrt_kernel.make_trees(a, b.reshape(1, -1), MAX_PIECES + 1)
+    scratch = rrt_kernel.make_scratch(space, trees.nodes)
+    end = rrt_kernel.extended(space, limits, trees, 0, 0, b, 2.0 * distance(a, b), scratch)
+    return rrt_kernel.branch(trees, 0, end)
+
+
+@kernel(nogil=True)
+def simplify(space, limits, path, rounds, tries, state):
+    """A path with the same ends that is no longer: try shortcuts between random places, `tries` of them; then
+    in each of `rounds` rounds smooth the corners and leave out waypoints that a straight piece can skip."""
+    scratch = rrt_kernel.make_scratch(space, path)
+    points, lost = _finer(path), 0
+    for _ in range(tries):
+        n = len(points)
+        if n < 3 or lost > MAX_FAILED_SHORTCUTS:
+            break
+        i = min(int(random(state) * (n - 2)), n - 3)
+        k = min(i + 2 + int(random(state) * (n - i - 2)), n - 1)
+        before = path_length(points[i : k + 1])
+        if before <= distance(points[i], points[k]) * 1.0001:
+            continue
+        count = between(space, limits, points[i], points[k], SHORTCUT_GAIN * before, scratch)
+        lost += 1
+        if count > 0:
+            found = np.concatenate((points[i : i + 1], limits.out[:count]))
+            points = np.concatenate((points[:i], _finer(found), points[k + 1 :]))
+            lost = 0
+    points = _skipped(space, limits, points, scratch)
+    for _ in range(rounds):
+        points = _smoothed(space, limits, points, scratch)
+    return _skipped(space, limits, points, scratch)
+
+
+@inner_kernel()
+def _finer(path):
+    """The path with its pieces split until they are no longer than MAX_INITIAL_PIECE."""
+    total = 1
+    for i in range(len(path) - 1):
+        total += max(1, int(np.ceil(distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
+    out, n = np.empty((total, path.shape[1])), 0
+    for i in range(len(path) - 1):
+        parts = max(1, int(np.ceil(distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
+        for part in range(parts):
+            out[n] = path[i] + part / parts * (path[i + 1] - path[i])
+            n += 1
+    out[n] = path[-1]
+    return out
+
+
+@inner_kernel()
+def _skipped(space, limits, path, scratch):
+    """The path without waypoints that straight pieces can skip, in growing steps."""
+    out, n, i = np.empty(path.shape), 0, 0
+    while True:
+        out[n] = path[i]
+        n += 1
+        if i == len(path) - 1:
+            return out[:n].copy()
+        following, ahead = i + 1, 2
+        while i + ahead < len(path) and _usable(space, limits, path[i], path[i + ahead], scratch):
+            following, ahead = i + ahead, ahead + max(1, ahead // 2)
+        i = following
+
+
+@inner_kernel()
+def _smoothed(space, limits, path, scratch):
+    """The path with the middles of its pieces as waypoints, and its corners moved towards them."""
+    finer, dof = np.empty((2 * len(path) - 1, path.shape[1])), path.shape[1]
+    for i in range(len(path)):
+        finer[2 * i] = path[i]
+        if i > 0:
+            finer[2 * i - 1] = 0.5 * (path[i - 1] + path[i])
+    trial = np.empty(dof)
+    for i in range(2, len(finer) - 1, 2):
+        for j in range(dof):
+            trial[j] = 0.5 * finer[i, j] + 0.25 * (finer[i - 1, j] + finer[i + 1, j])
+        if distance(trial, finer[i]) < MIN_CORNER_MOVE:
+            continue
+        if (
+            project(limits.rows, limits.kept, trial, limits.work)
+            and _usable(space, limits, finer[i - 1], trial, scratch)
+            and _usable(space, limits, trial, finer[i + 1], scratch)
+        ):
+            finer[i] = trial
+    return finer
 
 
 class ConstrainedSearch(AnytimeSearch):
     """Restarts of RRT-Connect under constraints."""
 
+    clock_interval = CLOCK_INTERVAL
+    spare_nodes = MAX_PIECES
+
     def __init__(self, context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> None:
         constraints = context.validator.constraints
-        assert constraints is not None  # else AnytimeSearch would be used
-        self.constraints: PathConstraints = constraints
-        rows, start = constraints.rows, start_goal.start_lead
-        assert start is not None  # a StartGoal without a start is refused before
-        self.kept = constraints.limits(TOLERANCE_FRACTION)
+        start = start_goal.start_lead
+        assert constraints is not None and start is not None  # problems without are planned otherwise
+        kept = constraints.limits(TOLERANCE_FRACTION)
         at_ends = constraints.values(np.stack([start, *start_goal.goal_leads])).max(axis=0) + END_MARGIN
-        self.kept = np.minimum(np.maximum(self.kept, at_ends), rows.limit)
+        kept = np.minimum(np.maximum(kept, at_ends), constraints.rows.limit)
+        self.context = context
+        self.limits: Limits = make_limits(constraints.rows, kept)
         self.cost = np.inf
         """Of the best path: its estimated duration [s]; its length [rad] if that is the objective."""
         self._speed_limits = scaled_limits(context.problem.robot, context.timing)
-        super().__init__(context, start_goal, settings, STAGE, bounded=False)
+        super().__init__(
+            start_goal,
+            settings,
+            STAGE,
+            context.request.seed,
+            usual_clearances(context.clearance),
+            bounded=False,
+            stop=lambda: context.remaining <= 0,
+            improved=context.improved,
+        )
         self.start, self.goals = start, np.stack(start_goal.goal_leads)
-        self._trees: constrained_kernel.Trees | None = None
 
     @property
     def shortest(self) -> bool:
         """Whether no path can be shorter by more than a small part: the constraints hardly bend the straight
         line."""
-        straight = np.linalg.norm(self.goals - self.start, axis=1).min()
-        return bool(self.length <= STRAIGHT_FACTOR * straight)
+        return self._near_straight(STRAIGHT_EXCESS)
 
     def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
         """Whether the polyline through configurations keeps the clearance and the constraints."""
-        return corner_kept(self.constraints, q) and super().keeps_clearance(q)
+        return self.context.keeps_constraints(q) and super().keeps_clearance(q)
 
     def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
         """See `AnytimeSearch`; the path also keeps the constraints, and the one of the least cost is kept."""
-        settings = self.settings
-        path = constrained_kernel.simplify(self.limits, path, settings.smoothings, SHORTCUTS, self._state)
+        path = simplify(self.space, self.limits, path, self.settings.smoothings, SHORTCUTS, self._state)
         cost = self._cost_of(path)
         if cost >= self.cost:
             return False
         self.cost = cost
-        return self._take(path, constrained_kernel.length(path), stage)
+        return self._take(path, float(path_length(path)), STAGE)
 
     def _cost_of(self, path: Float[ndarray, "n dof"]) -> float:
         if self.context.request.objective == LENGTH:
-            return constrained_kernel.length(path)
+            return float(path_length(path))
         return estimated_duration(path, self.context.timing.corner_deviation, self._speed_limits)
 
     def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
         """See `AnytimeSearch`."""
         super().refuse(accepted)
         self.cost = np.inf if accepted is None else self._cost_of(accepted)
-        self._trees = None
 
-    def _set_level(self, level: int) -> None:
-        super()._set_level(level)
-        self.limits = constrained_kernel.Limits(self.space, self.constraints.rows, self.kept)
-
-    def _try_straight_lines(self) -> None:
-        for goal in sorted(self.goals, key=lambda goal: float(np.linalg.norm(goal - self.start))):
-            path = constrained_kernel.line(self.limits, self.start, goal)
-            if len(path) and self.offer(path, self.name):
-                self.found += 1
-                return
-
-    def _iterate(self) -> None:
-        settings = self.settings
-        if (
-            self._trees is None
-            or self._trees.sizes.max() >= self._trees.nodes.shape[1] - constrained_kernel.MAX_PIECES
-        ):
-            capacity = settings.iterations + len(self.goals) + 2 * constrained_kernel.MAX_PIECES
-            self._trees = constrained_kernel.make_trees(self.start, self.goals, capacity)
-        path = constrained_kernel.search(
-            self.limits, self._trees, settings.range, CLOCK_INTERVAL, self._state
-        )
-        self.work, self._tried = self.work + CLOCK_INTERVAL, self._tried + CLOCK_INTERVAL
-        if len(path):
-            self.found += 1
-            self._trees = None
-            self.offer(path, self.name)
-
-
-def corner_kept(constraints: PathConstraints | None, q: Float[ndarray, "n dof"]) -> bool:
-    """Whether the polyline through configurations, such as a rounded corner, keeps the constraints as closely
-    as the search does."""
-    rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
-    return (
-        constraints is None
-        or constraints.first_violation(rows, tolerance_fraction=TOLERANCE_FRACTION) is None
-    )
+    def _line(self, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+        return line(self.space, self.limits, self.start, goal)

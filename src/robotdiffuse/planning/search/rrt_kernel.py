@@ -1,10 +1,13 @@
-"""Compiled RRT-Connect and AORRTC, which adds costs to the trees and a bound on the length of paths.
+"""Compiled trees of sampling planners, and RRT-Connect and AORRTC, which grow two of them.
 
 J. Kuffner and S. LaValle, "RRT-Connect: An efficient approach to single-query path planning", ICRA 2000;
 balanced trees as in J. Kuffner and S. LaValle, "An efficient approach to path planning using balanced
 bidirectional RRT search", 2005. T. S. Wilson, W. Thomason, Z. Kingston and J. D. Gammell, "AORRTC:
 Almost-surely asymptotically optimal planning with RRT-Connect", RA-L 2025; samples as in J. D. Gammell, S. S.
 Srinivasa and T. D. Barfoot, "Informed RRT*", IROS 2014.
+
+Edges are straight motions where `limits` is None. Under path constraints it is `constrained_kernel.Limits`,
+for which that module defines `keep` and `extended`.
 """
 
 from typing import NamedTuple
@@ -19,12 +22,16 @@ from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _TAU = np.float32(6.283185307179586)
+INFINITE = np.float32(np.inf)
 _NOWHERE = np.float32(1e15)
 """A coordinate far from all nodes, with a finite square [rad]."""
+_FAR = np.float32(1e29)
+"""Less than the square of a distance to _NOWHERE, and more than any other."""
 
 
 class Trees(NamedTuple):
-    """Two trees, from the start and from the goals; filled in place, so that a search can be continued."""
+    """A tree from the start and one from the goals, if there are any; filled in place, so that a search can
+    be continued."""
 
     nodes: np.ndarray
     """[2, capacity, dof]"""
@@ -35,116 +42,156 @@ class Trees(NamedTuple):
     """[2, capacity in full lanes] path lengths from the roots [rad]; roots come first and have 0."""
     parents: np.ndarray
     """[2, capacity] -1 for roots."""
+    children: np.ndarray
+    """[2, capacity] first child, -1 for none."""
+    siblings: np.ndarray
+    """[2, capacity] next child of the same parent, -1 for the last."""
     sizes: np.ndarray
     """[2]"""
 
 
+class Scratch(NamedTuple):
+    """Working memory for checks of motions."""
+
+    work: tuple
+    block: np.ndarray
+    end: np.ndarray
+    """[dof] where a motion ends."""
+
+
 @kernel()
 def make_trees(start, goals, capacity):
-    """Trees with the start and the goals as their roots."""
-    dof, lanes = len(start), (capacity + W - 1) // W * W
+    """Trees with the start and the goals as their roots, of the start's type of numbers."""
+    dof = len(start)
+    lanes = (capacity + W - 1) // W * W
     trees = Trees(
-        np.empty((2, capacity, dof), np.float32),
+        np.empty((2, capacity, dof), start.dtype),
         np.empty((2 * dof, lanes), np.float32),
         np.zeros((2, lanes), np.float32),
         np.empty((2, capacity), np.int32),
+        np.empty((2, capacity), np.int32),
+        np.empty((2, capacity), np.int32),
         np.zeros(2, np.int32),
     )
-    _add(trees, 0, start, _ZERO, -1)
+    add(trees, 0, start, _ZERO, -1)
     for goal in goals:
-        _add(trees, 1, goal, _ZERO, -1)
+        add(trees, 1, goal, _ZERO, -1)
     return trees
 
 
-@kernel(nogil=True)
-def search(space, trees, goals, bound, longest, iterations, state):
-    """Grow the trees for a number of iterations, or until they hold a path shorter than `bound` [rad].
+@inner_kernel()
+def make_scratch(space, q):
+    dof = q.shape[-1]
+    return Scratch(
+        make_workspace(space.robot, space.scene),
+        np.empty((dof, W), np.float32),
+        np.empty(dof, q.dtype),
+    )
 
-    longest: largest extension [rad].
-    bound: infinite for RRT-Connect.
 
-    Returns the waypoints [n, dof] from the start to a goal; n = 0 if none was found yet. Stops early when a
-    tree is full.
+def keep(limits, q):
+    """Move q to where it keeps the path constraints; returns whether it does. Compiled code only."""
+
+
+def extended(space, limits, trees, tree, near, q, longest, scratch):
+    """`extended_straight` with edges that keep the path constraints. Compiled code only."""
+
+
+@allocation_free()
+def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
+    """Extend a tree from a node towards q by at most `longest` [rad].
+
+    Returns the last node added; -1 if the motion is not free, if no path through its end can be shorter than
+    `bound` [rad], and if the tree is full.
     """
-    nodes, costs, parents, sizes = trees.nodes, trees.costs, trees.parents, trees.sizes
-    dof, bounded = nodes.shape[2], bound < np.float32(np.inf)
-    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
-    sample, new = np.empty(dof, np.float32), np.empty(dof, np.float32)
-    shares = goal_shares(nodes[0, 0], goals, bound) if bounded else np.empty(0, np.float32)
+    origin, end = trees.nodes[tree, near], scratch.end
+    gap = distance(origin, q)
+    share = _ONE if gap <= longest else longest / gap
+    for j in range(len(end)):
+        end[j] = q[j] if gap <= longest else origin[j] + share * (q[j] - origin[j])
+    cost = trees.costs[tree, near] + share * gap
+    if trees.sizes[tree] == trees.nodes.shape[1]:
+        return -1
+    if bound < INFINITE and cost + _to_roots(trees, 1 - tree, end) >= bound:
+        return -1
+    if not motion_free(space, origin, end, scratch.block, scratch.work):
+        return -1
+    return add(trees, tree, end, cost, near)
+
+
+@kernel(nogil=True)
+def search(space, limits, trees, bound, longest, iterations, state):
+    """Grow both trees for a number of iterations, or until they hold a path shorter than `bound` [rad].
+
+    limits: None for straight edges, else those of path constraints.
+    bound: infinite for RRT-Connect, and under path constraints.
+    longest: largest extension [rad].
+
+    Returns the waypoints [n, dof] from the start to a goal; n = 0 if none was found yet.
+    """
+    nodes, costs, sizes = trees.nodes, trees.costs, trees.sizes
+    scratch, sample = make_scratch(space, trees.nodes), np.empty(nodes.shape[2], nodes.dtype)
+    start, goals = nodes[0, 0], nodes[1, : _root_count(trees, 1)]
+    bounded = bound < INFINITE
+    shares = goal_shares(start, goals, bound)
     for _ in range(iterations):
         tree = 0 if sizes[0] <= sizes[1] else 1
         other = 1 - tree
-        if sizes[tree] >= nodes.shape[1] or sizes[other] >= nodes.shape[1]:
-            break
-        if bounded:
-            sample_within(space, nodes[0, 0], goals, shares, bound, sample, state)
-        else:
-            _sample_box(space, sample, state)
-        roots, other_roots = (len(goals), 1) if tree else (1, len(goals))
         allowed = bound
         if bounded:
-            least = _to_roots(nodes, tree, roots, sample)
-            allowed = least + random(state) * (bound - _to_roots(nodes, other, other_roots, sample) - least)
-        near = _nearest(trees, tree, sample, allowed)
-        gap = distance(nodes[tree, near], sample)
-        share = min(longest / max(gap, np.float32(1e-6)), _ONE)
-        for j in range(dof):
-            new[j] = nodes[tree, near, j] + share * (sample[j] - nodes[tree, near, j])
-        cost = costs[tree, near] + share * gap
-        if bounded and cost + _to_roots(nodes, other, other_roots, new) >= bound:
+            u, g = random(state), 0
+            while g < len(goals) - 1 and u > shares[g]:
+                g += 1
+            sample_within(space, start, goals[g], bound, sample, state)
+            least = _to_roots(trees, tree, sample)
+            allowed = least + random(state) * (bound - _to_roots(trees, other, sample) - least)
+        else:
+            sample_box(space, sample, state)
+        if limits is None:
+            near = nearest(trees, tree, sample, allowed)
+            here = extended_straight(space, trees, tree, near, sample, longest, bound, scratch)
+            if here >= 0 and bounded:
+                _lower_cost(space, trees, tree, here, scratch, state)
+        else:
+            if not keep(limits, sample):
+                continue
+            near = nearest(trees, tree, sample, allowed)
+            here = extended(space, limits, trees, tree, near, sample, longest, scratch)
+        if here < 0:
             continue
-        if not motion_free(space, nodes[tree, near], new, block, work):
-            continue
-        if bounded:
-            near, cost = _cheaper(space, trees, tree, roots, near, cost, new, block, work, state)
-        here = _add(trees, tree, new, cost, near)
-        near = _nearest(trees, other, new, bound - cost)
-        while sizes[other] < nodes.shape[1]:
-            gap = distance(nodes[other, near], new)
-            if bounded and costs[other, near] + gap + cost >= bound:
+        cost = costs[tree, here]
+        for j in range(len(sample)):
+            sample[j] = nodes[tree, here, j]
+        near = nearest(trees, other, sample, bound - cost)
+        while True:
+            gap = distance(nodes[other, near], sample)
+            if costs[other, near] + gap + cost >= bound:
                 break
-            last = gap <= longest
-            share = _ONE if last else longest / gap
-            for j in range(dof):
-                sample[j] = nodes[other, near, j] + share * (new[j] - nodes[other, near, j])
-            if not motion_free(space, nodes[other, near], sample, block, work):
+            if limits is None:
+                there = extended_straight(space, trees, other, near, sample, longest, INFINITE, scratch)
+            else:
+                there = extended(space, limits, trees, other, near, sample, longest, scratch)
+            if there < 0:
                 break
-            if last:
-                return _join(nodes, parents, tree, here, near)
-            near = _add(trees, other, sample, costs[other, near] + longest, near)
-    return np.empty((0, dof), np.float32)
-
-
-@kernel(nogil=True)
-def connect(space, trees, longest, iterations, state):
-    """RRT-Connect: `search` without a bound."""
-    nowhere = np.empty((0, trees.nodes.shape[2]), np.float32)
-    return search(space, trees, nowhere, np.float32(np.inf), longest, iterations, state)
+            if gap <= longest:
+                return _joined(trees, tree, here, there)
+            near = there
+    return np.empty((0, nodes.shape[2]), nodes.dtype)
 
 
 @kernel(nogil=True)
 def extend(space, trees, targets, longest):
     """Extend the start's tree from its nearest node towards each of the targets [n, dof], by at most
-    longest[n] [rad], where that motion is free; stops early when the tree is full."""
-    nodes, sizes = trees.nodes, trees.sizes
-    dof = nodes.shape[2]
-    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
-    new = np.empty(dof, np.float32)
+    longest[n] [rad], where that motion is free."""
+    scratch = make_scratch(space, trees.nodes)
     for n in range(len(targets)):
-        if sizes[0] >= nodes.shape[1]:
-            break
-        near = _nearest(trees, 0, targets[n], np.float32(np.inf))
-        gap = distance(nodes[0, near], targets[n])
-        share = min(longest[n] / max(gap, np.float32(1e-6)), _ONE)
-        for j in range(dof):
-            beyond = nodes[0, near, j] + share * (targets[n, j] - nodes[0, near, j])
-            new[j] = min(max(beyond, space.lower[j]), space.upper[j])
-        if motion_free(space, nodes[0, near], new, block, work):
-            _add(trees, 0, new, trees.costs[0, near] + share * gap, near)
+        near = nearest(trees, 0, targets[n], INFINITE)
+        extended_straight(space, trees, 0, near, targets[n], longest[n], INFINITE, scratch)
 
 
 @allocation_free(inline="always")
-def _add(trees, tree, q, cost, parent):
+def add(trees, tree, q, cost, parent):
+    """Add a node to a tree, which must not be full; returns the node."""
     here, dof = trees.sizes[tree], len(q)
     for j in range(dof):
         trees.nodes[tree, here, j] = q[j]
@@ -152,28 +199,70 @@ def _add(trees, tree, q, cost, parent):
             trees.columns[tree * dof + j, here : here + W] = _NOWHERE
         trees.columns[tree * dof + j, here] = q[j]
     trees.costs[tree, here], trees.parents[tree, here] = cost, parent
+    trees.children[tree, here] = -1
+    if parent >= 0:
+        trees.siblings[tree, here] = trees.children[tree, parent]
+        trees.children[tree, parent] = here
     trees.sizes[tree] += 1
     return here
 
 
+@allocation_free()
+def rewire(trees, tree, node, parent, cost):
+    """Move a node, with its subtree, to another parent."""
+    parents, costs = trees.parents[tree], trees.costs[tree]
+    children, siblings = trees.children[tree], trees.siblings[tree]
+    old = parents[node]
+    if children[old] == node:
+        children[old] = siblings[node]
+    else:
+        before = children[old]
+        while siblings[before] != node:
+            before = siblings[before]
+        siblings[before] = siblings[node]
+    parents[node], siblings[node], children[parent] = parent, children[parent], node
+    gain = costs[node] - cost
+    costs[node] = cost
+    # all descendants, in depth-first order without a stack
+    at = children[node]
+    while at >= 0:
+        costs[at] -= gain
+        if children[at] >= 0:
+            at = children[at]
+            continue
+        while at != node and siblings[at] < 0:
+            at = parents[at]
+        if at == node:
+            break
+        at = siblings[at]
+
+
+@allocation_free()
+def _root_count(trees, tree):
+    count = 0
+    while count < trees.sizes[tree] and trees.parents[tree, count] < 0:
+        count += 1
+    return count
+
+
 @allocation_free(fastmath=True)
-def _to_roots(nodes, tree, roots, q):
+def _to_roots(trees, tree, q):
     """Distance to the nearest root, a lower bound of the cost of q [rad]."""
     least = np.float32(1e9)
-    for r in range(roots):
-        least = min(least, distance(nodes[tree, r], q))
+    for r in range(_root_count(trees, tree)):
+        least = min(least, distance(trees.nodes[tree, r], q))
     return least
 
 
 @allocation_free()
-def _nearest(trees, tree, q, allowed):
+def nearest(trees, tree, q, allowed):
     """The nearest node, by position and cost, of those that reach q at a cost of at most `allowed`.
 
     The cost of q is taken to be `allowed`. Without a bound, the nearest node by position; if no node reaches
     q, the nearest root.
     """
-    bounded = allowed < np.float32(np.inf)
-    best, where = np.float32(np.inf), -1
+    bounded = allowed < INFINITE
+    best, where = INFINITE, -1
     for part in range((trees.sizes[tree] + W - 1) // W):
         apart = _squared(trees, tree, part, q)
         if bounded:
@@ -190,46 +279,67 @@ def _nearest(trees, tree, q, allowed):
             near, i = near >> 1, i + 1
     if where >= 0:
         return where
-    for n in range(trees.sizes[tree]):
-        if trees.parents[tree, n] >= 0:
-            break
+    for n in range(_root_count(trees, tree)):
         apart = distance(trees.nodes[tree, n], q)
         if apart < best:
             best, where = apart, n
     return where
 
 
+@allocation_free(inner=False)
+def nearest_few(trees, tree, q, index, squares):
+    """Write the nodes nearest to q to `index`, the nearest first, and their squared distances to `squares`;
+    returns their number, fewer than len(index) only in a smaller tree."""
+    count, worst = 0, _FAR
+    for part in range((trees.sizes[tree] + W - 1) // W):
+        apart = _squared(trees, tree, part, q)
+        near, i = apart < worst, 0
+        while near != 0:
+            if near & 1 and lane(apart, i) < worst:
+                count = min(count + 1, len(index))
+                at = count - 1
+                while at > 0 and squares[at - 1] > lane(apart, i):
+                    index[at], squares[at] = index[at - 1], squares[at - 1]
+                    at -= 1
+                index[at], squares[at] = W * part + i, lane(apart, i)
+                if count == len(index):
+                    worst = squares[count - 1]
+            near, i = near >> 1, i + 1
+    return count
+
+
 @allocation_free(inline="always")
 def _squared(trees, tree, part, q):
     """Squared distances of sixteen nodes from q."""
     dof = len(q)
-    aside = load(trees.columns, tree * dof, part) - q[0]
+    aside = load(trees.columns, tree * dof, part) - np.float32(q[0])
     total = aside * aside
     for j in range(1, dof):
-        aside = load(trees.columns, tree * dof + j, part) - q[j]
+        aside = load(trees.columns, tree * dof + j, part) - np.float32(q[j])
         total = total + aside * aside
     return total
 
 
-@inner_kernel(inline="always")
-def _cheaper(space, trees, tree, roots, near, cost, new, block, work, state):
-    """A parent that reaches `new` at a lower cost, and that cost: draws cheaper ones until an edge
-    collides."""
-    least = _to_roots(trees.nodes, tree, roots, new)
+@allocation_free()
+def _lower_cost(space, trees, tree, leaf, scratch, state):
+    """Give a leaf a parent through which its cost is lower: draws such parents until an edge collides."""
+    q = trees.nodes[tree, leaf]
+    parent, cost = trees.parents[tree, leaf], trees.costs[tree, leaf]
+    least = _to_roots(trees, tree, q)
     while cost > least:
-        allowed = least + random(state) * (cost - least)
-        other = _nearest(trees, tree, new, allowed)
-        through = trees.costs[tree, other] + distance(trees.nodes[tree, other], new)
-        if other == near or through >= cost:
+        other = nearest(trees, tree, q, least + random(state) * (cost - least))
+        through = trees.costs[tree, other] + distance(trees.nodes[tree, other], q)
+        if other == parent or through >= cost:
             break
-        if not motion_free(space, trees.nodes[tree, other], new, block, work):
+        if not motion_free(space, trees.nodes[tree, other], q, scratch.block, scratch.work):
             break
-        near, cost = other, through
-    return near, cost
+        parent, cost = other, through
+    rewire(trees, tree, leaf, parent, cost)
 
 
 @allocation_free()
-def _sample_box(space, q, state):
+def sample_box(space, q, state):
+    """Sample q uniformly within the joint limits."""
     for j in range(len(q)):
         q[j] = space.lower[j] + random(state) * (space.upper[j] - space.lower[j])
 
@@ -247,14 +357,12 @@ def goal_shares(start, goals, bound):
     return shares / max(total, np.float32(1e-30))
 
 
-@kernel()
-def sample_within(space, start, goals, shares, bound, q, state):
+@allocation_free(inner=False)
+def sample_within(space, start, goal, bound, q, state):
     """Sample q uniformly in the prolate hyperspheroid of paths from the start to a goal shorter than `bound`,
-    clamped to the limits; the goal is drawn by `shares`."""
-    dof, u, g = len(q), random(state), 0
-    while g < len(goals) - 1 and u > shares[g]:
-        g += 1
-    straight = distance(start, goals[g])
+    clamped to the limits."""
+    dof = len(q)
+    straight = distance(start, goal)
     across = _HALF * np.sqrt(max(bound * bound - straight * straight, _ZERO))
     norm = _ZERO
     for j in range(dof):
@@ -266,13 +374,13 @@ def sample_within(space, start, goals, shares, bound, q, state):
     # Householder reflection of the first axis onto the direction of the goal
     along, total = _ZERO, _ZERO
     for j in range(dof):
-        v = (_ONE if j == 0 else _ZERO) - (goals[g, j] - start[j]) / max(straight, np.float32(1e-9))
+        v = (_ONE if j == 0 else _ZERO) - (goal[j] - start[j]) / max(straight, np.float32(1e-9))
         along += v * q[j]
         total += v * v
     for j in range(dof):
-        v = (_ONE if j == 0 else _ZERO) - (goals[g, j] - start[j]) / max(straight, np.float32(1e-9))
+        v = (_ONE if j == 0 else _ZERO) - (goal[j] - start[j]) / max(straight, np.float32(1e-9))
         turned = q[j] - (np.float32(2.0) * along / total * v if total > np.float32(1e-9) else _ZERO)
-        q[j] = min(max(turned + _HALF * (start[j] + goals[g, j]), space.lower[j]), space.upper[j])
+        q[j] = min(max(turned + _HALF * (start[j] + goal[j]), space.lower[j]), space.upper[j])
 
 
 @allocation_free()
@@ -282,26 +390,26 @@ def _normal(state):
     return radius * np.cos(_TAU * random(state))
 
 
-@inner_kernel()
-def _join(nodes, parents, tree, here, near):
-    a, b = (here, near) if tree == 0 else (near, here)
-    count = 0
-    for side, node in ((0, a), (1, b)):
-        while node >= 0:
-            node = parents[side, node]
-            count += 1
-    path = np.empty((count, nodes.shape[2]), np.float32)
-    count, node = 0, a
-    while node >= 0:
-        count += 1
-        node = parents[0, node]
-    node = a
+@kernel()
+def branch(trees, tree, node):
+    """Waypoints [n, dof] from a root to a node; n = 0 for node -1."""
+    count, at = 0, node
+    while at >= 0:
+        count, at = count + 1, trees.parents[tree, at]
+    path = np.empty((count, trees.nodes.shape[2]), trees.nodes.dtype)
     for i in range(count - 1, -1, -1):
-        path[i] = nodes[0, node]
-        node = parents[0, node]
-    node = b
-    while node >= 0:
-        path[count] = nodes[1, node]
-        count += 1
-        node = parents[1, node]
+        path[i] = trees.nodes[tree, node]
+        node = trees.parents[tree, node]
+    return path
+
+
+@inner_kernel()
+def _joined(trees, tree, here, there):
+    """The path from the start to a goal through two nodes at the same place, `here` in `tree` and `there` in
+    the other."""
+    first, second = (here, there) if tree == 0 else (there, here)
+    forth, back = branch(trees, 0, first), branch(trees, 1, trees.parents[1, second])
+    path = np.empty((len(forth) + len(back), forth.shape[1]), forth.dtype)
+    path[: len(forth)] = forth
+    path[len(forth) :] = back[::-1]
     return path

@@ -1,0 +1,422 @@
+"""Shared-Tree Informed RRT*, the paper's planner for data: one tree, many goals, a safety distance.
+
+The parts of the paper's section on data sets, and where they are here:
+
+- *Shared spanning tree*: one tree from the start is searched towards all goal configurations of a target
+  pose at once; every goal keeps its own best cost, the cheapest one is returned. Goals are drawn
+  by promise (`draw_goal`); the authors' code takes them in turn.
+- *Informed*: samples come from the prolate hyperspheroid of the drawn goal (`rrt_kernel.sample_within`;
+  J. Gammell et al., IROS 2014). The authors reject uniform samples instead.
+- *RRT\\**: choose-parent and rewiring among the k nearest nodes, k = e (1 + 1/d) ln n, which asymptotic
+  optimality needs (S. Karaman and E. Frazzoli, IJRR 2011; `add_node`). The authors rewire within a
+  fixed radius of 1.2 and have choose-parent commented out.
+- *Node security defence*: nodes and edges keep a safety distance to obstacles; near a start or goal that is
+  itself closer it is relaxed in steps (`collision.kernels.motions.padding_near`), and if no path is
+  found, the whole distance is lowered in steps. The authors enlarge the obstacles by 5 cm. The distance kept
+  is recorded.
+- *Cost*: joint-space length. The authors' is that of the end effector plus a little for orientation, which
+  makes detours of the joints cheap.
+
+Beyond the paper, to lower the cost within milliseconds: each round also asks RRT-Connect for one path,
+shortens it, and adds it to the tree if it is the shortest to its goal; and it shortens the best path. So the
+hyperspheroids shrink early. Both only add branches, so the tree remains one of RRT*.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random, random_state
+from robotdiffuse.collision.kernels.motions import distance, motion_free, motions_free, path_length
+from robotdiffuse.core.kernels import allocation_free, kernel
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.planner import Planner, ever_finer
+from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.search.rrt_kernel import INFINITE, add, nearest_few, rewire
+from robotdiffuse.planning.start_goal import StartGoal, falling_clearances, padded_space
+from robotdiffuse.trajectories.simplification import shortcut
+
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+CAPACITY = 500_000
+"""Most nodes of the tree; the system allocates their memory as it is used."""
+GOAL_BIAS = np.float32(0.1)
+"""Part of the samples that are at a goal, while it is not reached."""
+GAIN = np.float32(1e-4)
+"""A cost must fall by more than this part to count; less is rounding."""
+NEIGHBOURS = 64
+"""Largest number of near neighbours; e (1 + 1 / dof) ln n is below it up to 10^8 nodes of 7 joints."""
+REMAINING_EXCESS = np.float32(0.5)
+"""Part of a goal's present excess over the straight line that is expected to remain."""
+MIN_PROMISE = np.float32(0.03)
+"""Smallest promise of a goal that may still have the shortest path, so that none is left out forever."""
+SHORTCUTS = 20
+"""Attempts to shorten a path."""
+
+
+class Goals(NamedTuple):
+    """The goals of the tree."""
+
+    at: np.ndarray
+    """[k, dof]"""
+    node: np.ndarray
+    """[k] the goal's node, -1 until it is reached."""
+    bound: np.ndarray
+    """[k] the straight distance from the start: no path to the goal is shorter [rad]."""
+    failures: np.ndarray
+    """[k] failed searches for this goal alone."""
+
+
+def make_goals(start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"]) -> Goals:
+    """Goals that are not reached yet, for a tree from a start."""
+    at = goals.astype(np.float32)
+    count = len(at)
+    bound = np.linalg.norm(at - start, axis=1).astype(np.float32)
+    return Goals(at, np.full(count, -1, np.int32), bound, np.zeros(count, np.float32))
+
+
+@allocation_free()
+def _goal_cost(trees, goals, g):
+    node = goals.node[g]
+    return trees.costs[0, node] if node >= 0 else INFINITE
+
+
+@allocation_free()
+def _best_cost(trees, goals):
+    best = INFINITE
+    for g in range(len(goals.at)):
+        best = min(best, _goal_cost(trees, goals, g))
+    return best
+
+
+@allocation_free()
+def _is_open(trees, goals, g, best):
+    """Whether a path to the goal might still be shorter than the best one to any goal."""
+    return goals.bound[g] < min(best, _goal_cost(trees, goals, g)) * (_ONE - GAIN)
+
+
+@allocation_free(inner=False)
+def draw_goal(trees, goals, state):
+    """Draw a goal by its promise; -1 if no path can be shortened.
+
+    Promise: how much shorter the best path would get if the goal's own path lost the expected part of its
+    excess over the straight line; while no goal is reached, its nearness. Failed searches for the goal alone
+    lower it.
+    """
+    best = _best_cost(trees, goals)
+    total, chosen = _ZERO, -1
+    for g in range(len(goals.at)):
+        if not _is_open(trees, goals, g, best):
+            continue
+        bound = goals.bound[g]
+        if best < INFINITE:
+            cost = min(_goal_cost(trees, goals, g), np.float32(1.5) * best)
+            hope = best - bound - REMAINING_EXCESS * (cost - bound)
+            promise = max(hope / best, _ZERO) + MIN_PROMISE
+        else:
+            promise = _ONE / (bound * bound + np.float32(0.1))
+        promise /= _ONE + goals.failures[g]
+        total += promise
+        # reservoir sampling: one pass and no array of promises
+        if random(state) * total < promise:
+            chosen = g
+    return chosen
+
+
+@allocation_free()
+def _draw(space, trees, goals, g, state, out):
+    """A sample for the goal: until it is reached sometimes the goal itself, else from its hyperspheroid."""
+    best = min(_goal_cost(trees, goals, g), _best_cost(trees, goals))
+    if goals.node[g] < 0 and random(state) < GOAL_BIAS:
+        for j in range(len(out)):
+            out[j] = goals.at[g, j]
+    elif best < INFINITE:
+        rrt_kernel.sample_within(space, trees.nodes[0, 0], goals.at[g], best, out, state)
+    else:
+        rrt_kernel.sample_box(space, out, state)
+
+
+@allocation_free()
+def _remaining(trees, goals, q, best):
+    """A lower bound of the way from q to any goal that may still improve."""
+    least = INFINITE
+    for g in range(len(goals.at)):
+        if _is_open(trees, goals, g, best):
+            least = min(least, distance(q, goals.at[g]))
+    return least
+
+
+@allocation_free()
+def add_node(space, trees, goals, q, scratch, index, gaps):
+    """RRT*'s extension to q: the cheapest free way from the near nodes; then those near nodes that q reaches
+    more cheaply are hung under it. Returns the node; -1 if q is of no use or cannot be reached.
+
+    index, gaps: memory for the near nodes and their distances.
+    """
+    # k of k-nearest RRT*: S. Karaman and E. Frazzoli, IJRR 2011, e (1 + 1 / d) ln n
+    most = np.ceil(np.e * (1.0 + 1.0 / len(q)) * np.log(trees.sizes[0] + 1.0))
+    count = nearest_few(trees, 0, q, index[: min(int(most), NEIGHBOURS)], gaps)
+    nodes, costs, best = trees.nodes[0], trees.costs[0], _best_cost(trees, goals)
+    remaining = _remaining(trees, goals, q, best)
+    for i in range(count):
+        gaps[i] = np.sqrt(gaps[i])
+    # parents in the order of cost: mostly the first is free; a negative distance marks those in collision
+    while True:
+        chosen, cost = -1, INFINITE
+        for i in range(count):
+            if gaps[i] >= _ZERO and costs[index[i]] + gaps[i] < cost:
+                chosen, cost = i, costs[index[i]] + gaps[i]
+        # of no use, or a copy of a node
+        if chosen < 0 or cost + remaining >= best or gaps[chosen] <= np.float32(1e-6):
+            return -1
+        parent = index[chosen]
+        if motion_free(space, nodes[parent], q, scratch.block, scratch.work):
+            break
+        gaps[chosen] = -_ONE - gaps[chosen]
+    node = add(trees, 0, q, cost, parent)
+    for i in range(count):
+        near, through = index[i], cost + gaps[i]
+        if gaps[i] < _ZERO or near == parent or through >= costs[near] * (_ONE - GAIN):
+            continue
+        if motion_free(space, q, nodes[near], scratch.block, scratch.work):
+            rewire(trees, 0, near, node, through)
+    return node
+
+
+@allocation_free()
+def _reach(trees, goals, g, node, cost):
+    """Make a node the last one before a goal."""
+    if goals.node[g] < 0:
+        goals.node[g] = add(trees, 0, goals.at[g], cost, node)
+    else:
+        rewire(trees, 0, goals.node[g], node, cost)
+
+
+@allocation_free()
+def _try_goals(space, trees, goals, node, drawn, longest, scratch):
+    """Join the goals that the node reaches more cheaply: the drawn one, and those nearby."""
+    for g in range(len(goals.at)):
+        gap = distance(trees.nodes[0, node], goals.at[g])
+        cost = trees.costs[0, node] + gap
+        # a goal that cannot beat the best one still gets its own first path
+        if (g != drawn and gap > longest) or cost >= _goal_cost(trees, goals, g) * (_ONE - GAIN):
+            continue
+        if motion_free(space, trees.nodes[0, node], goals.at[g], scratch.block, scratch.work):
+            _reach(trees, goals, g, node, cost)
+
+
+@kernel(nogil=True)
+def grow(space, trees, goals, longest, iterations, state):
+    """RRT* iterations with extensions of at most `longest` [rad]; they end early when the tree is full or no
+    path can be shortened."""
+    dof = trees.nodes.shape[2]
+    scratch, sample = rrt_kernel.make_scratch(space, trees.nodes), np.empty(dof, np.float32)
+    index, gaps = np.empty(NEIGHBOURS, np.int32), np.empty(NEIGHBOURS, np.float32)
+    _grow(space, trees, goals, longest, iterations, state, scratch, sample, index, gaps)
+
+
+@allocation_free()
+def _grow(space, trees, goals, longest, iterations, state, scratch, sample, index, gaps):
+    new = scratch.end
+    for _ in range(iterations):
+        if trees.sizes[0] + len(goals.at) >= trees.nodes.shape[1]:
+            return
+        g = draw_goal(trees, goals, state)
+        if g < 0:
+            return
+        _draw(space, trees, goals, g, state, sample)
+        near = trees.nodes[0, rrt_kernel.nearest(trees, 0, sample, INFINITE)]
+        share = min(longest / max(distance(near, sample), np.float32(1e-6)), _ONE)
+        for j in range(len(new)):
+            new[j] = near[j] + share * (sample[j] - near[j])
+        node = add_node(space, trees, goals, new, scratch, index, gaps)
+        if node >= 0:
+            _try_goals(space, trees, goals, node, g, longest, scratch)
+
+
+@kernel()
+def graft(trees, goals, path, g):
+    """Add a free path from the start to a goal as a branch if it is the shortest known."""
+    if path_length(path) >= _goal_cost(trees, goals, g) * (_ONE - GAIN):
+        return
+    if trees.sizes[0] + len(path) >= trees.nodes.shape[1]:
+        return
+    node, cost = 0, _ZERO
+    for i in range(1, len(path) - 1):
+        cost += distance(path[i - 1], path[i])
+        node = add(trees, 0, path[i], cost, node)
+    _reach(trees, goals, g, node, cost + distance(path[len(path) - 2], path[len(path) - 1]))
+
+
+@dataclass(frozen=True)
+class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
+    safety_distance: NotNegative = 0.05
+    """Distance to obstacles that nodes and edges keep [m]; the default is what the authors' scenes imply."""
+    step_rounds: Count = 4
+    """Rounds without a path before the safety distance is lowered."""
+    range: Positive = 1.0
+    """Longest extension of a tree [rad, joint-space L2]."""
+    resolution: Positive = 0.05
+    """No point of the arm moves further than this between two checks of a motion [m]."""
+    growth: Count = 150
+    """Iterations of RRT* in a round."""
+    connect_iterations: Count = 1_000
+    """Most iterations of RRT-Connect in a round."""
+    rounds: Count = 100_000
+    """Most rounds."""
+    improvement: NotNegative = 0.005
+    """The search ends when the best cost fell by less than this part in `patience` rounds; 0: never."""
+    patience: Count = 20
+    """See `improvement`."""
+
+
+class SharedTreeSearch:
+    """One search: start, goals, the tree, and the costs so far. The same state gives the same search."""
+
+    def __init__(
+        self,
+        checker: CollisionChecker,
+        start: Float[ndarray, "dof"],
+        goals: Float[ndarray, "k dof"],
+        settings: SharedTreeSettings,
+        state: ndarray,
+    ) -> None:
+        """Start and goals must be free of collision. `state` is that of `random_state`."""
+        self.checker = checker
+        self.settings = settings
+        self.start = start.astype(np.float32)
+        self.goals = goals.astype(np.float32)
+        self.tree = rrt_kernel.make_trees(self.start, self.goals[:0], CAPACITY)
+        self.targets = make_goals(self.start, self.goals)
+        self.costs: list[float] = []
+        """The best cost after each round [rad], infinite while there is no path."""
+        self._state = state
+        self._ends = np.concatenate([self.start[None], self.goals])
+        self._distances = falling_clearances(settings.safety_distance, checker, self._ends)
+        self._step = 0
+        self._enter_step()
+
+    @property
+    def goal_costs(self) -> Float[ndarray, "k"]:
+        """The length of the best path to each goal [rad]; infinite where there is none."""
+        nodes = self.targets.node
+        return np.where(nodes >= 0, self.tree.costs[0, nodes], np.inf)
+
+    @property
+    def cost(self) -> float:
+        """The length of the best path to any goal [rad]; infinite if there is none."""
+        return float(self.goal_costs.min())
+
+    @property
+    def best_goal(self) -> int:
+        """The goal that the best path leads to; -1 if there is no path."""
+        return int(self.goal_costs.argmin()) if (self.targets.node >= 0).any() else -1
+
+    def path(self, goal: int | None = None) -> Float[ndarray, "n dof"] | None:
+        """Waypoints of the best path, or of the best one to a goal; None if there is none."""
+        g = self.best_goal if goal is None else goal
+        path = rrt_kernel.branch(self.tree, 0, self.targets.node[g] if g >= 0 else -1)
+        return path if len(path) else None
+
+    @property
+    def finished(self) -> bool:
+        """Whether it is enough by the settings: no path can be shorter, or it hardly improves any more."""
+        settings, costs = self.settings, self.costs
+        if self.cost < np.inf:
+            if self.targets.bound.min() >= self.cost * (1 - GAIN):
+                return True
+            if settings.improvement > 0 and len(costs) > settings.patience:
+                before = costs[-1 - settings.patience]
+                if before < np.inf and before - costs[-1] < settings.improvement * before:
+                    return True
+        elif self._step == len(self._distances) - 1 and self._rounds_at_step >= 3 * settings.step_rounds:
+            # no path at any distance: give up after three times the usual number of rounds
+            return settings.improvement > 0
+        return len(costs) >= settings.rounds
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Search until it is finished, or `stop` returns True."""
+        while not (self.finished or stop()):
+            self.round()
+
+    def round(self) -> None:
+        """Run a round: one path by RRT-Connect, RRT* iterations, and shortcuts of the best path."""
+        settings, longest = self.settings, np.float32(self.settings.range)
+        g = draw_goal(self.tree, self.targets, self._state)
+        if g >= 0:
+            self._connect(np.arange(len(self.goals)) if self.best_goal < 0 else np.array([g]))
+            grow(self._space, self.tree, self.targets, longest, settings.growth, self._state)
+            path = self.path()
+            if path is not None:
+                self._graft(path, self.best_goal)
+        self.costs.append(self.cost)
+        self._rounds_at_step += 1
+        last = self._step == len(self._distances) - 1
+        if self.best_goal < 0 and not last and self._rounds_at_step >= settings.step_rounds:
+            self._step += 1
+            self._enter_step()
+
+    def _enter_step(self) -> None:
+        """Set the safety distance of the step; the tree stays valid, as distances only fall."""
+        self.safety_distance = self._distances[self._step]
+        """Distance to obstacles that paths keep, except near a start or goal that is closer [m]."""
+        self._rounds_at_step = 0
+        self._space = padded_space(self.checker, self._ends, self.settings.resolution, self.safety_distance)
+        for g, goal in enumerate(self.goals):
+            line = np.stack([self.start, goal])
+            if motions_free(self._space, line)[0]:
+                graft(self.tree, self.targets, line, g)
+
+    def _connect(self, targets: ndarray) -> None:
+        iterations = self.settings.connect_iterations
+        trees = rrt_kernel.make_trees(self.start, self.goals[targets], 8 * iterations + len(targets))
+        longest = np.float32(self.settings.range)
+        path = rrt_kernel.search(self._space, None, trees, INFINITE, longest, iterations, self._state)
+        if len(path):
+            self._graft(path, int(targets[np.abs(self.goals[targets] - path[-1]).max(axis=1).argmin()]))
+        elif len(targets) == 1:
+            self.targets.failures[targets] += 1
+
+    def _graft(self, path: Float[ndarray, "n dof"], g: int) -> None:
+        graft(self.tree, self.targets, shortcut(self._space, path, SHORTCUTS, self._state), g)
+
+
+class SharedTreeRRTStar(Planner[SharedTreeSettings]):
+    """Shared-Tree Informed RRT* as an anytime planner: it ends when it hardly improves or time runs out."""
+
+    name = "shared_tree_rrt_star"
+    settings_class = SharedTreeSettings
+
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        for settings, attempt in ever_finer(context, self.settings):
+            state = random_state(context.request.seed, attempt)
+            search = SharedTreeSearch(start_goal.checker, *start_goal.rows(), settings, state)
+
+            def out_of_time(search: SharedTreeSearch = search) -> bool:
+                if search.cost < np.inf:
+                    context.improved(search.cost)
+                return context.remaining <= 0
+
+            search.run(out_of_time)
+            path = search.path()
+            if path is None:
+                break
+            result = context.finish(start_goal.complete(path), self.name, reason=_reason(search))
+            if result is not None:
+                return result
+        return context.unsolved()
+
+
+def _reason(search: SharedTreeSearch) -> str:
+    reached = int(np.isfinite(search.goal_costs).sum())
+    return (
+        f"solved by {SharedTreeRRTStar.name}: {len(search.costs)} rounds, {reached} of {len(search.goals)} "
+        f"goals reached, {100 * search.safety_distance:.0f} cm of safety distance kept away from the ends"
+    )
