@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.progress import track
 
 from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.tables import Column, Rows, Table, show
 from robotdiffuse.core.types import UNTIL, Trajectory
-from robotdiffuse.evaluation.machine import about
 from robotdiffuse.evaluation.problem_sets import hard_cases
-from robotdiffuse.evaluation.tables import Column, Rows, Table, show
+from robotdiffuse.evaluation.report import about
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot

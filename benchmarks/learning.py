@@ -28,8 +28,9 @@ import numpy as np
 
 from common import WIDTH, draw_hard_cases, header, parse, parts_of, print_table
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core import tables
+from robotdiffuse.core.tables import Cell, Column, Table, show
 from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.evaluation import tables
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     Draw,
@@ -39,10 +40,8 @@ from robotdiffuse.evaluation.methods import (
     sampled,
     without_network,
 )
-from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run, run_all
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Record, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
-from robotdiffuse.evaluation.tables import Cell, Column, Table, show
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case

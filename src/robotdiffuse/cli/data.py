@@ -266,9 +266,8 @@ def generate_with_progress(
 
 
 def run_info(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.datasets.page import write_page
-    from robotdiffuse.evaluation.datasets.report import tables
-    from robotdiffuse.evaluation.tables import show
+    from robotdiffuse.core.tables import show
+    from robotdiffuse.evaluation.data_report import tables, write_page
 
     page = Path(arguments.page or Path(arguments.folder) / "report.html")
     show(*tables(write_page(arguments.folder, page, _robot(arguments.robot))))
@@ -277,8 +276,8 @@ def run_info(arguments: argparse.Namespace) -> int:
 
 
 def run_check(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.datasets.check import check_data
-    from robotdiffuse.evaluation.tables import show
+    from robotdiffuse.core.tables import show
+    from robotdiffuse.evaluation.checks import check_data
 
     with progress("checking motions") as update:
         check = check_data(
@@ -291,7 +290,7 @@ def run_check(arguments: argparse.Namespace) -> int:
             update,
         )
     show(*check.tables)
-    return CLEAN if check.clean else VIOLATIONS
+    return VIOLATIONS if check.findings else CLEAN
 
 
 def run_view(arguments: argparse.Namespace) -> int:

@@ -24,8 +24,17 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status
 from robotdiffuse.evaluation.metrics import Measure
-from robotdiffuse.evaluation.records import ENDED_EARLY, RAISED, RESTARTABLE, SHORTEST_FACTOR, SOLVED
-from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run
+from robotdiffuse.evaluation.runs import (
+    ENDED_EARLY,
+    RAISED,
+    RESTARTABLE,
+    SHORTEST_FACTOR,
+    SOLVED,
+    Clock,
+    Fields,
+    Method,
+    Run,
+)
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planning.diffusion.diffusion import ModelSampler, encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuseSettings
@@ -78,7 +87,7 @@ def planner_calls(
         if restarts and result.status.value in RESTARTABLE and result.planning_time < ENDED_EARLY * limit:
             again, result = restarted(planner, problem, seed, limit, result, request)
             yield {"restarts": again, **fields_of(result, measure)}
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         traceback.print_exc()
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         yield {"status": RAISED, "reason": reason, "time": time.perf_counter() - began}

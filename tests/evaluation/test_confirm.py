@@ -7,7 +7,7 @@ import pytest
 
 from robotdiffuse.cli import main
 from robotdiffuse.evaluation.problem_sets import gather_cases
-from robotdiffuse.evaluation.records import Record, RecordFile, record_path
+from robotdiffuse.evaluation.runs import Record, RecordFile, record_path
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.problem import JointGoal
 

@@ -17,7 +17,9 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.processes import Workers
+from robotdiffuse.core.tables import Column, Table
 from robotdiffuse.datasets.manifest import read_manifest
+from robotdiffuse.evaluation.comparison import Mean
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     from_network,
@@ -26,12 +28,11 @@ from robotdiffuse.evaluation.methods import (
     without_network,
 )
 from robotdiffuse.evaluation.metrics import Kinematics
-from robotdiffuse.evaluation.paper.problems import straight_line_shares
+from robotdiffuse.evaluation.paper import paper_report, share_cells, straight_line_shares
 from robotdiffuse.evaluation.problem_sets import hard_cases
-from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import run_all
-from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
-from robotdiffuse.evaluation.tables import Column, Table
+from robotdiffuse.evaluation.report import Report, interval
+from robotdiffuse.evaluation.runs import Record, run_all
+from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
@@ -292,58 +293,68 @@ LINE_NOTES = (
 )
 
 
+def table2(settings: AblationSettings, results: list[RowResult]) -> Report:
+    """Table 2 and, beside its rows, no planner at all."""
+    command = (
+        f"robotdiffuse reproduce table2 --data DATA --out FOLDER --samples {settings.samples} "
+        f"--encoder-samples {settings.encoder_samples} --problems {settings.problems} "
+        f"--seeds {settings.seeds}"
+    )
+    report = paper_report("Table 2", command)
+    report.table(table(settings, results), level=2)
+    report.table(straight_line_table(settings.problems), level=2)
+    return report
+
+
 def table(settings: AblationSettings, results: list[RowResult]) -> Table:
-    """Table 2, with the paper's figures beside ours."""
+    """The rows of Table 2, with the paper's figures beside ours."""
     known = asdict(settings)
     budget = ("samples", "encoder_samples", "problems", "candidates")
     title = f"Table 2 on {settings.family}: {', '.join(f'{name} {known[name]:,}' for name in budget)}"
-    shares = Column("single", "%", ".1f", "more", scale=100.0), Column("95 %", dim=True)
+    several = settings.seeds > 1
     columns = (
-        "row",
-        "guided",
-        *shares,
+        *("row", "guided"),
+        *(Column("single", "%", ".1f", "more", scale=100.0), "95 %"),
         Column("best", "%", ".1f", "more", scale=100.0),
-        Column("collision", "%", ".1f", "less", scale=100.0),
-        Column("95 %", dim=True),
+        *(Column("collision", "%", ".1f", "less", scale=100.0), "95 %"),
         Column("length", "m", ".3f", "less"),
         Column("to first", "", ".3f", "less"),
         Column("CPU", "ms", ".0f", "less", scale=1000.0),
-        replace(shares[0], heading="unguided"),
-        shares[1],
-        *(("each seed",) if settings.seeds > 1 else ()),
+        *(Column("unguided", "%", ".1f", "more", scale=100.0), "95 %"),
+        *(("each seed",) if several else ()),
         *("paper: suc", "col", "len", "s"),
     )
-    first, rows = results[0].as_in_paper, []
+    first = results[0].as_in_paper
+    rows = []
     for result in results:
-        evaluation, of = result.as_in_paper, ROWS.get(result.name)
-        rows.append(
-            (
-                result.name,
-                "yes" if evaluation is result.guided else "no",
-                *_share(evaluation.single),
-                float(evaluation.best.mean()),
-                *_share(evaluation.collided),
-                _mean(evaluation.length),
-                _mean(evaluation.length / first.length),
-                float(np.median(evaluation.seconds)),
-                *_share(result.alone.single),
-                *((", ".join(f"{100 * x:.1f}" for x in result.by_seed),) if settings.seeds > 1 else ()),
-                *((None,) * 4 if of is None else of.paper),
-            )
+        evaluation = result.as_in_paper
+        paper = ROWS[result.name].paper if result.name in ROWS else (None,) * 4
+        by_seed = ", ".join(f"{100 * x:.1f}" for x in result.by_seed)
+        row = (
+            result.name,
+            "yes" if evaluation is result.guided else "no",
+            *_share(evaluation.single),
+            float(evaluation.best.mean()),
+            *_share(evaluation.collided),
+            Mean.of(evaluation.length).value,
+            Mean.of(evaluation.length / first.length).value,
+            float(np.median(evaluation.seconds)),
+            *_share(result.alone.single),
+            *((by_seed,) if several else ()),
+            *paper,
         )
+        rows.append(row)
     return Table.of(title, columns, rows, NOTES)
 
 
 def straight_line_table(problems: int) -> Table:
     """No planner under the authors' own draw, beside the paper's rows of Table 2."""
-    rows: list[tuple[str, float, str]] = []
+    rows = [(f"paper: {name}", float(row.paper[0] or 0), "") for name, row in ROWS.items()]
     for obstacles, family in LINE_FAMILIES.items():
         for goals, free in straight_line_shares(problems, family).items():
-            low, high = (100 * x for x in wilson_interval(free, problems))
             name = f"no planner: straight line to {goals}, {obstacles}"
-            rows.append((name, 100 * free / problems, f"{low:.1f} to {high:.1f}"))
-    rows += [(f"paper: {name}", float(row.paper[0] or 0), "") for name, row in ROWS.items()]
-    columns = "row", Column("success", "%", ".1f"), Column("95 %", dim=True)
+            rows.append((name, *share_cells(free, problems)))
+    columns = ("row", Column("success", "%", ".1f"), "95 %")
     rows.sort(key=lambda row: row[1])
     return Table.of(
         f"No planner among the paper's rows: {problems} problems drawn", columns, rows, LINE_NOTES
@@ -352,11 +363,4 @@ def straight_line_table(problems: int) -> Table:
 
 def _share(values: Float[ndarray, "n"]) -> tuple[float, str]:
     """Mean of shares, and its 95 % interval in per cent."""
-    low, high = (100 * x for x in bootstrap_interval(values))
-    return float(values.mean()), f"{low:.1f} to {high:.1f}"
-
-
-def _mean(values: Float[ndarray, "n"]) -> float | None:
-    """Mean of the values that are not NaN; None without any."""
-    known = values[values == values]
-    return float(known.mean()) if len(known) else None
+    return float(values.mean()), interval(*bootstrap_interval(values), scale=100.0)

@@ -1,11 +1,10 @@
-"""Tables for the terminal, Markdown, LaTeX and HTML."""
+"""Tables for the terminal and Markdown."""
 
-import html as markup
 import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -32,10 +31,6 @@ class Column:
     """Whether texts are aligned left, as in the first column."""
     scale: float = 1.0
     """Shown units per unit of the values."""
-    bar: bool = False
-    """Whether pages draw a bar beside the figure, a percentage."""
-    dim: bool = False
-    """Whether pages print it faintly, as an addition to the column before."""
 
     @property
     def title(self) -> str:
@@ -84,11 +79,6 @@ class Table:
         return any(column.title for column in self.columns)
 
     @property
-    def paired(self) -> bool:
-        """Whether the table is one of `pairs`."""
-        return len(self.columns) == 2 and not self.headed
-
-    @property
     def texts(self) -> list[list[str]]:
         """All cells as texts."""
         return [
@@ -99,16 +89,16 @@ class Table:
     def best(self) -> set[tuple[int, int]]:
         """Row and column of the best figures of each column, compared as shown; none if more than half of the
         rows have it."""
-        found: set[tuple[int, int]] = set()
+        places: set[tuple[int, int]] = set()
         for j, column in enumerate(self.columns):
             values = {i: _value(row[j]) for i, row in enumerate(self.rows)}
             known = {i: value for i, value in values.items() if value == value}
             if column.better and known:
-                top = (max if column.better == "more" else min)(known.values())
-                shown = {_text(self.rows[i][j], column) for i, value in known.items() if value == top}
-                level = [i for i in known if _text(self.rows[i][j], column) in shown]
-                found |= {(i, j) for i in level if 2 * len(level) <= len(self.rows)}
-        return found
+                best = (max if column.better == "more" else min)(known.values())
+                texts = {_text(self.rows[i][j], column) for i, value in known.items() if value == best}
+                level = [i for i in known if _text(self.rows[i][j], column) in texts]
+                places |= {(i, j) for i in level if 2 * len(level) <= len(self.rows)}
+        return places
 
     def at_left(self, j: int) -> bool:
         return j == 0 or self.columns[j].left
@@ -122,10 +112,8 @@ def _value(cell: Cell) -> float:
 
 
 def _text(cell: Cell, column: Column) -> str:
-    if isinstance(cell, str):
-        return cell
-    if isinstance(cell, Figure):
-        return cell.text
+    if isinstance(cell, str | Figure):
+        return str(cell)
     if cell is None or cell != cell:
         return NO_VALUE
     plain = isinstance(cell, int) and column.scale == 1 and not column.format
@@ -138,7 +126,7 @@ def terminal(table: Table) -> "RichTable":
     from rich.markup import escape
     from rich.table import Table as RichTable
 
-    found = RichTable(
+    made = RichTable(
         title=escape(table.title) or None,
         title_justify="left",
         caption=escape("\n".join(table.notes)) or None,
@@ -149,20 +137,21 @@ def terminal(table: Table) -> "RichTable":
         padding=(0, 1),
     )
     for j, column in enumerate(table.columns):
-        found.add_column(escape(column.title), justify="left" if table.at_left(j) else "right")
+        made.add_column(escape(column.title), justify="left" if table.at_left(j) else "right")
     for i, texts in enumerate(table.texts):
         marked = (
             f"[bold]{escape(t)}[/bold]" if (i, j) in table.best else escape(t) for j, t in enumerate(texts)
         )
-        found.add_row(*marked)
-    return found
+        made.add_row(*marked)
+    return made
 
 
 def show(*tables: Table, width: int | None = None) -> None:
     """Print tables as wide as the terminal, or as WIDTH without one."""
-    if all(table.paired for table in tables):  # without rich, whose import takes longer than a plan
-        wide = width or (shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH)
-        print("\n\n".join("\n".join(pair_lines(table, wide)) for table in tables))
+    # pairs are printed without rich, whose import takes longer than a plan
+    if all(len(table.columns) == 2 and not table.headed for table in tables):
+        columns = width or (shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH)
+        print("\n\n".join("\n".join(pair_lines(table, columns)) for table in tables))
         return
     from rich.console import Console
 
@@ -216,81 +205,3 @@ def plain(text: str) -> str:
     """Escape a text for Markdown: characters of formatting and columns; an underscore within a word is
     neither."""
     return re.sub(r"[\\|*<`]|(?<!\w)_|_(?!\w)", r"\\\g<0>", text)
-
-
-def latex(table: Table) -> list[str]:
-    """Lines of a LaTeX tabular, without the title; it needs booktabs."""
-    best = table.best
-
-    def line(cells: Sequence[str]) -> str:
-        return " & ".join(cells) + r" \\"
-
-    places = "".join("l" if table.at_left(j) else "r" for j in range(len(table.columns)))
-    rows = [
-        line([rf"\textbf{{{tex(t)}}}" if (i, j) in best else tex(t) for j, t in enumerate(texts)])
-        for i, texts in enumerate(table.texts)
-    ]
-    return [
-        rf"\begin{{tabular}}{{{places}}}",
-        r"\toprule",
-        line([tex(column.title) for column in table.columns]),
-        r"\midrule",
-        *rows,
-        r"\bottomrule",
-        r"\end{tabular}",
-        *(tex(note) for note in table.notes),
-    ]
-
-
-TEX = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        "_": r"\_",
-        "%": r"\%",
-        "&": r"\&",
-        "#": r"\#",
-        "$": r"\$",
-        "{": r"\{",
-        "}": r"\}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "<": "$<$",
-        ">": "$>$",
-        "–": "--",
-        "−": "$-$",
-        "±": r"$\pm$",
-        "†": r"$\dagger$",
-        "*": "$*$",
-    }
-)
-
-
-def tex(text: str) -> str:
-    """Escape a text for LaTeX."""
-    return text.translate(TEX)
-
-
-def html(table: Table, colors: Mapping[str, str] | None = None, ours: str = "") -> str:
-    """An HTML table element, without the title; `style.STYLE` is its style sheet.
-
-    colors: of rows, by the text of their first cell.
-    ours: the text of the row that is emphasized.
-    """
-    head = "".join(f"<th>{markup.escape(column.title)}</th>" for column in table.columns)
-    body, best = [], table.best
-    for i, texts in enumerate(table.texts):
-        color = (colors or {}).get(texts[0], "")
-        swatch = f'<i style="background:{color}"></i>' if color else ""
-        cells = [f"<td>{swatch}{markup.escape(texts[0])}</td>"]
-        for j, (text, column) in enumerate(zip(texts[1:], table.columns[1:], strict=True), start=1):
-            kind = "best" if (i, j) in best else "dim" if column.dim else ""
-            bar = _bar(column.scale * _value(table.rows[i][j]), color) if column.bar else ""
-            cells.append(f'<td class="{kind}">{bar}<span>{markup.escape(text)}</span></td>')
-        body.append(f"<tr{' class=ours' if ours and texts[0] == ours else ''}>{''.join(cells)}</tr>")
-    notes = "".join(f"<p>{markup.escape(note)}</p>" for note in table.notes)
-    whole = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
-    return f'<div class="wide">{whole}</div>{notes}'
-
-
-def _bar(percent: float, color: str) -> str:
-    return f'<span class="bar"><b style="width:{percent:.1f}%;background:{color or "#6b7684"}"></b></span>'

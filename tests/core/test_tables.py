@@ -1,16 +1,16 @@
-"""One table, four renderers: every cell is there, what would be formatting is escaped, the best is marked."""
+"""One table, two renderers: every cell is there, what would be formatting is escaped, the best is marked."""
 
 import re
 from io import StringIO
 
 from rich.console import Console
 
-from robotdiffuse.evaluation import tables
-from robotdiffuse.evaluation.tables import Column, Figure, Table
+from robotdiffuse.core import tables
+from robotdiffuse.core.tables import Column, Figure, Table
 
 COLUMNS = (
     "planner",
-    Column("success", "%", ".1f", "more", scale=100.0, bar=True),
+    Column("success", "%", ".1f", "more", scale=100.0),
     Column("a & b", "s", better="less"),
 )
 ROWS = (
@@ -45,22 +45,6 @@ def test_markdown() -> None:
         "",
         r"note_1 \< 2",
     ]
-
-
-def test_latex() -> None:
-    lines = tables.latex(TABLE)
-    assert lines[0] == r"\begin{tabular}{lrr}"
-    assert r"planner & success \% & a \& b s \\" in lines
-    assert r"rrt\_star$*$ & 25.0 & \textbf{0.0010} \\" in lines
-    assert lines[-1] == r"note\_1 $<$ 2"
-
-
-def test_html() -> None:
-    text = tables.html(TABLE, {"<d>": "#123456"}, ours="b|c [x]")
-    assert text.count("<tr>") == 3 and "<tr class=ours><td>b|c [x]</td>" in text
-    assert '<td><i style="background:#123456"></i>&lt;d&gt;</td>' in text
-    assert '<td class="best"><span class="bar"><b style="width:75.0%' in text
-    assert "<p>note_1 &lt; 2</p>" in text
 
 
 def test_pairs_are_printed_without_rich_in_lines_that_fit() -> None:

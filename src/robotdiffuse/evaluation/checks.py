@@ -1,13 +1,15 @@
-"""Checks of a data set: every shard is complete, and motions pass the validator and PyBullet on meshes.
-
-Problems are rebuilt from their rows alone; results of the generation are not trusted.
+"""Checks of motions. Of a data set: every shard is complete, and motions pass the validator and PyBullet on
+meshes; problems are rebuilt from their rows alone, results of the generation are not trusted. Of a bench: its
+motions pass PyBullet, a second validator with its own kinematics.
 """
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,15 +18,20 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError, distinct
 from robotdiffuse.core.processes import Workers, in_order
+from robotdiffuse.core.tables import Column, Table
 from robotdiffuse.core.types import Path
 from robotdiffuse.datasets.manifest import Manifest, read_manifest
 from robotdiffuse.datasets.motion_rows import path_of, problem_of, scenes_of
 from robotdiffuse.datasets.shards import Shard, check_shard, existing_shards, pick_rows, read_shard
-from robotdiffuse.evaluation.tables import Column, Table
+from robotdiffuse.evaluation.problem_sets import read_cases
+from robotdiffuse.evaluation.runs import Record, read_records
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import Verifier, VerifySettings
+
+if TYPE_CHECKING:
+    from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle
 
 KINDS: dict[str, str] = {
     "damaged": "shards damaged",
@@ -90,39 +97,41 @@ class DataCheck:
     """Motions that were validated."""
     pybullet: bool
     """Whether PyBullet checked too."""
-    counts: dict[str, int]
-    """Findings by kind, for all of KINDS."""
-    examples: tuple[Finding, ...]
-    """The first few of each kind, by shard and row."""
+    findings: tuple[Finding, ...]
+    """By shard and row."""
     least_clearance: float
     """Least recorded distance between arm and obstacles of the validated motions [m]; NaN without any."""
     seconds: float
     """Wall time."""
 
     @property
-    def clean(self) -> bool:
-        return not any(self.counts.values())
+    def counts(self) -> Counter[str]:
+        """Findings by kind."""
+        return Counter(finding.kind for finding in self.findings)
 
     @property
     def tables(self) -> list[Table]:
         """A table of the result, and one of the first examples of each kind."""
         planned = f" of {self.planned:,} planned" if self.motions < self.planned else ""
         rate = self.checked / max(self.seconds, 1e-9)
-        checked = {kind: kind != "pybullet" or self.pybullet for kind in KINDS}
         rows = [
             ("shards, motions", f"{self.shards:,}, {self.motions:,}{planned}"),
             ("validated", f"{self.checked:,} in {self.seconds:.1f} s ({rate:.0f}/s)"),
-            *(
-                (name, f"{self.counts[kind]:,}" if checked[kind] else "not checked")
-                for kind, name in KINDS.items()
-            ),
+            *((name, f"{self.counts[kind]:,}") for kind, name in KINDS.items()),
             ("least clearance recorded", f"{1e3 * self.least_clearance + 0.0:.3f} mm"),
         ]
-        found = [Table.pairs(f"{self.robot}: {'clean' if self.clean else 'violations found'}", rows)]
-        if self.examples:
-            columns = "first examples", Column("where", left=True), Column("what", left=True)
-            found.append(Table.of("", columns, [(f.kind, f.where, f.message) for f in self.examples]))
-        return found
+        if not self.pybullet:
+            rows = [(name, "not checked" if name == KINDS["pybullet"] else text) for name, text in rows]
+        tables = [Table.pairs(f"{self.robot}: {'violations found' if self.findings else 'clean'}", rows)]
+        if self.findings:
+            examples = [
+                (finding.kind, finding.where, finding.message)
+                for kind in KINDS
+                for finding in [f for f in self.findings if f.kind == kind][:EXAMPLES_PER_KIND]
+            ]
+            columns = ("first examples", Column("where", left=True), Column("what", left=True))
+            tables.append(Table.of("", columns, examples))
+        return tables
 
 
 def check_data(
@@ -132,7 +141,7 @@ def check_data(
     seed: int = 0,
     workers: int = 1,
     pybullet: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> DataCheck:
     """Check the structure of every shard, and `count` random motions (all by default).
 
@@ -152,28 +161,30 @@ def check_data(
     robot = load_robot(manifest.robot) if robot is None else robot
     manifest.check_robot(robot)
     if pybullet:
-        _need_pybullet()
+        _pybullet()
     indices = existing_shards(folder)
     task = _Task(str(folder), manifest, robot, pybullet)
     motions = min(manifest.trajectories, sys.maxsize if count is None else count)
     workers = min(workers, max(len(indices), -(-motions // MOTIONS_PER_TASK)))
+    done = 0
+    least = np.inf
     with Workers(workers if workers > 1 else 0) as processes:
         sizes = dict(zip(indices, in_order(processes.each(task.size, [(i,) for i in indices])), strict=True))
-        found = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
+        findings = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
         rows = {i: size for i, size in sizes.items() if isinstance(size, int)}
-        chosen = [
-            (index, picked[i : i + MOTIONS_PER_TASK])
-            for index, picked in pick_rows(rows, count, seed).items()
-            for i in range(0, len(picked), MOTIONS_PER_TASK)
+        parts = [
+            (index, chosen[i : i + MOTIONS_PER_TASK])
+            for index, chosen in pick_rows(rows, count, seed).items()
+            for i in range(0, len(chosen), MOTIONS_PER_TASK)
         ]
-        total, done, least = sum(len(part) for _, part in chosen), 0, np.inf
-        if progress is not None:
+        total = sum(len(chosen) for _, chosen in parts)
+        progress(done, total)
+        results = in_order(processes.each(task.validate, parts))
+        for (_, chosen), (part, clearance) in zip(parts, results, strict=True):
+            findings += part
+            least = min(least, clearance)
+            done += len(chosen)
             progress(done, total)
-        for part in in_order(processes.each(task.validate, [(some,) for some in chosen])):
-            found += part.findings
-            done, least = done + part.motions, min(least, part.least_clearance)
-            if progress is not None:
-                progress(done, total)
     return DataCheck(
         robot=robot.name,
         shards=len(indices),
@@ -181,32 +192,23 @@ def check_data(
         planned=manifest.trajectories,
         checked=done,
         pybullet=pybullet,
-        counts={kind: sum(f.kind == kind for f in found) for kind in KINDS},
-        examples=tuple(f for kind in KINDS for f in [f for f in found if f.kind == kind][:EXAMPLES_PER_KIND]),
+        findings=tuple(findings),
         least_clearance=least if done else float("nan"),
         seconds=time.perf_counter() - began,
     )
 
 
-def _need_pybullet() -> None:
+def _pybullet() -> "type[PyBulletOracle]":
     try:
-        import robotdiffuse.simulation.validator  # noqa: F401
+        from robotdiffuse.simulation.validator import PyBulletOracle
     except ModuleNotFoundError as error:
         if error.name != "pybullet":
             raise
         raise InputError(
             "the second validator needs PyBullet, whose wheels stop at Python 3.11: pip install "
-            "'robotdiffuse[sim]', or leave it out by --no-pybullet (pybullet=False)"
+            "'robotdiffuse[sim]'; `data check` can leave it out by --no-pybullet (pybullet=False)"
         ) from None
-
-
-@dataclass(frozen=True)
-class _PartResult:
-    """The result of some rows of a shard."""
-
-    motions: int
-    findings: list[Finding]
-    least_clearance: float
+    return PyBulletOracle
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,22 +227,21 @@ class _Task:
         except InputError as error:
             return str(error)
 
-    def validate(self, part: tuple[int, Int[ndarray, "n"]]) -> _PartResult:
-        """Validate some rows of a shard."""
-        index, rows = part
+    def validate(self, index: int, rows: Int[ndarray, "n"]) -> tuple[list[Finding], float]:
+        """Findings in some rows of a shard, and the least clearance recorded."""
         shard = read_shard(self.folder, index)
-        findings: list[Finding] = []
-        for row in rows.tolist():
-            findings += [Finding(kind, index, row, text) for kind, text in _defects(self, shard, row)]
+        findings = [
+            Finding(kind, index, row, text)
+            for row in rows.tolist()
+            for kind, text in _defects(self, shard, row)
+        ]
         if self.pybullet:
             findings += self._pybullet_findings(shard, rows)
         least = float(shard["clearance"][rows].min(initial=np.inf))
-        return _PartResult(len(rows), sorted(findings, key=lambda f: f.row or 0), least)
+        return sorted(findings, key=lambda finding: finding.row or 0), least
 
     def _pybullet_findings(self, shard: Shard, rows: Int[ndarray, "n"]) -> Iterator[Finding]:
-        from robotdiffuse.simulation.validator import PyBulletOracle
-
-        with PyBulletOracle(self.robot, Scene([])) as oracle:
+        with _pybullet()(self.robot, Scene([])) as oracle:
             for row in rows.tolist():
                 try:
                     oracle.set_scene(scenes_of(self.manifest, shard, slice(row, row + 1)).scene(0))
@@ -316,3 +317,51 @@ def _lengths(shard: Shard, row: int, path: Path) -> Iterator[tuple[str, str]]:
             "cost",
             f"detour is {detour:.4f}; cost over the straight distance is {cost / max(straight, 1e-9):.4f}",
         )
+
+
+# Motions of a bench
+
+CONFIRM_STEP = 0.02
+"""Between checked configurations [rad, joint-space L2]."""
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    checked: dict[str, int]
+    """Number of checked motions by planner."""
+    refuted: "list[tuple[Record, OracleContact]]"
+    """Motions that were returned as solved and collide by PyBullet, with the first contact."""
+
+
+def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], None]) -> Confirmation:
+    """Check the returned motions in a folder of `bench run`.
+
+    count: first problems of each set; None: all.
+    progress: called with the numbers of problems done and in all.
+
+    Raises InputError if the folder holds no records or is damaged, and without PyBullet.
+    """
+    oracle = _pybullet()
+    records = [record for of in read_records(out).values() for record in of]
+    solved: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        if record.solved:
+            solved.setdefault((record.problem_set, record.name), []).append(record)
+    sets = {name: read_cases(out, name) for name in sorted({record.problem_set for record in records})}
+    lost = solved.keys() - {case.key for cases in sets.values() for case in cases}
+    if lost:
+        problem_set, name = min(lost)
+        raise InputError(f"{out}/problems lacks {name} of {problem_set}, which has results")
+    chosen = [case for cases in sets.values() for case in cases[:count] if case.key in solved]
+    checked = {record.planner: 0 for record in records}
+    refuted: list[tuple[Record, OracleContact]] = []
+    for done, case in enumerate(chosen, start=1):
+        robot = case.problem.robot
+        with oracle(robot, case.problem.scene) as validator:
+            for record in solved[case.key]:
+                contact = validator.check_path(Path(robot.joint_names, record.waypoints), CONFIRM_STEP)
+                checked[record.planner] += 1
+                if contact is not None:
+                    refuted.append((record, contact))
+        progress(done, len(chosen))
+    return Confirmation(checked, refuted)

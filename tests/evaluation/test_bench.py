@@ -19,14 +19,21 @@ from robotdiffuse.core import registry
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.types import Path as Motion
-from robotdiffuse.evaluation.bench import planner_process, runner
-from robotdiffuse.evaluation.bench.outcomes import LATE_SECONDS
-from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
-from robotdiffuse.evaluation.bench.runner import BenchSettings, open_runs, run_bench
+from robotdiffuse.evaluation import bench, planner_processes
+from robotdiffuse.evaluation.bench import (
+    PRESETS,
+    BenchSettings,
+    Preset,
+    Stage,
+    open_runs,
+    preset_settings,
+    run_bench,
+)
+from robotdiffuse.evaluation.comparison import LATE_SECONDS
 from robotdiffuse.evaluation.metrics import METRICS
-from robotdiffuse.evaluation.problem_sets import gather_cases, validator
-from robotdiffuse.evaluation.records import Record, RecordFile, read_records
-from robotdiffuse.evaluation.runs import Run
+from robotdiffuse.evaluation.planner_processes import PlannerProcess, PlannerSpec
+from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name, validator
+from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records
 from robotdiffuse.learning.weights_registry import BUNDLED
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.diffusion.diffusion import Diffusion
@@ -87,19 +94,20 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
 
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planner_process, "GRACE", 6.0)
+    monkeypatch.setattr(planner_processes, "GRACE", 6.0)
     monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("faulty")
 def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) -> None:
-    asked = replace(settings(tmp_path, "faulty", count=1), seeds=5, time_limit=0.5)
-    assert run_bench(asked, quiet, quiet) == 5
+    asked = replace(settings(tmp_path, "faulty", count=1), seeds=7, time_limit=0.5)
+    assert run_bench(asked, quiet, quiet) == 7
     found = {record.seed: record for record in read_records(tmp_path)["faulty"]}
     assert found[faulty_planner.SOLVES].solved and found[faulty_planner.TALKS].solved
     assert found[faulty_planner.RAISES].status == "exception"
     assert found[faulty_planner.RAISES].reason == "ValueError: no such thing"
+    assert found[faulty_planner.EXITS].reason == "SystemExit: no licence"
     assert found[faulty_planner.DIES].status == "crashed" and "SIGKILL" in found[faulty_planner.DIES].reason
     assert found[faulty_planner.HANGS].status == "overran"
     log = (tmp_path / "logs" / "faulty.log").read_text()
@@ -128,20 +136,6 @@ def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch:
         assert record.measures["legs"] == len(record.waypoints) - 1
     finally:
         METRICS.pop("legs", None)
-
-
-def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An answer right behind the warm-up's line was taken for it, and then waited for in vain."""
-    far_side = (
-        'import sys\nprint(flush=True)\nfor _ in sys.stdin: print(\'\\n{"time": 0.1}\\n"end"\', flush=True)'
-    )
-    monkeypatch.setattr(planner_process, "COMMAND", (sys.executable, "-c", far_side))
-    monkeypatch.setattr(planner_process, "GRACE", 5.0)
-    process = planner_process.PlannerProcess(PlannerSpec.parse("rrt_connect"), tmp_path / "log")
-    (case,) = gather_cases(["rop"], 1, tmp_path, quiet)
-    run = Run(case, 0, "rrt_connect", 0, 1.0)
-    assert [process.plan(run) for _ in range(2)] == [[{"time": 0.1}]] * 2
-    process.close()
 
 
 @pytest.mark.slow
@@ -222,7 +216,7 @@ def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pyte
     """Whatever else the machine does then hits them alike; so many calls are made at once all the time."""
     calls, at_once, most = [], [0], [0]
 
-    def plan(self: planner_process.PlannerProcess, run: Run, restarts: bool) -> list[dict]:
+    def plan(self: PlannerProcess, run: Run, restarts: bool) -> list[dict]:
         at_once[0] += 1
         most[0] = max(most[0], at_once[0])
         calls.append((run.case.name, run.method))
@@ -230,8 +224,8 @@ def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pyte
         at_once[0] -= 1
         return [{"status": "timeout", "time": 2.0}]
 
-    monkeypatch.setattr(planner_process.PlannerProcess, "plan", plan)
-    monkeypatch.setattr(planner_process.PlannerProcess, "warm", quiet)
+    monkeypatch.setattr(PlannerProcess, "plan", plan)
+    monkeypatch.setattr(PlannerProcess, "warm", quiet)
     planners = "rrt_connect,mpnet,a_star"
     assert run_bench(settings(tmp_path / "a", planners), quiet, quiet) == 9
     assert calls == [(f"rop/{i}", name) for i in range(3) for name in planners.split(",")]
@@ -340,7 +334,7 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
 
 def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their calls counted as made, or shared a row."""
-    monkeypatch.setattr(runner, "execute_runs", lambda *_: 0)
+    monkeypatch.setattr(bench, "keep_records", lambda *_: 0)
     for parent, digest in (("a", "1"), ("b", "2")):
         (tmp_path / parent / "best").mkdir(parents=True)
         about = {"format": 2, "weights_sha256": digest}
@@ -381,3 +375,37 @@ def test_command_with_bad_input(tmp_path: Path, capfd: pytest.CaptureFixture[str
     assert main([*asked, "--planners", "nonsense"]) == 2
     assert "unknown planner 'nonsense'" in capfd.readouterr().err
     assert main([*asked, "--planners", "rrt_connect", "--workers", "2", "--cluster", "ray"]) == 2
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_planners_and_problems_of_presets_are_known(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("ompl")
+    stages = preset_settings(name, tmp_path)
+    assert stages
+    for settings in stages:
+        assert settings.specs and all(problem_set_name(text) for text in settings.problems)
+
+
+def test_a_smaller_count_and_further_problems(tmp_path: Path) -> None:
+    counts = [settings.count for settings in preset_settings("anytime", tmp_path, ("shelf",), count=50)]
+    assert counts == [50]
+    problems = preset_settings("anytime", tmp_path, ("shelf",))[0].problems
+    assert problems == ("rop_nontrivial", "rop_dense_nontrivial", "shelf")
+
+
+def test_the_command_runs_every_stage_of_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stages = Stage(("rrt_connect",), 0.5, 2), Stage(("aorrtc",), 0.2, 5)
+    monkeypatch.setitem(PRESETS, "small", Preset("for tests", ("rop",), stages))
+    assert main(["bench", "run", "--preset", "small", "--count", "2", "--out", str(tmp_path)]) == 0
+    found = read_records(tmp_path)
+    assert {name: len(records) for name, records in found.items()} == {"aorrtc": 2, "rrt_connect": 2}
+
+
+def test_a_preset_in_place_of_planners_and_limits(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError, match="unknown preset 'table2'; known: anytime"):
+        preset_settings("table2", tmp_path)
+    asked = ["bench", "run", "--out", str(tmp_path)]
+    assert main([*asked, "--planners", "rrt_connect"]) == 2
+    assert "name --planners and --problems, or a --preset" in capfd.readouterr().err
+    assert main([*asked, "--preset", "anytime", "--planners", "rrt_connect"]) == 2
+    assert "--preset cannot be combined with --planners" in capfd.readouterr().err

@@ -8,8 +8,8 @@ import pytest
 from helpers.example_robots import planar_arm
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation import ablation
 from robotdiffuse.evaluation.metrics import Kinematics
-from robotdiffuse.evaluation.paper import table2
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.transformer import Transformer
@@ -56,8 +56,8 @@ def test_what_is_given_beside_a_config_wins() -> None:
 
 
 def test_every_row_has_its_config() -> None:
-    assert len(table2.ROWS) == 10
-    assert {row.config for row in table2.ROWS.values()} == {c for c in CONFIGS if c.startswith("table2_")}
+    assert len(ablation.ROWS) == 10
+    assert {row.config for row in ablation.ROWS.values()} == {c for c in CONFIGS if c.startswith("table2_")}
 
 
 def test_link_path_length_by_hand() -> None:
@@ -93,21 +93,23 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_the_mean_of_two_trainings_leaves_unsolved_problems_out() -> None:
-    def evaluation(single: list[float], length: list[float]) -> table2.Evaluation:
+    def evaluation(single: list[float], length: list[float]) -> ablation.Evaluation:
         each = np.array(single, float)
-        return table2.Evaluation(each, each, each, np.array(length, float), each)
+        return ablation.Evaluation(each, each, each, np.array(length, float), each)
 
     nan = float("nan")
-    mean = table2.Evaluation.mean([evaluation([0, 1, 0], [nan, 4, nan]), evaluation([1, 1, 0], [3, 6, nan])])
+    mean = ablation.Evaluation.mean(
+        [evaluation([0, 1, 0], [nan, 4, nan]), evaluation([1, 1, 0], [3, 6, nan])]
+    )
     np.testing.assert_array_equal(mean.single, [0.5, 1, 0])
     np.testing.assert_array_equal(mean.length, [3, 5, nan])
-    assert [table2.Training("table2_jpc", seed).folder for seed in (0, 1)] == [
+    assert [ablation.Training("table2_jpc", seed).folder for seed in (0, 1)] == [
         "table2_jpc",
         "table2_jpc_seed1",
     ]
 
 
 def test_straight_lines_stand_among_the_papers_rows() -> None:
-    table = table2.straight_line_table(4)
+    table = ablation.straight_line_table(4)
     shares = [float(str(row[1])) for row in table.rows]
-    assert shares == sorted(shares) and len(table.rows) == 2 * 3 + len(table2.ROWS)
+    assert shares == sorted(shares) and len(table.rows) == 2 * 3 + len(ablation.ROWS)

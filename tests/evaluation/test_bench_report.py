@@ -1,8 +1,9 @@
-"""The report of a bench: figures by hand, tables that read well in Markdown and LaTeX, the page."""
+"""The report of a bench: figures by hand, tables, plots, the page, and the motions to replay."""
 
 import json
 import re
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -10,15 +11,21 @@ import pytest
 
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.tables import Table
 from robotdiffuse.core.types import Path as Motion
-from robotdiffuse.evaluation import style
-from robotdiffuse.evaluation.bench import figures, page, plots, report
-from robotdiffuse.evaluation.bench.outcomes import GAVE_UP, LATER, RAN_OUT, deciding_record, outcome
-from robotdiffuse.evaluation.bench.run_folder import Bench, read_bench
+from robotdiffuse.evaluation import bench_report, comparison, plots
+from robotdiffuse.evaluation.comparison import (
+    GAVE_UP,
+    LATER,
+    RAN_OUT,
+    Bench,
+    deciding_record,
+    outcome,
+    read_bench,
+)
 from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
 from robotdiffuse.evaluation.problem_sets import case_file
-from robotdiffuse.evaluation.records import RESTARTED, Record, record_of_row, record_path
-from robotdiffuse.evaluation.tables import Table
+from robotdiffuse.evaluation.runs import RESTARTED, Record, record_of_row, record_path
 from robotdiffuse.problems.held_out import Case, held_out_problem
 
 RUN = {
@@ -128,9 +135,9 @@ def small(tmp_path: Path) -> Path:
     return write(tmp_path / "small_run", records)
 
 
-def rows(section: figures.Section, limit: float) -> dict[str, figures.Row]:
-    comparison = next(c for c in section.comparisons if c.limit == limit)
-    return {row.planner: row for row in comparison.rows}
+def rows(section: comparison.Section, limit: float) -> dict[str, comparison.Row]:
+    (found,) = (c for c in section.comparisons if c.limit == limit)
+    return {row.planner: row for row in found.rows}
 
 
 def test_a_call_counts_for_shorter_limits_and_for_longer_ones_if_it_ended_by_itself() -> None:
@@ -168,7 +175,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
     bench = read_bench(small)
     assert next(iter(bench.records)) == bench.reference == "robotdiffuse"
     assert set(bench.records) == {"robotdiffuse", "mpnet", "ompl_rrt_star"}
-    whole, apart = figures.sections(bench)
+    whole, apart = comparison.sections(bench)
     assert (whole.name, apart.name) == ("rop", "rop, non-trivial")
     assert [c.limit for c in whole.comparisons] == [0.1, 1.0, 10.0]
     assert [c.problems for c in whole.comparisons] == [4, 4, 4]
@@ -192,7 +199,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
 
 
 def test_comscore_of_a_small_run(small: Path) -> None:
-    whole, _ = figures.sections(read_bench(small), [1.0])
+    whole, _ = comparison.sections(read_bench(small), [1.0])
     of = rows(whole, 1.0)
     lengths = {"robotdiffuse": 6.0, "mpnet": 6.6, "ompl_rrt_star": 9.0}
     times = {"robotdiffuse": 0.05, "mpnet": 0.51, "ompl_rrt_star": 1.0}
@@ -212,7 +219,7 @@ def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_pa
     records += [failed("edmp", name, 1.0, 1.0) for name in names]
     folder = write(tmp_path / "run", records, {10.0: 2})
     keep_problems(folder, names)
-    (section,) = figures.sections(read_bench(folder))
+    (section,) = comparison.sections(read_bench(folder))
     whole = {c.limit: c for c in section.comparisons}
     assert whole[1.0].problems == 6
     assert whole[1.0].missing == ()
@@ -230,7 +237,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
         records.append(solved("robotdiffuse", "b", 1.0, [(0.1, 2.0)], seed=seed))
         one = solved("mpd", "b", 1.0, [(0.1, 2.0)], seed=seed)
         records.append(one if seed == 0 else failed("mpd", "b", 1.0, 1.0, seed=seed))
-    (section,) = figures.sections(read_bench(write(tmp_path / "run", records)), [1.0])
+    (section,) = comparison.sections(read_bench(write(tmp_path / "run", records)), [1.0])
     row = rows(section, 1.0)["mpd"]
     assert section.main.seeds == 3
     assert row.success == pytest.approx(4 / 6)
@@ -240,7 +247,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
 
 
 def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) -> None:
-    whole, _ = figures.sections(read_bench(small))
+    whole, _ = comparison.sections(read_bench(small))
     curves = {curve.planner: curve for curve in whole.curves}
     assert curves["mpnet"].end == 10.0
     assert curves["ompl_rrt_star"].found.tolist() == [0.05, 0.5, 5.0]
@@ -272,8 +279,8 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
         ]
     bench = read_bench(write(tmp_path / "run", records))
     assert list(bench.records)[:2] == ["robotdiffuse", "robotdiffuse+restarts"]
-    section = figures.sections(bench)[-1]
-    table = report.main_table(section, section.main, bench.reference)
+    section = comparison.sections(bench)[-1]
+    table = bench_report.main_table(section, section.main, bench.reference)
     assert cells(table, "joint length / robotdiffuse: hybrid, restarted") == {
         "robotdiffuse: hybrid": "–",
         "robotdiffuse: hybrid, restarted": "1",
@@ -282,20 +289,20 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
         "ompl_aorrtc": "1.000",
     }
     assert cells(table, "ComScore")["rrt_connect, restarted"] == "–"
-    tenth = report.main_table(section, section.comparisons[0], bench.reference)
+    tenth = bench_report.main_table(section, section.comparisons[0], bench.reference)
     assert cells(tenth, "joint length / robotdiffuse: hybrid, restarted")["rrt_connect, restarted"] == "1.200"
     plain = read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
     assert len(plain.records) == 4
     alone = Bench(
         plain.folder, plain.sessions, {n: r for n, r in plain.records.items() if RESTARTED not in n}
     )
-    section = figures.sections(alone)[-1]
-    table = report.main_table(section, section.main, alone.reference)
+    section = comparison.sections(alone)[-1]
+    table = bench_report.main_table(section, section.main, alone.reference)
     assert cells(table, "joint length / robotdiffuse: hybrid") == {
         "robotdiffuse: hybrid": "1",
         "rrt_connect": "1.200 †",
     }
-    assert report.UNEQUAL_NOTE in table.notes
+    assert bench_report.UNEQUAL_NOTE in table.notes
 
 
 def test_a_call_that_used_up_its_time_stands_for_its_restarts(tmp_path: Path) -> None:
@@ -322,8 +329,8 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     ]
     (folder / "runs.jsonl").write_text("".join(json.dumps(run) + "\n" for run in runs))
     bench = read_bench(folder)
-    (section,) = figures.sections(bench, [1.0])
-    table = report.main_table(section, section.main, bench.reference)
+    (section,) = comparison.sections(bench, [1.0])
+    table = bench_report.main_table(section, section.main, bench.reference)
     assert cells(table, "timed") == {
         "robotdiffuse: hybrid": "run 1, 2 at once",
         "rrt_connect": "run 1, 2 at once",
@@ -331,8 +338,8 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     }
     assert "Not all rows were timed alike" in table.notes[0]
     bench = read_bench(folder, ["robotdiffuse", "rrt_connect"])
-    (section,) = figures.sections(bench, [1.0])
-    table = report.main_table(section, section.main, bench.reference)
+    (section,) = comparison.sections(bench, [1.0])
+    table = bench_report.main_table(section, section.main, bench.reference)
     assert table.columns[-1].heading == "ComScore"
     assert table.notes[0] == "All rows were timed alike: run 1, 2 at once; load average 1.5 to 2.2."
 
@@ -344,8 +351,8 @@ def test_runs_that_noted_nothing_with_their_calls_are_told_by_what_they_called(t
     run = RUN | {"planners": ["robotdiffuse"], "time_limit": 1.0, "count": 3, "workers": 2}
     with (folder / "runs.jsonl").open("a") as stream:
         stream.write(json.dumps(run) + "\n")
-    (section,) = figures.sections(read_bench(folder), [1.0])
-    table = report.main_table(section, section.main, "robotdiffuse")
+    (section,) = comparison.sections(read_bench(folder), [1.0])
+    table = bench_report.main_table(section, section.main, "robotdiffuse")
     assert cells(table, "timed") == {
         "robotdiffuse: hybrid": "run 1 or 2, 1 or 2 at once",
         "mpd": "run 1, 1 at once",
@@ -353,15 +360,17 @@ def test_runs_that_noted_nothing_with_their_calls_are_told_by_what_they_called(t
 
 
 def test_planners_are_called_what_they_are() -> None:
-    assert report.named("diffusion:guidance_steps=0:samples=4") == ("diffusion, guidance_steps=0, samples=4")
-    assert report.named("rrt_connect:step=0.5+restarts") == "rrt_connect, step=0.5, restarted"
-    assert report.named("mpnet@mine") == "mpnet@mine"
+    assert bench_report.named("diffusion:guidance_steps=0:samples=4") == (
+        "diffusion, guidance_steps=0, samples=4"
+    )
+    assert bench_report.named("rrt_connect:step=0.5+restarts") == "rrt_connect, step=0.5, restarted"
+    assert bench_report.named("mpnet@mine") == "mpnet@mine"
 
 
 def test_a_metric_is_declared_in_one_place(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is then in records, in the tables as Markdown and LaTeX, in the plots and in the page."""
+    """It is then in records, in the tables, in the plots and in the page."""
     pytest.importorskip("matplotlib")
     waypoints = Metric("waypoint_count", "kilo", "less", ".4f", lambda m: len(m.path.positions), 1e-3)
     monkeypatch.setitem(METRICS, waypoints.name, waypoints)
@@ -372,27 +381,13 @@ def test_a_metric_is_declared_in_one_place(
     assert record.row()["waypoint_count"] == 3
     assert record_of_row(json.loads(json.dumps(record.row()))) == record
     bench = read_bench(write(tmp_path / "run", [record]))
-    parts = figures.sections(bench, [1.0])
-    assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown(bench, parts))
-    assert "waypoint count kilo" in report.latex(bench, parts)
-    page.write_page(bench, parts, tmp_path / "index.html", None)
-    shown = (tmp_path / "index.html").read_text()
-    assert "<th>waypoint count kilo</th>" in shown and "<span>0.0030</span>" in shown
-    assert ">waypoint count [kilo], less is better<" in shown
-
-
-def test_latex_is_escaped_and_every_row_has_all_columns(small: Path) -> None:
-    bench = read_bench(small)
-    text = report.latex(bench, figures.sections(bench))
-    assert r"ompl\_rrt\_star" in text
-    assert r"Abacus\_9 \& sons" in text
-    assert not re.search(r"(?<!\\)[_#]", text)
-    assert not re.search(r"[^\x00-\x7f]", text)
-    assert text.count(r"\begin{") == text.count(r"\end{")
-    for columns, body in re.findall(r"\\begin{tabular}{(l[r]*)}(.*?)\\end{tabular}", text, flags=re.DOTALL):
-        lines = [line for line in body.splitlines() if line.endswith(r"\\")]
-        assert lines
-        assert {len(re.findall(r"(?<!\\)&", line)) for line in lines} == {len(columns) - 1}
+    parts = comparison.sections(bench, [1.0])
+    report = bench_report.bench_report(bench, parts)
+    assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown)
+    page = report.page
+    assert re.search(r"<th[^>]*>waypoint count kilo</th>", page)
+    assert re.search(r"<td[^>]*>0.0030</td>", page)
+    assert ">waypoint count [kilo], less is better<" in page
 
 
 @pytest.mark.slow
@@ -408,32 +403,36 @@ def test_the_command_writes_everything(
     assert "ompl_rrt_star" in said
     page = (out / "index.html").read_text()
     for name in ("robotdiffuse: hybrid", "mpnet", "ompl_rrt_star"):
-        assert page.count(f">{name}<") >= 4
+        assert page.count(f">{name}<") >= 4, name
     assert "http" not in re.sub(r'xmlns(:\w+)?="[^"]*"|<metadata>.*?</metadata>', "", page, flags=re.DOTALL)
     names = re.findall(r'\bid="([^"]*)"', page)
     assert len(names) == len(set(names))
-    assert (out / "report.md").exists()
-    assert (out / "report.tex").exists()
     assert not (out / "replays.html").exists()
-    for name in ("success_rop", "length_rop", "success_rop_non_trivial", "length_rop_non_trivial"):
-        assert ElementTree.parse(out / f"{name}.svg").getroot().tag.endswith("svg")
+    plots = re.findall(r"!\[.*?\]\((.*?)\)", (out / "report.md").read_text())
+    assert {"success_rop.svg", "length_rop_non_trivial.svg"} < set(plots)
+    for name in plots:
+        assert ElementTree.parse(out / name).getroot().tag.endswith("svg")
 
 
 def test_no_legend_or_name_is_clipped() -> None:
     """Names of planners with settings ended at the edge of a plot."""
     pytest.importorskip("matplotlib")
-    with style.style():
-        figure = style.make_figure(6, 2.0)
-        text = figure.text(0.9, 0.5, "robotdiffuse:search.range=0.5+restarts")
-        svg = ElementTree.fromstring(style.as_svg(figure))
-    width, end = 72 * style.WIDTHS[6], text.get_window_extent().x1 * 72 / figure.dpi
-    assert end > width and float(svg.attrib["viewBox"].split()[2]) >= end
+    figures: list[Any] = []
+
+    def fill(figure: Any) -> None:
+        figures.append(figure)
+        figure.text(0.9, 0.5, "robotdiffuse:search.range=0.5+restarts")
+
+    svg = ElementTree.fromstring(plots.draw(fill, plots.HALF, 2.0))
+    (text,) = figures[0].texts
+    end = text.get_window_extent().x1 * 72 / figures[0].dpi
+    assert end > 72 * plots.HALF and float(svg.attrib["viewBox"].split()[2]) >= end
 
 
 def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     keep_problems(small, [f"rop/{i}" for i in range(4)])
     bench = read_bench(small)
-    shown = page.motions_to_replay(bench, figures.sections(bench, [1.0]))
+    shown = bench_report.motions_to_replay(bench, comparison.sections(bench, [1.0]))
     titles = [motion.title for motion in shown]
     assert titles[0] == "robotdiffuse · rop/0"  # solved by all; made up as one and the same
     assert "ompl_rrt_star · rop/0" in titles
@@ -444,7 +443,7 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     captions = {motion.title: motion.caption for motion in shown}
     assert captions["mpnet fails · rop/2"].startswith("gave up before; shown: robotdiffuse")
     assert not any("Figure(" in caption for caption in captions.values())
-    assert len(shown) <= page.MAX_REPLAYS
+    assert len(shown) <= bench_report.MAX_REPLAYS
 
 
 def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -453,7 +452,7 @@ def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[
     with pytest.raises(InputError, match=r"no records of foo; it has .*mpnet, "):
         read_bench(small, ["foo"])
     with pytest.raises(InputError, match="no planner was run that long"):
-        figures.sections(read_bench(small, ["ompl_rrt_star"]), [60.0])
+        comparison.sections(read_bench(small, ["ompl_rrt_star"]), [60.0])
     assert main(["bench", "report", str(small), "--limits", "1,x"]) == 2
     assert "limits are '1,x'" in capsys.readouterr().err
     (small / "runs.jsonl").write_text('{"date": 1}\n')
@@ -470,15 +469,3 @@ def test_an_empty_folder_says_how_to_go_on(tmp_path: Path) -> None:
     (tmp_path / "records" / "mpnet.jsonl").touch()
     with pytest.raises(InputError, match="no records yet"):
         read_bench(tmp_path)
-
-
-@pytest.mark.parametrize("count", [0, 1, 5, 13, 18])
-def test_names_beside_a_plot_keep_apart_and_inside(count: int) -> None:
-    gap = 0.0535
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        wanted = np.sort(rng.choice([rng.uniform(0.3, 1.0, count), np.full(count, 0.99)]))
-        heights = plots.spread_apart(wanted, gap)
-        assert len(heights) == count
-        assert (np.diff(heights) >= gap - 1e-9).all()
-        assert count == 0 or (heights[0] >= 0.01 and heights[-1] <= 0.99)

@@ -1,4 +1,7 @@
-"""The bench: calls planners on problems and keeps a record of each call; kept calls are not repeated."""
+"""The bench: calls planners on problems and keeps a record of each call; kept calls are not repeated.
+
+Presets are comparisons of planners by name, the tables of docs/results.md.
+"""
 
 import os
 import platform
@@ -12,12 +15,19 @@ from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import JsonLines, lock_folder
 from robotdiffuse.core.ray_cluster import CLUSTERS
-from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
-from robotdiffuse.evaluation.bench.workers import on_cluster, on_this_machine
-from robotdiffuse.evaluation.machine import processor, versions
+from robotdiffuse.evaluation.planner_processes import PlannerSpec, on_cluster, on_this_machine
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
-from robotdiffuse.evaluation.records import RESTARTED, Record, RecordFile, record_path
-from robotdiffuse.evaluation.runs import Run, execute_runs, runs_of
+from robotdiffuse.evaluation.report import processor, versions
+from robotdiffuse.evaluation.runs import (
+    RESTARTED,
+    Record,
+    RecordFile,
+    Run,
+    keep_records,
+    load_average,
+    record_path,
+    runs_of,
+)
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.held_out import Case
 
@@ -69,11 +79,10 @@ class BenchSettings:
     def specs(self) -> dict[str, PlannerSpec]:
         """The planners by their names in results. Raises InputError for an unknown planner or two of one
         name."""
-        found = [PlannerSpec.parse(text) for text in self.planners]
-        labels = [spec.label for spec in found]
-        if len(set(labels)) < len(labels):
+        specs = {spec.label: spec for spec in map(PlannerSpec.parse, self.planners)}
+        if len(specs) < len(self.planners):
             raise InputError(f"planners is {', '.join(self.planners)!r}; two are called the same")
-        return dict(zip(labels, found, strict=True))
+        return specs
 
 
 Report = Callable[[str], None]
@@ -102,12 +111,12 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
         wanted = len(cases) * settings.seeds
         for label in specs:
             done(label, wanted - sum(run.method == label for run in todo), wanted)
-        about = {"restarts": settings.equal_time, "session": session, "logs": settings.out / "logs"}
+        about = (settings.equal_time, session, settings.out / "logs")
         if settings.cluster is None:
-            execute = on_this_machine(specs, workers=settings.workers, **about)
+            results = on_this_machine(specs, todo, settings.workers, *about)
         else:
-            execute = on_cluster(specs, settings.cluster, **about)
-        return execute_runs(todo, execute, files, lambda label, left: done(label, wanted - left, wanted))
+            results = on_cluster(specs, todo, settings.cluster, *about)
+        return keep_records(todo, results, files, lambda label, left: done(label, wanted - left, wanted))
 
 
 def open_runs(
@@ -157,8 +166,134 @@ def _note_session(settings: BenchSettings, sessions: JsonLines) -> str:
         "seeds": settings.seeds,
         "count": settings.count,
         "workers": settings.cluster or settings.workers,
-        "load": round(os.getloadavg()[0], 2),
+        "load": load_average(),
         "equal_time": settings.equal_time,
     }
     sessions.append(note)
     return session
+
+
+# Presets
+
+BY_LENGTH = ":objective=length"
+"""Suffix of planners that compete in the length of paths."""
+NONTRIVIAL_ROP = ("rop_nontrivial", "rop_dense_nontrivial")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One pass of a preset: planners on the first problems of each set, with one time limit."""
+
+    planners: tuple[str, ...]
+    time_limit: float
+    """Of a call [s]."""
+    count: int
+    """Problems of each set."""
+    equal_time: bool = False
+    """See `BenchSettings`."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    description: str
+    problems: tuple[str, ...]
+    """Problem sets of every stage."""
+    stages: tuple[Stage, ...]
+
+
+PRESETS: dict[str, Preset] = {
+    "equal_time": Preset(
+        "path lengths at one second: search, the hybrid, diffusion, learned baselines",
+        (*NONTRIVIAL_ROP, "shelf_nontrivial"),
+        (
+            Stage(
+                (
+                    *(name + BY_LENGTH for name in ("robotdiffuse", "aorrtc", "rrt_connect")),
+                    *("shared_tree_rrt_star", "diffusion", "mpd", "edmp", "mpnet", "mpinets"),
+                ),
+                1.0,
+                30,
+                equal_time=True,
+            ),
+        ),
+    ),
+    "learning": Preset(
+        "what the network adds: diffusion and the hybrid beside search, with 0.1 and 0.3 s",
+        (*NONTRIVIAL_ROP, "shelf_nontrivial"),
+        tuple(
+            Stage(
+                ("robotdiffuse" + BY_LENGTH, "diffusion", "aorrtc" + BY_LENGTH, "shared_tree_rrt_star"),
+                limit,
+                150,
+                equal_time=True,
+            )
+            for limit in (0.1, 0.3)
+        ),
+    ),
+    "durations": Preset(
+        "durations of motions with 0.1 and 1 s: by time, by length, and the timed paths of OMPL",
+        ("shelf_nontrivial", "crate_nontrivial", "table_nontrivial", "kitchen_nontrivial", "rop_nontrivial"),
+        tuple(
+            Stage(
+                (
+                    *("aorrtc", "robotdiffuse", "diffusion"),
+                    *(name + BY_LENGTH for name in ("aorrtc", "robotdiffuse")),
+                    *("ompl_rrt_connect", "ompl_aorrtc"),
+                ),
+                limit,
+                100,
+            )
+            for limit in (0.1, 1.0)
+        ),
+    ),
+    "anytime": Preset(
+        "anytime search beside OMPL's: Shared-Tree Informed RRT*, AORRTC, Informed RRT*",
+        NONTRIVIAL_ROP,
+        (
+            Stage(
+                ("shared_tree_rrt_star", "aorrtc" + BY_LENGTH, "ompl_aorrtc", "ompl_informed_rrt_star"),
+                1.0,
+                100,
+                equal_time=True,
+            ),
+        ),
+    ),
+    "restarts": Preset(
+        "the hybrid beside restarts of RRT-Connect until the same limit",
+        (*NONTRIVIAL_ROP, "shelf_nontrivial"),
+        (Stage(("robotdiffuse" + BY_LENGTH, "rrt_connect" + BY_LENGTH), 1.0, 100, equal_time=True),),
+    ),
+}
+
+
+def preset_settings(
+    name: str,
+    out: FilePath,
+    problems: Sequence[str] = (),
+    count: int | None = None,
+    workers: int = 1,
+    cluster: str | None = None,
+) -> list[BenchSettings]:
+    """The settings of each stage of a preset.
+
+    problems: sets beside those of the preset.
+    count: most problems of each set; None: as the preset says.
+
+    Raises InputError for an unknown preset, listing the known.
+    """
+    if name not in PRESETS:
+        raise unknown_name("preset", name, PRESETS)
+    preset = PRESETS[name]
+    return [
+        BenchSettings(
+            stage.planners,
+            (*preset.problems, *problems),
+            out,
+            time_limit=stage.time_limit,
+            count=min(count or stage.count, stage.count),
+            workers=workers,
+            cluster=cluster,
+            equal_time=stage.equal_time,
+        )
+        for stage in preset.stages
+    ]

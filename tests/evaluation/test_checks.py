@@ -14,7 +14,7 @@ from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.datasets.motion_rows import motion_of, problem_of
 from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
-from robotdiffuse.evaluation.datasets.check import KINDS, check_data
+from robotdiffuse.evaluation.checks import check_data
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
@@ -45,8 +45,7 @@ def test_what_is_right_passes(tmp_path, pybullet):
     write_motions(tmp_path, ARM, right(5), shard=2)
     seen = []
     check = check_data(tmp_path, ARM, progress=lambda *numbers: seen.append(numbers))
-    assert check.clean and not check.examples
-    assert check.counts == dict.fromkeys(KINDS, 0)
+    assert not check.findings
     assert (check.shards, check.motions, check.planned, check.checked) == (3, 5, 5, 5)
     assert seen == [(0, 5), (2, 5), (4, 5), (5, 5)]
     assert check.least_clearance == min(row["clearance"] for row in right(5))
@@ -57,7 +56,7 @@ def test_collision_is_found_by_both_validators(tmp_path, pybullet):
     write_motions(tmp_path, ARM, [*right(3), record(ARM, BALL, line(AWAY, BACK))], shard=3)
     check = check_data(tmp_path, ARM)
     assert {kind: n for kind, n in check.counts.items() if n} == {"collision": 1, "pybullet": 1}
-    for example in check.examples:
+    for example in check.findings:
         assert (
             example.where == "shard 1, row 0" and "sphere" in example.message and "inside" in example.message
         )
@@ -87,7 +86,7 @@ def test_limit_violation_is_found(tmp_path, pybullet):
     write_motions(tmp_path, ARM, [*right(1), record(ARM, Scene([]), q)])
     check = check_data(tmp_path, ARM)
     assert {kind: n for kind, n in check.counts.items() if n} == {"limits": 1}
-    (example,) = check.examples
+    (example,) = check.findings
     assert example.where == "shard 0, row 1" and "j0 is 2.801 at waypoint 7" in example.message
 
 
@@ -137,7 +136,7 @@ def test_damaged_shard_is_named_and_the_others_are_validated(tmp_path):
     chunk.write_bytes(chunk.read_bytes()[:-1])
     check = check_data(tmp_path, ARM, pybullet=False)
     assert check.counts["damaged"] == 1 and check.checked == check.motions == 2
-    (example,) = check.examples
+    (example,) = check.findings
     assert example.where == "shard 1" and "shard_00001.zarr, array cost" in example.message
 
 
@@ -161,14 +160,14 @@ def test_random_motions_are_the_same_for_the_same_seed(tmp_path):
     write_motions(tmp_path, ARM, bent, shard=2)
     a, b, c = (check_data(tmp_path, ARM, 3, seed, pybullet=False) for seed in (1, 1, 2))
     assert a.checked == a.counts["collision"] == 3
-    assert a.examples == b.examples != c.examples
+    assert a.findings == b.findings != c.findings
 
 
 def test_processes_find_the_same(tmp_path):
     write_motions(tmp_path, ARM, [*right(2), record(ARM, BALL, line(AWAY, BACK))], shard=1)
     one, two = (check_data(tmp_path, ARM, workers=n, pybullet=False) for n in (1, 2))
     assert replace(one, seconds=0.0) == replace(two, seconds=0.0)
-    assert one.examples[0].where == "shard 2, row 0"
+    assert one.findings[0].where == "shard 2, row 0"
 
 
 def test_missing_pybullet_is_one_line(tmp_path, monkeypatch):
@@ -178,7 +177,7 @@ def test_missing_pybullet_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(InputError, match=r"pip install 'robotdiffuse\[sim\]'.*--no-pybullet"):
         check_data(tmp_path, ARM)
-    assert check_data(tmp_path, ARM, pybullet=False).clean
+    assert not check_data(tmp_path, ARM, pybullet=False).findings
 
 
 def test_rows_are_problems_again(tmp_path):
