@@ -179,7 +179,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         return self._run(jobs)
 
     def _run(self, jobs: Iterator) -> Iterator[RopBatch]:
-        threads = min(MAX_THREADS, torch.get_num_threads()) if self.device.type == "cpu" else 1
+        threads = min(MAX_THREADS, torch.get_num_threads())
         # one thread makes a batch: PyTorch's own threads would wait for each other at every step
         pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
         waiting: deque = deque()
