@@ -12,7 +12,7 @@ from helpers.motion_stores import line, random_motions, record, write_motions
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.datasets.motion_rows import motion_of, problem_of
+from robotdiffuse.datasets.rows import motion_of, problem_of
 from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
 from robotdiffuse.evaluation.checks import check_data
 from robotdiffuse.problems.problem import JointGoal

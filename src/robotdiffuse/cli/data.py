@@ -208,7 +208,7 @@ def run_generate(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from robotdiffuse.generation import GenerationSettings
-    from robotdiffuse.generation.solvers import SEARCHES
+    from robotdiffuse.generation.factory import SEARCHES
 
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError(
@@ -296,7 +296,7 @@ def run_check(arguments: argparse.Namespace) -> int:
 def run_view(arguments: argparse.Namespace) -> int:
     from robotdiffuse.cli.drawing import show
     from robotdiffuse.core.output_files import check_output
-    from robotdiffuse.datasets.manifest import read_manifest
+    from robotdiffuse.datasets.shards import read_manifest
     from robotdiffuse.robots import load_robot
     from robotdiffuse.visualization.gallery import write_gallery
 
@@ -318,9 +318,8 @@ def run_view(arguments: argparse.Namespace) -> int:
 
 def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[GalleryEntry]":
     """Random motions, in the order of the shards."""
-    from robotdiffuse.datasets.manifest import read_manifest
-    from robotdiffuse.datasets.motion_rows import motion_of, scenes_of
-    from robotdiffuse.datasets.shards import random_rows
+    from robotdiffuse.datasets.rows import motion_of, scenes_of
+    from robotdiffuse.datasets.shards import random_rows, read_manifest
     from robotdiffuse.visualization.gallery import GalleryEntry
 
     manifest = read_manifest(folder)
@@ -336,7 +335,7 @@ def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "I
 
 
 def run_export(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.datasets.robot_npz import export_npz
+    from robotdiffuse.datasets.external import export_npz
 
     made, left_out = export_npz(arguments.folder, arguments.file)
     others = f"; left out {left_out:,}, whose scenes are not exactly two spheres" if left_out else ""
@@ -345,7 +344,7 @@ def run_export(arguments: argparse.Namespace) -> int:
 
 
 def run_import(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.datasets.robot_npz import import_npz
+    from robotdiffuse.datasets.external import import_npz
 
     with progress("importing motions") as update:
         made = import_npz(arguments.file, arguments.out, arguments.robot, arguments.radius, update)

@@ -20,9 +20,8 @@ except ImportError:
     raise ImportError('RopDataset needs torch, not installed: pip install "robotdiffuse[train]"') from None
 
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.datasets.rows import read_rows
-from robotdiffuse.datasets.shards import SPLITS
+from robotdiffuse.datasets.shards import SPLITS, read_manifest
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.robots.robot import Robot

@@ -18,7 +18,7 @@ from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.processes import Workers
 from robotdiffuse.core.tables import Column, Table
-from robotdiffuse.datasets.manifest import read_manifest
+from robotdiffuse.datasets.shards import read_manifest
 from robotdiffuse.evaluation.comparison import Mean
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,

@@ -20,9 +20,16 @@ from robotdiffuse.core.errors import InputError, distinct
 from robotdiffuse.core.processes import Workers, in_order
 from robotdiffuse.core.tables import Column, Table
 from robotdiffuse.core.types import Path
-from robotdiffuse.datasets.manifest import Manifest, read_manifest
-from robotdiffuse.datasets.motion_rows import path_of, problem_of, scenes_of
-from robotdiffuse.datasets.shards import Shard, check_shard, existing_shards, pick_rows, read_shard
+from robotdiffuse.datasets.rows import path_of, problem_of, scenes_of
+from robotdiffuse.datasets.shards import (
+    Manifest,
+    Shard,
+    check_shard,
+    existing_shards,
+    pick_rows,
+    read_manifest,
+    read_shard,
+)
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.runs import Record, read_records
 from robotdiffuse.robots import load_robot

@@ -14,9 +14,16 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.tables import Column, Table, plain
-from robotdiffuse.datasets.manifest import Manifest, read_manifest
-from robotdiffuse.datasets.motion_rows import scenes_of
-from robotdiffuse.datasets.shards import SPLITS, existing_shards, read_shard, shard_path, split_of
+from robotdiffuse.datasets.rows import scenes_of
+from robotdiffuse.datasets.shards import (
+    SPLITS,
+    Manifest,
+    existing_shards,
+    read_manifest,
+    read_shard,
+    shard_path,
+    split_of,
+)
 from robotdiffuse.evaluation import plots
 from robotdiffuse.evaluation.report import Report
 from robotdiffuse.robots import load_robot
