@@ -24,7 +24,6 @@ from robotdiffuse.evaluation.bench import (
     PRESETS,
     BenchSettings,
     Preset,
-    Stage,
     open_runs,
     preset_settings,
     run_bench,
@@ -394,11 +393,12 @@ def test_a_smaller_count_and_further_problems(tmp_path: Path) -> None:
 
 
 def test_the_command_runs_every_stage_of_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stages = Stage(("rrt_connect",), 0.5, 2), Stage(("aorrtc",), 0.2, 5)
-    monkeypatch.setitem(PRESETS, "small", Preset("for tests", ("rop",), stages))
+    preset = Preset("for tests", ("rrt_connect",), ("rop",), (0.001, 0.5), 5, equal_time=False)
+    monkeypatch.setitem(PRESETS, "small", preset)
     assert main(["bench", "run", "--preset", "small", "--count", "2", "--out", str(tmp_path)]) == 0
     found = read_records(tmp_path)
-    assert {name: len(records) for name, records in found.items()} == {"aorrtc": 2, "rrt_connect": 2}
+    limits = {record.time_limit for record in found["rrt_connect"]}
+    assert 0.001 in limits and len({record.name for record in found["rrt_connect"]}) == 2
 
 
 def test_a_preset_in_place_of_planners_and_limits(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

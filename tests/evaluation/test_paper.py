@@ -22,7 +22,7 @@ from robotdiffuse.evaluation.paper import (
     problem_file,
     write_problems,
 )
-from robotdiffuse.evaluation.runs import Record, read_records
+from robotdiffuse.evaluation.runs import read_records
 from robotdiffuse.evaluation.statistics import Indicators, comscores
 from robotdiffuse.learning.denoisers.settings import CrossAttentionSettings
 from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings, PointsSettings
@@ -44,19 +44,6 @@ def test_scores_are_the_papers_and_further_rows_replace_its_method() -> None:
     for row, score in zip(PAPER_TABLE_1, printed, strict=True):
         assert found[ROW_NAMES[row.name]] == pytest.approx(score)
     assert found["aorrtc"] == 1.0  # the best in all four
-
-
-def test_indicators_of_solved_and_refused_calls() -> None:
-    def record(status: str, refused: str = "", **measures: float) -> Record:
-        return Record("p", "s", "n", "f", False, 0, 2.0, status, "", 0.5, refused=refused, measures=measures)
-
-    records = [
-        record("solved", link_length=4.0),
-        record("solved", link_length=6.0),
-        record("timeout", "scene_collision"),
-        record("timeout"),
-    ]
-    assert paper.indicators(records) == Indicators(50.0, 25.0, 5.0, 0.5)
 
 
 def test_the_papers_method_has_a_row_only_with_weights_that_see_the_code_alone(tmp_path: Path) -> None:

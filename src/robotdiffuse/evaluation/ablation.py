@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.processes import Workers
+from robotdiffuse.core.settings import Count, OneOf, Settings
 from robotdiffuse.core.tables import Column, Table
 from robotdiffuse.datasets.shards import read_manifest
 from robotdiffuse.evaluation.comparison import Mean
@@ -38,8 +39,8 @@ from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
-from robotdiffuse.problems.families import load_family
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.robots import load_robot
@@ -77,29 +78,25 @@ ROWS: dict[str, Row] = {
 
 
 @dataclass(frozen=True)
-class AblationSettings:
+class AblationSettings(Settings):
+    """Data, budgets and problems of Table 2."""
+
     data: str
     """Folder of a data set."""
     out: str
     """Folder for the trained networks; existing ones are kept, interrupted trainings continue."""
-    samples: int = 300_000
+    samples: Count = 300_000
     """Training samples of each row, the equal budget."""
-    encoder_samples: int = 300_000
+    encoder_samples: Count = 300_000
     """Clouds that the frozen encoder is trained on first."""
-    problems: int = 500
+    problems: Count = 500
     """Held-out problems that the straight line does not solve and search does."""
-    family: str = "rop"
+    family: Annotated[str, OneOf(FAMILIES)] = "rop"
     """Family of the problems, a name in `problems.families`."""
-    candidates: int = 16
+    candidates: Count = 16
     """Trajectories sampled for each problem."""
-    seeds: int = 1
+    seeds: Count = 1
     """Trainings of each row, with seeds 0, 1, ...; figures are means over them."""
-
-    def __post_init__(self) -> None:
-        for name in ("samples", "encoder_samples", "problems", "candidates", "seeds"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        load_family(self.family)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +116,9 @@ class Evaluation:
 
     @classmethod
     def of(cls, records: list[Record]) -> "Evaluation":
-        single, collided = (np.array([getattr(r, name) for r in records]) for name in ("passed", "collided"))
-        length = np.array([record.measures.get("link_length", np.nan) for record in records])
-        return cls(single, (single > 0) * 1.0, collided, length, np.array([record.cpu for record in records]))
+        figures = [(r.passed, r.collided, r.measures.get("link_length", np.nan), r.cpu) for r in records]
+        single, collided, length, seconds = np.array(figures, np.float64).T
+        return cls(single, (single > 0) * 1.0, collided, length, seconds)
 
     @classmethod
     def mean(cls, of: "list[Evaluation]") -> "Evaluation":
@@ -160,46 +157,42 @@ def run_ablation(
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
     read_manifest(settings.data).check_robot(load_robot("panda"))
-    with lock_folder(FilePath(settings.out)):
-        return _run(settings, rows, workers, report)
-
-
-def _run(
-    settings: AblationSettings, rows: list[str], workers: int, report: Callable[[str], None]
-) -> list[RowResult]:
-    encoder = FilePath(settings.out) / ENCODER
-    if not (encoder / "encoder.json").exists():
-        report(f"training {ENCODER}: {settings.encoder_samples:,} clouds")
-        train_encoder(
-            EncoderTraining(name=ENCODER, minutes=None, samples=settings.encoder_samples), str(encoder)
-        )
-    _check_budget(encoder / "encoder.json", "encoder_samples", settings.encoder_samples)
-    configs = list(dict.fromkeys(ROWS[name].config for name in rows))
+    out = FilePath(settings.out)
+    configs = dict.fromkeys(ROWS[name].config for name in rows)
     trainings = [Training(config, seed) for config in configs for seed in range(settings.seeds)]
-    found: dict[tuple[Training | None, bool], Evaluation] = {}
-    with Workers(workers, STOP_TIMEOUT) as pool:
+    evaluations: dict[tuple[Training | None, bool], Evaluation] = {}
+    with lock_folder(out), Workers(workers, STOP_TIMEOUT) as pool:
+        if not (out / ENCODER / "encoder.json").exists():
+            report(f"training {ENCODER}: {settings.encoder_samples:,} clouds")
+            encoder = EncoderTraining(name=ENCODER, minutes=None, samples=settings.encoder_samples)
+            train_encoder(encoder, str(out / ENCODER))
+        _training(out / ENCODER / "encoder.json", "encoder_samples", settings.encoder_samples)
+        digests = {}
         for _, training in pool.each(_train, [(settings, training) for training in trainings]):
-            file = FilePath(settings.out) / training.folder / "model.json"
-            _check_budget(file, "samples", settings.samples)
+            about = _training(out / training.folder / "model.json", "samples", settings.samples)
+            digests[training.folder] = about["data"]
             report(f"trained {training.folder}")
-        _check_same_data(settings, trainings)
-        cases = hard_cases(settings.family, settings.problems, FilePath(settings.out) / "problems", report)
+        if len(set(digests.values())) > 1:
+            found = ", ".join(f"{name} {digest}" for name, digest in digests.items())
+            raise InputError(f"{out} holds networks of different data: {found}; use another folder")
+        cases = hard_cases(settings.family, settings.problems, out / "problems", report)
         todo = [(settings, which, guided, cases) for which in (*trainings, None) for guided in (False, True)]
-        for _, (which, guided, result) in pool.each(_evaluate, todo):
-            found[which, guided] = result
-            name, how = which.folder if which else CONTROL, "with" if guided else "without"
-            report(f"evaluated {name} {how} guidance: {100 * result.single.mean():.1f} % of samples")
+        for number, evaluation in pool.each(_evaluate, todo):
+            _, which, guided, _ = todo[number]
+            evaluations[which, guided] = evaluation
+            name = which.folder if which else CONTROL
+            how = "with" if guided else "without"
+            report(f"evaluated {name} {how} guidance: {100 * evaluation.single.mean():.1f} % of samples")
     results = []
     for name in rows:
         row = ROWS[name]
-        each = [
-            [found[Training(row.config, seed), guided] for seed in range(settings.seeds)]
+        alone, guided = (
+            [evaluations[Training(row.config, seed), guided] for seed in range(settings.seeds)]
             for guided in (False, True)
-        ]
-        by_seed = tuple(float(of.single.mean()) for of in each[row.guided])
-        alone, guided = map(Evaluation.mean, each)
-        results.append(RowResult(name, alone, guided, by_seed))
-    return [*results, RowResult(CONTROL, found[None, False], found[None, True])]
+        )
+        by_seed = tuple(float(of.single.mean()) for of in (guided if row.guided else alone))
+        results.append(RowResult(name, Evaluation.mean(alone), Evaluation.mean(guided), by_seed))
+    return [*results, RowResult(CONTROL, evaluations[None, False], evaluations[None, True])]
 
 
 class Training(NamedTuple):
@@ -214,68 +207,46 @@ class Training(NamedTuple):
         return f"{self.config}_seed{self.seed}" if self.seed else self.config
 
 
-def _training(file: FilePath) -> dict[str, Any]:
-    return json.loads(file.read_text())["training"]
-
-
-def _check_budget(file: FilePath, name: str, wanted: int) -> None:
-    """Raise InputError if a network was trained with another budget."""
-    found = _training(file)["settings"]["samples"]
-    if found != wanted:
+def _training(file: FilePath, name: str, budget: int) -> dict[str, Any]:
+    """What a network's file says of its training. Raises InputError if that had another budget."""
+    about = json.loads(file.read_text())["training"]
+    samples = about["settings"]["samples"]
+    if samples != budget:
         raise InputError(
-            f"{file.parent} was trained with {name} {found}, now it is {wanted}; use another folder, "
+            f"{file.parent} was trained with {name} {samples}, now it is {budget}; use another folder, "
             "or the same budget"
         )
-
-
-def _check_same_data(settings: AblationSettings, trainings: list[Training]) -> None:
-    """Raise InputError unless all networks were trained on the same data."""
-    names = [training.folder for training in trainings]
-    seen = {name: _training(FilePath(settings.out) / name / "model.json")["data"] for name in names}
-    if len(set(seen.values())) > 1:
-        found = ", ".join(f"{name} {digest}" for name, digest in seen.items())
-        raise InputError(f"{settings.out} holds networks of different data: {found}; use another folder")
+    return about
 
 
 def _train(settings: AblationSettings, training: Training) -> Training:
-    out, config = FilePath(settings.out) / training.folder, training.config
+    out = FilePath(settings.out) / training.folder
     if not (out / "model.json").exists():
         given = {"data": settings.data, "samples": settings.samples, "seed": training.seed}
-        alone = {"encoder": str(FilePath(settings.out) / ENCODER)}
-        names_one = "encoder" in CONFIGS[config].changes
-        train_planner(planner_training(config, given if names_one else given | alone), str(out))
+        if "encoder" not in CONFIGS[training.config].changes:
+            given["encoder"] = str(FilePath(settings.out) / ENCODER)
+        train_planner(planner_training(training.config, given), str(out))
     return training
 
 
 def _evaluate(
     settings: AblationSettings, training: Training | None, guided: bool, cases: list[Case]
-) -> tuple[Training | None, bool, Evaluation]:
+) -> Evaluation:
     robot = load_robot("panda")
     folder = FilePath(settings.out) / (training.folder if training else CONTROL.replace(" ", "_"))
-    planner = _planner_settings(settings, training, guided)
-    digest = sampling_digest(planner, None if training is None else folder)
-    name = f"{'guided' if guided else 'unguided'} {digest}"
-    alone = training is None
-    draw = without_network(planner, CONTROL_WAYPOINTS) if alone else from_network(RobotDiffuse(planner))
-    method = sampled(draw, Kinematics(robot).link_length)
-    return (
-        training,
-        guided,
-        Evaluation.of(run_all(cases, {name: method}, seeds=(1,), folder=folder, bar=False)[name]),
-    )
-
-
-def _planner_settings(
-    settings: AblationSettings, training: Training | None, guided: bool
-) -> RobotDiffuseSettings:
     steps = NETWORK_ALONE.guidance_steps if guided else 0
-    alone = replace(NETWORK_ALONE, samples=settings.candidates, guidance_steps=steps)
+    planner = replace(NETWORK_ALONE, samples=settings.candidates, guidance_steps=steps)
     if training is None:
-        return alone
-    weights = str(FilePath(settings.out) / training.folder)
-    encoder = load_model(weights, load_robot("panda")).encoder
-    assert encoder is not None  # every row has one
-    return replace(alone, weights=weights, points=encoder.settings.cloud)
+        draw = without_network(planner, CONTROL_WAYPOINTS)
+    else:
+        encoder = load_model(str(folder), robot).encoder
+        assert encoder is not None  # every row has one
+        planner = replace(planner, weights=str(folder), points=encoder.settings.cloud)
+        draw = from_network(RobotDiffuse(planner))
+    digest = sampling_digest(planner, None if training is None else folder)
+    method = {f"{'guided' if guided else 'unguided'} {digest}": sampled(draw, Kinematics(robot).link_length)}
+    (records,) = run_all(cases, method, seeds=(1,), folder=folder, bar=False).values()
+    return Evaluation.of(records)
 
 
 NOTES = (

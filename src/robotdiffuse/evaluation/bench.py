@@ -9,12 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Annotated, Any
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import JsonLines, lock_folder
 from robotdiffuse.core.ray_cluster import CLUSTERS
+from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
 from robotdiffuse.evaluation.planner_processes import PlannerSpec, on_cluster, on_this_machine
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
 from robotdiffuse.evaluation.report import processor, versions
@@ -36,22 +37,24 @@ PACKAGES = ("numpy", "numba", "onnxruntime", "ompl")
 
 
 @dataclass(frozen=True)
-class BenchSettings:
-    planners: tuple[str, ...]
+class BenchSettings(Settings):
+    """What `bench run` runs."""
+
+    planners: Annotated[tuple[str, ...], Filled()]
     """Texts of planners, see `PlannerSpec.parse`; or `all` alone."""
-    problems: tuple[str, ...]
+    problems: Annotated[tuple[str, ...], Filled()]
     """Families (rop, rop_dense, ..., each also with _nontrivial), files or folders."""
     out: FilePath
     """Folder for problems and results."""
-    time_limit: float = 1.0
+    time_limit: Positive = 1.0
     """Of a call [s]."""
-    seeds: int = 1
+    seeds: Count = 1
     """Calls on each problem, with seeds 0, 1, ..."""
-    count: int | None = None
+    count: Count | None = None
     """Problems of each set; None: 100 of a family, all of a file or folder."""
-    workers: int = 1
+    workers: Count = 1
     """Planners that run at once, each in a process of its own."""
-    cluster: str | None = None
+    cluster: Annotated[str, OneOf(CLUSTERS)] | None = None
     """ray: on the cluster that RAY_ADDRESS names; None: this machine."""
     equal_time: bool = False
     """Whether planners that end early are called again with other seeds until the limit, in rows of their
@@ -60,20 +63,10 @@ class BenchSettings:
     def __post_init__(self) -> None:
         if self.planners == ("all",):
             object.__setattr__(self, "planners", tuple(PLANNERS))
+        super().__post_init__()
         _ = self.specs
-        for field in ("planners", "problems"):
-            names = getattr(self, field)
-            if not names or len(set(names)) < len(names):
-                raise InputError(
-                    f"{field} is {', '.join(names)!r}; it must name at least one, and none twice"
-                )
-        if not 0 < self.time_limit < float("inf"):
-            raise InputError(f"time_limit is {self.time_limit}; it must be a positive number of seconds")
-        for field in ("seeds", "count", "workers"):
-            if getattr(self, field) is not None and getattr(self, field) < 1:
-                raise InputError(f"{field} is {getattr(self, field)}; it must be at least 1")
-        if self.cluster is not None and self.cluster not in CLUSTERS:
-            raise unknown_name("cluster", self.cluster, CLUSTERS)
+        if len(set(self.problems)) < len(self.problems):
+            raise InputError(f"problems are {', '.join(self.problems)!r}; they must name none twice")
 
     @property
     def specs(self) -> dict[str, PlannerSpec]:
@@ -177,91 +170,72 @@ def _note_session(settings: BenchSettings, sessions: JsonLines) -> str:
 
 BY_LENGTH = ":objective=length"
 """Suffix of planners that compete in the length of paths."""
-NONTRIVIAL_ROP = ("rop_nontrivial", "rop_dense_nontrivial")
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One pass of a preset: planners on the first problems of each set, with one time limit."""
-
-    planners: tuple[str, ...]
-    time_limit: float
-    """Of a call [s]."""
-    count: int
-    """Problems of each set."""
-    equal_time: bool = False
-    """See `BenchSettings`."""
+ROP = ("rop_nontrivial", "rop_dense_nontrivial")
 
 
 @dataclass(frozen=True)
 class Preset:
+    """Planners on the first problems of each set, once with each time limit."""
+
     description: str
+    planners: tuple[str, ...]
     problems: tuple[str, ...]
-    """Problem sets of every stage."""
-    stages: tuple[Stage, ...]
+    limits: tuple[float, ...]
+    """Of a call [s]."""
+    count: int
+    """Problems of each set."""
+    equal_time: bool = True
+    """See `BenchSettings`."""
+
+
+def by_length(*planners: str) -> tuple[str, ...]:
+    """The planners, for the shortest paths."""
+    return tuple(name + BY_LENGTH for name in planners)
 
 
 PRESETS: dict[str, Preset] = {
     "equal_time": Preset(
         "path lengths at one second: search, the hybrid, diffusion, learned baselines",
-        (*NONTRIVIAL_ROP, "shelf_nontrivial"),
         (
-            Stage(
-                (
-                    *(name + BY_LENGTH for name in ("robotdiffuse", "aorrtc", "rrt_connect")),
-                    *("shared_tree_rrt_star", "diffusion", "mpd", "edmp", "mpnet", "mpinets"),
-                ),
-                1.0,
-                30,
-                equal_time=True,
-            ),
+            *by_length("robotdiffuse", "aorrtc", "rrt_connect"),
+            *("shared_tree_rrt_star", "diffusion", "mpd", "edmp", "mpnet", "mpinets"),
         ),
+        (*ROP, "shelf_nontrivial"),
+        (1.0,),
+        30,
     ),
     "learning": Preset(
         "what the network adds: diffusion and the hybrid beside search, with 0.1 and 0.3 s",
-        (*NONTRIVIAL_ROP, "shelf_nontrivial"),
-        tuple(
-            Stage(
-                ("robotdiffuse" + BY_LENGTH, "diffusion", "aorrtc" + BY_LENGTH, "shared_tree_rrt_star"),
-                limit,
-                150,
-                equal_time=True,
-            )
-            for limit in (0.1, 0.3)
-        ),
+        (*by_length("robotdiffuse"), "diffusion", *by_length("aorrtc"), "shared_tree_rrt_star"),
+        (*ROP, "shelf_nontrivial"),
+        (0.1, 0.3),
+        150,
     ),
     "durations": Preset(
         "durations of motions with 0.1 and 1 s: by time, by length, and the timed paths of OMPL",
-        ("shelf_nontrivial", "crate_nontrivial", "table_nontrivial", "kitchen_nontrivial", "rop_nontrivial"),
-        tuple(
-            Stage(
-                (
-                    *("aorrtc", "robotdiffuse", "diffusion"),
-                    *(name + BY_LENGTH for name in ("aorrtc", "robotdiffuse")),
-                    *("ompl_rrt_connect", "ompl_aorrtc"),
-                ),
-                limit,
-                100,
-            )
-            for limit in (0.1, 1.0)
+        (
+            *("aorrtc", "robotdiffuse", "diffusion"),
+            *by_length("aorrtc", "robotdiffuse"),
+            *("ompl_rrt_connect", "ompl_aorrtc"),
         ),
+        ("shelf_nontrivial", "crate_nontrivial", "table_nontrivial", "kitchen_nontrivial", "rop_nontrivial"),
+        (0.1, 1.0),
+        100,
+        equal_time=False,
     ),
     "anytime": Preset(
         "anytime search beside OMPL's: Shared-Tree Informed RRT*, AORRTC, Informed RRT*",
-        NONTRIVIAL_ROP,
-        (
-            Stage(
-                ("shared_tree_rrt_star", "aorrtc" + BY_LENGTH, "ompl_aorrtc", "ompl_informed_rrt_star"),
-                1.0,
-                100,
-                equal_time=True,
-            ),
-        ),
+        ("shared_tree_rrt_star", *by_length("aorrtc"), "ompl_aorrtc", "ompl_informed_rrt_star"),
+        ROP,
+        (1.0,),
+        100,
     ),
     "restarts": Preset(
         "the hybrid beside restarts of RRT-Connect until the same limit",
-        (*NONTRIVIAL_ROP, "shelf_nontrivial"),
-        (Stage(("robotdiffuse" + BY_LENGTH, "rrt_connect" + BY_LENGTH), 1.0, 100, equal_time=True),),
+        by_length("robotdiffuse", "rrt_connect"),
+        (*ROP, "shelf_nontrivial"),
+        (1.0,),
+        100,
     ),
 }
 
@@ -274,7 +248,7 @@ def preset_settings(
     workers: int = 1,
     cluster: str | None = None,
 ) -> list[BenchSettings]:
-    """The settings of each stage of a preset.
+    """The settings of a preset for each of its time limits.
 
     problems: sets beside those of the preset.
     count: most problems of each set; None: as the preset says.
@@ -286,14 +260,14 @@ def preset_settings(
     preset = PRESETS[name]
     return [
         BenchSettings(
-            stage.planners,
+            preset.planners,
             (*preset.problems, *problems),
             out,
-            time_limit=stage.time_limit,
-            count=min(count or stage.count, stage.count),
+            time_limit=limit,
+            count=min(count or preset.count, preset.count),
             workers=workers,
             cluster=cluster,
-            equal_time=stage.equal_time,
+            equal_time=preset.equal_time,
         )
-        for stage in preset.stages
+        for limit in preset.limits
     ]

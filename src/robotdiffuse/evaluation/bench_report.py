@@ -16,7 +16,6 @@ from robotdiffuse.evaluation.comparison import (
     FAILURES,
     Bench,
     Comparison,
-    Outcome,
     Row,
     Section,
     base_name,
@@ -440,22 +439,14 @@ class Replay:
 
 
 @dataclass(frozen=True, eq=False)
-class _ProblemOutcomes:
-    """The outcomes of all planners on a problem."""
+class _Tries:
+    """The calls of all planners on a problem."""
 
     case: Case
-    outcomes: dict[str, Outcome]
-
-    @property
-    def solved(self) -> list[Record]:
-        """Records of the solved calls, shortest path first."""
-        records = [o.record for o in self.outcomes.values() if o.solved]
-        return sorted(records, key=lambda record: record.joint_length or 0.0)
-
-    @property
-    def failed(self) -> dict[str, str]:
-        """Reasons of failures by planner."""
-        return {name: o.failure for name, o in self.outcomes.items() if not o.solved}
+    solved: list[Record]
+    """Shortest path first."""
+    failed: dict[str, str]
+    """Reasons of failures by planner."""
 
     @property
     def detour(self) -> float:
@@ -466,56 +457,57 @@ class _ProblemOutcomes:
 
 
 def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
-    """Motions on the problems with the longest detours that at least two planners solve, and on problems that
-    some planner failed on."""
-    tries: list[_ProblemOutcomes] = []
+    """Motions of the problems with the longest detours, then of problems on which the reference, or else
+    another planner, failed; at the main limit of their set, for cases that the folder keeps."""
+    tries: list[_Tries] = []
     for section in (section for section in parts if section.name == section.problem_set):
-        limit = section.main.limit
+        main = section.main
         cases = {case.name: case for case in read_cases(bench.folder, section.problem_set)}
-        calls = {
-            row.planner: calls_on(bench.records[row.planner], section.problem_set)
-            for row in section.main.rows
-        }
-        for name, seed in section.main.keys:
-            if seed == section.main.keys[0][1] and name in cases:
-                records = {planner: deciding_record(of[name, seed], limit) for planner, of in calls.items()}
-                outcomes = {planner: outcome(r, limit) for planner, r in records.items() if r is not None}
-                tries.append(_ProblemOutcomes(cases[name], outcomes))
+        calls = {row.planner: calls_on(bench.records[row.planner], section.problem_set) for row in main.rows}
+        for key in main.keys:
+            if key[1] == main.keys[0][1] and key[0] in cases:
+                records = {planner: deciding_record(of[key], main.limit) for planner, of in calls.items()}
+                outcomes = [outcome(record, main.limit) for record in records.values() if record is not None]
+                solved = [o.record for o in outcomes if o.solved]
+                solved.sort(key=lambda record: record.joint_length or 0.0)
+                failed = {o.record.planner: o.failure for o in outcomes if not o.solved}
+                tries.append(_Tries(cases[key[0]], solved, failed))
     hardest = sorted((t for t in tries if t.solved), key=lambda t: (len(t.solved) < 2, -t.detour))
     hardest = hardest[:SOLVED_PROBLEMS]
-    replays = [motion for t in hardest for motion in _solved(t, bench.reference)]
     failed = [
         t
         for t in tries
         if t.failed and t not in hardest and (t.solved or isinstance(t.case.problem.goal, JointGoal))
     ]
     failed.sort(key=lambda t: (bench.reference not in t.failed, len(t.solved)))
-    return replays + [_failed(t, bench.reference) for t in failed[: MAX_REPLAYS - len(replays)]]
+    replays = [replay for t in hardest for replay in _solved(t, bench.reference)]
+    return [*replays, *(_failed(t, bench.reference) for t in failed)][:MAX_REPLAYS]
 
 
-def _solved(tries: _ProblemOutcomes, reference: str) -> list[Replay]:
+def _solved(tries: _Tries, reference: str) -> list[Replay]:
     """The motion of the reference, the shortest and the longest."""
-    solved = tries.solved
-    chosen = [*(r for r in solved if r.planner == reference), solved[0], solved[-1]]
+    shortest = tries.solved[0]
+    longest = tries.solved[-1]
+    chosen = [*(r for r in tries.solved if r.planner == reference), shortest, longest]
     replays = []
     for record in {record.planner: record for record in chosen}.values():
-        which = "shortest, " if record is solved[0] else "longest, " if record is solved[-1] else ""
+        which = "shortest, " if record is shortest else "longest, " if record is longest else ""
         caption = f"{record.joint_length:.2f} rad, {which}in {seconds(record.time)} s"
         replays.append(Replay(f"{record.planner} · {tries.case.name}", caption, tries.case, record.waypoints))
     return replays
 
 
-def _failed(tries: _ProblemOutcomes, reference: str) -> Replay:
-    failures = tries.failed
-    solved = tries.solved
-    loser = reference if reference in failures else next(iter(failures))
-    if solved:
-        others = f"; shown: {solved[0].planner}" + (f", {len(solved)} solve it" if len(solved) > 1 else "")
-        return Replay(
-            f"{loser} fails · {tries.case.name}", failures[loser] + others, tries.case, solved[0].waypoints
-        )
+def _failed(tries: _Tries, reference: str) -> Replay:
+    """A motion that solves a problem on which planners failed, or the straight line."""
+    name = tries.case.name
+    if tries.solved:
+        loser = reference if reference in tries.failed else next(iter(tries.failed))
+        number = len(tries.solved)
+        solvers = tries.solved[0].planner + (f", {number} solve it" if number > 1 else "")
+        caption = f"{tries.failed[loser]}; shown: {solvers}"
+        return Replay(f"{loser} fails · {name}", caption, tries.case, tries.solved[0].waypoints)
     problem = tries.case.problem
     assert isinstance(problem.goal, JointGoal)
     caption = "solved by no planner; shown: the straight line, which is no solution"
     line = np.stack([problem.start, problem.goal.positions[0]])
-    return Replay(f"not solved · {tries.case.name}", caption, tries.case, line)
+    return Replay(f"not solved · {name}", caption, tries.case, line)

@@ -246,6 +246,8 @@ class Row:
     """Median time to the first path [s]."""
     returned: float
     """Mean time until the planner returns [s], over all problems; the limit for an unsolved one."""
+    time: float
+    """Mean of the calls' own times [s]."""
     comscore: float
     """Among the rows of this table."""
     paired: Paired | None
@@ -431,6 +433,7 @@ def _comparison(
             link_length=figures.length,
             first=float(np.median([o.found for o in solved])) if solved else np.nan,
             returned=figures.time,
+            time=Mean.of(o.record.time for o in of).value,
             comscore=scores.get(planner, np.nan),
             paired=None
             if planner == bench.reference or reference is None

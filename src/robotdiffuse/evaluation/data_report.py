@@ -1,14 +1,13 @@
 """The report of a data set: its figures as tables and plots."""
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
@@ -27,9 +26,7 @@ from robotdiffuse.datasets.shards import (
 from robotdiffuse.evaluation import plots
 from robotdiffuse.evaluation.report import Report
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,8 +45,10 @@ SAMPLED_WAYPOINTS = 24
 """Of each of these motions, spread evenly."""
 ARRAYS_OF_ALL = ("cost", "clearance", "end_clearance", "safety_distance", "line_free", "detour", "family")
 """Arrays that are kept of all motions."""
-ARRAYS_OF_SAMPLE = ("goal_costs", "obstacle_kinds", "obstacle_params", "trajectories")
+ARRAYS_OF_SAMPLE = ("goal_costs", "trajectories")
 """Arrays that are kept of the sample."""
+ARRAYS_OF_SCENES = ("obstacle_kinds", "obstacle_params")
+"""Arrays that tell the split of a row."""
 OUTCOMES = ("solved", "unsolved", "refused", "thinned")
 """Outcomes of problems."""
 SAFETY_TOLERANCE = 0.002
@@ -134,7 +133,9 @@ def read_figures(folder: str | FilePath) -> DataFigures:
     size = 0
     motions = 0
     for index in indices:
-        shard = read_shard(folder, index, (*ARRAYS_OF_ALL, *ARRAYS_OF_SAMPLE))
+        shard = read_shard(
+            folder, index, (*ARRAYS_OF_ALL, *ARRAYS_OF_SAMPLE, "obstacle_kinds", "obstacle_params")
+        )
         rows = np.arange(-motions % step, len(shard), step)
         motions += len(shard)
         for name, arrays in parts.items():
@@ -217,15 +218,12 @@ LAST_QUANTILE = 0.995
 DETOURS = {"line free": 0.0, "up to 5 % longer": 1.05, "up to 25 %": 1.25, "more": np.inf}
 CLEARANCES = {"below 1 cm": 0.01, "1 to 2": 0.02, "2 to 5": 0.05, "over 5": np.inf}
 """Classes of motions by their upper ends."""
-POINTS_PER_OBSTACLE = 64
-MAX_OBSTACLES = 20_000
-MAX_TIPS = 2_500
 
 
 def write_page(folder: str | FilePath, file: str | FilePath, robot: Robot | None = None) -> DataFigures:
     """Write tables and plots as .html and return the figures.
 
-    robot: that of the data, for the positions of the tip; None: found by the name in the manifest.
+    robot: that of the data; None: found by the name in the manifest.
 
     Raises InputError without matplotlib, for a file that cannot be written, and as `read_figures` does.
     """
@@ -233,11 +231,11 @@ def write_page(folder: str | FilePath, file: str | FilePath, robot: Robot | None
     data = read_figures(folder)
     robot = load_robot(data.manifest.robot) if robot is None else robot
     data.manifest.check_robot(robot)
-    write_atomically(target, data_report(data, robot, FilePath(folder).resolve().name).page)
+    write_atomically(target, data_report(data, FilePath(folder).resolve().name).page)
     return data
 
 
-def data_report(data: DataFigures, robot: Robot, name: str) -> Report:
+def data_report(data: DataFigures, name: str) -> Report:
     """The report of a data set."""
     manifest = data.manifest
     report = Report(name)
@@ -255,13 +253,6 @@ def data_report(data: DataFigures, robot: Robot, name: str) -> Report:
     height = 1.95 * -(-manifest.dof // across)
     joints = plots.draw(partial(_joints, data, across), plots.FULL, height)
     report.plot("joints.svg", "Joint values between their limits", joints)
-    caption = "Density of obstacles, without the floor; the cross is the robot's base"
-    obstacles = plots.draw(partial(_views, {"obstacles": _obstacle_points(data)}), plots.HALF, 3.0)
-    report.plot("obstacles.svg", caption, obstacles)
-    ends = data.sample["trajectories"][:: -(-len(data.sample["trajectories"]) // MAX_TIPS)]
-    tips = {end: link_origins(robot, ends[:, i], robot.tip) for end, i in (("start", 0), ("goal", -1))}
-    caption = f"Start and end positions of the robot's {robot.tip} in some of the motions"
-    report.plot("tip.svg", caption, plots.draw(partial(_views, tips), plots.HALF, 3.0))
     versions = ", ".join(f"{name} {version}" for name, version in manifest.versions.items())
     note = "The last bar of a histogram holds all larger values."
     report.add(plain(f"Made with {versions}; robot {manifest.robot_fingerprint}. {note}"))
@@ -325,41 +316,3 @@ def _joints(data: DataFigures, across: int, figure: "Figure") -> None:
         axes.set_xlabel("[rad]")
         if j == 0:
             figure.legend(loc="outside upper right", ncols=3)
-
-
-def _views(points: Mapping[str, Float[ndarray, "_ 3"]], figure: "Figure") -> None:
-    """Draw points from above and from the side: as a density if they are many."""
-    for axes, (name, across) in zip(figure.subplots(1, 2), (("top", 1), ("side", 2)), strict=True):
-        for label, at in points.items():
-            if len(at) > MAX_TIPS:
-                axes.hist2d(at[:, 0], at[:, across], 64, cmap="Oranges", rasterized=True)
-            else:
-                axes.scatter(
-                    at[:, 0], at[:, across], 4.0, alpha=0.6, linewidths=0, label=label, rasterized=True
-                )
-        axes.plot(0, 0, "+", color=plots.INK, markersize=8)
-        axes.set_aspect("equal")
-        axes.set_title(f"from the {name}")
-        axes.set_xlabel("x [m]")
-        axes.set_ylabel("y [m]" if across == 1 else "z [m]")
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(**plots.LEGEND_BESIDE)
-
-
-def _obstacle_points(data: DataFigures) -> Float[ndarray, "_ 3"]:
-    """Random points in the obstacles, as many in each; the rotation of boxes is ignored."""
-    kinds = data.sample["obstacle_kinds"]
-    rows = data.sample["obstacle_params"][kinds > 0].astype(np.float64)
-    kinds = kinds[kinds > 0]
-    step = max(1, -(-len(rows) // MAX_OBSTACLES))
-    rows = rows[::step]
-    kinds = kinds[::step]
-    cube = np.random.default_rng(0).uniform(-1, 1, (8 * POINTS_PER_OBSTACLE, 3))
-    ball = cube[np.linalg.norm(cube, axis=1) <= 1][:POINTS_PER_OBSTACLE]
-    spheres = rows[kinds == SPHERE, None]
-    boxes = rows[kinds == BOX, None]
-    points = (
-        spheres[..., :3] + spheres[..., 3:4] * ball,
-        boxes[..., :3] + boxes[..., 3:6] / 2 * cube[:POINTS_PER_OBSTACLE],
-    )
-    return np.concatenate([part.reshape(-1, 3) for part in points])

@@ -22,7 +22,7 @@ from robotdiffuse.core.types import Path
 from robotdiffuse.evaluation import plots
 from robotdiffuse.evaluation.bench import BenchSettings, Done, run_bench
 from robotdiffuse.evaluation.bench_report import about, crashes, success_over_time
-from robotdiffuse.evaluation.comparison import Bench, Mean, read_bench, sections
+from robotdiffuse.evaluation.comparison import Bench, Section, read_bench, sections
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, sampling_digest
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.problem_sets import hard_cases, read_cases, validator
@@ -307,41 +307,22 @@ def table1(settings: Table1Settings, bench: Bench) -> Report:
         f"--time-limit {settings.time_limit:g}{weights}"
     )
     report = paper_report("Table 1", command)
-    labels = dict(zip((row.name for row in settings.rows), settings.bench.specs, strict=True))
-    for problem_set, goal in GOALS.items():
-        names = {case_name(problem_set, i) for i in range(settings.problems)}  # the folder may have more
-        records = {
-            name: [r for r in bench.records[label] if r.name in names and r.time_limit == settings.time_limit]
-            for name, label in labels.items()
-        }
-        solvable = {r.name for of in records.values() for r in of if r.solved}
-        hard = {name: [r for r in of if not r.trivial and r.name in solvable] for name, of in records.items()}
-        parts = {"all problems": records, "not trivial, and solved by some row": hard}
-        for part, of in parts.items():
-            count = len(next(iter(of.values())))
-            beside = problem_set == POSE and of is records
-            if count:
-                title = f"Goal: {goal}; {part}: {count}"
-                report.table(_table(title, settings.rows, of, beside), level=2)
-    loads = [r.load for of in bench.records.values() for r in of if r.load is not None]
-    load = (
-        [f"Load average of the machine after the calls: {min(loads):.1f} to {max(loads):.1f}."]
-        if loads
-        else []
-    )
-    add_notes(report, [*notes(settings), *about(bench), *load, *crashes(bench)])
+    rows = dict(zip(settings.bench.specs, settings.rows, strict=True))
+    # the folder may have more
+    names = {case_name(problem_set, i) for problem_set in GOALS for i in range(settings.problems)}
+    records = {
+        label: [r for r in bench.records[label] if r.name in names and r.time_limit == settings.time_limit]
+        for label in rows
+    }
+    loads: list[float] = []
+    for section in sections(replace(bench, records=records), [settings.time_limit]):
+        loads += section.main.loads
+        report.table(_table(section, rows), level=2)
+    lines = [*notes(settings), *about(bench), *crashes(bench)]
+    if loads:
+        lines.append(f"Load average of the machine after the calls: {min(loads):.1f} to {max(loads):.1f}.")
+    add_notes(report, lines)
     return report
-
-
-def indicators(records: Sequence[Record]) -> Indicators:
-    """The figures that ComScore weighs; an unsolved call counts with its own time."""
-    solved = [r for r in records if r.solved]
-    return Indicators(
-        100 * len(solved) / max(len(records), 1),
-        100 * sum(r.in_collision for r in records) / max(len(records), 1),
-        Mean.of(r.measures["link_length"] for r in solved).value,
-        Mean.of(r.time for r in records).value,
-    )
 
 
 def scores(rows: Sequence[Row], of: dict[str, Indicators]) -> dict[str, float]:
@@ -361,31 +342,32 @@ def share_cells(part: int, whole: int) -> tuple[float, str]:
     return 100 * part / max(whole, 1), interval(*wilson_interval(part, whole), scale=100.0)
 
 
-def _table(title: str, rows: Sequence[Row], records: dict[str, list[Record]], beside: bool) -> Table:
-    """beside: whether the paper's figures are in the table."""
-    figures = {name: indicators(of) for name, of in records.items()}
-    comscore = scores(rows, figures)
-    printed = {row.name: row for row in PAPER_TABLE_1}
+def _table(section: Section, rows: dict[str, Row]) -> Table:
+    """The table of a problem set or of its part; `rows` by planner."""
+    comparison = section.main
+    whole = section.name == section.problem_set
+    part = "all problems" if whole else "not trivial, and solved by some row"
+    title = f"Goal: {GOALS[section.problem_set]}; {part}: {comparison.problems}"
+    indicators = {
+        rows[of.planner].name: Indicators(100 * of.success, 100 * of.collision, of.link_length, of.time)
+        for of in comparison.rows
+    }
+    comscore = scores(tuple(rows.values()), indicators)
+    printed = {row.name: (*astuple(row.indicators), row.comscore) for row in PAPER_TABLE_1}
+    beside = section.name == POSE
     table = []
-    for row in rows:
-        of = records[row.name]
-        solved = [r for r in of if r.solved]
-        cells: list[Cell] = [
-            row.name,
-            *share_cells(len(solved), len(of)),
-            *share_cells(sum(r.in_collision for r in of), len(of)),
-        ]
+    for of in comparison.rows:
+        row = rows[of.planner]
+        shares = (round(share * comparison.problems) for share in (of.success, of.collision))
+        cells: list[Cell] = [row.name]
+        for share in shares:
+            cells += share_cells(share, comparison.problems)
         for name in MEASURES:
-            mean, half = Mean.of(r.measures.get(name) for r in solved)
+            mean, half = of.measures[name]
             form = METRICS[name].format
-            cells.append(Figure(f"{mean:{form}} ± {half:{form}}", mean) if len(solved) > 1 else None)
-        cells += [figures[row.name].time, comscore[row.name]]
-        if beside and row.paper:
-            paper = printed[row.paper]
-            cells += [*astuple(paper.indicators), paper.comscore]
-        elif beside:
-            cells += [None] * 5
-        table.append(cells)
+            cells.append(Figure(f"{mean:{form}} ± {half:{form}}", mean) if half == half else None)
+        cells += [of.time, comscore[row.name]]
+        table.append([*cells, *(printed.get(row.paper, (None,) * 5) if beside else ())])
     columns = (
         "row",
         Column("success", "%", ".1f", "more"),
