@@ -131,14 +131,15 @@ def _table1(arguments: argparse.Namespace) -> "tuple[Table1Settings, Bench]":
 
 def run_table2(arguments: argparse.Namespace) -> int:
     import sys
+    from dataclasses import fields
 
     from robotdiffuse.learning import need_packages
 
     need_packages("the ablation", "torch")
     from robotdiffuse.evaluation.ablation import ROWS, AblationSettings, run_ablation, table2
 
-    names = ("data", "out", "samples", "encoder_samples", "problems", "family", "seeds")
-    given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
+    known = {field.name for field in fields(AblationSettings)}
+    given = {name: value for name, value in vars(arguments).items() if name in known and value is not None}
     settings = AblationSettings(**given)
     rows = list(ROWS) if arguments.rows is None else arguments.rows.split(",")
     results = run_ablation(
