@@ -264,7 +264,8 @@ class _Task:
 
 def _defects(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
     """Kind and message of each defect of a motion, without PyBullet."""
-    robot, path = task.robot, path_of(task.robot, shard, row)
+    robot = task.robot
+    path = path_of(robot, shard, row)
     yield from _ends(shard, row)
     yield from _limits(robot, path.positions)
     yield from _lengths(shard, row, path)
@@ -278,27 +279,30 @@ def _defects(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
         yield "collision", f"{violation.message} at waypoint {violation.time:.2f}"
     elif violation is not None and violation.kind not in ("limits", "start"):
         yield "motion", violation.message
-    checker = CollisionChecker(robot, problem.scene)
-    clearances = checker.link_clearances(path.positions).min(axis=1, initial=1.0)
-    measured = float(clearances.min())
-    recorded = float(shard["clearance"][row])
-    if abs(measured - recorded) > CLEARANCE_TOLERANCE:
-        yield "clearance", f"clearance is {1e3 * recorded:.2f} mm; measured: {1e3 * measured:.2f} mm"
-    worst = int(np.abs(shard["end_clearance"][row] - clearances[[0, -1]]).argmax())
-    end, at_end = float(shard["end_clearance"][row, worst]), float(clearances[[0, -1]][worst])
-    if abs(end - at_end) > CLEARANCE_TOLERANCE:
-        yield "clearance", f"end_clearance is {1e3 * end:.2f} mm; measured: {1e3 * at_end:.2f} mm"
+    clearances = CollisionChecker(robot, problem.scene).link_clearances(path.positions)
+    clearances = clearances.min(axis=1, initial=1.0)
+    recorded = {"clearance": shard["clearance"][row, None], "end_clearance": shard["end_clearance"][row]}
+    measured = {"clearance": clearances.min(keepdims=True), "end_clearance": clearances[[0, -1]]}
+    for name, values in recorded.items():
+        worst = int(np.abs(values - measured[name]).argmax())
+        stated = float(values[worst])
+        value = float(measured[name][worst])
+        if abs(stated - value) > CLEARANCE_TOLERANCE:
+            yield "clearance", f"{name} is {1e3 * stated:.2f} mm; measured: {1e3 * value:.2f} mm"
 
 
 def _ends(shard: Shard, row: int) -> Iterator[tuple[str, str]]:
-    q, goals, goal = shard["trajectories"][row], shard["goals"][row], int(shard["goal_index"][row])
-    if not np.array_equal(q[0], shard["start"][row]):
-        off = np.abs(q[0] - shard["start"][row]).max()
+    q = shard["trajectories"][row]
+    goals = shard["goals"][row]
+    goal = int(shard["goal_index"][row])
+    off = np.abs(q[0] - shard["start"][row]).max()
+    if off:
         yield "ends", f"the first waypoint differs from the start by {off:.3g}"
     if not 0 <= goal < len(goals) or np.isnan(goals[goal]).any():
         yield "ends", f"goal_index is {goal}; there is no such goal"
-    elif not np.array_equal(q[-1], goals[goal]):
-        off = np.abs(q[-1] - goals[goal]).max()
+        return
+    off = np.abs(q[-1] - goals[goal]).max()
+    if off:
         yield "ends", f"the last waypoint differs from goal {goal} by {off:.3g}"
 
 
@@ -308,22 +312,19 @@ def _limits(robot: Robot, q: Float[ndarray, "n dof"]) -> Iterator[tuple[str, str
     if excess.max() > LIMIT_SLACK:
         i, j = np.unravel_index(excess.argmax(), excess.shape)
         value, low, high = distinct(q[i, j], robot.lower[j], robot.upper[j])
-        yield (
-            "limits",
-            f"{robot.joint_names[j]} is {value} at waypoint {i}; its limits are {low} to {high}",
-        )
+        name = robot.joint_names[j]
+        yield "limits", f"{name} is {value} at waypoint {i}; its limits are {low} to {high}"
 
 
 def _lengths(shard: Shard, row: int, path: Path) -> Iterator[tuple[str, str]]:
-    cost, detour = float(shard["cost"][row]), float(shard["detour"][row])
+    cost = float(shard["cost"][row])
+    detour = float(shard["detour"][row])
     if not cost * (1 - COST_TOLERANCE) - ROUNDING <= path.length <= cost * (1 + ROUNDING) + ROUNDING:
         yield "cost", f"cost is {cost:.4f} rad; the waypoints are {path.length:.4f} rad long"
     straight = float(np.linalg.norm(path.positions[-1] - path.positions[0]))
     if abs(detour * straight - cost) > ROUNDING * max(cost, 1.0):
-        yield (
-            "cost",
-            f"detour is {detour:.4f}; cost over the straight distance is {cost / max(straight, 1e-9):.4f}",
-        )
+        ratio = cost / max(straight, 1e-9)
+        yield "cost", f"detour is {detour:.4f}; cost over the straight distance is {ratio:.4f}"
 
 
 # Motions of a bench

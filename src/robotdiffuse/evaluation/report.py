@@ -1,7 +1,6 @@
 """A report: texts, tables and plots as Markdown, and the same as an HTML page that needs no network."""
 
 import html
-import os
 import platform
 import re
 from collections.abc import Iterable
@@ -113,12 +112,3 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
         except PackageNotFoundError:
             numbers[name] = "none"
     return numbers
-
-
-def about(packages: Iterable[str]) -> str:
-    """Processor, load and versions, as one line for the head of a report."""
-    names = ", ".join(f"{name} {number}" for name, number in versions(packages).items())
-    return (
-        f"{processor()}, {os.cpu_count()} cores, load average {os.getloadavg()[0]:.1f} before; "
-        f"Python {platform.python_version()}, {names}"
-    )
