@@ -49,6 +49,12 @@ MEASURES = {
 }
 
 
+def record(planner: str, name: str, limit: float, **fields: object) -> Record:
+    about = {"problem_set": "rop", "family": "rop", "trivial": False, "seed": 0}
+    values = {"planner": planner, "name": name, "time_limit": limit} | about | fields
+    return Record(**values)  # pyright: ignore[reportArgumentType]
+
+
 def solved(
     planner: str,
     name: str,
@@ -60,13 +66,6 @@ def solved(
     """A record of a motion of which the links go three times as far [m] as the joints [rad]."""
     length = progress[-1][1]
     values = {
-        "planner": planner,
-        "problem_set": "rop",
-        "name": name,
-        "family": "rop",
-        "trivial": False,
-        "seed": 0,
-        "time_limit": limit,
         "status": "solved",
         "reason": "solved",
         "time": progress[-1][0] if time is None else time,
@@ -75,23 +74,11 @@ def solved(
         "memory": 100.0,
         "positions": ((0.0,) * 7, (0.1,) * 7),
     }
-    return Record(**(values | fields))  # pyright: ignore[reportArgumentType]
+    return record(planner, name, limit, **(values | fields))
 
 
 def failed(planner: str, name: str, limit: float, time: float, **fields: object) -> Record:
-    values = {
-        "planner": planner,
-        "problem_set": "rop",
-        "name": name,
-        "family": "rop",
-        "trivial": False,
-        "seed": 0,
-        "time_limit": limit,
-        "status": "timeout",
-        "reason": "no path",
-        "time": time,
-    }
-    return Record(**(values | fields))  # pyright: ignore[reportArgumentType]
+    return record(planner, name, limit, **({"status": "timeout", "reason": "no path", "time": time} | fields))
 
 
 def write(folder: Path, records: list[Record], counts: dict[float, int | None] | None = None) -> Path:

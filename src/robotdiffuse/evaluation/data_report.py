@@ -215,7 +215,7 @@ def size_in_words(size: int) -> str:
 BINS = 50
 LAST_QUANTILE = 0.995
 """Histograms end at this quantile; the last bar holds all larger values."""
-DETOURS = {"line free": 0.0, "up to 5 % longer": 1.05, "up to 25 %": 1.25, "more": np.inf}
+DETOURS = {"line free": 0.5, "up to 5 % longer": 1.05, "up to 25 %": 1.25, "more": np.inf}
 CLEARANCES = {"below 1 cm": 0.01, "1 to 2": 0.02, "2 to 5": 0.05, "over 5": np.inf}
 """Classes of motions by their upper ends."""
 
@@ -274,9 +274,9 @@ def _motions(data: DataFigures, figure: "Figure") -> None:
 def _difficulty(data: DataFigures, figure: "Figure") -> None:
     """Draw shares by detour and by clearance, a bar for each family."""
     detours = np.where(data.all["line_free"], 0.0, data.all["detour"])
-    kinds = ((DETOURS, detours, "left"), (CLEARANCES, data.all["clearance"], "right"))
-    for axes, (ends, values, side) in zip(figure.subplots(1, 2), kinds, strict=True):
-        classes = np.searchsorted(list(ends.values()), values, side=side)
+    kinds = ((DETOURS, detours), (CLEARANCES, data.all["clearance"]))
+    for axes, (ends, values) in zip(figure.subplots(1, 2), kinds, strict=True):
+        classes = np.searchsorted(list(ends.values()), values, side="right")
         shares = {
             label: [100 * float((classes[rows] == i).mean()) for rows in data.families.values()]
             for i, label in enumerate(ends)

@@ -128,7 +128,8 @@ def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
     """Of `count` problems with ten goal configurations by the position alone, as the authors draw them, the
     number with a free straight line: to the first, to the nearest, to any. family: the obstacles."""
     robot = load_robot("panda")
-    shares = dict.fromkeys(("a single goal", "the nearest of ten goals", "any of ten goals"), 0)
+    names = ("a single goal", "the nearest of ten goals", "any of ten goals")
+    shares: dict[str, int] = dict.fromkeys(names, 0)
     for number in range(count):
         rng = np.random.default_rng([SEED, STREAM + 1, number])
         drawn = family.draw(robot, rng, GOAL_COUNT, POSITION)

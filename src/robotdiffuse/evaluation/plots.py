@@ -101,14 +101,15 @@ def intervals(
     interval."""
 
     def fill(figure: "Figure") -> None:
-        for panel, of in zip(panels(figure, list(values), 4), values.values(), strict=True):
+        drawn = zip(panels(figure, list(values), 4), values.values(), strict=True)
+        for i, (panel, of) in enumerate(drawn):
             for y, name in enumerate(names):
                 value, low, high = of.get(name, (np.nan,) * 3)
                 panel.plot([low, high], [y, y], color=colors[name])
                 panel.plot(value, y, "o", color=colors[name], markersize=4)
             panel.set_yticks(range(len(names)), names)
             panel.set_ylim(len(names) - 0.4, -0.6)
-            panel.tick_params(labelleft=panel.get_subplotspec().is_first_col())
+            panel.tick_params(labelleft=i % 4 == 0)
 
     return draw(fill, FULL, (0.165 * len(names) + 0.5) * -(-len(values) // 4) + 0.1)
 
