@@ -1,6 +1,8 @@
 """What the benchmarks share: the head of a report, tables, problems, processor time, and checks on meshes."""
 
 import argparse
+import os
+import platform
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
@@ -16,10 +18,10 @@ from rich.console import Console
 from rich.progress import track
 
 from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.tables import Column, Rows, Table, show
 from robotdiffuse.core.types import UNTIL, Trajectory
-from robotdiffuse.evaluation.machine import about
 from robotdiffuse.evaluation.problem_sets import hard_cases
-from robotdiffuse.evaluation.tables import Column, Rows, Table, show
+from robotdiffuse.evaluation.report import processor, versions
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
@@ -39,7 +41,9 @@ ORACLE_TOLERANCE = 0.001
 
 def header(*packages: str) -> str:
     """Date, processor, load and versions: the first line of a report."""
-    return f"{date.today()}; {about(packages)}"
+    names = ", ".join(f"{name} {number}" for name, number in versions(packages).items())
+    machine = f"{processor()}, {os.cpu_count()} cores, load average {os.getloadavg()[0]:.1f} before"
+    return f"{date.today()}; {machine}; Python {platform.python_version()}, {names}"
 
 
 def print_table(title: str, columns: Sequence[Column | str], rows: Rows, notes: Sequence[str] = ()) -> None:

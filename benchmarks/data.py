@@ -26,20 +26,18 @@ import torch
 
 from common import header, parse, print_table, progress
 from robotdiffuse.datasets.loader import RopDataset
-from robotdiffuse.datasets.manifest import Manifest, floor_record, write_manifest
-from robotdiffuse.datasets.shards import SPLITS, write_shard
+from robotdiffuse.datasets.shards import SPLITS, Manifest, write_manifest, write_shard
 from robotdiffuse.generation import GenerationSettings
-from robotdiffuse.generation.shard_maker import solve
+from robotdiffuse.generation.factory import solve
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 STAGES = {
-    "drawing scene, start and goals (inverse kinematics)": ("shard_maker.py", "draw"),
-    "search": ("shared_tree/planner.py", "run"),
+    "drawing scene, start and goals (inverse kinematics)": ("factory.py", "draw"),
+    "search": ("search/shared_tree.py", "run"),
     "validator": ("validator.py", "path"),
 }
 """Files and functions of the profile."""
@@ -98,16 +96,13 @@ def cost(count: int) -> None:
 
 def write_store(folder: str, robot: Robot, trajectories: int) -> None:
     """Write a data set of straight lines between random configurations in random scenes."""
-    manifest = Manifest(
-        robot=robot.name,
-        robot_fingerprint=robot_fingerprint(robot),
-        joint_names=robot.joint_names,
-        lower=tuple(robot.lower.tolist()),
-        upper=tuple(robot.upper.tolist()),
+    families = ("rop", "rop_dense")
+    manifest = Manifest.of(
+        robot,
+        robot.name,
         waypoints=WAYPOINTS,
-        timing="arc",
-        families={"rop": {}, "rop_dense": {}},
-        floors=dict.fromkeys(("rop", "rop_dense"), floor_record(ROP.floor)),
+        families={name: {} for name in families},
+        floors=dict.fromkeys(families, ROP.floor),
         slots=SLOTS,
         goals=GOALS,
         trajectories=trajectories,

@@ -25,11 +25,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy import ndarray
 
 from common import WIDTH, draw_hard_cases, header, parse, parts_of, print_table
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core import tables
+from robotdiffuse.core.tables import Cell, Column, Table, show
 from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.evaluation import tables
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     Draw,
@@ -39,10 +41,9 @@ from robotdiffuse.evaluation.methods import (
     sampled,
     without_network,
 )
-from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run, run_all
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Record, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
-from robotdiffuse.evaluation.tables import Cell, Column, Table, show
+from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case
@@ -111,6 +112,19 @@ def summary(title: str, of: Mapping[str, Sequence[Record]], figures: Sequence[Su
     return Table.of(title, [Column(""), *(figure.column for figure in figures)], rows)
 
 
+def clearances_without_obstacles(model: MotionModel) -> ClearanceFn:
+    """The clearance inputs of a model in a scene without obstacles; guidance knows the obstacles."""
+    links = len(model.robot.links)
+    width = model.dof if model.settings.clearance_gradients else 0
+
+    def clearances(q: ndarray) -> ndarray:
+        inputs = np.zeros((*q.shape[:2], links + width), np.float32)
+        inputs[..., :links] = model.settings.clearance_high
+        return inputs
+
+    return clearances
+
+
 def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
     """The network with guidance and without, and with fewer of its inputs."""
 
@@ -120,13 +134,14 @@ def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]
     unguided = RobotDiffuse(replace(planner.settings, guidance_steps=0))
     model = planner.model(PANDA)
     assert model is not None
+    blind = clearances_without_obstacles(model)
     found: dict[str, Draw] = {}
     for name, of in (("guided", planner), ("without guidance", unguided)):
         found |= {
             name: from_network(of),
             f"{name}, code of another scene": from_network(of, other),
-            f"{name}, clearances hidden": from_network(of, hidden=True),
-            f"{name}, both": from_network(of, other, hidden=True),
+            f"{name}, clearances hidden": from_network(of, clearances=blind),
+            f"{name}, both": from_network(of, other, blind),
         }
         if model.settings.null_condition:
             found[f"{name}, condition hidden"] = from_network(

@@ -36,12 +36,11 @@ from common import (
     use_processor_time,
 )
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.tables import Figure
 from robotdiffuse.core.types import LENGTH, TIME
 from robotdiffuse.evaluation.methods import fields_of, from_network, measure_of, planned, validated
-from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import Fields, Method, Run, run_all
+from robotdiffuse.evaluation.runs import Fields, Method, Record, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval
-from robotdiffuse.evaluation.tables import Figure
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse

@@ -40,8 +40,7 @@ from robotdiffuse.evaluation.methods import validated
 from robotdiffuse.evaluation.problem_sets import case_file, validator
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
-from robotdiffuse.generation.factory import generate
-from robotdiffuse.generation.settings import GenerationSettings
+from robotdiffuse.generation.factory import GenerationSettings, generate
 from robotdiffuse.learning.checkpoint import load_encoder, read_tensors, write_tensors
 from robotdiffuse.learning.denoisers.layers import two_layers
 from robotdiffuse.learning.denoisers.settings import (

@@ -49,6 +49,7 @@ EXTRAS = {
     "uvicorn": {"server"},
     "orjson": {"server"},
     "viser": {"visualization"},
+    "markdown_it": {"evaluation"},
     "matplotlib": {"evaluation"},
     "foxglove_schemas_protobuf": {"interop"},
     "mcap": {"interop"},

@@ -10,8 +10,8 @@ from .core.transforms import pose as pose
 from .core.types import Path as Path
 from .core.types import Status as Status
 from .core.types import Trajectory as Trajectory
+from .datasets.external import write_dataset as write_dataset
 from .datasets.loader import RopDataset as RopDataset
-from .datasets.own_motions import write_dataset as write_dataset
 from .interop.depth_recording import read_depth_views as read_depth_views
 from .perception.depth_view import DepthView as DepthView
 from .planning import load_planner as load_planner

@@ -37,7 +37,7 @@ def test_info_prints_figures_and_writes_the_page(folder, capsys):
         "panda: 5 motions",
         "waypoints, evenly spaced in length",
         "71.4 %",
-        "of 9 problems",
+        "of 9 tried",
         "rop_dense",
         "length [rad]",
         "clearance [cm]",

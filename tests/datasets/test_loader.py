@@ -13,9 +13,8 @@ from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.loader import RopBatch, RopDataset
-from robotdiffuse.datasets.manifest import write_manifest
 from robotdiffuse.datasets.rows import resample
-from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_path, split_of, write_shard
+from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_path, split_of, write_manifest, write_shard
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 
 ARM, WAYPOINTS, SIZES = box_arm(), 20, (150, 0, 130, 40)

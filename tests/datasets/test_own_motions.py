@@ -7,9 +7,8 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.commands import run
-from robotdiffuse.datasets.manifest import read_manifest
-from robotdiffuse.datasets.motion_rows import problem_of
-from robotdiffuse.datasets.shards import check_shard
+from robotdiffuse.datasets.rows import problem_of
+from robotdiffuse.datasets.shards import check_shard, read_manifest
 
 PANDA = rd.load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])

@@ -10,12 +10,11 @@ from helpers.box_arm import box_arm
 from helpers.motion_stores import line, record, write_motions
 from helpers.stores import random_arrays, write_store
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.datasets import robot_npz
+from robotdiffuse.datasets import external as robot_npz
+from robotdiffuse.datasets.external import export_npz, import_npz
 from robotdiffuse.datasets.loader import RopDataset
-from robotdiffuse.datasets.manifest import read_manifest
-from robotdiffuse.datasets.motion_rows import problem_of
-from robotdiffuse.datasets.robot_npz import export_npz, import_npz
-from robotdiffuse.datasets.shards import check_shard, read_shard, write_shard
+from robotdiffuse.datasets.rows import problem_of
+from robotdiffuse.datasets.shards import check_shard, read_manifest, read_shard, write_shard
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene

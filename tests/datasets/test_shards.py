@@ -13,23 +13,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from zarr.codecs import ZstdCodec
 
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.datasets import shards
-from robotdiffuse.datasets.manifest import read_manifest, write_manifest
-from robotdiffuse.datasets.robot_npz import import_npz
+from robotdiffuse.datasets.external import import_npz
 from robotdiffuse.datasets.shards import (
     ARRAYS,
     SPLITS,
     check_shard,
+    read_manifest,
     read_shard,
     remove_leftovers,
     shard_indices,
     shard_path,
     split_of,
+    write_manifest,
     write_shard,
 )
 from robotdiffuse.robots import load_robot
@@ -96,24 +96,6 @@ def test_same_arrays_same_bytes(tmp_path, arrays):
     write_shard(tmp_path / "b", 0, arrays, counts)  # once more in its place
     assert files(tmp_path / "a") == files(tmp_path / "b")
     assert [p.name for p in (tmp_path / "b").iterdir()] == ["shard_00000.zarr"]
-
-
-def test_a_compressed_or_divided_array_is_read_too(tmp_path, arrays):
-    write_shard(tmp_path, 0, arrays, {})
-    group = zarr.open_group(shard_path(tmp_path, 0), mode="a")
-    prints = dict(group["trajectories"].attrs)
-    for rows, compressors in ((2, None), (7, ZstdCodec())):
-        group.create_array(
-            "trajectories",
-            data=arrays["trajectories"],
-            chunks=(rows, WAYPOINTS, ARM.dof),
-            compressors=compressors,
-            attributes=prints,
-            overwrite=True,
-        )
-        q = check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))["trajectories"]
-        assert not isinstance(q, np.memmap)
-        np.testing.assert_array_equal(q, arrays["trajectories"])
 
 
 def test_a_full_disk(tmp_path, arrays, monkeypatch):

@@ -21,13 +21,15 @@ from robotdiffuse.evaluation.metrics import (
     spectral_arc_length,
     turning,
 )
-from robotdiffuse.evaluation.paper.comscore import (
-    PAPER_TABLE_1,
+from robotdiffuse.evaluation.paper import PAPER_TABLE_1
+from robotdiffuse.evaluation.statistics import (
     Indicators,
+    bootstrap_interval,
+    compare,
     comscores,
     normalized,
+    wilson_interval,
 )
-from robotdiffuse.evaluation.statistics import bootstrap_interval, compare, wilson_interval
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose

@@ -10,8 +10,7 @@ import pytest
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation.methods import planned, restarted, sampled
-from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import Fields, Run, run_all
+from robotdiffuse.evaluation.runs import Fields, Record, Run, run_all
 from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal, Problem

@@ -13,8 +13,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path
 from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
-from robotdiffuse.generation.shard_maker import draw, solve
-from robotdiffuse.generation.solvers import SEARCHES
+from robotdiffuse.generation.factory import SEARCHES, draw, solve
 from robotdiffuse.robots import load_robot
 from robotdiffuse.validation.validator import verify
 

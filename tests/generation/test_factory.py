@@ -20,11 +20,10 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion
 from robotdiffuse.core.types import Path as Motion
-from robotdiffuse.datasets.manifest import read_manifest
-from robotdiffuse.datasets.motion_rows import path_of, problem_of
-from robotdiffuse.datasets.shards import check_shard, read_shard
+from robotdiffuse.datasets.rows import path_of, problem_of
+from robotdiffuse.datasets.shards import check_shard, read_manifest, read_shard
 from robotdiffuse.generation import GenerationSettings, factory, generate
-from robotdiffuse.generation.shard_maker import PROBLEMS_PER_SHARD, draw, make_shard
+from robotdiffuse.generation.factory import PROBLEMS_PER_SHARD, draw, make_shard
 from robotdiffuse.problems.families import family, rop
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot, names_a_file

@@ -7,8 +7,7 @@ from numpy import ndarray
 
 from helpers.stores import GOALS, SLOTS, manifest_of
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.datasets.manifest import Manifest, write_manifest
-from robotdiffuse.datasets.shards import write_shard
+from robotdiffuse.datasets.shards import Manifest, write_manifest, write_shard
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes

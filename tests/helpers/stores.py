@@ -7,8 +7,7 @@ import numpy as np
 from numpy import ndarray
 from numpy.random import Generator
 
-from robotdiffuse.datasets.manifest import Manifest, write_manifest
-from robotdiffuse.datasets.shards import write_shard
+from robotdiffuse.datasets.shards import Manifest, write_manifest, write_shard
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE

@@ -14,8 +14,7 @@ from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.datasets.manifest import write_manifest
-from robotdiffuse.datasets.shards import write_shard
+from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
 from robotdiffuse.learning.denoisers.settings import CrossAttentionSettings, TransformerSettings

@@ -7,8 +7,7 @@ import pytest
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.generation.settings import TARGETS, GenerationSettings
-from robotdiffuse.generation.shard_maker import draw
+from robotdiffuse.generation.factory import TARGETS, GenerationSettings, draw
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families import family as drawing
 from robotdiffuse.problems.families.family import CONFIGURATION, POSITION

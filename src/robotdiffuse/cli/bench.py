@@ -15,9 +15,8 @@ from robotdiffuse.problems.families import FAMILIES
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from robotdiffuse.evaluation.bench.figures import Section
-    from robotdiffuse.evaluation.bench.run_folder import Bench
-    from robotdiffuse.evaluation.bench.runner import BenchSettings, Done, Report
+    from robotdiffuse.evaluation.bench import BenchSettings, Done, Report
+    from robotdiffuse.evaluation.comparison import Bench, Section
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -75,8 +74,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     report = actions.add_parser(
         "report",
         help="write tables, plots and replays of a run",
-        description="Write report.md, report.tex, index.html (plots and tables), replays.html (motions in "
-        "3D) and curves of success and length over time as .svg, and print the table of each problem set.",
+        description="Write report.md with its plots as .svg, the same as index.html, and replays.html "
+        "(motions in 3D), and print the table of each problem set.",
     )
     report.add_argument("folder", metavar="FOLDER", help="folder of `robotdiffuse bench run`")
     report.add_argument(
@@ -103,7 +102,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def run_run(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.bench.runner import run_bench
+    from robotdiffuse.evaluation.bench import run_bench
 
     made = 0
     for settings in _bench_settings(arguments):
@@ -137,8 +136,7 @@ def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
     """The settings of each pass: of the preset, or one from the options."""
     from pathlib import Path
 
-    from robotdiffuse.evaluation.bench.presets import preset_settings
-    from robotdiffuse.evaluation.bench.runner import BenchSettings
+    from robotdiffuse.evaluation.bench import BenchSettings, preset_settings
 
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers sets the processes on this machine; --cluster always uses all its cores")
@@ -171,31 +169,31 @@ def run_report(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
     from robotdiffuse.core.output_files import write_atomically
-    from robotdiffuse.evaluation.bench import report
-    from robotdiffuse.evaluation.bench.figures import sections
-    from robotdiffuse.evaluation.bench.page import write_page, write_plots
-    from robotdiffuse.evaluation.bench.run_folder import read_bench
+    from robotdiffuse.core.tables import show
+    from robotdiffuse.evaluation.bench_report import bench_report, main_table, missing_line
+    from robotdiffuse.evaluation.comparison import read_bench, sections
 
     planners = None if arguments.planners is None else arguments.planners.split(",")
     limits = None if arguments.limits is None else _limits(arguments.limits)
     bench = read_bench(Path(arguments.folder), planners)
     parts = sections(bench, limits)
     out = Path(arguments.out or arguments.folder)
-    write_atomically(out / "report.md", report.markdown(bench, parts), make_folder=True)
-    write_atomically(out / "report.tex", report.latex(bench, parts))
     replays = None if arguments.no_replays else _write_replays(bench, parts, out / "replays.html")
-    write_page(bench, parts, out / "index.html", replays)
-    files = ["index.html", *([replays] if replays else []), "report.md", "report.tex"]
-    curves = write_plots(bench, parts, out)
-    print_bench(bench, parts)
-    print(f"wrote {', '.join(str(out / name) for name in files)} and {len(curves)} plots as .svg")
+    report = bench_report(bench, parts, replays)
+    report.write(out / "report.md")
+    write_atomically(out / "index.html", report.page)
+    for section in parts:
+        show(main_table(section, section.main, bench.reference))
+        print(missing_line(section.main), end="\n\n" if section.main.missing else "\n")
+    files = ["index.html", *([replays] if replays else []), "report.md"]
+    print(f"wrote {', '.join(str(out / name) for name in files)} and {len(report.plots)} plots as .svg")
     return 0
 
 
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
     """The name of the written file; None if there is no motion to replay."""
     from robotdiffuse.core.types import Path as Waypoints
-    from robotdiffuse.evaluation.bench.page import motions_to_replay
+    from robotdiffuse.evaluation.bench_report import motions_to_replay
     from robotdiffuse.visualization.gallery import GalleryEntry, write_gallery
 
     shown = motions_to_replay(bench, parts)
@@ -222,32 +220,18 @@ def _limits(text: str) -> list[float]:
         ) from None
 
 
-def print_bench(bench: "Bench", parts: "list[Section]") -> None:
-    """Print a table for each problem set, at the time limit that most planners were run with."""
-    from robotdiffuse.evaluation.bench.report import main_table, missing_line
-    from robotdiffuse.evaluation.tables import show
-
-    for section in parts:
-        show(main_table(section, section.main, bench.reference))
-        print(missing_line(section.main), end="\n\n" if section.main.missing else "\n")
-
-
 def run_confirm(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
-    from robotdiffuse.evaluation.tables import Table, show
-
-    try:
-        from robotdiffuse.evaluation.bench.confirm import confirm
-    except ImportError:
-        raise InputError('PyBullet is not installed: pip install "robotdiffuse[sim]"') from None
+    from robotdiffuse.core.tables import Table, show
+    from robotdiffuse.evaluation.checks import confirm
 
     with progress("checking problems") as update:
         found = confirm(Path(arguments.folder), arguments.count, update)
-    rows = [(planner, of.checked, len(of.refuted)) for planner, of in found.items()]
+    refuted = [record.planner for record, _ in found.refuted]
+    rows = [(planner, checked, refuted.count(planner)) for planner, checked in found.checked.items()]
     show(Table.of("", ("planner", "motions", "in collision (PyBullet)"), rows))
-    refuted = [each for confirmation in found.values() for each in confirmation.refuted]
-    for record, contact in refuted:
+    for record, contact in found.refuted:
         print(
             f"{record.planner}, {record.problem_set} {record.name}, seed {record.seed}: {contact.link} and "
             f"{contact.other}, {-1000 * contact.distance:.1f} mm deep"

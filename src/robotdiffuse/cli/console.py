@@ -122,7 +122,7 @@ def print_result(result: "PlanResult", asked: float | None = None) -> None:
 
     asked: the requested clearance, or the default one [m]; None: the planner keeps none.
     """
-    from robotdiffuse.evaluation.tables import Table, show
+    from robotdiffuse.core.tables import Table, show
 
     rows = [
         ("reason", result.reason),

@@ -2,9 +2,6 @@
 
 import argparse
 import os
-import sys
-import time
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,27 +21,11 @@ from robotdiffuse.problems.families import FAMILIES
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from robotdiffuse.generation import GenerationSettings
     from robotdiffuse.robots.robot import Robot
     from robotdiffuse.visualization.gallery import GalleryEntry
 
-LOG_INTERVAL = 60.0
-"""Time between two progress lines without a terminal [s]."""
-GENERATE_OPTIONS = (
-    "robot",
-    "planner",
-    "trajectories",
-    "seed",
-    "mix",
-    "trivial_share",
-    "target",
-    "goals",
-    "waypoints",
-    "timing",
-    "shard",
-)
-"""Options that are fields of GenerationSettings."""
-CLEAN, VIOLATIONS = 0, 1
+CLEAN = 0
+VIOLATIONS = 1
 FOLDER_HELP = "folder of `robotdiffuse data generate`"
 ROBOT_HELP = "the robot of the data, if the name in the manifest is not known here"
 
@@ -205,70 +186,33 @@ def _robot(name: str | None) -> "Robot | None":
 
 
 def run_generate(arguments: argparse.Namespace) -> int:
-    from dataclasses import replace
+    from dataclasses import fields, replace
 
-    from robotdiffuse.generation import GenerationSettings
-    from robotdiffuse.generation.solvers import SEARCHES
+    from robotdiffuse.generation import GenerationSettings, generate
+    from robotdiffuse.generation.factory import SEARCHES
 
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError(
             "--workers sets the processes on this machine; --cluster always uses all cores of the cluster"
         )
-    given = {
-        name: getattr(arguments, name) for name in GENERATE_OPTIONS if getattr(arguments, name) is not None
-    }
+    known = {field.name for field in fields(GenerationSettings)}
+    given = {name: value for name, value in vars(arguments).items() if name in known and value is not None}
     if arguments.planner is not None and arguments.planner != GenerationSettings.planner:
         given["search"] = SEARCHES.defaults(arguments.planner)
     settings = GenerationSettings(**given)
     if arguments.safety_distance is not None:
         search = replace(settings.search, safety_distance=arguments.safety_distance)
         settings = replace(settings, search=search)
-    made = generate_with_progress(settings, arguments.out, arguments.workers, arguments.cluster)
+    with progress("trajectories") as update:
+        workers = arguments.workers or os.cpu_count() or 1
+        made = generate(settings, Path(arguments.out), workers, arguments.cluster, update)
     print(f"{made:,} trajectories of {settings.waypoints} waypoints in {arguments.out}")
     return 0
 
 
-def generate_with_progress(
-    settings: "GenerationSettings", out: str | Path, workers: int | None = None, cluster: str | None = None
-) -> int:
-    """Run `generation.generate` with a progress bar; returns the number of motions made. Default: all
-    cores."""
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    from robotdiffuse.generation import generate
-
-    console = Console(stderr=True)
-    columns = (
-        *Progress.get_default_columns()[:2],
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[left]}"),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("trajectories", rate="", left="", total=settings.trajectories)
-        before, said = list[int](), [time.monotonic()]
-
-        def show(done: int, total: int) -> None:
-            if not before:
-                before.append(done)
-                bar.reset(task, completed=done)
-            elapsed, new = bar.tasks[0].elapsed, done - before[0]
-            if elapsed and new:
-                left = timedelta(seconds=round((total - done) * elapsed / new))
-                bar.update(task, completed=done, rate=f"{new / elapsed:.1f}/s", left=f"{left} left")
-                if not console.is_terminal and time.monotonic() > said[-1] + LOG_INTERVAL:
-                    said.append(time.monotonic())
-                    print(f"{done:,} of {total:,} trajectories, {left} left", file=sys.stderr, flush=True)
-
-        return generate(settings, Path(out), workers or os.cpu_count() or 1, cluster, show)
-
-
 def run_info(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.datasets.page import write_page
-    from robotdiffuse.evaluation.datasets.report import tables
-    from robotdiffuse.evaluation.tables import show
+    from robotdiffuse.core.tables import show
+    from robotdiffuse.evaluation.data_report import tables, write_page
 
     page = Path(arguments.page or Path(arguments.folder) / "report.html")
     show(*tables(write_page(arguments.folder, page, _robot(arguments.robot))))
@@ -277,8 +221,8 @@ def run_info(arguments: argparse.Namespace) -> int:
 
 
 def run_check(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.datasets.check import check_data
-    from robotdiffuse.evaluation.tables import show
+    from robotdiffuse.core.tables import show
+    from robotdiffuse.evaluation.checks import check_data
 
     with progress("checking motions") as update:
         check = check_data(
@@ -291,13 +235,13 @@ def run_check(arguments: argparse.Namespace) -> int:
             update,
         )
     show(*check.tables)
-    return CLEAN if check.clean else VIOLATIONS
+    return VIOLATIONS if check.findings else CLEAN
 
 
 def run_view(arguments: argparse.Namespace) -> int:
     from robotdiffuse.cli.drawing import show
     from robotdiffuse.core.output_files import check_output
-    from robotdiffuse.datasets.manifest import read_manifest
+    from robotdiffuse.datasets.shards import read_manifest
     from robotdiffuse.robots import load_robot
     from robotdiffuse.visualization.gallery import write_gallery
 
@@ -319,9 +263,8 @@ def run_view(arguments: argparse.Namespace) -> int:
 
 def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[GalleryEntry]":
     """Random motions, in the order of the shards."""
-    from robotdiffuse.datasets.manifest import read_manifest
-    from robotdiffuse.datasets.motion_rows import motion_of, scenes_of
-    from robotdiffuse.datasets.shards import random_rows
+    from robotdiffuse.datasets.rows import motion_of, scenes_of
+    from robotdiffuse.datasets.shards import random_rows, read_manifest
     from robotdiffuse.visualization.gallery import GalleryEntry
 
     manifest = read_manifest(folder)
@@ -337,7 +280,7 @@ def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "I
 
 
 def run_export(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.datasets.robot_npz import export_npz
+    from robotdiffuse.datasets.external import export_npz
 
     made, left_out = export_npz(arguments.folder, arguments.file)
     others = f"; left out {left_out:,}, whose scenes are not exactly two spheres" if left_out else ""
@@ -346,7 +289,7 @@ def run_export(arguments: argparse.Namespace) -> int:
 
 
 def run_import(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.datasets.robot_npz import import_npz
+    from robotdiffuse.datasets.external import import_npz
 
     with progress("importing motions") as update:
         made = import_npz(arguments.file, arguments.out, arguments.robot, arguments.radius, update)

@@ -17,7 +17,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.tables import Column, Table, show
+    from robotdiffuse.core.tables import Column, Table, show
     from robotdiffuse.planning import PLANNERS, planner_settings
 
     if arguments.planner is None:

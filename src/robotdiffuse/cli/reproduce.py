@@ -9,8 +9,9 @@ from robotdiffuse.cli.arguments import count, positive
 from robotdiffuse.core.ray_cluster import CLUSTERS
 
 if TYPE_CHECKING:
-    from robotdiffuse.evaluation.bench.run_folder import Bench
-    from robotdiffuse.evaluation.paper.table1 import Table1Settings
+    from robotdiffuse.evaluation.comparison import Bench
+    from robotdiffuse.evaluation.paper import Table1Settings
+    from robotdiffuse.evaluation.report import Report
 
 FIGURE_PROBLEMS = 60
 """Most problems of the plot of success against denoising steps."""
@@ -99,19 +100,24 @@ def _add_planning(parser: argparse.ArgumentParser) -> None:
 
 
 def run_table1(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.paper import page
+    from robotdiffuse.evaluation.paper import table1
 
     settings, bench = _table1(arguments)
-    print(f"wrote {page.write_table1(settings, bench)}")
+    return _write(table1(settings, bench), settings.out / "table1.md")
+
+
+def _write(report: "Report", file: Path) -> int:
+    report.write(file)
+    print(f"wrote {file}")
     return 0
 
 
 def _table1(arguments: argparse.Namespace) -> "tuple[Table1Settings, Bench]":
     """The settings of table 1, and its calls, of which the missing ones are made."""
     from robotdiffuse.cli.bench import calls_shown
-    from robotdiffuse.evaluation.paper import table1
+    from robotdiffuse.evaluation.paper import Table1Settings, run_table1
 
-    settings = table1.Table1Settings(
+    settings = Table1Settings(
         out=Path(arguments.out),
         problems=arguments.problems,
         time_limit=arguments.time_limit,
@@ -120,71 +126,59 @@ def _table1(arguments: argparse.Namespace) -> "tuple[Table1Settings, Bench]":
         cluster=arguments.cluster,
     )
     with calls_shown(settings.bench) as (report, done):
-        return settings, table1.run_table1(settings, report, done)
+        return settings, run_table1(settings, report, done)
 
 
 def run_table2(arguments: argparse.Namespace) -> int:
     import sys
+    from dataclasses import fields
 
     from robotdiffuse.learning import need_packages
 
     need_packages("the ablation", "torch")
-    from robotdiffuse.evaluation.paper import page, table2
+    from robotdiffuse.evaluation.ablation import ROWS, AblationSettings, run_ablation, table2
 
-    names = ("data", "out", "samples", "encoder_samples", "problems", "family", "seeds")
-    given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
-    settings = table2.AblationSettings(**given)
-    rows = list(table2.ROWS) if arguments.rows is None else arguments.rows.split(",")
-    results = table2.run_ablation(
+    known = {field.name for field in fields(AblationSettings)}
+    given = {name: value for name, value in vars(arguments).items() if name in known and value is not None}
+    settings = AblationSettings(**given)
+    rows = list(ROWS) if arguments.rows is None else arguments.rows.split(",")
+    results = run_ablation(
         settings, rows, arguments.workers, lambda text: print(text, file=sys.stderr, flush=True)
     )
-    print(f"wrote {page.write_table2(settings, results)}")
-    return 0
+    return _write(table2(settings, results), Path(settings.out) / "table2.md")
 
 
 def run_figures(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.core.output_files import write_atomically
-    from robotdiffuse.evaluation.bench.report import about
-    from robotdiffuse.evaluation.paper import figures, page
+    from robotdiffuse.evaluation import paper
+    from robotdiffuse.evaluation.bench_report import about
     from robotdiffuse.evaluation.problem_sets import hard_cases
     from robotdiffuse.visualization.picture import PictureSettings, write_comparison, write_picture
 
     settings, bench = _table1(arguments)
-    out, count = settings.out, min(settings.problems, FIGURE_PROBLEMS)
-    pictures = []
-
-    def keep(name: str, caption: str) -> Path:
-        pictures.append((caption, name))
-        return out / name
-
-    problem = hard_cases("rop", 1, out / "problems")[0].problem
-    for number, state in enumerate(figures.denoising(problem)):
-        file = keep(f"figure1_{number}.png", f"Figure 1: a motion at noise level {state.level:.2f} T")
-        size = PictureSettings(width=960, height=600, ghosts=8, azimuth=FIGURE_AZIMUTH)
-        write_picture(
-            problem.robot, problem.scene, state.path, file, title=f"{state.level:.2f} T", settings=size
-        )
-    by_steps = figures.plot_success_by_steps(figures.success_by_steps(out, count))
-    write_atomically(
-        keep("figure1_steps.svg", f"Figure 1: success against T, {count} problems, 95 % intervals"), by_steps
-    )
-    write_atomically(
-        keep("figure3a.svg", "Figure 3a: success over time, goals are poses, trivial problems too"),
-        figures.plot_success_over_time(bench),
-    )
-    compared = figures.compared_motions(bench)
-    if compared is not None:
-        robot, scene = compared.case.problem.standing()
-        file = keep("figure3b.png", "Figure 3b: motions of two planners, with a safety shell of 5 cm")
-        write_comparison(
-            robot,
-            scene,
-            compared.motions,
-            file,
-            title=compared.case.name,
-            settings=PictureSettings(shell=0.05),
-        )
+    out = settings.out
+    count = min(settings.problems, FIGURE_PROBLEMS)
     command = f"robotdiffuse reproduce figures --out FOLDER --problems {settings.problems} "
     command += f"--time-limit {settings.time_limit:g}"
-    print(f"wrote {page.write_page(out / 'figures.md', 'Figures', command, about(bench), (), pictures)}")
-    return 0
+    report = paper.paper_report("Figures", command)
+    report.add("## Figure 1")
+    problem = hard_cases("rop", 1, out / "problems")[0].problem
+    for number, state in enumerate(paper.denoising(problem)):
+        file = f"figure1_{number}.png"
+        size = PictureSettings(width=960, height=600, ghosts=8, azimuth=FIGURE_AZIMUTH)
+        title = f"{state.level:.2f} T"
+        write_picture(problem.robot, problem.scene, state.path, out / file, title=title, settings=size)
+        report.picture(file, f"A motion at noise level {title}")
+    by_steps = paper.plot_success_by_steps(paper.success_by_steps(out, count))
+    report.plot("figure1_steps.svg", f"Success against T, {count} problems, 95 % intervals", by_steps)
+    report.add("## Figure 3")
+    caption = "a: success over time, goals are poses, trivial problems too"
+    report.plot("figure3a.svg", caption, paper.plot_success_over_time(bench))
+    compared = paper.compared_motions(bench)
+    if compared is not None:
+        robot, scene = compared.case.problem.standing()
+        size = PictureSettings(shell=0.05)
+        title = compared.case.name
+        write_comparison(robot, scene, compared.motions, out / "figure3b.png", title=title, settings=size)
+        report.picture("figure3b.png", "b: motions of two planners, with a safety shell of 5 cm")
+    paper.add_notes(report, about(bench))
+    return _write(report, out / "figures.md")

@@ -102,7 +102,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def run_list(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.tables import Column, Table, show
+    from robotdiffuse.core.tables import Column, Table, show
     from robotdiffuse.learning.weights_registry import weights_for
     from robotdiffuse.robots import known_robots, load_robot
     from robotdiffuse.robots.robot_folder import read_source
@@ -176,7 +176,7 @@ def run_add(arguments: argparse.Namespace) -> int:
 def print_preparation(report: "AddReport") -> None:
     """Print links, the pairs with most false collisions, and the time and memory of preparation; warnings go
     to standard error."""
-    from robotdiffuse.evaluation.tables import Column, Table, show
+    from robotdiffuse.core.tables import Column, Table, show
 
     columns = ("link", "convex parts", "spheres", Column("stick-out", "mm", ".1f", scale=1e3), "covered")
     links = [
@@ -207,7 +207,7 @@ def print_preparation(report: "AddReport") -> None:
 
 def _print_pairs(report: "AddReport") -> None:
     """Print the number of allowed pairs of links by reason, and where they differ from the SRDF."""
-    from robotdiffuse.evaluation.tables import Column, Table, show
+    from robotdiffuse.core.tables import Column, Table, show
 
     reasons = Counter(pair.reason for pair in report.pairs)
     counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
@@ -222,8 +222,8 @@ def _print_pairs(report: "AddReport") -> None:
 
 def print_robot(robot: "Robot") -> None:
     """Print joints, limits, collision model and notes of a robot."""
+    from robotdiffuse.core.tables import Column, Table, show
     from robotdiffuse.core.transforms import inverse
-    from robotdiffuse.evaluation.tables import Column, Table, show
 
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
     joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]

@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def print_replay(robot: str, duration: float, done: "Replay") -> None:
     """Print tracking errors and contacts."""
-    from robotdiffuse.evaluation.tables import Column, Table, show
+    from robotdiffuse.core.tables import Column, Table, show
 
     title = f"{robot}: {'free' if done.free else 'contact'}, {duration:.2f} s"
     rms = float((done.tip_errors**2).mean() ** 0.5)

@@ -78,7 +78,8 @@ def train_for_robot(
 
     Raises InputError for an unknown robot, a folder of other settings, and too little disk space.
     """
-    from robotdiffuse.cli.data import generate_with_progress
+    from robotdiffuse.cli.console import progress
+    from robotdiffuse.generation import generate
     from robotdiffuse.learning.training.config import PlannerTraining
     from robotdiffuse.learning.training.planner import train_planner
     from robotdiffuse.learning.weights_registry import user_weights
@@ -95,7 +96,8 @@ def train_for_robot(
     defaults |= {"encoder": str(work / "encoder")}
     settings: PlannerTraining = make(defaults | given | {"data": str(work / "data"), "robot": source})
     _say(f"{robot.name}: {data.trajectories:,} motions, then training; all in {work}")
-    generate_with_progress(data, work / "data", workers)
+    with progress("trajectories") as update:
+        generate(data, work / "data", workers or os.cpu_count() or 1, progress=update)
     if "encoder" not in given:
         copy_bundled_encoder(work / "encoder")
     report = train_planner(settings, str(work))

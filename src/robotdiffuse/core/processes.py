@@ -170,6 +170,15 @@ class SingleWorker:
         pool.submit(_prepare_single, self._prepare, self._arguments)
         return pool.submit(call, *arguments)
 
+    @property
+    def ending(self) -> str:
+        """How the process ended that the last call was sent to: by a signal or with an exit status."""
+        for process in self._processes():
+            process.join(TERMINATE_TIMEOUT)
+            code = process.exitcode or 0
+            return f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
+        return "by request"
+
     def terminate(self, by: signal.Signals = signal.SIGTERM) -> None:
         """End the process, even during a call; the next call starts a new one."""
         pool, processes = self._pool, self._processes()

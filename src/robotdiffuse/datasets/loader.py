@@ -20,9 +20,8 @@ except ImportError:
     raise ImportError('RopDataset needs torch, not installed: pip install "robotdiffuse[train]"') from None
 
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.datasets.rows import read_rows
-from robotdiffuse.datasets.shards import SPLITS
+from robotdiffuse.datasets.shards import SPLITS, read_manifest
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.robots.robot import Robot
@@ -179,7 +178,7 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         return self._run(jobs)
 
     def _run(self, jobs: Iterator) -> Iterator[RopBatch]:
-        threads = min(MAX_THREADS, torch.get_num_threads()) if self.device.type == "cpu" else 1
+        threads = min(MAX_THREADS, torch.get_num_threads())
         # one thread makes a batch: PyTorch's own threads would wait for each other at every step
         pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
         waiting: deque = deque()

@@ -1,6 +1,6 @@
-"""Shards of a data set: the schema of rows, and files on disk.
+"""Data sets on disk: the manifest, the schema of rows, and shards.
 
-    FOLDER/manifest.json             robot, scenes and settings, see `manifest.py`
+    FOLDER/manifest.json             robot, scenes, settings and versions
     FOLDER/shard_00000.zarr/         a Zarr v3 group, one chunk per array
 
 A shard is written under a temporary name and renamed, so that a shard with its final name is complete. The
@@ -10,13 +10,14 @@ mapped to memory.
 
 import hashlib
 import json
+import os
 import re
 import shutil
 import sys
 import tempfile
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
 from types import ModuleType
 from typing import Any
@@ -25,11 +26,154 @@ import numpy as np
 from jaxtyping import Int, Int8
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.input_files import input_file
-from robotdiffuse.core.output_files import write_error
-from robotdiffuse.datasets.manifest import FORMAT, MANIFEST, Manifest, check_format
+from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.input_files import file_name, input_file, read_json
+from robotdiffuse.core.output_files import write_atomically, write_error
+from robotdiffuse.core.settings import Count, Natural, Settings
+from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.shapes import Box
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class Manifest(Settings):
+    """Robot, scenes, settings and versions of a data set."""
+
+    robot: str
+    """A bundled name, or the path of a URDF."""
+    robot_fingerprint: str
+    joint_names: tuple[str, ...]
+    lower: tuple[float, ...]
+    """Limits [rad]."""
+    upper: tuple[float, ...]
+    waypoints: Count
+    timing: str
+    """How waypoints are spaced: "arc", evenly in joint-space length, or "time"."""
+    families: dict[str, dict[str, Any]]
+    """Settings of each family of scenes; their order gives the numbers of the array `family`."""
+    floors: dict[str, dict[str, list[float]] | None]
+    """`center` and `size` of the box that the scenes of each family stand on [m]; None without one."""
+    slots: Natural
+    """Most obstacles of a scene."""
+    goals: Count
+    """Most goal configurations of a problem."""
+    trajectories: Natural
+    """Number of trajectories of the whole set."""
+    shard: Count
+    """Rows per shard."""
+    settings: dict[str, Any]
+    """Settings of the generation."""
+    versions: dict[str, str]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not len(self.joint_names) == len(self.lower) == len(self.upper) > 0:
+            raise InputError(
+                f"joint_names, lower and upper have {len(self.joint_names)}, {len(self.lower)} and "
+                f"{len(self.upper)} entries; they must have as many as there are joints"
+            )
+        if self.timing not in ("arc", "time"):
+            raise InputError(f"timing is {self.timing!r}; it must be arc or time")
+        if self.floors.keys() != self.families.keys():
+            raise InputError(f"floors are of {[*self.floors]}; they must be of {[*self.families]}")
+        for i in range(len(self.families)):
+            self.floor(i)
+
+    @classmethod
+    def of(
+        cls,
+        robot: Robot,
+        source: str,
+        *,
+        waypoints: int,
+        families: dict[str, dict[str, Any]],
+        floors: Mapping[str, Box | None],
+        slots: int,
+        goals: int,
+        trajectories: int,
+        shard: int,
+        settings: dict[str, Any],
+        versions: dict[str, str],
+        timing: str = "arc",
+    ) -> "Manifest":
+        """The manifest of data of a robot, which `source` names: the fields, with floors as boxes."""
+        records = {
+            name: None if floor is None else {"center": floor.center.tolist(), "size": floor.size.tolist()}
+            for name, floor in floors.items()
+        }
+        return cls(
+            source,
+            robot_fingerprint(robot),
+            robot.joint_names,
+            tuple(robot.lower.tolist()),
+            tuple(robot.upper.tolist()),
+            waypoints,
+            timing,
+            families,
+            records,
+            slots,
+            goals,
+            trajectories,
+            shard,
+            settings,
+            versions,
+        )
+
+    @property
+    def dof(self) -> int:
+        return len(self.joint_names)
+
+    def floor(self, family: int) -> Box | None:
+        """The box that the scenes of a family stand on; None without one."""
+        floor = list(self.floors.values())[family]
+        return None if floor is None else Box(**floor, name="floor")
+
+    def check_robot(self, robot: Robot) -> None:
+        """Raise InputError if the data were made with another robot."""
+        found = robot_fingerprint(robot)
+        if found != self.robot_fingerprint:
+            raise InputError(
+                f"the data are of the robot {self.robot} with fingerprint {self.robot_fingerprint}; "
+                f"{robot.name} has {found}; use the robot of the data"
+            )
+
+
+def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
+    """Write manifest.json atomically, making the folder. Raises InputError if it cannot be written."""
+    data = {"format": FORMAT, "dof": manifest.dof} | asdict(manifest)
+    write_atomically(FilePath(folder) / MANIFEST, json.dumps(data, indent=1) + "\n", make_folder=True)
+
+
+def read_manifest(folder: str | FilePath) -> Manifest:
+    """Read manifest.json. Raises InputError if it is missing, damaged or of another version of the format."""
+    file = file_name(folder, "folder") / MANIFEST
+    if not os.path.lexists(file):
+        raise InputError(f"no data set: there is no {file}; make one with: robotdiffuse data generate")
+    try:
+        data = read_json(file)
+    except InputError as error:
+        raise InputError(f"{file} is damaged: {error}") from None
+    if not isinstance(data, dict) or "format" not in data:
+        raise InputError(f"{file} is no manifest of a data set: it has no format")
+    check_format(file, data.pop("format"))
+    try:
+        data.pop("dof")
+        return Manifest.from_json(data, MANIFEST)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{file} is damaged: {error}") from None
+
+
+def check_format(file: FilePath, found: object) -> None:
+    """Raise InputError for another version of the format."""
+    if found != FORMAT:
+        raise InputError(f"{file}: format is {shown(found)}; this version reads {FORMAT}")
+
+
+# Shards
 
 COMPRESSION_LEVEL = 3
 """Of Zstandard."""
@@ -242,41 +386,29 @@ def _read_array(path: FilePath, group: Any, name: str) -> ndarray:
         raise InputError(f"{where}: missing")
     try:
         array = group[name]
-        found, ndim = array.dtype.str, len(array.shape)
-        files = sum(file.is_file() for file in (path / name).rglob("*"))
-        # zarr counts through all chunks, however many there should be
-        whole = array.nchunks <= files and array.nchunks_initialized == array.nchunks
+        kind = (array.dtype.str, array.ndim)
+        chunk = path / name / array.metadata.encode_chunk_key((0,) * array.ndim)
+        # zarr reads missing chunks as zeros
+        complete = not array.size or (array.chunks == array.shape and chunk.is_file())
     except _DAMAGE_ERRORS as error:
         raise InputError(f"{where} is damaged: {_line(error)}") from None
-    if found != dtype or ndim != 1 + len(row):
-        raise InputError(f"{where} is {found} with {ndim} axes; it must be {dtype} with {1 + len(row)}")
-    if not whole:
+    if kind != (dtype, 1 + len(row)):
+        raise InputError(f"{where} is {kind[0]} with {kind[1]} axes; it must be {dtype} with {1 + len(row)}")
+    if not complete:
         raise InputError(f"{where} is damaged: a chunk is missing")
     try:
-        if name == "trajectories" and _is_one_plain_chunk(array):
-            return _map(path / name, array)
-        return array[...]
+        if name != "trajectories" or not array.size:
+            return array[...]
+        size = chunk.stat().st_size
+        if size != array.nbytes:
+            raise ValueError(f"its chunk has {size:,} bytes; it must have {array.nbytes:,}")
+        return np.memmap(chunk, dtype, "r", shape=array.shape)
     except _DAMAGE_ERRORS as error:
         raise InputError(f"{where} is damaged: {_line(error)}") from None
 
 
 def _line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
-
-
-def _is_one_plain_chunk(array: Any) -> bool:
-    """Whether the array is one uncompressed file with the layout of memory."""
-    codecs = [codec.to_dict() for codec in array.metadata.codecs]
-    plain = len(codecs) == 1 and codecs[0]["name"] == "bytes"
-    return plain and codecs[0]["configuration"] == {"endian": "little"} and array.chunks == array.shape
-
-
-def _map(path: FilePath, array: Any) -> ndarray:
-    file = path / array.metadata.encode_chunk_key((0,) * array.ndim)
-    size, wanted = file.stat().st_size, array.dtype.itemsize * array.size
-    if size != wanted:
-        raise ValueError(f"its chunk has {size:,} bytes; it must have {wanted:,}")
-    return np.memmap(file, array.dtype, "r", shape=array.shape)
 
 
 def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> None:
@@ -322,15 +454,13 @@ def split_of(scenes: PackedScenes) -> Int8[ndarray, "n"]:
 
 def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, Int[ndarray, "n"]]:
     """Random rows without repetition from shards of these sizes; all if `count` is None."""
-    total, first, picked = sum(sizes.values()), 0, {}
-    if count is None or count >= total:
-        rows = np.arange(total)
-    else:
+    ends = np.cumsum([0, *sizes.values()])
+    total = int(ends[-1])
+    rows = np.arange(total)
+    if count is not None and count < total:
         rows = np.sort(np.random.default_rng(seed).choice(total, count, replace=False))
-    for index, size in sizes.items():
-        picked[index] = rows[(rows >= first) & (rows < first + size)] - first
-        first += size
-    return picked
+    parts = np.split(rows, np.searchsorted(rows, ends[1:-1])) if sizes else []
+    return {index: part - first for index, part, first in zip(sizes, parts, ends, strict=False)}
 
 
 def random_rows(folder: str | FilePath, count: int, seed: int) -> Iterator[tuple[Shard, Int[ndarray, "n"]]]:

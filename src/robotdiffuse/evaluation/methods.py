@@ -24,8 +24,17 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status
 from robotdiffuse.evaluation.metrics import Measure
-from robotdiffuse.evaluation.records import ENDED_EARLY, RAISED, RESTARTABLE, SHORTEST_FACTOR, SOLVED
-from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run
+from robotdiffuse.evaluation.runs import (
+    ENDED_EARLY,
+    RAISED,
+    RESTARTABLE,
+    SHORTEST_FACTOR,
+    SOLVED,
+    Clock,
+    Fields,
+    Method,
+    Run,
+)
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planning.diffusion.diffusion import ModelSampler, encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuseSettings
@@ -37,7 +46,7 @@ from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import VerifySettings, verifier
 
 if TYPE_CHECKING:
-    from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
+    from robotdiffuse.learning.motion_model import ClearanceFn
 
 NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4, guidance_scale=1.0)
 """Settings of networks that are measured alone; the planner's own number of steps is too small without
@@ -70,15 +79,16 @@ def planner_calls(
 ) -> Iterator[Fields]:
     """Yield the fields of a call's record; with `restarts`, if the call ended early, also those of
     `restarted`. An exception is a record too."""
-    measure, began = measure_of(problem.robot), time.perf_counter()
+    measure = measure_of(problem.robot)
+    began = time.perf_counter()
     try:
         with Clock() as clock:
             result = planner.plan(problem, time_limit=limit, seed=seed, **request)
-        yield {"cpu": round(clock.cpu, 6), **fields_of(result, measure)}
+        yield {"cpu": clock.fields["cpu"], **fields_of(result, measure)}
         if restarts and result.status.value in RESTARTABLE and result.planning_time < ENDED_EARLY * limit:
-            again, result = restarted(planner, problem, seed, limit, result, request)
-            yield {"restarts": again, **fields_of(result, measure)}
-    except Exception as error:
+            count, result = restarted(planner, problem, seed, limit, result, request)
+            yield {"restarts": count, **fields_of(result, measure)}
+    except (Exception, SystemExit) as error:
         traceback.print_exc()
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         yield {"status": RAISED, "reason": reason, "time": time.perf_counter() - began}
@@ -98,31 +108,30 @@ def restarted(
     found. Stops early if no shorter path exists. The time for timing the other paths does not count: a single
     call times its answer only.
     """
-    best, spent, least, again = first, first.planning_time, first.planning_time, 0
-    progress, straight = list(first.progress), _straight_length(problem)
-    while limit - spent > least and _length(best) > SHORTEST_FACTOR * straight:
-        again += 1
-        fresh = int(np.random.SeedSequence([seed, again]).generate_state(1)[0])
+    straight = 0.0
+    if isinstance(problem.goal, JointGoal):
+        straight = float(np.linalg.norm(problem.goal.positions - problem.start, axis=1).min())
+    best = first
+    spent = first.planning_time
+    shortest_call = spent
+    count = 0
+    progress = list(first.progress)
+    while limit - spent > shortest_call and _length(best) > SHORTEST_FACTOR * straight:
+        count += 1
+        fresh = int(np.random.SeedSequence([seed, count]).generate_state(1)[0])
         result = planner.plan(problem, time_limit=limit - spent, seed=fresh, **request)
         for at, length in result.progress:
             if not progress or length < progress[-1][1]:
                 progress.append((spent + at, length))
-        spent, least = spent + result.planning_time, min(least, result.planning_time)
-        if _length(result) < _length(best):
-            best = result
-    return again, replace(best, planning_time=spent, progress=tuple(progress))
+        spent += result.planning_time
+        shortest_call = min(shortest_call, result.planning_time)
+        best = min(best, result, key=_length)
+    return count, replace(best, planning_time=spent, progress=tuple(progress))
 
 
 def _length(result: PlanResult) -> float:
     """Length of the path [rad]; infinite without one."""
     return np.inf if result.path_length is None else result.path_length
-
-
-def _straight_length(problem: Problem) -> float:
-    """Distance from the start to the nearest goal configuration [rad]; 0 if goals are poses."""
-    if not isinstance(problem.goal, JointGoal):
-        return 0.0
-    return float(np.linalg.norm(problem.goal.positions - problem.start, axis=1).min())
 
 
 def fields_of(result: PlanResult, measure: Measure) -> Fields:
@@ -209,38 +218,24 @@ def sampling_digest(settings: RobotDiffuseSettings, folder: FilePath | None) -> 
 def from_network(
     sampler: ModelSampler,
     encoded: Callable[[Run], Problem] | None = None,
-    hidden: bool = False,
+    clearances: "ClearanceFn | None" = None,
 ) -> Draw:
     """Samples of the network: no refinement, no search, no shortcuts.
 
     encoded: the problem whose obstacles are encoded, in place of the run's own.
-    hidden: whether the clearances given to the denoiser are those without obstacles; guidance knows the
-        obstacles in any case.
+    clearances: inputs of the denoiser in place of the true ones.
     """
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:
-        problem, rng = run.problem, run.rng()
+        problem = run.problem
+        rng = run.rng()
         model = sampler.model(problem.robot)
         assert model is not None
         other = checker if encoded is None else CollisionChecker(problem.robot, encoded(run).scene)
         code = encode(model, other, sampler.settings.points, rng)
-        ends = problem.start, goal_of(problem)[None]
-        clearances = clearances_without_obstacles(model) if hidden else None
-        return sampler.draw(model, checker, code, *ends, rng, clearances)
+        return sampler.draw(model, checker, code, problem.start, goal_of(problem)[None], rng, clearances)
 
     return draw
-
-
-def clearances_without_obstacles(model: "MotionModel") -> "ClearanceFn":
-    """The clearance inputs of a model in a scene without obstacles."""
-    links, width = len(model.robot.links), model.dof if model.settings.clearance_gradients else 0
-
-    def clearances(q: ndarray) -> ndarray:
-        inputs = np.zeros((*q.shape[:2], links + width), np.float32)
-        inputs[..., :links] = model.settings.clearance_high
-        return inputs
-
-    return clearances
 
 
 def without_network(settings: RobotDiffuseSettings, waypoints: int, steps: int | None = None) -> Draw:

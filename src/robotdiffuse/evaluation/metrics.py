@@ -23,7 +23,9 @@ SAMPLE_TIME = 0.01
 """Time between the rows that smoothness is measured at [s]."""
 STANDSTILL = 1e-6
 """A motion shorter than this [rad] or [m] stands still."""
-CUTOFF, THRESHOLD, PADDING = 10.0, 0.05, 4
+CUTOFF = 10.0
+THRESHOLD = 0.05
+PADDING = 4
 """Of the spectral arc length, from its paper: highest frequency [Hz]; least amplitude as a share of that at
 frequency 0; zeros are appended up to 2 to the power PADDING times the length, or up to twice as many."""
 BENDING_SAMPLES = 129
@@ -85,10 +87,6 @@ class Motion:
     def fine(self) -> Float[ndarray, "n dof"]:
         return _fine(self.path.positions)
 
-    @cached_property
-    def even(self) -> tuple[Trajectory, float] | None:
-        return None if self.trajectory is None else _evenly(self.trajectory)
-
 
 @dataclass(frozen=True)
 class Metric:
@@ -116,54 +114,43 @@ def _clearance(name: str) -> Callable[[Motion], float | None]:
     return lambda motion: getattr(motion.verdict, name, None)
 
 
-def _duration(motion: Motion) -> float | None:
-    return None if motion.trajectory is None else motion.trajectory.duration
+def _timed(of: Callable[[Trajectory, Kinematics], float | None]) -> Callable[[Motion], float | None]:
+    """A metric of timed motions."""
+    return lambda motion: None if motion.trajectory is None else of(motion.trajectory, motion.kinematics)
 
 
-def _stops(motion: Motion) -> float | None:
-    return None if motion.trajectory is None else float(len(motion.trajectory.stops))
-
-
-def _over_straight_line(motion: Motion) -> float | None:
+def _over_straight_line(trajectory: Trajectory, kinematics: Kinematics) -> float | None:
     """Duration over the least time from the first row to the last along the straight line, obstacles and
     limits of jerk aside."""
-    robot = motion.kinematics.robot
-    if motion.trajectory is None or min(robot.velocity.min(), robot.acceleration.min()) <= 0:
+    robot = kinematics.robot
+    if min(robot.velocity.min(), robot.acceleration.min()) <= 0:
         return None
-    q = motion.trajectory.positions
+    q = trajectory.positions
     least = float(straight_line_time(q[0], q[-1], robot.velocity, robot.acceleration))
-    return motion.trajectory.duration / least if least > 0 else None
+    return trajectory.duration / least if least > 0 else None
 
 
 def _joint_jerk(of: Callable[[ndarray, ndarray], float]) -> Callable[[Motion], float | None]:
     """A metric of the jerks between rows, of the joint where each is largest, and of the steps' times."""
 
-    def value(motion: Motion) -> float | None:
-        if motion.trajectory is None or len(motion.trajectory.times) < 2:
+    def value(trajectory: Trajectory, _: Kinematics) -> float | None:
+        steps = np.diff(trajectory.times)
+        if not len(steps):
             return None
-        steps = np.diff(motion.trajectory.times)
-        jerks = np.abs(np.diff(motion.trajectory.accelerations, axis=0)) / steps[:, None]
+        jerks = np.abs(np.diff(trajectory.accelerations, axis=0)) / steps[:, None]
         return float(of(jerks.max(axis=1), steps))
 
-    return value
+    return _timed(value)
 
 
-def _jerk(motion: Motion) -> float | None:
-    return None if motion.trajectory is None else log_dimensionless_jerk(motion.trajectory)
-
-
-def _sparc_joint(motion: Motion) -> float | None:
-    if motion.even is None:
-        return None
-    even, step = motion.even
+def _sparc_joint(trajectory: Trajectory, _: Kinematics) -> float:
+    even, step = _evenly(trajectory)
     return spectral_arc_length(np.linalg.norm(even.velocities, axis=1), step)
 
 
-def _sparc_tip(motion: Motion) -> float | None:
-    if motion.even is None:
-        return None
-    even, step = motion.even
-    return spectral_arc_length(motion.kinematics.tip_speed(even), step)
+def _sparc_tip(trajectory: Trajectory, kinematics: Kinematics) -> float:
+    even, step = _evenly(trajectory)
+    return spectral_arc_length(kinematics.tip_speed(even), step)
 
 
 _METRICS = (
@@ -178,15 +165,15 @@ _METRICS = (
     Metric("min_clearance", "mm", "more", ".1f", _clearance("min_clearance"), 1000.0),
     Metric("scene_clearance", "mm", "more", ".1f", _clearance("scene_clearance"), 1000.0),
     Metric("self_clearance", "mm", "more", ".1f", _clearance("self_clearance"), 1000.0),
-    Metric("duration", "s", "less", ".2f", _duration),
-    Metric("over_straight_line", "", "less", ".3f", _over_straight_line),
-    Metric("stops", "", "less", ".2f", _stops),
+    Metric("duration", "s", "less", ".2f", _timed(lambda t, _: t.duration)),
+    Metric("over_straight_line", "", "less", ".3f", _timed(_over_straight_line)),
+    Metric("stops", "", "less", ".2f", _timed(lambda t, _: float(len(t.stops)))),
     Metric("peak_jerk", "rad/s³", "less", ".0f", _joint_jerk(lambda j, _: j.max())),
     Metric("mean_jerk", "rad/s³", "less", ".0f", _joint_jerk(lambda j, dt: np.average(j, weights=dt))),
     # logarithm of the dimensionless jerk
-    Metric("jerk", "", "less", ".2f", _jerk),
-    Metric("sparc_joint", "", "more", ".2f", _sparc_joint),
-    Metric("sparc_tip", "", "more", ".2f", _sparc_tip),
+    Metric("jerk", "", "less", ".2f", _timed(lambda t, _: log_dimensionless_jerk(t))),
+    Metric("sparc_joint", "", "more", ".2f", _timed(_sparc_joint)),
+    Metric("sparc_tip", "", "more", ".2f", _timed(_sparc_tip)),
 )
 METRICS = {metric.name: metric for metric in _METRICS}
 """Metrics by name, in the order of tables."""

@@ -1,4 +1,4 @@
-"""Runs: every case by every method with every seed, each validated and kept as a record.
+"""Runs: every case by every method with every seed, each validated and kept as a record, a line of JSON.
 
 A method takes a run and yields the fields of its records, with the validator's verdict; `methods` has those
 of planners and networks. An executor calls methods: in this process, one after the other (`in_this_process`),
@@ -7,19 +7,194 @@ or in the processes of a bench. Runs whose records are kept are not made again.
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path as FilePath
 from typing import Any
+from urllib.parse import quote, unquote
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 from rich.console import Console
 from rich.progress import Progress
 
-from robotdiffuse.evaluation.records import Record, RecordFile, record_of_row, record_path
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.types import Status
 from robotdiffuse.problems.held_out import SEED, Case
 from robotdiffuse.problems.problem import Problem
+
+SOLVED = Status.SOLVED.value
+CRASHED = "crashed"
+OVERRAN = "overran"
+RAISED = "exception"
+"""Statuses of records beside those of `types.Status`: the process died, did not answer, or the planner
+raised."""
+ENDED_EARLY = 0.9
+"""A call that took less than this share of its time limit ended by itself: a longer limit changes nothing."""
+SHORTEST_FACTOR = 1 + 1e-6
+"""A path counts as the shortest if it is at most so many times as long as the shortest known or possible
+one."""
+RESTARTABLE = {SOLVED, Status.TIMEOUT.value, Status.NO_PATH.value}
+"""Statuses that another seed can change."""
+RESTARTED = "+restarts"
+"""Suffix of a planner's name whose calls were repeated until the time limit."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One call on one problem."""
+
+    planner: str
+    """Name of the planner or other method."""
+    problem_set: str
+    name: str
+    """Of the problem, in its set."""
+    family: str
+    trivial: bool
+    seed: int
+    time_limit: float
+    """[s]"""
+    status: str
+    """Of `types.Status`, or crashed, overran, exception."""
+    reason: str
+    time: float
+    """Planning time, with validation and without timing the trajectory [s]."""
+    cpu: float | None = None
+    """CPU time [s], where it was measured."""
+    restarts: int | None = None
+    """How often the planner was called again; None if it was not to be."""
+    refused: str = ""
+    """Why the validator refused the last path, see PlanResult."""
+    stage: str = ""
+    progress: tuple[tuple[float, float], ...] = ()
+    """Time of each shorter path [s] and its joint-space length [rad]."""
+    passed: float | None = None
+    """Share of the samples of a batch that passed the validator."""
+    collided: float | None = None
+    """Share of the samples in collision."""
+    reference: float | None = None
+    """Length of the shortest known path [rad], see `held_out.Case`."""
+    measures: dict[str, float] = field(default_factory=dict)
+    """Of the returned motion, by the names of `metrics.METRICS`; in files they are fields of the line."""
+    memory: float | None = None
+    """Peak memory of the planner's process so far [MB]."""
+    run: str = ""
+    """Start of the session that made the call; empty if it was not noted."""
+    workers: int | str = ""
+    """Number of calls at a time, or the cluster."""
+    load: float | None = None
+    """Load average of the machine after the call."""
+    positions: tuple[tuple[float, ...], ...] = ()
+    """Waypoints of the returned path [rad]."""
+
+    @property
+    def key(self) -> tuple[str, str, int, float]:
+        """Identifies the record among those of its planner."""
+        return *self.case, self.time_limit
+
+    @property
+    def case(self) -> tuple[str, str, int]:
+        """Problem set, problem and seed."""
+        return self.problem_set, self.name, self.seed
+
+    @property
+    def joint_length(self) -> float | None:
+        """Of the returned path [rad]."""
+        return self.measures.get("joint_length")
+
+    @property
+    def solved(self) -> bool:
+        return self.status == SOLVED
+
+    @property
+    def ended_by_itself(self) -> bool:
+        """Whether a longer time limit would give the same."""
+        cut_off = self.status in (CRASHED, OVERRAN) or bool(self.restarts)
+        return not cut_off and self.time < ENDED_EARLY * self.time_limit
+
+    @property
+    def restartable(self) -> bool:
+        """Whether time was left for a call with another seed."""
+        return self.ended_by_itself and self.status in RESTARTABLE
+
+    @property
+    def in_collision(self) -> bool:
+        """Whether the validator refused the planner's last path because it collides."""
+        return not self.solved and self.refused.endswith("collision")
+
+    @property
+    def waypoints(self) -> Float[ndarray, "n dof"]:
+        return np.array(self.positions, np.float64)
+
+    def row(self) -> dict[str, Any]:
+        """The record as JSON data, without fields that have their defaults."""
+        defaults = {f.name: f.default for f in fields(self)}
+        values = asdict(self)
+        measures = values.pop("measures")
+        return {name: value for name, value in values.items() if value != defaults[name]} | measures
+
+
+def record_of_row(row: dict[str, Any]) -> Record:
+    """The record of JSON data. Unknown numbers are measures; raises TypeError for other unknown fields."""
+    measures = dict(row)
+    values = {f.name: measures.pop(f.name) for f in fields(Record) if f.name in row}
+    for name, value in measures.items():
+        if not isinstance(value, int | float):
+            raise TypeError(f"{name} is no field of a record and no number")
+    for name in ("progress", "positions"):
+        values[name] = tuple(map(tuple, values.get(name, ())))
+    return Record(**values, measures=measures)
+
+
+class RecordFile:
+    """The records of one method in the order of their making, in a file or in memory."""
+
+    def __init__(self, file: FilePath | None) -> None:
+        """Read the file without a last line that was cut off. Raises InputError, naming file and line, for
+        any other line that is no record."""
+        self._lines = JsonLines(file)
+        self.records: list[Record] = []
+        for number, row in enumerate(self._lines.rows, start=1):
+            try:
+                self.records.append(record_of_row(row))
+            except TypeError as error:
+                raise InputError(f"{file}, line {number} is no record: {error}") from None
+        self._keys = {record.key for record in self.records}
+
+    def append(self, record: Record) -> None:
+        """Write a record, which is on the disk when this returns, unless one with its key exists."""
+        if record.key not in self._keys:
+            self._lines.append(record.row())
+            self.records.append(record)
+            self._keys.add(record.key)
+
+
+def record_path(folder: FilePath, method: str) -> FilePath:
+    """The file of a method's records."""
+    return folder / "records" / f"{quote(method, safe='@:=,+ ')}.jsonl"
+
+
+def recorded(folder: FilePath) -> dict[str, FilePath]:
+    """The record files of a folder, by method."""
+    return {unquote(file.stem): file for file in sorted((folder / "records").glob("*.jsonl"))}
+
+
+def read_records(folder: FilePath, methods: Sequence[str] | None = None) -> dict[str, list[Record]]:
+    """Read the records of all methods, or of some, by name.
+
+    Raises InputError for a folder without records, for methods without any, and for damaged files.
+    """
+    files = recorded(folder)
+    if not files:
+        raise InputError(f"{folder} holds no records of a bench; `robotdiffuse bench run` makes them")
+    for name in methods or ():
+        if name not in files:
+            raise InputError(f"{folder} has no records of {name}; it has {', '.join(files)}")
+    return {name: RecordFile(files[name]).records for name in methods or files}
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +223,7 @@ class Run:
         """Random numbers, the same ones for all methods."""
         return np.random.default_rng([SEED, self.seed, self.index])
 
-    def record(self, found: "Fields") -> Record:
+    def record(self, values: "Fields") -> Record:
         """The record of this run with these fields."""
         about = {
             "planner": self.method,
@@ -61,7 +236,7 @@ class Run:
             "time_limit": self.limit,
             "reason": "",
         }
-        return record_of_row(about | found)
+        return record_of_row(about | values)
 
 
 Fields = dict[str, Any]
@@ -69,7 +244,7 @@ Fields = dict[str, Any]
 Method = Callable[[Run], Iterable[Fields]]
 """Yields the fields of one record, or of several if one call answers for several time limits."""
 Results = Generator[tuple[Run, list[Record]], None, None]
-Executor = Callable[[Sequence[Run]], Results]
+"""Runs with their records, in the order in which they end."""
 OnProgress = Callable[[str, int], None]
 """Called with a method and the number of its runs that are left."""
 
@@ -80,11 +255,13 @@ class Clock:
     wall = cpu = 0.0
 
     def __enter__(self) -> "Clock":
-        self._began = time.perf_counter(), time.process_time()
+        self._wall = time.perf_counter()
+        self._cpu = time.process_time()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.wall, self.cpu = time.perf_counter() - self._began[0], time.process_time() - self._began[1]
+        self.wall = time.perf_counter() - self._wall
+        self.cpu = time.process_time() - self._cpu
 
     @property
     def fields(self) -> Fields:
@@ -96,41 +273,40 @@ def runs_of(
 ) -> list[Run]:
     """All runs in their order: methods take turns on each case, so that other work on the machine affects
     them alike."""
-    names, numbered = list(methods), list(enumerate(cases))
-    return [Run(case, i, name, seed, limit) for seed in seeds for i, case in numbered for name in names]
+    names = list(methods)
+    return [
+        Run(case, i, name, seed, limit) for seed in seeds for i, case in enumerate(cases) for name in names
+    ]
 
 
-def execute_runs(
+def load_average() -> float:
+    """That of the machine over the last minute."""
+    return round(os.getloadavg()[0], 2)
+
+
+def keep_records(
     runs: Sequence[Run],
-    execute: Executor,
+    results: Results,
     files: Mapping[str, RecordFile],
     on_progress: OnProgress = lambda method, left: None,
 ) -> int:
-    """Make the runs, keeping each record at once; returns how many were made."""
-    left = {run.method: 0 for run in runs}
-    for run in runs:
-        left[run.method] += 1
-    made = 0
-    with closing(execute(runs)) as found:  # Ctrl-C ends the executor's processes too
-        for run, records in found:
+    """Keep the records of runs as they come; returns the number of runs made."""
+    left = Counter(run.method for run in runs)
+    with closing(results):  # Ctrl-C ends the processes of runs too
+        for run, records in results:
             for record in records:
                 files[record.planner].append(record)
-            made += 1
             left[run.method] -= 1
             on_progress(run.method, left[run.method])
-    return made
+    return len(runs) - left.total()
 
 
-def in_this_process(methods: Mapping[str, Method]) -> Executor:
-    """An executor that calls methods in this process, one after the other."""
-
-    def execute(runs: Sequence[Run]) -> Results:
-        for run in runs:
-            found = list(methods[run.method](run))
-            load = {"workers": 1, "load": round(os.getloadavg()[0], 2)}
-            yield run, [run.record(load | fields) for fields in found]
-
-    return execute
+def in_this_process(methods: Mapping[str, Method], runs: Sequence[Run]) -> Results:
+    """Make runs in this process, one after the other."""
+    for run in runs:
+        results = list(methods[run.method](run))
+        load = {"workers": 1, "load": load_average()}
+        yield run, [run.record(load | fields) for fields in results]
 
 
 def run_all(
@@ -148,13 +324,13 @@ def run_all(
     title: of the progress bar, which `bar` switches off.
     """
     files = {name: RecordFile(None if folder is None else record_path(folder, name)) for name in methods}
-    there = {(name, record.key) for name, file in files.items() for record in file.records}
+    recorded = {(name, record.key) for name, file in files.items() for record in file.records}
     runs = runs_of(cases, methods, seeds, limit)
-    todo = [t for t in runs if (t.method, t.key) not in there]
-    with Progress(transient=True, console=Console(stderr=True), disable=not bar) as shown:
-        task = shown.add_task(title, total=len(runs), completed=len(runs) - len(todo))
-        execute_runs(todo, in_this_process(methods), files, lambda *_: shown.advance(task))
-    order = {t.key: i for i, t in enumerate(runs)}
+    todo = [run for run in runs if (run.method, run.key) not in recorded]
+    with Progress(transient=True, console=Console(stderr=True), disable=not bar) as progress:
+        task = progress.add_task(title, total=len(runs), completed=len(runs) - len(todo))
+        keep_records(todo, in_this_process(methods, todo), files, lambda *_: progress.advance(task))
+    order = {run.key: i for i, run in enumerate(runs)}
     return {
         name: sorted((r for r in file.records if r.key in order), key=lambda record: order[record.key])
         for name, file in files.items()

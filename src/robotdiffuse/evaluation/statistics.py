@@ -1,7 +1,7 @@
-"""Confidence intervals, and paired comparisons of two planners on the same problems."""
+"""Confidence intervals, paired comparisons of two planners on the same problems, and the paper's ComScore."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -19,16 +19,14 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
 
     Unlike the interval by the standard error it stays within 0 and 1 and has a width at shares of 0 and 1.
     """
-    from scipy.stats import norm
+    from scipy.stats import binomtest
 
     if not 0 <= successes <= n:
         raise InputError(f"successes is {successes}; of {n} trials it must lie in 0 to {n}")
     if n == 0:
         return 0.0, 1.0
-    z, p = float(norm.ppf(0.975)), successes / n
-    middle, half = p + z**2 / (2 * n), z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
-    low, high = ((middle + side * half) / (1 + z**2 / n) for side in (-1, 1))
-    return max(low, 0.0), min(high, 1.0)
+    interval = binomtest(successes, n).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 def bootstrap_interval(
@@ -75,18 +73,67 @@ def compare(a: Float[ndarray, "n"], b: Float[ndarray, "n"]) -> Paired:
 
     if len(a) != len(b):
         raise InputError(f"a has {len(a)} problems, b {len(b)}; they must be the same problems")
-    solved_a, solved_b = ~np.isnan(a), ~np.isnan(b)
+    solved_a = ~np.isnan(a)
+    solved_b = ~np.isnan(b)
     both = solved_a & solved_b
-    a_only, b_only = int((solved_a & ~both).sum()), int((solved_b & ~both).sum())
+    a_only = int((solved_a & ~solved_b).sum())
+    b_only = int((solved_b & ~solved_a).sum())
     p_success = float(binomtest(a_only, a_only + b_only).pvalue) if a_only + b_only else 1.0
-    ratio = ratio_interval = None
+    ratio = None
+    ratio_interval = None
     p_length = 1.0
     if both.any():
         logs = np.log(np.maximum(a[both], TIE)) - np.log(np.maximum(b[both], TIE))
         logs[np.abs(logs) < TIE] = 0.0
         ratios = np.exp(logs)
-        ratio, ratio_interval = float(np.median(ratios)), bootstrap_interval(ratios, np.median)
+        ratio = float(np.median(ratios))
+        ratio_interval = bootstrap_interval(ratios, np.median)
         if logs.any():
             p_length = float(wilcoxon(logs).pvalue)  # pyright: ignore[reportAttributeAccessIssue]
-    neither = len(a) - a_only - b_only - int(both.sum())
+    neither = int((~solved_a & ~solved_b).sum())
     return Paired(a_only, b_only, int(both.sum()), neither, p_success, ratio, ratio_interval, p_length)
+
+
+# The paper's ComScore
+
+
+@dataclass(frozen=True)
+class Indicators:
+    """The four figures of a planner that ComScore weighs; NaN if unknown."""
+
+    success: float
+    """Share of problems solved, in any unit that all rows share (the paper: per cent)."""
+    collision: float
+    """Share of motions in collision."""
+    length: float
+    """Path length; in the paper that of all links, without a unit."""
+    time: float
+    """Time per problem [s]."""
+
+
+HIGHER_IS_BETTER = np.array([True, False, False, False])
+"""For the fields of Indicators, in their order."""
+
+
+def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
+    """V_norm of every row and indicator: 1 for the best of these rows, 0 for the worst, linear in between.
+
+    If all rows have the same indicator, where the paper's formulas give 0 / 0, it is 1 for all: each row is
+    as good as the best. An unknown indicator (NaN, such as the length if nothing was solved) is 0, as for the
+    worst.
+    """
+    values = np.array([astuple(row) for row in rows], dtype=np.float64).reshape(len(rows), 4)
+    if not len(rows):
+        return values
+    gains = np.where(HIGHER_IS_BETTER, values, -values)
+    worst, best = np.fmin.reduce(gains, axis=0), np.fmax.reduce(gains, axis=0)
+    span = best - worst
+    with np.errstate(invalid="ignore"):
+        share = np.where(span > 0, (gains - worst) / np.where(span > 0, span, 1.0), 1.0)
+    return np.where(np.isnan(values), 0.0, share)
+
+
+def comscores(rows: Sequence[Indicators]) -> Float[ndarray, "n"]:
+    """The ComScore of each row, in [0, 1], with the paper's equal weights. It depends on which rows are
+    compared."""
+    return normalized(rows).mean(axis=1)

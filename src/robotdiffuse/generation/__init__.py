@@ -1,7 +1,6 @@
 """Data generation: random problems solved by Shared-Tree Informed RRT* or AORRTC, validated, and kept in
 shards."""
 
-from robotdiffuse.generation.factory import generate
-from robotdiffuse.generation.settings import GenerationSettings
+from robotdiffuse.generation.factory import GenerationSettings, generate
 
 __all__ = ["GenerationSettings", "generate"]

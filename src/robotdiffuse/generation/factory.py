@@ -1,35 +1,268 @@
-"""Data generation into a folder of shards: makes the missing ones on this machine or on Ray."""
+"""Data generation into a folder of shards: draws random problems, solves and validates them, here or on Ray.
+
+A shard depends on the settings and its number alone.
+"""
 
 import json
 import platform
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
-from pathlib import Path
-from typing import Any
+from pathlib import Path as FilePath
+from typing import Annotated, Any
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
 
 from robotdiffuse import __version__
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.processes import delay_interrupts, on_this_machine
 from robotdiffuse.core.ray_cluster import CLUSTERS
-from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
-from robotdiffuse.datasets.shards import remove_leftovers, shard_indices, write_shard
-from robotdiffuse.generation.settings import GenerationSettings
-from robotdiffuse.generation.shard_maker import Arrays, Counts, make_shard
+from robotdiffuse.core.registry import Entry, Registry
+from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
+from robotdiffuse.core.types import Path
+from robotdiffuse.datasets.rows import Row, resample, row_of
+from robotdiffuse.datasets.shards import (
+    MANIFEST,
+    Manifest,
+    read_manifest,
+    remove_leftovers,
+    shard_indices,
+    write_manifest,
+    write_shard,
+)
+from robotdiffuse.generation.aorrtc_solver import AORRTCSearch, AORRTCSearchSettings
+from robotdiffuse.planning.search.shared_tree import SharedTreeSearch, SharedTreeSettings
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.families.family import POSE, POSITION, Family, SampledProblem
+from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.robots import load_robot, names_a_file
 from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.trajectories.timing import time_parameterize
+from robotdiffuse.validation.validator import Verifier, VerifySettings
 
 PACKAGES = ("numpy", "numba", "zarr")
+"""Packages that the data depend on."""
+SEARCHES = Registry(
+    "planner of data",
+    {
+        "shared_tree_rrt_star": Entry(
+            "robotdiffuse.planning.search.shared_tree:SharedTreeSearch",
+            "the paper's: one tree towards all goals of a target, with the cost of each",
+            "SharedTreeSettings",
+        ),
+        "aorrtc": Entry(
+            "robotdiffuse.generation.aorrtc_solver:AORRTCSearch",
+            "shorter paths in less time at the same safety distance, with the cost of one goal",
+            "AORRTCSearchSettings",
+        ),
+    },
+)
+"""Searches that solve the problems of data sets, by name."""
+TARGETS = (POSITION, POSE)
+TIMINGS = ("arc", "time")
+
+
+@dataclass(frozen=True)
+class GenerationSettings(Settings):
+    """Settings of a data set. The same settings give the same data, for any number of workers and
+    interruptions."""
+
+    robot: str = "panda"
+    """Bundled name, or path to a URDF."""
+    trajectories: Count = 140_000
+    """Solved and verified motions to make, each in a scene of its own (the paper: 0.14 million)."""
+    seed: Natural = 0
+    mix: dict[str, float] = field(default_factory=lambda: {"rop": 1.0})
+    """Relative shares of problems by family of scenes; the default is the paper's. Rows of the data hold the
+    number of their family in this order."""
+    trivial_share: Share = 1.0
+    """Share of the problems solved by the straight line that is kept; 1 is the paper's distribution."""
+    target: Annotated[str, OneOf(TARGETS)] = POSITION
+    """Goal of the tip: its position alone, as in the paper, or its pose. Among furniture it is always the
+    pose, such as with the fingers in a compartment."""
+    goals: Annotated[int, Bound(least=1.0, most=127.0)] = 10
+    """Most goal configurations of a target, found by inverse kinematics (the paper's k)."""
+    waypoints: Annotated[int, Bound(least=2.0)] = 254
+    """Waypoints of a trajectory (the authors' number)."""
+    timing: Annotated[str, OneOf(TIMINGS)] = "arc"
+    """Spacing of waypoints: evenly in joint-space length (arc), or in time by time parameterization
+    (time)."""
+    shard: Count = 500
+    """Trajectories in a shard, the most that an interruption loses."""
+    planner: Annotated[str, OneOf(SEARCHES)] = "shared_tree_rrt_star"
+    """Planner that solves the problems; the default is the paper's."""
+    search: Annotated[SharedTreeSettings | AORRTCSearchSettings, SettingsOf("planner", SEARCHES)] = field(
+        default=SharedTreeSettings(
+            resolution=0.02, improvement=0.01, patience=6, step_rounds=5, connect_iterations=800
+        )
+    )
+    """Settings of that planner; for the paper's planner faster than its defaults, at 1 % more length."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, share in self.mix.items():
+            if name not in FAMILIES:
+                raise unknown_name("family of scenes in mix", name, FAMILIES)
+            if not 0 < share < float("inf"):
+                raise InputError(f"mix: the share of {name} is {share}; it must be positive")
+        if not self.mix:
+            raise InputError(f"mix is empty; it must name a family: {', '.join(FAMILIES)}")
+
+    @property
+    def families(self) -> dict[str, Family]:
+        """The families of the mix, in its order and scaled to the robot."""
+        robot = load_robot(self.robot)
+        return {name: family_for(name, robot) for name in self.mix}
+
+    @property
+    def slots(self) -> int:
+        """Most obstacles of a scene, without the floor."""
+        return max(family.max_obstacles for family in self.families.values())
+
+    @property
+    def shards(self) -> int:
+        return -(-self.trajectories // self.shard)
+
+    def rows(self, index: int) -> int:
+        """Trajectories of a shard; the last shard may have fewer."""
+        return min(self.shard, self.trajectories - index * self.shard)
+
+
+# One shard
+
+MAX_PROBLEMS_PER_ROW = 50
+EXTRA_PROBLEMS = 1_000
+"""A shard is given up after so many problems for each row, and as many extra ones."""
+PROBLEMS_PER_SHARD = 2**32
+"""Problem numbers reserved for each shard, so that shards share none."""
+
+Arrays = dict[str, ndarray]
+Counts = dict[str, int]
+
+
+def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts]:
+    """Arrays and counts of a shard in the form of `datasets.shards`.
+
+    Counts are of problems: `tried` of all; `solved` are in the shard; `thinned` are trivial and left out; for
+    `unsolved` the search found no path; the validator rejected the motions of `refused`. Raises InputError if
+    hardly any problem can be solved.
+    """
+    robot, rows = load_robot(settings.robot), settings.rows(index)
+    kept: list[Row] = []
+    counts: Counts = dict.fromkeys(("tried", "solved", "thinned", "unsolved", "refused"), 0)
+    while len(kept) < rows:
+        if counts["tried"] >= MAX_PROBLEMS_PER_ROW * rows + EXTRA_PROBLEMS:
+            raise InputError(
+                f"only {len(kept)} of {counts['tried']} problems were solved for {robot.name}; a smaller "
+                f"safety_distance than {settings.search.safety_distance} m or other scenes may help"
+            )
+        number = index * PROBLEMS_PER_SHARD + counts["tried"]
+        counts["tried"] += 1
+        row = solve(settings, robot, number)
+        if isinstance(row, str):
+            counts[row] += 1
+        else:
+            kept.append(row)
+            counts["solved"] += 1
+    return {name: np.stack([row[name] for row in kept]) for name in kept[0]}, counts
+
+
+def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
+    """Solve the problem of a number: its row, or thinned, unsolved or refused."""
+    rng = np.random.default_rng([settings.seed, number])
+    family, drawn = draw(settings, robot, rng)
+    # goals of continuous joints are moved by whole turns as near to the start as possible
+    goals = np.stack([robot.equivalent_configurations(q, drawn.start)[0] for q in drawn.goals])
+    drawn = replace(drawn, goals=goals)
+    checker = CollisionChecker(robot, drawn.scene)
+    space = search_space(checker, settings.search.resolution)
+    lines_free = [bool(motions_free(space, np.stack([drawn.start, goal]))[0]) for goal in goals]
+    thinned = rng.random() >= settings.trivial_share
+    if thinned and all(lines_free):
+        return "thinned"  # for whichever goal a search chooses
+    search: SharedTreeSearch | AORRTCSearch = SEARCHES.load(settings.planner)(
+        checker, drawn.start, drawn.goals, settings.search, random_state(settings.seed, number)
+    )
+    search.run()
+    path = search.path()
+    if path is None:
+        return "unsolved"
+    goal, line_free = search.goals[search.best_goal], lines_free[search.best_goal]
+    if thinned and line_free:
+        return "thinned"
+    validator = Verifier(drawn.problem(robot), VerifySettings())
+    motion = _resampled(settings, robot, path, validator)
+    if motion is None:
+        return "refused"
+    times, q = motion
+    q[0], q[-1] = drawn.start, goal
+    if not validator.path(Path(robot.joint_names, q.astype(np.float64))).valid:
+        return "refused"
+    floor = list(settings.families.values())[family].floor
+    return row_of(
+        PackedScenes.pack([drawn.scene], settings.slots, floor is not None),
+        q,
+        checker.link_clearances(q).min(axis=1),
+        search.goals,
+        search.goal_costs,
+        search.best_goal,
+        drawn.T_base_tip,
+        family,
+        search.cost,
+        search.safety_distance,
+        line_free,
+        number,
+        settings.goals,
+        times if settings.timing == "time" else None,
+    )
+
+
+def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -> tuple[int, SampledProblem]:
+    """A random problem and the number of its family in the mix; it depends on the state of `rng` alone."""
+    shares = np.array(list(settings.mix.values()))
+    number = int(rng.choice(len(shares), p=shares / shares.sum()))
+    family = list(settings.families.values())[number]
+    return number, family.draw(robot, rng, settings.goals, settings.target)
+
+
+def _resampled(
+    settings: GenerationSettings, robot: Robot, path: Float32[ndarray, "n dof"], validator: Verifier
+) -> tuple[ndarray, Float32[ndarray, "waypoints dof"]] | None:
+    """Times and joint values of the waypoints; None if the validator rejects the timed motion."""
+    if settings.timing == "arc":
+        return np.zeros(0), resample(path[None], settings.waypoints, exact=True)[0]
+    waypoints = Path(robot.joint_names, path.astype(np.float64))
+    if not validator.path(waypoints).valid:
+        return None
+    timed = time_parameterize(
+        robot, waypoints, lambda motion: validator.trajectory(motion).valid, validator.collision_free
+    )
+    if not validator.trajectory(timed).valid:
+        return None
+    times = np.linspace(0.0, timed.duration, settings.waypoints)
+    rows = [np.interp(times, timed.times, timed.positions[:, j]) for j in range(robot.dof)]
+    return times, np.stack(rows, axis=1).astype(np.float32)
+
+
+# The folder
 
 
 def generate(
     settings: GenerationSettings,
-    out: Path,
+    out: FilePath,
     workers: int = 1,
     cluster: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
     """Make the shards that the folder lacks; returns the number of trajectories in all.
 
@@ -50,18 +283,14 @@ def generate(
         try:
             remove_leftovers(out)
             _claim(wanted, out)
-            return _fill(settings, out, workers, cluster, progress or _silent)
+            return _fill(settings, out, workers, cluster, progress)
         finally:
             remove_leftovers(out)
 
 
-def _silent(_done: int, _total: int) -> None:
-    """Ignore progress."""
-
-
 def _fill(
     settings: GenerationSettings,
-    out: Path,
+    out: FilePath,
     workers: int,
     cluster: str | None,
     progress: Callable[[int, int], None],
@@ -92,7 +321,7 @@ def _fill(
 
 def _as_absolute(settings: GenerationSettings) -> GenerationSettings:
     """The settings with an absolute path of the robot, for nodes with other working folders."""
-    file = Path(settings.robot)
+    file = FilePath(settings.robot)
     return replace(settings, robot=str(file.resolve())) if names_a_file(settings.robot) else settings
 
 
@@ -120,17 +349,13 @@ def versions() -> dict[str, str]:
 
 def manifest_of(settings: GenerationSettings) -> Manifest:
     """The manifest of a data set with these settings."""
-    robot = load_robot(settings.robot)
-    return Manifest(
-        robot=settings.robot,
-        robot_fingerprint=robot_fingerprint(robot),
-        joint_names=robot.joint_names,
-        lower=tuple(robot.lower.tolist()),
-        upper=tuple(robot.upper.tolist()),
+    return Manifest.of(
+        load_robot(settings.robot),
+        settings.robot,
         waypoints=settings.waypoints,
         timing=settings.timing,
         families={name: asdict(family) for name, family in settings.families.items()},
-        floors={name: floor_record(family.floor) for name, family in settings.families.items()},
+        floors={name: family.floor for name, family in settings.families.items()},
         slots=settings.slots,
         goals=settings.goals,
         trajectories=settings.trajectories,
@@ -140,7 +365,7 @@ def manifest_of(settings: GenerationSettings) -> Manifest:
     )
 
 
-def _claim(wanted: Manifest, out: Path) -> None:
+def _claim(wanted: Manifest, out: FilePath) -> None:
     """Write the manifest, or raise InputError if the folder's manifest is of other data."""
     if not (out / MANIFEST).exists():
         if shard_indices(out):

@@ -468,7 +468,7 @@ def _npz(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """The authors' data sets."""
     import io
 
-    from robotdiffuse.datasets.robot_npz import import_npz
+    from robotdiffuse.datasets.external import import_npz
 
     stream, x = io.BytesIO(), np.zeros((2, 254, 7), np.float32)
     x += np.array(PROBLEM["start"], np.float32)

@@ -9,8 +9,7 @@ import torch
 from helpers.box_arm import box_arm
 from helpers.stores import WAYPOINTS as STORED
 from helpers.stores import manifest_of, random_arrays
-from robotdiffuse.datasets.manifest import write_manifest
-from robotdiffuse.datasets.shards import write_shard
+from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.learning.checkpoint import save_encoder
 from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoder
 from robotdiffuse.learning.encoders.settings import PointAutoencoderSettings

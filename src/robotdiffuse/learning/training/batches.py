@@ -15,8 +15,7 @@ from torch import Tensor
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.datasets.augmentation import turns_about_vertical
-from robotdiffuse.datasets.rows import read_rows
+from robotdiffuse.datasets.rows import read_rows, turns_about_vertical
 from robotdiffuse.datasets.shards import SPLITS, shard_indices
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint

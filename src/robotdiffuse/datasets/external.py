@@ -1,0 +1,311 @@
+"""Data sets of motions that were made elsewhere: `rd.write_dataset`, and the layout of the paper's authors.
+
+In the authors' robot.npz `x_train` [n, 254, 7] are joint values [rad], and `y_train` [n, 23]: start 7, goal
+that was reached 7, centres of two spheres 6, position of the target 3 [m]. The authors' viewer sends the
+first 20; that the last three are the target's position is our interpretation of the 23. float32.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+from numpy.typing import ArrayLike
+
+from robotdiffuse import __version__
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.bounds import numbers
+from robotdiffuse.core.errors import InputError, distinct, shortened, shown
+from robotdiffuse.core.input_files import input_file
+from robotdiffuse.core.output_files import lock_folder, write_error
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.datasets.rows import Row, resample, row_of
+from robotdiffuse.datasets.shards import (
+    MANIFEST,
+    SPLITS,
+    Manifest,
+    check_shapes,
+    read_manifest,
+    read_shard,
+    shard_indices,
+    split_of,
+    write_manifest,
+    write_shard,
+)
+from robotdiffuse.problems.families import load_family
+from robotdiffuse.problems.problem_fields import LIMIT_SLACK
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
+from robotdiffuse.scenes.shapes import Box, Sphere
+
+ROWS_PER_SHARD = 500
+FAMILY = "own"
+"""Name of the family of all scenes of `write_dataset`."""
+RESOLUTION = 0.02
+"""No point of the arm moves further than this between two checks of the straight line [m]."""
+WAYPOINTS = 254
+DOF = 7
+CONDITION_NUMBERS = 23
+"""Of robot.npz."""
+SPHERE_RADIUS = 0.25
+"""[m]; that of the authors' planner. Their loader and viewer use 0.2, which leaves a margin of 5 cm."""
+END_TOLERANCE = 1e-4
+"""Largest difference of start and goal from the first and last waypoint [rad]."""
+ARRAYS_READ = ("trajectories", "start", "target_pose", "obstacle_kinds", "obstacle_params")
+
+
+def write_dataset(
+    paths: Iterable[Path | Trajectory | ArrayLike],
+    scenes: Scene | Sequence[Scene],
+    folder: str | FilePath,
+    robot: Robot | str = "panda",
+    waypoints: int = 254,
+) -> int:
+    """Make a data set of motions in an empty folder, to train on; returns their number.
+
+    paths: joint values of each motion, n x dof [rad] or [m], in the order of the robot's planned joints; or
+        paths and trajectories, of which the positions are taken. They are resampled evenly in joint space.
+    scenes: the scene of each motion, of spheres and boxes; or one for all. A first box named "floor" that all
+        scenes share is what the arm stands on, not an obstacle.
+    robot: a Robot, or what `load_robot` takes.
+    waypoints: rows of a stored motion.
+
+    Motions are not validated: `robotdiffuse data check` does. The target is the pose of the robot's tip at
+    the last waypoint. Training, validation and test are split by scene, so give many.
+
+    Raises InputError for joint values of the wrong shape or out of limits, other shapes, a folder that holds
+    data, and scenes of which none falls into the training split.
+    """
+    arm = robot if isinstance(robot, Robot) else load_robot(robot)
+    if waypoints < 2:
+        raise InputError(f"waypoints is {waypoints}; it must be at least 2")
+    motions = [_positions(arm, i, path) for i, path in enumerate(paths)]
+    if not motions:
+        raise InputError("paths is empty; a data set has at least one motion")
+    around = [scenes] * len(motions) if isinstance(scenes, Scene) else list(scenes)
+    if len(around) != len(motions) or not all(isinstance(scene, Scene) for scene in around):
+        raise InputError(
+            f"scenes are {len(around)}; they must be one rd.Scene, or one for each of {len(motions)} paths"
+        )
+    floor = _shared_floor(around)
+    slots = max(len(scene.shapes) for scene in around) - (floor is not None)
+    packed = PackedScenes.pack(around, slots, floor is not None)
+    if not (split_of(packed) == SPLITS.index("train")).any():
+        raise InputError(
+            "no scene falls into the training split, which takes most of them, by a hash; give more scenes"
+        )
+    q = np.stack([resample(motion[None].astype(np.float32), waypoints, exact=True)[0] for motion in motions])
+    about = {"families": {FAMILY: {}}, "floors": {FAMILY: floor}, "slots": slots}
+    about["settings"] = {"imported": "write_dataset"}
+    return _write(FilePath(folder), arm, arm.source or arm.name, around, q, about)
+
+
+def _write(
+    folder: FilePath,
+    robot: Robot,
+    source: str,
+    scenes: Sequence[Scene],
+    q: Float32[ndarray, "n waypoints dof"],
+    about: dict[str, Any],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> int:
+    """Write a data set into an empty folder; returns the number of its motions. about: further fields of the
+    manifest."""
+    manifest = Manifest.of(
+        robot,
+        source,
+        waypoints=q.shape[1],
+        goals=1,
+        trajectories=len(q),
+        shard=ROWS_PER_SHARD,
+        versions={"robotdiffuse": __version__},
+        **about,
+    )
+    packed = PackedScenes.pack(scenes, manifest.slots, manifest.floor(0) is not None)
+    with lock_folder(folder):
+        if (folder / MANIFEST).exists() or shard_indices(folder):
+            raise InputError(f"{folder} holds data already; write into another folder")
+        for index, first in enumerate(range(0, len(q), ROWS_PER_SHARD)):
+            rows = range(first, min(first + ROWS_PER_SHARD, len(q)))
+            made = [measured_row(robot, scenes[i], packed[i : i + 1], q[i], i) for i in rows]
+            arrays = {name: np.stack([row[name] for row in made]) for name in made[0]}
+            write_shard(folder, index, arrays, {"tried": len(made), "solved": len(made)})
+            progress(rows.stop, len(q))
+        write_manifest(folder, manifest)
+    return len(q)
+
+
+def measured_row(
+    robot: Robot, scene: Scene, packed: PackedScenes, q: Float32[ndarray, "waypoints dof"], number: int
+) -> Row:
+    """The row of a motion that was made elsewhere, by its number.
+
+    Clearances, its length and whether the straight line is free are measured; the safety distance is unknown
+    and 0.
+    """
+    ends = q[[0, -1]]
+    checker = CollisionChecker(robot, scene)
+    line = motions_free(search_space(checker, RESOLUTION), ends)
+    cost = float(np.linalg.norm(np.diff(q.astype(np.float64), axis=0), axis=1).sum())
+    return row_of(
+        packed,
+        q,
+        checker.link_clearances(q).min(axis=1, initial=1.0),
+        goals=q[-1:],
+        goal_costs=np.array([cost]),
+        goal_index=0,
+        T_base_tip=link_pose(robot, q[-1].astype(np.float64), robot.tip),
+        family=0,
+        cost=cost,
+        safety_distance=0.0,
+        line_free=bool(line[0] and checker.free(ends[:1])[0]),
+        seed=number,
+        most_goals=1,
+    )
+
+
+def _positions(robot: Robot, i: int, path: object) -> ndarray:
+    given = path.positions if isinstance(path, Path | Trajectory) else path
+    q = numbers(given)
+    if q is None or q.ndim != 2 or q.shape[1] != robot.dof or len(q) < 2:
+        names = ", ".join(robot.joint_names)
+        raise InputError(
+            f"paths[{i}] is {shown(given)}; it must be n x {robot.dof} numbers, n at least 2: {names}"
+        )
+    beyond = np.maximum(robot.lower - q, q - robot.upper)
+    beyond[:, robot.continuous] = 0
+    if not np.isfinite(q).all() or beyond.max() > LIMIT_SLACK:
+        row, j = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(q), beyond, np.inf))), q.shape)
+        value, lower, upper = distinct(q[row, j], robot.lower[j], robot.upper[j])
+        limits = f"its limits are {lower} to {upper} [rad]"
+        raise InputError(f"paths[{i}]: {robot.joint_names[j]} is {value} in row {row}; {limits}")
+    return q
+
+
+def _shared_floor(scenes: Sequence[Scene]) -> Box | None:
+    """The floor that all scenes begin with; None if there is none."""
+    firsts = [scene.shapes[0] if scene.shapes else None for scene in scenes]
+    floor = firsts[0]
+    if not isinstance(floor, Box) or floor.name != "floor" or floor.wxyz[0] != 1:
+        return None
+    same = (
+        isinstance(one, Box) and one.name == "floor" and np.array_equal(one.bounds, floor.bounds)
+        for one in firsts
+    )
+    return floor if all(same) else None
+
+
+# The layout of the paper's authors
+
+
+def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
+    """Write the trajectories of all scenes with exactly two spheres, atomically.
+
+    Returns their number, and the number of those that were left out.
+
+    Raises InputError if there is no data set, it has no such scene, other numbers of waypoints or joints, or
+    the file cannot be written.
+    """
+    manifest, file = read_manifest(folder), FilePath(file)
+    if (manifest.waypoints, manifest.dof) != (WAYPOINTS, DOF):
+        raise InputError(
+            f"{folder} has {manifest.waypoints} waypoints of {manifest.dof} joints; "
+            f"robot.npz holds {WAYPOINTS} waypoints of {DOF} joints"
+        )
+    x, y = [np.zeros((0, WAYPOINTS, DOF), np.float32)], [np.zeros((0, CONDITION_NUMBERS), np.float32)]
+    total = 0
+    for index in shard_indices(folder):
+        shard = read_shard(folder, index, ARRAYS_READ)
+        check_shapes(folder, shard, manifest)
+        total += len(shard["trajectories"])
+        kinds = shard["obstacle_kinds"]
+        rows = np.flatnonzero(((kinds == SPHERE).sum(1) == 2) & ((kinds != NONE).sum(1) == 2))
+        q, kinds = shard["trajectories"][rows], kinds[rows]
+        centers = shard["obstacle_params"][rows][kinds == SPHERE, :3].reshape(-1, 6)
+        x.append(q)
+        y.append(np.concatenate([shard["start"][rows], q[:, -1], centers, shard["target_pose"][rows, 4:]], 1))
+    x_train, y_train = np.concatenate(x), np.concatenate(y)
+    if not len(x_train):
+        raise InputError(f"{folder} has no scene of exactly two spheres, all that robot.npz can hold")
+    fresh = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        with open(fresh, "wb") as stream:
+            np.savez(stream, x_train=x_train, y_train=y_train)
+        os.replace(fresh, file)
+    except OSError as error:
+        raise write_error(file, error) from None
+    finally:
+        fresh.unlink(missing_ok=True)
+    return len(x_train), total - len(x_train)
+
+
+def import_npz(
+    file: str | FilePath,
+    folder: str | FilePath,
+    robot: str = "panda",
+    radius: float = SPHERE_RADIUS,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> int:
+    """Make a data set from a robot.npz in an empty folder; returns the number of its motions.
+
+    Scenes are two spheres of this radius [m] on ROP's floor. Motions are not validated; `robotdiffuse data
+    check` does. Clearances, lengths and whether the straight line is free are measured. The target is the
+    pose of the robot's tip at the last waypoint: the target in the file is that of the authors' arm, which
+    has no hand. The safety distance is unknown and set to 0. `progress` is called with the numbers of motions
+    done and in all.
+
+    Raises InputError if the file is no robot.npz, or the folder holds data or cannot be written.
+    """
+    arm, folder = load_robot(robot), FilePath(folder)
+    if arm.dof != DOF:
+        raise InputError(f"{arm.name} has {arm.dof} joints; robot.npz holds {DOF}")
+    if not radius > 0:
+        raise InputError(f"radius is {radius}; it must be positive")
+    q, centers = _read(file)
+    floor = load_family("rop").floor
+    assert floor is not None
+    scenes = [Scene([floor, *(Sphere(center, radius) for center in pair)]) for pair in centers]
+    about = {
+        "families": {"rop": {"kinds": ["sphere"], "sphere_radius": [radius, radius]}},
+        "floors": {"rop": floor},
+        "slots": 2,
+        "settings": {"imported": FilePath(file).name, "radius": radius},
+    }
+    return _write(folder, arm, robot, scenes, q, about, progress)
+
+
+def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[ndarray, "n 2 3"]]:
+    """The motions, and the centres of the two spheres of each."""
+    wanted = {"x_train": (WAYPOINTS, DOF), "y_train": (CONDITION_NUMBERS,)}
+    input_file(file, largest=sys.maxsize)
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            x, y = (np.asarray(stored[name], np.float32) for name in wanted)
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}") from None
+    except Exception as error:  # NumPy, zipfile and Python's tokenizer raise many types of exceptions
+        raise InputError(f"{file} is no robot.npz: {shortened(str(error))}") from None
+    for (name, row), array in zip(wanted.items(), (x, y), strict=True):
+        if array.shape != (len(x), *row) or not len(x):
+            shape = " x ".join(map(str, ("n", *row)))
+            raise InputError(f"{file}: {name} has shape {array.shape}; it must be {shape}, with n at least 1")
+        if not np.isfinite(array).all():
+            raise InputError(f"{file}: {name} holds numbers that are not finite")
+    for name, stated, found in (("start", y[:, :DOF], x[:, 0]), ("goal", y[:, DOF : 2 * DOF], x[:, -1])):
+        off = np.abs(stated - found).max(axis=1)
+        if off.max() > END_TOLERANCE:
+            end = "first" if name == "start" else "last"
+            raise InputError(
+                f"{file}: row {off.argmax()} has a {name} that differs from its {end} waypoint by "
+                f"{off.max():.3g} rad; they must be the same"
+            )
+    return x, y[:, 2 * DOF : 2 * DOF + 6].reshape(-1, 2, 3)

@@ -1,0 +1,337 @@
+"""The paper's Table 2: every row is trained with the same budget and evaluated on the same held-out problems.
+
+Collision guidance alone, without a network, solves many problems. What a row owes to its network is measured
+without guidance, and by a control: guidance of trajectories that do not come from a network.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path as FilePath
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.processes import Workers
+from robotdiffuse.core.settings import Count, OneOf, Settings
+from robotdiffuse.core.tables import Column, Table
+from robotdiffuse.datasets.shards import read_manifest
+from robotdiffuse.evaluation.comparison import Mean
+from robotdiffuse.evaluation.methods import (
+    NETWORK_ALONE,
+    from_network,
+    sampled,
+    sampling_digest,
+    without_network,
+)
+from robotdiffuse.evaluation.metrics import Kinematics
+from robotdiffuse.evaluation.paper import paper_report, share_cells, straight_line_shares
+from robotdiffuse.evaluation.problem_sets import hard_cases
+from robotdiffuse.evaluation.report import Report, interval
+from robotdiffuse.evaluation.runs import Record, run_all
+from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.learning.checkpoint import load_model
+from robotdiffuse.learning.training.config import EncoderTraining
+from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+from robotdiffuse.learning.training.encoder import train_encoder
+from robotdiffuse.learning.training.planner import train_planner
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.families.rop import ROP, Rop
+from robotdiffuse.problems.held_out import Case
+from robotdiffuse.robots import load_robot
+
+ENCODER = "compression_autoencoder"
+CONTROL = "no network"
+"""Smooth noise about the straight line in place of a network's samples."""
+CONTROL_WAYPOINTS = 48
+"""As many as those of the rows' networks."""
+STOP_TIMEOUT = 20.0
+"""A stopped training writes a checkpoint; it is killed after this time [s]."""
+
+
+class Row(NamedTuple):
+    config: str
+    """Name in `learning.training.configs`."""
+    guided: bool
+    """Whether samples are drawn under collision guidance."""
+    paper: tuple[float | None, ...]
+    """The paper's success [%], collision [%], length and time [s]; None if it has no such row."""
+
+
+ROWS: dict[str, Row] = {
+    "PointNet": Row("table2_pointnet", True, (69.4, 26.7, 17.154, 42)),
+    "DGCNN": Row("table2_dgcnn", True, (73.4, 22.5, 16.864, 64)),
+    "U-Net": Row("table2_unet", True, (59.3, 29.7, 17.358, 27)),
+    "Transformer": Row("table2_transformer", True, (69.0, 16.5, 17.137, 32)),
+    "Decoder-only": Row("table2_decoder_only", True, (62.8, 23.8, 16.195, 23)),
+    "Noise": Row("table2_noise", True, (64.5, 41.6, 17.628, 15)),
+    "Joint-only": Row("table2_joint", False, (68.1, 21.1, 16.148, 15)),
+    "Joint&Point": Row("table2_joint_point", False, (74.0, 19.5, 14.762, 15)),
+    "JPC": Row("table2_jpc", False, (79.1, 9.2, 14.571, 15)),
+    "Ours": Row("table2_jpc", True, (84.9, 9.8, 14.218, 15)),
+}
+
+
+@dataclass(frozen=True)
+class AblationSettings(Settings):
+    """Data, budgets and problems of Table 2."""
+
+    data: str
+    """Folder of a data set."""
+    out: str
+    """Folder for the trained networks; existing ones are kept, interrupted trainings continue."""
+    samples: Count = 300_000
+    """Training samples of each row, the equal budget."""
+    encoder_samples: Count = 300_000
+    """Clouds that the frozen encoder is trained on first."""
+    problems: Count = 500
+    """Held-out problems that the straight line does not solve and search does."""
+    family: Annotated[str, OneOf(FAMILIES)] = "rop"
+    """Family of the problems, a name in `problems.families`."""
+    candidates: Count = 16
+    """Trajectories sampled for each problem."""
+    seeds: Count = 1
+    """Trainings of each row, with seeds 0, 1, ...; figures are means over them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Figures of a network, one value for each problem."""
+
+    single: Float[ndarray, "n"]
+    """Share of the sampled trajectories that passed the validator."""
+    best: Float[ndarray, "n"]
+    """1 if any of them passed."""
+    collided: Float[ndarray, "n"]
+    """Share of the sampled trajectories in collision."""
+    length: Float[ndarray, "n"]
+    """Link path length of the shortest that passed [m]; NaN without one."""
+    seconds: Float[ndarray, "n"]
+    """CPU time of encoding and sampling on one thread [s]."""
+
+    @classmethod
+    def of(cls, records: list[Record]) -> "Evaluation":
+        figures = [(r.passed, r.collided, r.measures.get("link_length", np.nan), r.cpu) for r in records]
+        single, collided, length, seconds = np.array(figures, np.float64).T
+        return cls(single, (single > 0) * 1.0, collided, length, seconds)
+
+    @classmethod
+    def mean(cls, of: "list[Evaluation]") -> "Evaluation":
+        """The mean over several trainings, of each problem; NaN lengths do not count."""
+        values = [np.stack([getattr(each, f.name) for each in of]) for f in fields(cls)]
+        return cls(*(np.ma.masked_invalid(x).mean(axis=0).filled(np.nan) for x in values))
+
+
+class RowResult(NamedTuple):
+    name: str
+    alone: Evaluation
+    """Without guidance."""
+    guided: Evaluation
+    """With it."""
+    by_seed: tuple[float, ...] = ()
+    """Share of samples that pass the validator, as in the paper's row, of each training."""
+
+    @property
+    def as_in_paper(self) -> Evaluation:
+        return self.guided if self.name not in ROWS or ROWS[self.name].guided else self.alone
+
+
+def run_ablation(
+    settings: AblationSettings,
+    rows: list[str],
+    workers: int = 1,
+    report: Callable[[str], None] = lambda text: None,
+) -> list[RowResult]:
+    """Train the networks of the rows and evaluate every row. After an interruption, the same call continues.
+
+    Raises InputError for an unknown row, listing the known ones, and for data of another robot.
+    """
+    for name in rows:
+        if name not in ROWS:
+            raise unknown_name("row of Table 2", name, ROWS)
+    if workers < 1:
+        raise InputError(f"workers is {workers}; it must be at least 1")
+    read_manifest(settings.data).check_robot(load_robot("panda"))
+    out = FilePath(settings.out)
+    configs = dict.fromkeys(ROWS[name].config for name in rows)
+    trainings = [Training(config, seed) for config in configs for seed in range(settings.seeds)]
+    evaluations: dict[tuple[Training | None, bool], Evaluation] = {}
+    with lock_folder(out), Workers(workers, STOP_TIMEOUT) as pool:
+        if not (out / ENCODER / "encoder.json").exists():
+            report(f"training {ENCODER}: {settings.encoder_samples:,} clouds")
+            encoder = EncoderTraining(name=ENCODER, minutes=None, samples=settings.encoder_samples)
+            train_encoder(encoder, str(out / ENCODER))
+        _training(out / ENCODER / "encoder.json", "encoder_samples", settings.encoder_samples)
+        digests = {}
+        for _, training in pool.each(_train, [(settings, training) for training in trainings]):
+            about = _training(out / training.folder / "model.json", "samples", settings.samples)
+            digests[training.folder] = about["data"]
+            report(f"trained {training.folder}")
+        if len(set(digests.values())) > 1:
+            found = ", ".join(f"{name} {digest}" for name, digest in digests.items())
+            raise InputError(f"{out} holds networks of different data: {found}; use another folder")
+        cases = hard_cases(settings.family, settings.problems, out / "problems", report)
+        todo = [(settings, which, guided, cases) for which in (*trainings, None) for guided in (False, True)]
+        for number, evaluation in pool.each(_evaluate, todo):
+            _, which, guided, _ = todo[number]
+            evaluations[which, guided] = evaluation
+            name = which.folder if which else CONTROL
+            how = "with" if guided else "without"
+            report(f"evaluated {name} {how} guidance: {100 * evaluation.single.mean():.1f} % of samples")
+    results = []
+    for name in rows:
+        row = ROWS[name]
+        alone, guided = (
+            [evaluations[Training(row.config, seed), guided] for seed in range(settings.seeds)]
+            for guided in (False, True)
+        )
+        by_seed = tuple(float(of.single.mean()) for of in (guided if row.guided else alone))
+        results.append(RowResult(name, Evaluation.mean(alone), Evaluation.mean(guided), by_seed))
+    return [*results, RowResult(CONTROL, evaluations[None, False], evaluations[None, True])]
+
+
+class Training(NamedTuple):
+    """One training of a row's network."""
+
+    config: str
+    seed: int
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder of its weights."""
+        return f"{self.config}_seed{self.seed}" if self.seed else self.config
+
+
+def _training(file: FilePath, name: str, budget: int) -> dict[str, Any]:
+    """What a network's file says of its training. Raises InputError if that had another budget."""
+    about = json.loads(file.read_text())["training"]
+    samples = about["settings"]["samples"]
+    if samples != budget:
+        raise InputError(
+            f"{file.parent} was trained with {name} {samples}, now it is {budget}; use another folder, "
+            "or the same budget"
+        )
+    return about
+
+
+def _train(settings: AblationSettings, training: Training) -> Training:
+    out = FilePath(settings.out) / training.folder
+    if not (out / "model.json").exists():
+        given = {"data": settings.data, "samples": settings.samples, "seed": training.seed}
+        if "encoder" not in CONFIGS[training.config].changes:
+            given["encoder"] = str(FilePath(settings.out) / ENCODER)
+        train_planner(planner_training(training.config, given), str(out))
+    return training
+
+
+def _evaluate(
+    settings: AblationSettings, training: Training | None, guided: bool, cases: list[Case]
+) -> Evaluation:
+    robot = load_robot("panda")
+    folder = FilePath(settings.out) / (training.folder if training else CONTROL.replace(" ", "_"))
+    steps = NETWORK_ALONE.guidance_steps if guided else 0
+    planner = replace(NETWORK_ALONE, samples=settings.candidates, guidance_steps=steps)
+    if training is None:
+        draw = without_network(planner, CONTROL_WAYPOINTS)
+    else:
+        encoder = load_model(str(folder), robot).encoder
+        assert encoder is not None  # every row has one
+        planner = replace(planner, weights=str(folder), points=encoder.settings.cloud)
+        draw = from_network(RobotDiffuse(planner))
+    digest = sampling_digest(planner, None if training is None else folder)
+    method = {f"{'guided' if guided else 'unguided'} {digest}": sampled(draw, Kinematics(robot).link_length)}
+    (records,) = run_all(cases, method, seeds=(1,), folder=folder, bar=False).values()
+    return Evaluation.of(records)
+
+
+NOTES = (
+    "single: share of samples that pass the validator; best: of problems with at least one such sample.",
+    "length: of the shortest such sample, over the problems that have one; to first: the mean ratio to that "
+    "of the first row, over the problems that both solve. Intervals are over problems, not over trainings: "
+    "another seed may move a row by more.",
+    f"{CONTROL}: smooth noise about the straight line, which networks start from, under the same guidance.",
+)
+LINE_FAMILIES = {"spheres and cubes": ROP, "spheres alone": Rop(kinds=("sphere",))}
+LINE_NOTES = (
+    "The straight line in joint space, under the authors' own draw of problems, with inverse kinematics of "
+    "the position alone: share of problems on which it is free. The paper's rows are of all problems, "
+    "trivial ones too, so a row near these shares has shown no planner.",
+)
+
+
+def table2(settings: AblationSettings, results: list[RowResult]) -> Report:
+    """Table 2 and, beside its rows, no planner at all."""
+    command = (
+        f"robotdiffuse reproduce table2 --data DATA --out FOLDER --samples {settings.samples} "
+        f"--encoder-samples {settings.encoder_samples} --problems {settings.problems} "
+        f"--seeds {settings.seeds}"
+    )
+    report = paper_report("Table 2", command)
+    report.table(table(settings, results), level=2)
+    report.table(straight_line_table(settings.problems), level=2)
+    return report
+
+
+def table(settings: AblationSettings, results: list[RowResult]) -> Table:
+    """The rows of Table 2, with the paper's figures beside ours."""
+    known = asdict(settings)
+    budget = ("samples", "encoder_samples", "problems", "candidates")
+    title = f"Table 2 on {settings.family}: {', '.join(f'{name} {known[name]:,}' for name in budget)}"
+    several = settings.seeds > 1
+    columns = (
+        *("row", "guided"),
+        *(Column("single", "%", ".1f", "more", scale=100.0), "95 %"),
+        Column("best", "%", ".1f", "more", scale=100.0),
+        *(Column("collision", "%", ".1f", "less", scale=100.0), "95 %"),
+        Column("length", "m", ".3f", "less"),
+        Column("to first", "", ".3f", "less"),
+        Column("CPU", "ms", ".0f", "less", scale=1000.0),
+        *(Column("unguided", "%", ".1f", "more", scale=100.0), "95 %"),
+        *(("each seed",) if several else ()),
+        *("paper: suc", "col", "len", "s"),
+    )
+    first = results[0].as_in_paper
+    rows = []
+    for result in results:
+        evaluation = result.as_in_paper
+        paper = ROWS[result.name].paper if result.name in ROWS else (None,) * 4
+        by_seed = ", ".join(f"{100 * x:.1f}" for x in result.by_seed)
+        row = (
+            result.name,
+            "yes" if evaluation is result.guided else "no",
+            *_share(evaluation.single),
+            float(evaluation.best.mean()),
+            *_share(evaluation.collided),
+            Mean.of(evaluation.length).value,
+            Mean.of(evaluation.length / first.length).value,
+            float(np.median(evaluation.seconds)),
+            *_share(result.alone.single),
+            *((by_seed,) if several else ()),
+            *paper,
+        )
+        rows.append(row)
+    return Table.of(title, columns, rows, NOTES)
+
+
+def straight_line_table(problems: int) -> Table:
+    """No planner under the authors' own draw, beside the paper's rows of Table 2."""
+    rows = [(f"paper: {name}", float(row.paper[0] or 0), "") for name, row in ROWS.items()]
+    for obstacles, family in LINE_FAMILIES.items():
+        for goals, free in straight_line_shares(problems, family).items():
+            name = f"no planner: straight line to {goals}, {obstacles}"
+            rows.append((name, *share_cells(free, problems)))
+    columns = ("row", Column("success", "%", ".1f"), "95 %")
+    rows.sort(key=lambda row: row[1])
+    return Table.of(
+        f"No planner among the paper's rows: {problems} problems drawn", columns, rows, LINE_NOTES
+    )
+
+
+def _share(values: Float[ndarray, "n"]) -> tuple[float, str]:
+    """Mean of shares, and its 95 % interval in per cent."""
+    return float(values.mean()), interval(*bootstrap_interval(values), scale=100.0)

@@ -1,0 +1,375 @@
+"""Checks of motions. Of a data set: every shard is complete, and motions pass the validator and PyBullet on
+meshes; problems are rebuilt from their rows alone, results of the generation are not trusted. Of a bench: its
+motions pass PyBullet, a second validator with its own kinematics.
+"""
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError, distinct
+from robotdiffuse.core.processes import Workers, in_order
+from robotdiffuse.core.tables import Column, Table
+from robotdiffuse.core.types import Path
+from robotdiffuse.datasets.rows import path_of, problem_of, scenes_of
+from robotdiffuse.datasets.shards import (
+    Manifest,
+    Shard,
+    check_shard,
+    existing_shards,
+    pick_rows,
+    read_manifest,
+    read_shard,
+)
+from robotdiffuse.evaluation.problem_sets import read_cases
+from robotdiffuse.evaluation.runs import Record, read_records
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.validation.validator import Verifier, VerifySettings
+
+if TYPE_CHECKING:
+    from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle
+
+KINDS: dict[str, str] = {
+    "damaged": "shards damaged",
+    "ends": "start or goal not exact",
+    "limits": "joint limits exceeded",
+    "collision": "collisions found by the validator",
+    "pybullet": "collisions found by PyBullet",
+    "motion": "refused by the validator for other reasons",
+    "cost": "length or detour not as recorded",
+    "clearance": "clearance not as recorded",
+}
+"""Kinds of findings, with their titles."""
+EXAMPLES_PER_KIND = 5
+"""Findings of each kind that are listed."""
+
+LIMIT_SLACK = 1e-6
+"""Tolerance of limits [rad], as waypoints are in single precision."""
+CLEARANCE_TOLERANCE = 1e-4
+"""Largest difference of the recorded clearance from the least one of the waypoints by covering spheres
+[m]."""
+COST_TOLERANCE = 0.05
+"""Largest share by which waypoints, which cut corners, may be shorter than the recorded length."""
+ROUNDING = 1e-4
+"""Largest share by which waypoints may be longer than the recorded length; also the tolerance of the
+detour."""
+PYBULLET_STEP = 0.01
+"""PyBullet checks every waypoint, and configurations between them at most this far apart [rad, joint-space
+L2]."""
+PYBULLET_TOLERANCE = 0.001
+"""Contacts of less depth are rounding errors of Bullet [m]."""
+MOTIONS_PER_TASK = 100
+"""Motions of a shard that a process checks in one task."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A defect."""
+
+    kind: str
+    """One of KINDS."""
+    shard: int
+    row: int | None
+    """None for the whole shard."""
+    message: str
+
+    @property
+    def where(self) -> str:
+        return f"shard {self.shard}" + ("" if self.row is None else f", row {self.row}")
+
+
+@dataclass(frozen=True)
+class DataCheck:
+    """The result of a check."""
+
+    robot: str
+    shards: int
+    """Shards, complete or damaged."""
+    motions: int
+    """Motions in complete shards."""
+    planned: int
+    """Motions according to the manifest."""
+    checked: int
+    """Motions that were validated."""
+    pybullet: bool
+    """Whether PyBullet checked too."""
+    findings: tuple[Finding, ...]
+    """By shard and row."""
+    least_clearance: float
+    """Least recorded distance between arm and obstacles of the validated motions [m]; NaN without any."""
+    seconds: float
+    """Wall time."""
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Findings by kind."""
+        return Counter(finding.kind for finding in self.findings)
+
+    @property
+    def tables(self) -> list[Table]:
+        """A table of the result, and one of the first examples of each kind."""
+        planned = f" of {self.planned:,} planned" if self.motions < self.planned else ""
+        rate = self.checked / max(self.seconds, 1e-9)
+        rows = [
+            ("shards, motions", f"{self.shards:,}, {self.motions:,}{planned}"),
+            ("validated", f"{self.checked:,} in {self.seconds:.1f} s ({rate:.0f}/s)"),
+            *((name, f"{self.counts[kind]:,}") for kind, name in KINDS.items()),
+            ("least clearance recorded", f"{1e3 * self.least_clearance + 0.0:.3f} mm"),
+        ]
+        if not self.pybullet:
+            rows = [(name, "not checked" if name == KINDS["pybullet"] else text) for name, text in rows]
+        tables = [Table.pairs(f"{self.robot}: {'violations found' if self.findings else 'clean'}", rows)]
+        if self.findings:
+            examples = [
+                (finding.kind, finding.where, finding.message)
+                for kind in KINDS
+                for finding in [f for f in self.findings if f.kind == kind][:EXAMPLES_PER_KIND]
+            ]
+            columns = ("first examples", Column("where", left=True), Column("what", left=True))
+            tables.append(Table.of("", columns, examples))
+        return tables
+
+
+def check_data(
+    folder: str | FilePath,
+    robot: Robot | None = None,
+    count: int | None = None,
+    seed: int = 0,
+    workers: int = 1,
+    pybullet: bool = True,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> DataCheck:
+    """Check the structure of every shard, and `count` random motions (all by default).
+
+    The problem of each motion is rebuilt from its row. The validator checks ends, limits and collisions;
+    PyBullet checks collisions on meshes at and between the waypoints. Recorded values are compared with
+    measured ones.
+
+    robot: that of the data; None: found by the name in the manifest.
+    workers: processes; the motions and findings do not depend on them.
+    progress: called with the numbers of motions done and in all, first with 0.
+
+    Raises InputError if there is no data set, for another robot than that of the data, and if PyBullet is
+    asked for but not installed.
+    """
+    began = time.perf_counter()
+    manifest = read_manifest(folder)
+    robot = load_robot(manifest.robot) if robot is None else robot
+    manifest.check_robot(robot)
+    if pybullet:
+        _pybullet()
+    indices = existing_shards(folder)
+    task = _Task(str(folder), manifest, robot, pybullet)
+    motions = min(manifest.trajectories, sys.maxsize if count is None else count)
+    workers = min(workers, max(len(indices), -(-motions // MOTIONS_PER_TASK)))
+    done = 0
+    least = np.inf
+    with Workers(workers if workers > 1 else 0) as processes:
+        sizes = dict(zip(indices, in_order(processes.each(task.size, [(i,) for i in indices])), strict=True))
+        findings = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
+        rows = {i: size for i, size in sizes.items() if isinstance(size, int)}
+        parts = [
+            (index, chosen[i : i + MOTIONS_PER_TASK])
+            for index, chosen in pick_rows(rows, count, seed).items()
+            for i in range(0, len(chosen), MOTIONS_PER_TASK)
+        ]
+        total = sum(len(chosen) for _, chosen in parts)
+        progress(done, total)
+        results = in_order(processes.each(task.validate, parts))
+        for (_, chosen), (part, clearance) in zip(parts, results, strict=True):
+            findings += part
+            least = min(least, clearance)
+            done += len(chosen)
+            progress(done, total)
+    return DataCheck(
+        robot=robot.name,
+        shards=len(indices),
+        motions=sum(rows.values()),
+        planned=manifest.trajectories,
+        checked=done,
+        pybullet=pybullet,
+        findings=tuple(findings),
+        least_clearance=least if done else float("nan"),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _pybullet() -> "type[PyBulletOracle]":
+    try:
+        from robotdiffuse.simulation.validator import PyBulletOracle
+    except ModuleNotFoundError as error:
+        if error.name != "pybullet":
+            raise
+        raise InputError(
+            "the second validator needs PyBullet, whose wheels stop at Python 3.11: pip install "
+            "'robotdiffuse[sim]'; `data check` can leave it out by --no-pybullet (pybullet=False)"
+        ) from None
+    return PyBulletOracle
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """The work of a process; it is pickled."""
+
+    folder: str
+    manifest: Manifest
+    robot: Robot
+    pybullet: bool
+
+    def size(self, index: int) -> int | str:
+        """Number of rows of a shard, or the defect of the shard."""
+        try:
+            return len(check_shard(self.folder, index, self.manifest))
+        except InputError as error:
+            return str(error)
+
+    def validate(self, index: int, rows: Int[ndarray, "n"]) -> tuple[list[Finding], float]:
+        """Findings in some rows of a shard, and the least clearance recorded."""
+        shard = read_shard(self.folder, index)
+        findings = [
+            Finding(kind, index, row, text)
+            for row in rows.tolist()
+            for kind, text in _defects(self, shard, row)
+        ]
+        if self.pybullet:
+            findings += self._pybullet_findings(shard, rows)
+        least = float(shard["clearance"][rows].min(initial=np.inf))
+        return sorted(findings, key=lambda finding: finding.row or 0), least
+
+    def _pybullet_findings(self, shard: Shard, rows: Int[ndarray, "n"]) -> Iterator[Finding]:
+        with _pybullet()(self.robot, Scene([])) as oracle:
+            for row in rows.tolist():
+                try:
+                    oracle.set_scene(scenes_of(self.manifest, shard, slice(row, row + 1)).scene(0))
+                except InputError:
+                    continue  # already a finding
+                path = path_of(self.robot, shard, row)
+                contact = oracle.check_path(path, PYBULLET_STEP, PYBULLET_TOLERANCE)
+                if contact is not None:
+                    depth, at = -1e3 * contact.distance, contact.at
+                    text = f"{contact.link} is {depth:.1f} mm inside {contact.other} at waypoint {at:.2f}"
+                    yield Finding("pybullet", shard.index, row, text)
+
+
+def _defects(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
+    """Kind and message of each defect of a motion, without PyBullet."""
+    robot = task.robot
+    path = path_of(robot, shard, row)
+    yield from _ends(shard, row)
+    yield from _limits(robot, path.positions)
+    yield from _lengths(shard, row, path)
+    try:
+        problem = problem_of(task.manifest, robot, shard, row)
+    except InputError as error:
+        yield "motion", f"makes no problem: {error}"
+        return
+    violation = Verifier(problem, VerifySettings()).path(path).violation
+    if violation is not None and violation.kind.endswith("collision"):
+        yield "collision", f"{violation.message} at waypoint {violation.time:.2f}"
+    elif violation is not None and violation.kind not in ("limits", "start"):
+        yield "motion", violation.message
+    clearances = CollisionChecker(robot, problem.scene).link_clearances(path.positions)
+    clearances = clearances.min(axis=1, initial=1.0)
+    recorded = {"clearance": shard["clearance"][row, None], "end_clearance": shard["end_clearance"][row]}
+    measured = {"clearance": clearances.min(keepdims=True), "end_clearance": clearances[[0, -1]]}
+    for name, values in recorded.items():
+        worst = int(np.abs(values - measured[name]).argmax())
+        stated = float(values[worst])
+        value = float(measured[name][worst])
+        if abs(stated - value) > CLEARANCE_TOLERANCE:
+            yield "clearance", f"{name} is {1e3 * stated:.2f} mm; measured: {1e3 * value:.2f} mm"
+
+
+def _ends(shard: Shard, row: int) -> Iterator[tuple[str, str]]:
+    q = shard["trajectories"][row]
+    goals = shard["goals"][row]
+    goal = int(shard["goal_index"][row])
+    off = np.abs(q[0] - shard["start"][row]).max()
+    if off:
+        yield "ends", f"the first waypoint differs from the start by {off:.3g}"
+    if not 0 <= goal < len(goals) or np.isnan(goals[goal]).any():
+        yield "ends", f"goal_index is {goal}; there is no such goal"
+        return
+    off = np.abs(q[-1] - goals[goal]).max()
+    if off:
+        yield "ends", f"the last waypoint differs from goal {goal} by {off:.3g}"
+
+
+def _limits(robot: Robot, q: Float[ndarray, "n dof"]) -> Iterator[tuple[str, str]]:
+    excess = np.maximum(robot.lower - q, q - robot.upper)
+    excess[:, robot.continuous] = 0.0
+    if excess.max() > LIMIT_SLACK:
+        i, j = np.unravel_index(excess.argmax(), excess.shape)
+        value, low, high = distinct(q[i, j], robot.lower[j], robot.upper[j])
+        name = robot.joint_names[j]
+        yield "limits", f"{name} is {value} at waypoint {i}; its limits are {low} to {high}"
+
+
+def _lengths(shard: Shard, row: int, path: Path) -> Iterator[tuple[str, str]]:
+    cost = float(shard["cost"][row])
+    detour = float(shard["detour"][row])
+    if not cost * (1 - COST_TOLERANCE) - ROUNDING <= path.length <= cost * (1 + ROUNDING) + ROUNDING:
+        yield "cost", f"cost is {cost:.4f} rad; the waypoints are {path.length:.4f} rad long"
+    straight = float(np.linalg.norm(path.positions[-1] - path.positions[0]))
+    if abs(detour * straight - cost) > ROUNDING * max(cost, 1.0):
+        ratio = cost / max(straight, 1e-9)
+        yield "cost", f"detour is {detour:.4f}; cost over the straight distance is {ratio:.4f}"
+
+
+# Motions of a bench
+
+CONFIRM_STEP = 0.02
+"""Between checked configurations [rad, joint-space L2]."""
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    checked: dict[str, int]
+    """Number of checked motions by planner."""
+    refuted: "list[tuple[Record, OracleContact]]"
+    """Motions that were returned as solved and collide by PyBullet, with the first contact."""
+
+
+def confirm(out: FilePath, count: int | None, progress: Callable[[int, int], None]) -> Confirmation:
+    """Check the returned motions in a folder of `bench run`.
+
+    count: first problems of each set; None: all.
+    progress: called with the numbers of problems done and in all.
+
+    Raises InputError if the folder holds no records or is damaged, and without PyBullet.
+    """
+    oracle = _pybullet()
+    records = [record for of in read_records(out).values() for record in of]
+    solved: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        if record.solved:
+            solved.setdefault((record.problem_set, record.name), []).append(record)
+    sets = {name: read_cases(out, name) for name in sorted({record.problem_set for record in records})}
+    lost = solved.keys() - {case.key for cases in sets.values() for case in cases}
+    if lost:
+        problem_set, name = min(lost)
+        raise InputError(f"{out}/problems lacks {name} of {problem_set}, which has results")
+    chosen = [case for cases in sets.values() for case in cases[:count] if case.key in solved]
+    checked = {record.planner: 0 for record in records}
+    refuted: list[tuple[Record, OracleContact]] = []
+    for done, case in enumerate(chosen, start=1):
+        robot = case.problem.robot
+        with oracle(robot, case.problem.scene) as validator:
+            for record in solved[case.key]:
+                contact = validator.check_path(Path(robot.joint_names, record.waypoints), CONFIRM_STEP)
+                checked[record.planner] += 1
+                if contact is not None:
+                    refuted.append((record, contact))
+        progress(done, len(chosen))
+    return Confirmation(checked, refuted)

@@ -1,0 +1,114 @@
+"""A report: texts, tables and plots as Markdown, and the same as an HTML page that needs no network."""
+
+import html
+import platform
+import re
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path as FilePath
+
+from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.tables import Table, markdown, plain
+
+STYLE = """
+body { max-width: 1320px; margin: 0 auto; padding: 24px; color: #222b38; background: white;
+  font: 14px/1.45 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
+nav { position: sticky; top: 0; padding: 8px 0; background: white; }
+nav a { margin-right: 16px; }
+h2 { margin-top: 36px; padding-top: 12px; border-top: 1px solid #ccd2d9; }
+table { display: block; overflow-x: auto; border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: 4px 9px; border-bottom: 1px solid #eef0f3; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+strong { color: #0a7d5e; }
+svg { max-width: 100%; height: auto; }
+"""
+
+
+class Report:
+    """Blocks of Markdown in their order, and plots."""
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self.blocks = [f"# {plain(title)}"]
+        self.plots: dict[str, str] = {}
+        """SVG by file name."""
+
+    def add(self, *blocks: str) -> None:
+        """Add blocks of Markdown."""
+        self.blocks += blocks
+
+    def items(self, texts: Iterable[str]) -> None:
+        """Add a list."""
+        self.add("\n".join(f"- {text}" for text in texts))
+
+    def table(self, table: Table, level: int = 3) -> None:
+        """Add a table below its title, a heading of this level."""
+        if table.title:
+            self.add(f"{level * '#'} {plain(table.title)}")
+        self.add("\n".join(markdown(table)))
+
+    def plot(self, file: str, caption: str, svg: str) -> None:
+        """Add a plot, which is to lie in a file beside the report."""
+        self.plots[file] = svg
+        self.picture(file, caption)
+
+    def picture(self, file: str, caption: str) -> None:
+        """Add a picture in a file beside the report."""
+        self.add(plain(caption), f"![{FilePath(file).stem}]({file})")
+
+    @property
+    def markdown(self) -> str:
+        return "\n\n".join(self.blocks) + "\n"
+
+    @property
+    def page(self) -> str:
+        """The report as HTML, with its plots in it and links to its parts."""
+        from markdown_it import MarkdownIt
+
+        body = MarkdownIt().enable("table").render(self.markdown)
+        for file, svg in self.plots.items():
+            # references into another plot would draw nothing
+            svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{FilePath(file).stem}-", svg)
+            body = re.sub(rf'<img src="{re.escape(file)}"[^>]*>', lambda _, svg=svg: svg, body)
+        titles = re.findall("<h2>(.*?)</h2>", body)
+        for i, title in enumerate(titles):
+            body = body.replace(f"<h2>{title}</h2>", f'<h2 id="part-{i}">{title}</h2>', 1)
+        links = "".join(f'<a href="#part-{i}">{title}</a>' for i, title in enumerate(titles))
+        head = (
+            '<!doctype html>\n<html lang="en">\n<head><meta charset="utf-8">'
+            f"<title>{html.escape(self.title)}</title>"
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"<style>{STYLE}</style></head>\n<body><nav>{links}</nav>\n"
+        )
+        return f"{head}{body}</body></html>\n"
+
+    def write(self, file: FilePath) -> None:
+        """Write the report as Markdown, and its plots beside."""
+        write_atomically(file, self.markdown, make_folder=True)
+        for name, svg in self.plots.items():
+            # the text is dark
+            write_atomically(file.with_name(name), svg.replace("<svg ", '<svg style="background: white" ', 1))
+
+
+def interval(low: float, high: float, digits: int = 1, scale: float = 1.0) -> str:
+    """The ends of an interval as a text."""
+    return f"{scale * low:.{digits}f} to {scale * high:.{digits}f}"
+
+
+def processor() -> str:
+    """The name of the processor."""
+    info = FilePath("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = (line.split(": ")[1] for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
+
+
+def versions(packages: Iterable[str]) -> dict[str, str]:
+    """Versions of packages; `none` for one that is not installed."""
+    numbers = {}
+    for name in packages:
+        try:
+            numbers[name] = version(name)
+        except PackageNotFoundError:
+            numbers[name] = "none"
+    return numbers

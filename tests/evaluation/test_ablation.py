@@ -1,0 +1,115 @@
+"""Configs by name, metrics of motions, and the runner of Table 2."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.example_robots import planar_arm
+from robotdiffuse.cli import main
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation import ablation
+from robotdiffuse.evaluation.metrics import Kinematics
+from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.denoisers.transformer import Transformer
+from robotdiffuse.learning.encoders import make_encoder
+from robotdiffuse.learning.motion_network import MotionNetwork
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+from robotdiffuse.learning.training.planner import model_settings
+from robotdiffuse.robots import load_robot
+
+PANDA = load_robot("panda")
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_every_config_makes_a_model(name: str) -> None:
+    given = {"data": "data"} if "encoder" in CONFIGS[name].changes else {"data": "data", "encoder": "folder"}
+    settings = planner_training(name, given)
+    encoder = settings.encoder if settings.jointly else "compression_autoencoder"
+    made = None if settings.encoder is None else make_encoder(encoder or "")
+    model = MotionNetwork(RobotIdentity.of(PANDA), model_settings(settings, made))
+    assert isinstance(model.denoiser, DENOISERS.load(settings.denoiser))
+    assert (settings.minutes is None) != (settings.samples is None)
+
+
+def test_the_papers_config_has_its_figures() -> None:
+    settings = planner_training("paper", {"data": "data", "encoder": "folder"})
+    assert settings.samples == 64 * 25_000 and settings.batch == 64 and settings.learning_rate == 3e-4
+    assert settings.schedule.steps == 200 and settings.waypoints == 254 and settings.objective == "clean"
+    model = MotionNetwork(
+        RobotIdentity.of(PANDA), model_settings(settings, make_encoder("compression_autoencoder"))
+    )
+    assert isinstance(model.denoiser, Transformer)
+    assert (model.denoiser.settings.width, model.denoiser.settings.layers) == (512, 8)
+    assert model.settings.code == 60
+
+
+def test_what_is_given_beside_a_config_wins() -> None:
+    settings = planner_training("paper", {"data": "d", "encoder": "e", "minutes": 3.0, "batch": 8})
+    assert (settings.minutes, settings.samples, settings.batch) == (3.0, None, 8)
+    with pytest.raises(InputError, match="table2_unet"):
+        planner_training("papr", {"data": "d", "encoder": "e"})
+    with pytest.raises(InputError, match="config compact needs an encoder"):
+        planner_training("compact", {"data": "d"})
+
+
+def test_every_row_has_its_config() -> None:
+    assert len(ablation.ROWS) == 10
+    assert {row.config for row in ablation.ROWS.values()} == {c for c in CONFIGS if c.startswith("table2_")}
+
+
+def test_link_path_length_by_hand() -> None:
+    """A two-link arm that turns as a whole about its base: the arc of the origin of l2."""
+    arm = planar_arm(0.5, 0.4)
+    turn = np.linspace(0.0, 1.0, 2001)
+    q = np.stack([turn, 0 * turn], axis=1)
+    # l1 turns in place; l2's origin is 0.5 m from the axis; the tip is fixed to l2
+    np.testing.assert_allclose(Kinematics(arm).link_length(np.stack([q, q[::-1]])), 0.5, rtol=1e-6)
+
+
+def test_bootstrap_covers_the_mean() -> None:
+    rng = np.random.default_rng(0)
+    covered = 0
+    for i in range(60):
+        low, high = bootstrap_interval(rng.normal(1.0, 2.0, 80), seed=i)
+        covered += low < 1.0 < high
+    assert 50 <= covered <= 60
+
+
+def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    base = ["reproduce", "table2", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main([*base, "--rows", "Ourz"]) == 2
+    assert "known: " in capsys.readouterr().err
+    assert main([*base, "--family", "ropp"]) == 2
+    assert "known: cabinet, clutter, crate" in capsys.readouterr().err
+    assert main(base) == 2 and "no data set" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*base, "--samples", "0"])
+    command = ["train", "planner", "--config", "papr", "--data", "d", "--encoder", "e", "--out", "o"]
+    assert main(command) == 2
+    assert "table2_jpc" in capsys.readouterr().err
+
+
+def test_the_mean_of_two_trainings_leaves_unsolved_problems_out() -> None:
+    def evaluation(single: list[float], length: list[float]) -> ablation.Evaluation:
+        each = np.array(single, float)
+        return ablation.Evaluation(each, each, each, np.array(length, float), each)
+
+    nan = float("nan")
+    mean = ablation.Evaluation.mean(
+        [evaluation([0, 1, 0], [nan, 4, nan]), evaluation([1, 1, 0], [3, 6, nan])]
+    )
+    np.testing.assert_array_equal(mean.single, [0.5, 1, 0])
+    np.testing.assert_array_equal(mean.length, [3, 5, nan])
+    assert [ablation.Training("table2_jpc", seed).folder for seed in (0, 1)] == [
+        "table2_jpc",
+        "table2_jpc_seed1",
+    ]
+
+
+def test_straight_lines_stand_among_the_papers_rows() -> None:
+    table = ablation.straight_line_table(4)
+    shares = [float(str(row[1])) for row in table.rows]
+    assert shares == sorted(shares) and len(table.rows) == 2 * 3 + len(ablation.ROWS)

@@ -1,0 +1,411 @@
+"""bench run: every call is a record; crashes, overruns and exceptions are failures; killed runs go on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers import faulty_planner
+from robotdiffuse.cli import main
+from robotdiffuse.core import registry
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.registry import Entry
+from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.evaluation import bench, planner_processes
+from robotdiffuse.evaluation.bench import (
+    PRESETS,
+    BenchSettings,
+    Preset,
+    open_runs,
+    preset_settings,
+    run_bench,
+)
+from robotdiffuse.evaluation.comparison import LATE_SECONDS
+from robotdiffuse.evaluation.metrics import METRICS
+from robotdiffuse.evaluation.planner_processes import PlannerProcess, PlannerSpec
+from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name, validator
+from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records
+from robotdiffuse.learning.weights_registry import BUNDLED
+from robotdiffuse.planning import PLANNERS
+from robotdiffuse.planning.diffusion.diffusion import Diffusion
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.planning.search.rrt import AORRTCSettings, RRTConnect
+from robotdiffuse.problems.files import problem_record
+from robotdiffuse.problems.held_out import held_out_problem, line_length
+from robotdiffuse.validation.validator import verify
+
+RECORD = Record(
+    "rrt_connect", "rop", "rop/0", "rop", False, 0, 1.0, "solved", "", 0.01, progress=((0.01, 2.0),)
+)
+
+
+def quiet(*_: object) -> None: ...
+
+
+def settings(
+    out: Path, planners: str = "rrt_connect", problems: str = "rop", count: int = 3
+) -> BenchSettings:
+    return BenchSettings(
+        tuple(planners.split(",")), tuple(problems.split(",")), out, time_limit=2.0, count=count
+    )
+
+
+def keys(records: list[Record]) -> Counter:
+    return Counter(record.key for record in records)
+
+
+@pytest.mark.slow
+def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -> None:
+    plain, with_settings = "rrt_connect", "rrt_connect:optimize_time=0.05:tightenings=0"
+    asked = replace(settings(tmp_path, f"{plain},{with_settings}", count=2), seeds=2)
+    assert run_bench(asked, quiet, quiet) == 8
+    assert run_bench(asked, quiet, quiet) == 0
+    rows = read_records(tmp_path)
+    assert list(rows) == [plain, with_settings], "a planner with settings is a row of its own"
+    for records in rows.values():
+        assert keys(records) == {("rop", f"rop/{i}", seed, 2.0): 1 for i in range(2) for seed in range(2)}
+    records = rows[plain]
+    solved = [record for record in records if record.solved]
+    runs = [json.loads(line) for line in (tmp_path / "runs.jsonl").read_text().splitlines()]
+    assert solved and len(runs) == 2
+    for record in solved:
+        problem = held_out_problem("rop", int(record.name.partition("/")[2]))
+        path = Motion(problem.robot.joint_names, record.waypoints)
+        assert verify(problem, path).valid
+        assert record.joint_length == pytest.approx(path.length, rel=1e-6)
+        assert record.progress[-1][1] == pytest.approx(path.length, rel=1e-5)
+        assert record.memory is not None and record.memory > 50
+        assert (record.workers, record.run) == (1, runs[0]["run"])
+        assert record.load is not None and record.cpu is not None
+        assert record.trivial == (line_length(problem, validator) is not None)
+    assert run_bench(replace(asked, count=3, planners=(plain,)), quiet, quiet) == 2
+    assert len(runs[0]["versions"]) > 3
+
+
+@pytest.fixture
+def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planner_processes, "GRACE", 6.0)
+    monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("faulty")
+def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) -> None:
+    asked = replace(settings(tmp_path, "faulty", count=1), seeds=7, time_limit=0.5)
+    assert run_bench(asked, quiet, quiet) == 7
+    found = {record.seed: record for record in read_records(tmp_path)["faulty"]}
+    assert found[faulty_planner.SOLVES].solved and found[faulty_planner.TALKS].solved
+    assert found[faulty_planner.RAISES].status == "exception"
+    assert found[faulty_planner.RAISES].reason == "ValueError: no such thing"
+    assert found[faulty_planner.EXITS].reason == "SystemExit: no licence"
+    assert found[faulty_planner.DIES].status == "crashed" and "SIGKILL" in found[faulty_planner.DIES].reason
+    assert found[faulty_planner.HANGS].status == "overran"
+    log = (tmp_path / "logs" / "faulty.log").read_text()
+    assert "about to die" in log and "this is no answer" in log and "ValueError" in log
+    assert run_bench(asked, quiet, quiet) == 0
+
+
+def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PLANNERS, "mine", Entry("__main__:Mine", "for tests"))
+    with pytest.raises(InputError, match="planner mine is in the program that was started"):
+        run_bench(settings(tmp_path, "mine", count=1), quiet, quiet)
+
+
+def test_a_metric_of_an_imported_module_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`bench run --import` measured it in no planner's process."""
+    (tmp_path / "counted.py").write_text(
+        "from robotdiffuse.evaluation.metrics import METRICS, Metric\n"
+        'METRICS["legs"] = Metric("legs", "", "less", ".0f", lambda motion: len(motion.path.positions) - 1)\n'
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(registry, "imported", [])
+    try:
+        registry.import_modules(["counted"])
+        assert run_bench(settings(tmp_path / "run", "rrt_connect", count=1), quiet, quiet) == 1
+        (record,) = read_records(tmp_path / "run")["rrt_connect"]
+        assert record.measures["legs"] == len(record.waypoints) - 1
+    finally:
+        METRICS.pop("legs", None)
+
+
+@pytest.mark.slow
+def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Path) -> None:
+    arguments = ["bench", "run", "--planners", "rrt_connect,shared_tree_rrt_star", "--problems", "rop"]
+    arguments += ["--count", "3", "--time-limit", "2", "--workers", "2", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "robotdiffuse", *arguments]
+    run = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
+    first = tmp_path / "records" / "rrt_connect.jsonl"
+    until = time.monotonic() + 400
+    while not (first.is_file() and first.read_text().count("\n") >= 2):
+        assert run.poll() is None and time.monotonic() < until
+        time.sleep(0.02)
+    os.kill(run.pid, signal.SIGKILL)
+    run.wait()
+    before = {file: file.read_text() for file in (tmp_path / "records").iterdir()}
+    assert main(arguments) == 0
+    for file in (tmp_path / "records").iterdir():
+        assert file.read_text().startswith(before.get(file, "").rpartition("\n")[0])
+        assert keys(RecordFile(file).records) == {("rop", f"rop/{i}", 0, 2.0): 1 for i in range(3)}
+
+
+def test_what_ended_by_itself_is_not_asked_again_with_more_time(tmp_path: Path) -> None:
+    cases = gather_cases(["rop"], 3, tmp_path, quiet)
+    ran_out = replace(RECORD, name="rop/1", status="timeout", time=1.0, progress=())
+    crashed = replace(RECORD, name="rop/2", status="crashed", time=0.0, progress=())
+    records = [RECORD, ran_out, crashed]
+
+    def left(time_limit: float, seeds: int = 1) -> list[tuple[str, int]]:
+        asked = replace(settings(tmp_path), time_limit=time_limit, seeds=seeds)
+        return [(t.case.name, t.seed) for t in open_runs({"rrt_connect": records}, cases, asked)]
+
+    assert left(1.0) == []
+    assert left(10.0) == [("rop/1", 0), ("rop/2", 0)]
+    assert left(0.5) == [("rop/0", 0), ("rop/1", 0), ("rop/2", 0)]
+    assert left(1.0, seeds=2) == [("rop/0", 1), ("rop/1", 1), ("rop/2", 1)]
+
+
+def test_restarts_are_asked_for_where_time_is_left(tmp_path: Path) -> None:
+    cases = gather_cases(["rop"], 3, tmp_path, quiet)
+    ran_out = replace(RECORD, name="rop/1", status="timeout", time=1.0, progress=())
+    refused = replace(RECORD, name="rop/2", status="invalid_goal", time=0.0, progress=())
+    plain = [RECORD, ran_out, refused]
+    asked = replace(settings(tmp_path), equal_time=True)
+    again = [replace(RECORD, planner="rrt_connect+restarts", time=0.99, restarts=80)]
+
+    def left(time_limit: float, restarted: list[Record]) -> list[str]:
+        records = {"rrt_connect": plain, "rrt_connect+restarts": restarted}
+        runs = open_runs(records, cases, replace(asked, time_limit=time_limit))
+        return [run.case.name for run in runs]
+
+    assert left(1.0, []) == ["rop/0"]
+    assert left(1.0, again) == []
+    assert left(10.0, again) == ["rop/0", "rop/1"]
+
+
+@pytest.mark.slow
+def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> None:
+    asked = replace(settings(tmp_path, "rrt_connect", "rop_nontrivial", count=2), time_limit=0.3)
+    assert run_bench(asked, quiet, quiet) == 2
+    before = read_records(tmp_path)["rrt_connect"]
+    assert run_bench(replace(asked, equal_time=True), quiet, quiet) == 2
+    assert run_bench(replace(asked, equal_time=True), quiet, quiet) == 0
+    found = read_records(tmp_path)
+    assert found["rrt_connect"] == before
+    for once, again in zip(before, found["rrt_connect+restarts"], strict=True):
+        assert again.name == once.name and again.restarts is not None and again.restarts > 0
+        assert once.joint_length is not None and again.joint_length is not None
+        assert again.joint_length <= once.joint_length
+        assert again.progress[-1][1] == pytest.approx(again.joint_length, rel=1e-5)
+        assert list(again.progress) == sorted(again.progress) and again.progress[-1][0] <= 0.3 + LATE_SECONDS
+        problem = held_out_problem("rop", int(again.name.partition("/")[2]))
+        assert verify(problem, Motion(problem.robot.joint_names, again.waypoints)).valid
+        assert not again.ended_by_itself
+
+
+def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever else the machine does then hits them alike; so many calls are made at once all the time."""
+    calls, at_once, most = [], [0], [0]
+
+    def plan(self: PlannerProcess, run: Run, restarts: bool) -> list[dict]:
+        at_once[0] += 1
+        most[0] = max(most[0], at_once[0])
+        calls.append((run.case.name, run.method))
+        time.sleep(0.02)
+        at_once[0] -= 1
+        return [{"status": "timeout", "time": 2.0}]
+
+    monkeypatch.setattr(PlannerProcess, "plan", plan)
+    monkeypatch.setattr(PlannerProcess, "warm", quiet)
+    planners = "rrt_connect,mpnet,a_star"
+    assert run_bench(settings(tmp_path / "a", planners), quiet, quiet) == 9
+    assert calls == [(f"rop/{i}", name) for i in range(3) for name in planners.split(",")]
+    assert most == [1]
+    assert run_bench(replace(settings(tmp_path / "b", planners), workers=2), quiet, quiet) == 9
+    assert most == [2]
+    for name in planners.split(","):
+        assert [name for name, _ in keys_in_order(tmp_path / "b", name)] == [f"rop/{i}" for i in range(3)]
+
+
+def keys_in_order(folder: Path, planner: str) -> list[tuple[str, int]]:
+    return [(record.name, record.seed) for record in read_records(folder)[planner]]
+
+
+def test_a_planner_with_settings() -> None:
+    planner = PlannerSpec.parse("rrt_connect:optimize_time=0.05:tightenings=0").load()
+    assert isinstance(planner, RRTConnect)
+    assert (planner.settings.optimize_time, planner.settings.tightenings) == (0.05, 0)
+    calls = PlannerSpec.parse("aorrtc:until=time_limit:gain=0.01:clearance=0")
+    assert calls.request()["until"] == "time_limit" and calls.request()["clearance"] == 0
+    assert calls.load().settings == AORRTCSettings(gain=0.01)
+    with pytest.raises(InputError, match="unknown until 'soon'"):
+        PlannerSpec.parse("aorrtc:until=soon")
+    nested = PlannerSpec.parse("robotdiffuse:search.range=0.5:samples=4").load()
+    assert isinstance(nested, RobotDiffuse)
+    assert (nested.settings.search.range, nested.settings.samples) == (0.5, 4)
+
+
+def test_weights_of_the_package_are_found_by_their_name() -> None:
+    """They were sought in the working folder, and the row of Table 1 without clearances could not run."""
+    spec = PlannerSpec.parse("diffusion@panda_points:samples=1")
+    assert spec.label == "diffusion@panda_points:samples=1" and list(spec.weights_hashes) == ["model"]
+    planner = spec.load()
+    assert isinstance(planner, Diffusion) and planner.settings.weights == str(BUNDLED / "panda_points")
+
+
+@pytest.mark.parametrize("cut", [1, 20, 100])
+def test_line_that_was_cut_off_is_made_again(tmp_path: Path, cut: int) -> None:
+    file = tmp_path / "a.jsonl"
+    whole = RecordFile(file)
+    whole.append(RECORD)
+    whole.append(replace(RECORD, seed=1))
+    cut_off = file.read_bytes()[:-cut]
+    file.write_bytes(cut_off)
+    appended = RecordFile(file)
+    assert appended.records == [RECORD]
+    assert file.read_bytes() == cut_off  # another process may be about to end the line
+    appended.append(replace(RECORD, seed=2))
+    assert RecordFile(file).records == [RECORD, replace(RECORD, seed=2)]
+
+
+def test_damaged_line_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "a.jsonl"
+    line = json.dumps(RECORD.row())
+    file.write_text(line + '\n{"planner": 1}\n' + line + "\n")
+    with pytest.raises(InputError, match="line 2 is no record"):
+        RecordFile(file)
+
+
+def test_nontrivial_problems_are_not_solved_by_the_line(tmp_path: Path) -> None:
+    cases = gather_cases(["rop_nontrivial", "rop"], 2, tmp_path, quiet)
+    hard = [case for case in cases if case.problem_set == "rop_nontrivial"]
+    assert len(hard) == 2 and not any(case.trivial or line_length(case.problem, validator) for case in hard)
+    again = gather_cases(["rop_nontrivial", "rop"], 2, tmp_path, quiet)
+    assert [case.key for case in again] == [case.key for case in cases]
+    more = gather_cases(["rop"], 5, tmp_path, quiet)
+    assert [case.name for case in more] == [f"rop/{i}" for i in range(5)]
+    kept, drawn = cases[2].problem, held_out_problem("rop", 0)
+    np.testing.assert_array_equal(kept.start, drawn.start)
+
+
+def test_problems_of_files_and_folders(tmp_path: Path) -> None:
+    lines = [json.dumps(problem_record(held_out_problem("rop", i))) for i in range(3)]
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "a.jsonl").write_text("\n".join(lines[:2]))
+    (folder / "b.json").write_text(lines[2])
+    (folder / "readme.txt").write_text("not a problem")
+    cases = gather_cases([str(folder)], None, tmp_path / "out", quiet)
+    assert [(case.problem_set, case.family) for case in cases] == [
+        ("mine", "a"),
+        ("mine", "b"),
+        ("mine", "a"),
+    ]
+    assert len(gather_cases([str(folder)], 2, tmp_path / "out", quiet)) == 2
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no usable problem"):
+        gather_cases([str(tmp_path / "empty")], None, tmp_path / "out", quiet)
+
+
+def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
+    """Those of the first file of a name were returned for any other."""
+    lines = [json.dumps(problem_record(held_out_problem("rop", i))) for i in range(2)]
+    for folder, line in zip("ab", lines, strict=True):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.jsonl").write_text(line)
+    first, other = str(tmp_path / "a" / "mine.jsonl"), str(tmp_path / "b" / "mine.jsonl")
+    for _ in range(2):
+        assert len(gather_cases([first], None, tmp_path / "out", quiet)) == 1
+    with pytest.raises(InputError, match=r"problems called mine that were read from .*; those in .* others"):
+        gather_cases([other], None, tmp_path / "out", quiet)
+    (tmp_path / "rop.jsonl").write_text(lines[0])
+    with pytest.raises(InputError, match="have the name of the family rop"):
+        gather_cases([str(tmp_path / "rop.jsonl")], None, tmp_path / "out", quiet)
+
+
+def test_other_weights_of_the_same_name_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their calls counted as made, or shared a row."""
+    monkeypatch.setattr(bench, "keep_records", lambda *_: 0)
+    for parent, digest in (("a", "1"), ("b", "2")):
+        (tmp_path / parent / "best").mkdir(parents=True)
+        about = {"format": 2, "weights_sha256": digest}
+        (tmp_path / parent / "best" / "mpnet.json").write_text(json.dumps(about))
+    first, other = (settings(tmp_path / "out", f"mpnet@{tmp_path / at}/best", count=1) for at in "ab")
+    for _ in range(2):
+        run_bench(first, quiet, quiet)
+    with pytest.raises(InputError, match="has records of mpnet@best with other weights than those in"):
+        run_bench(other, quiet, quiet)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"planners": ("rrt",)}, "unknown planner 'rrt'; known:"),
+        ({"planners": ("rrt_connect", "rrt_connect")}, "called the same"),
+        ({"planners": ("rrt_connect@.",)}, "rrt_connect has no weights"),
+        ({"planners": ("rrt_connect:stp=1",)}, "rrt_connect has no setting 'stp'; it has .*tightenings"),
+        ({"planners": ("rrt_connect:range=-1",)}, "rrt_connect.range is -1.0; it must be positive"),
+        ({"planners": ("rrt_connect:range",)}, "'range' is not NAME=VALUE"),
+        ({"planners": ("robotdiffuse@nowhere",)}, r"there are no weights \S*nowhere"),
+        ({"planners": ("mpnet@nowhere",)}, r"there are no weights \S*nowhere"),
+        ({"problems": ("rop", "rop")}, "none twice"),
+        ({"problems": ("ropp",)}, "neither a file or folder nor a family"),
+        ({"time_limit": 0.0}, "time_limit is 0.0"),
+        ({"count": 0}, "count is 0"),
+        ({"cluster": "slurm"}, "known: ray"),
+    ],
+)
+def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path, change: dict, match: str) -> None:
+    with pytest.raises(InputError, match=match):
+        run_bench(replace(settings(tmp_path / "out"), **change), quiet, quiet)
+    assert not (tmp_path / "out" / "records").exists()
+
+
+def test_command_with_bad_input(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    asked = ["bench", "run", "--problems", "rop", "--out", str(tmp_path)]
+    assert main([*asked, "--planners", "nonsense"]) == 2
+    assert "unknown planner 'nonsense'" in capfd.readouterr().err
+    assert main([*asked, "--planners", "rrt_connect", "--workers", "2", "--cluster", "ray"]) == 2
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_planners_and_problems_of_presets_are_known(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("ompl")
+    stages = preset_settings(name, tmp_path)
+    assert stages
+    for settings in stages:
+        assert settings.specs and all(problem_set_name(text) for text in settings.problems)
+
+
+def test_a_smaller_count_and_further_problems(tmp_path: Path) -> None:
+    counts = [settings.count for settings in preset_settings("anytime", tmp_path, ("shelf",), count=50)]
+    assert counts == [50]
+    problems = preset_settings("anytime", tmp_path, ("shelf",))[0].problems
+    assert problems == ("rop_nontrivial", "rop_dense_nontrivial", "shelf")
+
+
+@pytest.mark.slow
+def test_the_command_runs_every_stage_of_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    preset = Preset("for tests", ("rrt_connect",), ("rop",), (0.001, 0.5), 5, equal_time=False)
+    monkeypatch.setitem(PRESETS, "small", preset)
+    assert main(["bench", "run", "--preset", "small", "--count", "2", "--out", str(tmp_path)]) == 0
+    found = read_records(tmp_path)
+    limits = {record.time_limit for record in found["rrt_connect"]}
+    assert 0.001 in limits and len({record.name for record in found["rrt_connect"]}) == 2
+
+
+def test_a_preset_in_place_of_planners_and_limits(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError, match="unknown preset 'table2'; known: anytime"):
+        preset_settings("table2", tmp_path)
+    asked = ["bench", "run", "--out", str(tmp_path)]
+    assert main([*asked, "--planners", "rrt_connect"]) == 2
+    assert "name --planners and --problems, or a --preset" in capfd.readouterr().err
+    assert main([*asked, "--preset", "anytime", "--planners", "rrt_connect"]) == 2
+    assert "--preset cannot be combined with --planners" in capfd.readouterr().err

@@ -1,0 +1,458 @@
+"""The report of a bench: figures by hand, tables, plots, the page, and the motions to replay."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from robotdiffuse.cli import main
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.tables import Table
+from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.evaluation import bench_report, comparison, plots
+from robotdiffuse.evaluation.comparison import (
+    GAVE_UP,
+    LATER,
+    RAN_OUT,
+    Bench,
+    deciding_record,
+    outcome,
+    read_bench,
+)
+from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
+from robotdiffuse.evaluation.problem_sets import case_file
+from robotdiffuse.evaluation.runs import RESTARTED, Record, record_of_row, record_path
+from robotdiffuse.problems.held_out import Case, held_out_problem
+
+RUN = {
+    "date": "2026-01-02 03:04",
+    "processor": "Abacus_9 & sons",
+    "cores": 4,
+    "python": "3.12",
+    "versions": {"numpy": "2.0"},
+    "workers": 1,
+    "problems": ["rop"],
+    "seeds": 3,
+}
+MEASURES = {
+    "tip_length": 1.0,
+    "turning": 0.5,
+    "min_clearance": 0.01,
+    "duration": 2.0,
+    "jerk": 10.0,
+    "sparc_joint": -2.0,
+    "sparc_tip": -2.0,
+}
+
+
+def record(planner: str, name: str, limit: float, **fields: object) -> Record:
+    about = {"problem_set": "rop", "family": "rop", "trivial": False, "seed": 0}
+    values = {"planner": planner, "name": name, "time_limit": limit} | about | fields
+    return Record(**values)  # pyright: ignore[reportArgumentType]
+
+
+def solved(
+    planner: str,
+    name: str,
+    limit: float,
+    progress: list[tuple[float, float]],
+    time: float | None = None,
+    **fields: object,
+) -> Record:
+    """A record of a motion of which the links go three times as far [m] as the joints [rad]."""
+    length = progress[-1][1]
+    values = {
+        "status": "solved",
+        "reason": "solved",
+        "time": progress[-1][0] if time is None else time,
+        "progress": tuple(progress),
+        "measures": MEASURES | {"joint_length": length, "link_length": 3 * length},
+        "memory": 100.0,
+        "positions": ((0.0,) * 7, (0.1,) * 7),
+    }
+    return record(planner, name, limit, **(values | fields))
+
+
+def failed(planner: str, name: str, limit: float, time: float, **fields: object) -> Record:
+    return record(planner, name, limit, **({"status": "timeout", "reason": "no path", "time": time} | fields))
+
+
+def write(folder: Path, records: list[Record], counts: dict[float, int | None] | None = None) -> Path:
+    """A run for each time limit, of all its planners; `counts`: problems that it was given, if not all."""
+    (folder / "records").mkdir(parents=True)
+    for record in records:
+        with record_path(folder, record.planner).open("a") as stream:
+            stream.write(json.dumps(record.row()) + "\n")
+    for limit in sorted({record.time_limit for record in records}):
+        planners = sorted({record.planner for record in records if record.time_limit == limit})
+        run = RUN | {"planners": planners, "time_limit": limit, "count": (counts or {}).get(limit)}
+        with (folder / "runs.jsonl").open("a") as stream:
+            stream.write(json.dumps(run) + "\n")
+    return folder
+
+
+def keep_problems(folder: Path, names: list[str]) -> None:
+    problem = held_out_problem("rop", 0)
+    case_file(folder / "problems", "rop").fill([Case(n, "rop", problem, n == "rop/3") for n in names])
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """Four problems, the last one trivial; one planner answers at once, one is anytime, one learned."""
+    names = ["rop/0", "rop/1", "rop/2", "rop/3"]
+    trivial = [False, False, False, True]
+    records = [
+        solved("robotdiffuse", n, 1.0, [(0.05, 2.0)], trivial=t) for n, t in zip(names, trivial, strict=True)
+    ]
+    # the first path after 0.05, 0.5 and 5 s; the last problem beyond the limit of 10 s
+    for name, t, first in zip(names[:3], trivial, (0.05, 0.5, 5.0), strict=False):
+        progress = [(first, 4.0), (first * 1.5, 3.0)]
+        records.append(solved("ompl_rrt_star", name, 10.0, progress, time=10.0, trivial=t))
+    records.append(failed("ompl_rrt_star", names[3], 10.0, 10.0, trivial=True))
+    records += [
+        solved("mpnet", names[0], 1.0, [(0.02, 2.4)]),
+        failed("mpnet", names[1], 1.0, 0.4, refused="scene_collision"),
+        failed("mpnet", names[2], 1.0, 0.4),
+        solved("mpnet", names[3], 1.0, [(0.02, 2.0)], trivial=True),
+    ]
+    return write(tmp_path / "small_run", records)
+
+
+def rows(section: comparison.Section, limit: float) -> dict[str, comparison.Row]:
+    (found,) = (c for c in section.comparisons if c.limit == limit)
+    return {row.planner: row for row in found.rows}
+
+
+def test_a_call_counts_for_shorter_limits_and_for_longer_ones_if_it_ended_by_itself() -> None:
+    short = failed("mpnet", "a", 0.1, 0.1)
+    middle = failed("mpnet", "a", 1.0, 0.5)
+    long = failed("mpnet", "a", 10.0, 10.0)
+    assert deciding_record([short, middle, long], 0.05) is short
+    assert deciding_record([short, middle, long], 0.5) is middle
+    assert deciding_record([short, middle, long], 5.0) is long
+    assert deciding_record([short, middle, long], 60.0) is middle
+    assert deciding_record([short], 1.0) is None
+    assert deciding_record([failed("mpnet", "a", 1.0, 0.0, status="crashed")], 2.0) is None
+
+
+def test_an_outcome_is_what_was_found_by_then() -> None:
+    record = solved("ompl_rrt_star", "a", 10.0, [(0.5, 4.0), (2.0, 3.0)], time=10.0)
+    before, between, after = (outcome(record, t) for t in (0.4, 1.0, 10.0))
+    assert not before.solved
+    assert np.isnan(before.joint_length)
+    assert before.returned == 0.4
+    assert before.failure == LATER
+    assert (between.found, between.returned) == (0.5, 1.0)
+    assert (between.joint_length, between.link_length) == (4.0, pytest.approx(12.0))  # 9 x 4 / 3
+    assert (after.joint_length, after.link_length) == (3.0, 9.0)
+
+
+def test_the_validator_may_end_after_the_limit_of_the_call_alone() -> None:
+    record = solved("mpd", "a", 1.0, [(1.08, 4.0)])
+    assert outcome(record, 1.0).found == 1.0
+    assert not outcome(solved("mpd", "a", 1.0, [(1.2, 4.0)]), 1.0).solved
+    assert not outcome(solved("mpd", "a", 2.0, [(1.08, 4.0)]), 1.0).solved
+
+
+def test_figures_of_a_small_run(small: Path) -> None:
+    bench = read_bench(small)
+    assert next(iter(bench.records)) == bench.reference == "robotdiffuse"
+    assert set(bench.records) == {"robotdiffuse", "mpnet", "ompl_rrt_star"}
+    whole, apart = comparison.sections(bench)
+    assert (whole.name, apart.name) == ("rop", "rop, non-trivial")
+    assert [c.limit for c in whole.comparisons] == [0.1, 1.0, 10.0]
+    assert [c.problems for c in whole.comparisons] == [4, 4, 4]
+    assert [c.problems for c in apart.comparisons] == [3, 3, 3]
+    star = [rows(whole, t)["ompl_rrt_star"] for t in (0.1, 1.0, 10.0)]
+    assert [row.success for row in star] == [0.25, 0.5, 0.75]
+    assert star[0].link_length == 9.0  # improved by 0.075 s
+    assert star[1].first == pytest.approx((0.05 + 0.5) / 2)
+    assert star[1].returned == 1.0
+    assert star[2].failures == {RAN_OUT: 1}
+    net = rows(whole, 1.0)["mpnet"]
+    assert (net.success, net.collision) == (0.5, 0.25)
+    assert net.success_interval == pytest.approx((0.150, 0.850), abs=1e-3)
+    assert net.failures == {"scene collision": 1, GAVE_UP: 1}
+    assert net.returned == pytest.approx((0.02 + 1 + 1 + 0.02) / 4)
+    assert net.paired is not None
+    assert (net.paired.a_only, net.paired.b_only, net.paired.both) == (0, 2, 2)
+    assert net.paired.ratio == pytest.approx(1.1)  # of 1.2 and 1
+    assert net.link_length == pytest.approx(3 * 2.2)
+    assert rows(whole, 10.0)["mpnet"].success == 0.5  # it ended by itself
+
+
+def test_comscore_of_a_small_run(small: Path) -> None:
+    whole, _ = comparison.sections(read_bench(small), [1.0])
+    of = rows(whole, 1.0)
+    lengths = {"robotdiffuse": 6.0, "mpnet": 6.6, "ompl_rrt_star": 9.0}
+    times = {"robotdiffuse": 0.05, "mpnet": 0.51, "ompl_rrt_star": 1.0}
+    for name, success, collision in (("robotdiffuse", 1, 1), ("mpnet", 0, 0), ("ompl_rrt_star", 0, 1)):
+        length = (9.0 - lengths[name]) / 3.0
+        time = (1.0 - times[name]) / 0.95
+        assert of[name].comscore == pytest.approx((success + collision + length + time) / 4)
+
+
+def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_path: Path) -> None:
+    names = [f"rop/{i}" for i in range(6)]
+    records = [solved("robotdiffuse", name, 10.0, [(0.1, 2.0)]) for name in names]
+    # of the last four, a 10 s run did not get to, the easy ones ended by themselves in 1 s
+    records += [failed("mpd", name, 10.0, 10.0) for name in names[:2]]
+    records += [solved("mpd", name, 1.0, [(0.1, 2.0)]) for name in names[2:4]]
+    records += [failed("mpd", name, 1.0, 1.0) for name in names[4:]]
+    records += [failed("edmp", name, 1.0, 1.0) for name in names]
+    folder = write(tmp_path / "run", records, {10.0: 2})
+    keep_problems(folder, names)
+    (section,) = comparison.sections(read_bench(folder))
+    whole = {c.limit: c for c in section.comparisons}
+    assert whole[1.0].problems == 6
+    assert whole[1.0].missing == ()
+    assert (whole[10.0].problems, whole[10.0].of) == (2, 6)
+    assert whole[10.0].missing == ("edmp",)
+    assert rows(section, 10.0)["mpd"].success == 0.0
+    assert section.main.limit == 1.0
+
+
+def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> None:
+    records = []
+    for seed in range(3):
+        records.append(solved("robotdiffuse", "a", 1.0, [(0.1, 2.0)], seed=seed))
+        records.append(solved("mpd", "a", 1.0, [(0.1, 2.0 + seed)], seed=seed))
+        records.append(solved("robotdiffuse", "b", 1.0, [(0.1, 2.0)], seed=seed))
+        one = solved("mpd", "b", 1.0, [(0.1, 2.0)], seed=seed)
+        records.append(one if seed == 0 else failed("mpd", "b", 1.0, 1.0, seed=seed))
+    (section,) = comparison.sections(read_bench(write(tmp_path / "run", records)), [1.0])
+    row = rows(section, 1.0)["mpd"]
+    assert section.main.seeds == 3
+    assert row.success == pytest.approx(4 / 6)
+    assert row.paired is not None
+    assert (row.paired.both, row.paired.b_only) == (1, 1)
+    assert row.paired.ratio == pytest.approx(1.5)
+
+
+def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) -> None:
+    whole, _ = comparison.sections(read_bench(small))
+    curves = {curve.planner: curve for curve in whole.curves}
+    assert curves["mpnet"].end == 10.0
+    assert curves["ompl_rrt_star"].found.tolist() == [0.05, 0.5, 5.0]
+    assert curves["ompl_rrt_star"].anytime
+    assert not curves["mpnet"].anytime
+    # best known 2: first paths of 4, the second of the three at 0.5 s; 3 from 0.75 s on
+    star = curves["ompl_rrt_star"]
+    assert star.times[0] == pytest.approx(0.5, rel=0.06)
+    assert star.ratios[0] == 2.0
+    assert star.ratios[-1] == 1.5
+
+
+def cells(table: Table, heading: str) -> dict[str, str]:
+    column = [column.title.strip() for column in table.columns].index(heading)
+    return {row[0]: row[column] for row in table.texts}
+
+
+def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
+    """Planners that end early are restarted, in rows of their own; what used up its time needs none."""
+    records = []
+    for i in range(3):
+        name = f"rop/{i}"
+        records += [
+            solved("robotdiffuse", name, 1.0, [(0.05, 2.0)]),
+            solved("robotdiffuse" + RESTARTED, name, 1.0, [(0.05, 2.0), (0.6, 1.6)], 0.99, restarts=19),
+            solved("rrt_connect", name, 1.0, [(0.01, 2.4)]),
+            solved("rrt_connect" + RESTARTED, name, 1.0, [(0.01, 2.4), (0.3, 1.8)], 0.99, restarts=90),
+            solved("ompl_aorrtc", name, 1.0, [(0.01, 2.4), (0.3, 1.6)], 0.99),
+        ]
+    bench = read_bench(write(tmp_path / "run", records))
+    assert list(bench.records)[:2] == ["robotdiffuse", "robotdiffuse+restarts"]
+    section = comparison.sections(bench)[-1]
+    table = bench_report.main_table(section, section.main, bench.reference)
+    assert cells(table, "joint length / robotdiffuse: hybrid, restarted") == {
+        "robotdiffuse: hybrid": "–",
+        "robotdiffuse: hybrid, restarted": "1",
+        "rrt_connect": "–",
+        "rrt_connect, restarted": "1.125",
+        "ompl_aorrtc": "1.000",
+    }
+    assert cells(table, "ComScore")["rrt_connect, restarted"] == "–"
+    tenth = bench_report.main_table(section, section.comparisons[0], bench.reference)
+    assert cells(tenth, "joint length / robotdiffuse: hybrid, restarted")["rrt_connect, restarted"] == "1.200"
+    plain = read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
+    assert len(plain.records) == 4
+    alone = Bench(
+        plain.folder, plain.sessions, {n: r for n, r in plain.records.items() if RESTARTED not in n}
+    )
+    section = comparison.sections(alone)[-1]
+    table = bench_report.main_table(section, section.main, alone.reference)
+    assert cells(table, "joint length / robotdiffuse: hybrid") == {
+        "robotdiffuse: hybrid": "1",
+        "rrt_connect": "1.200 †",
+    }
+    assert bench_report.UNEQUAL_NOTE in table.notes
+
+
+def test_a_call_that_used_up_its_time_stands_for_its_restarts(tmp_path: Path) -> None:
+    records = [
+        solved("rrt_connect", "rop/0", 1.0, [(0.01, 2.4)]),
+        solved("rrt_connect" + RESTARTED, "rop/0", 1.0, [(0.01, 2.4), (0.3, 1.8)], 0.99, restarts=90),
+        failed("rrt_connect", "rop/1", 1.0, 1.0),
+    ]
+    bench = read_bench(write(tmp_path / "run", records))
+    again = bench.records["rrt_connect" + RESTARTED]
+    assert [record.name for record in again] == ["rop/0", "rop/1"]
+    assert {record.planner for record in again} == {"rrt_connect+restarts"}
+
+
+def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: Path) -> None:
+    names = [f"rop/{i}" for i in range(3)]
+    first = [solved("robotdiffuse", n, 1.0, [(0.05, 2.0)], run="a", load=1.5) for n in names]
+    same = [solved("rrt_connect", n, 1.0, [(0.05, 2.0)], run="a", load=2.25) for n in names]
+    other = [solved("mpd", n, 1.0, [(0.05, 2.0)], run="b", load=0.5) for n in names]
+    folder = write(tmp_path / "run", [*first, *same, *other])
+    runs = [
+        RUN | {"planners": [], "time_limit": 1.0, "count": 3, "run": r, "workers": w}
+        for r, w in (("a", 2), ("b", 1))
+    ]
+    (folder / "runs.jsonl").write_text("".join(json.dumps(run) + "\n" for run in runs))
+    bench = read_bench(folder)
+    (section,) = comparison.sections(bench, [1.0])
+    table = bench_report.main_table(section, section.main, bench.reference)
+    assert cells(table, "timed") == {
+        "robotdiffuse: hybrid": "run 1, 2 at once",
+        "rrt_connect": "run 1, 2 at once",
+        "mpd": "run 2, 1 at once",
+    }
+    assert "Not all rows were timed alike" in table.notes[0]
+    bench = read_bench(folder, ["robotdiffuse", "rrt_connect"])
+    (section,) = comparison.sections(bench, [1.0])
+    table = bench_report.main_table(section, section.main, bench.reference)
+    assert table.columns[-1].heading == "ComScore"
+    assert table.notes[0] == "All rows were timed alike: run 1, 2 at once; load average 1.5 to 2.2."
+
+
+def test_runs_that_noted_nothing_with_their_calls_are_told_by_what_they_called(tmp_path: Path) -> None:
+    names = [f"rop/{i}" for i in range(3)]
+    records = [solved(p, n, 1.0, [(0.05, 2.0)]) for p in ("robotdiffuse", "mpd") for n in names]
+    folder = write(tmp_path / "run", records)
+    run = RUN | {"planners": ["robotdiffuse"], "time_limit": 1.0, "count": 3, "workers": 2}
+    with (folder / "runs.jsonl").open("a") as stream:
+        stream.write(json.dumps(run) + "\n")
+    (section,) = comparison.sections(read_bench(folder), [1.0])
+    table = bench_report.main_table(section, section.main, "robotdiffuse")
+    assert cells(table, "timed") == {
+        "robotdiffuse: hybrid": "run 1 or 2, 1 or 2 at once",
+        "mpd": "run 1, 1 at once",
+    }
+
+
+def test_planners_are_called_what_they_are() -> None:
+    assert bench_report.named("diffusion:guidance_steps=0:samples=4") == (
+        "diffusion, guidance_steps=0, samples=4"
+    )
+    assert bench_report.named("rrt_connect:step=0.5+restarts") == "rrt_connect, step=0.5, restarted"
+    assert bench_report.named("mpnet@mine") == "mpnet@mine"
+
+
+def test_a_metric_is_declared_in_one_place(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is then in records, in the tables, in the plots and in the page."""
+    pytest.importorskip("matplotlib")
+    waypoints = Metric("waypoint_count", "kilo", "less", ".4f", lambda m: len(m.path.positions), 1e-3)
+    monkeypatch.setitem(METRICS, waypoints.name, waypoints)
+    problem = held_out_problem("rop", 0)
+    line = np.stack([problem.start, problem.start + 0.1, problem.start])
+    measured = Measure(problem.robot)(Motion(problem.robot.joint_names, line))
+    record = solved("robotdiffuse", "rop/9", 1.0, [(0.1, 0.5)], measures=measured)
+    assert record.row()["waypoint_count"] == 3
+    assert record_of_row(json.loads(json.dumps(record.row()))) == record
+    bench = read_bench(write(tmp_path / "run", [record]))
+    parts = comparison.sections(bench, [1.0])
+    report = bench_report.bench_report(bench, parts)
+    assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown)
+    page = report.page
+    assert re.search(r"<th[^>]*>waypoint count kilo</th>", page)
+    assert re.search(r"<td[^>]*>0.0030</td>", page)
+    assert ">waypoint count [kilo], less is better<" in page
+
+
+@pytest.mark.slow
+def test_the_command_writes_everything(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    keep_problems(small, ["rop/0", "rop/1"])
+    out = tmp_path / "out"
+    assert main(["bench", "report", str(small), "--out", str(out), "--limits", "1,10", "--no-replays"]) == 0
+    said = capsys.readouterr().out
+    assert "rop, non-trivial, 10 s: 3 problems" in said
+    assert "ompl_rrt_star" in said
+    page = (out / "index.html").read_text()
+    for name in ("robotdiffuse: hybrid", "mpnet", "ompl_rrt_star"):
+        assert page.count(f">{name}<") >= 4, name
+    assert "http" not in re.sub(r'xmlns(:\w+)?="[^"]*"|<metadata>.*?</metadata>', "", page, flags=re.DOTALL)
+    names = re.findall(r'\bid="([^"]*)"', page)
+    assert len(names) == len(set(names))
+    assert not (out / "replays.html").exists()
+    plots = re.findall(r"!\[.*?\]\((.*?)\)", (out / "report.md").read_text())
+    assert {"success_rop.svg", "length_rop_non_trivial.svg"} < set(plots)
+    for name in plots:
+        assert ElementTree.parse(out / name).getroot().tag.endswith("svg")
+
+
+def test_no_legend_or_name_is_clipped() -> None:
+    """Names of planners with settings ended at the edge of a plot."""
+    pytest.importorskip("matplotlib")
+    figures: list[Any] = []
+
+    def fill(figure: Any) -> None:
+        figures.append(figure)
+        figure.text(0.9, 0.5, "robotdiffuse:search.range=0.5+restarts")
+
+    svg = ElementTree.fromstring(plots.draw(fill, plots.HALF, 2.0))
+    (text,) = figures[0].texts
+    end = text.get_window_extent().x1 * 72 / figures[0].dpi
+    assert end > 72 * plots.HALF and float(svg.attrib["viewBox"].split()[2]) >= end
+
+
+def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
+    keep_problems(small, [f"rop/{i}" for i in range(4)])
+    bench = read_bench(small)
+    shown = bench_report.motions_to_replay(bench, comparison.sections(bench, [1.0]))
+    titles = [motion.title for motion in shown]
+    assert titles[0] == "robotdiffuse · rop/0"  # solved by all; made up as one and the same
+    assert "ompl_rrt_star · rop/0" in titles
+    assert {title for title in titles if "fails" in title} == {
+        "mpnet fails · rop/2",
+        "ompl_rrt_star fails · rop/3",
+    }
+    captions = {motion.title: motion.caption for motion in shown}
+    assert captions["mpnet fails · rop/2"].startswith("gave up before; shown: robotdiffuse")
+    assert not any("Figure(" in caption for caption in captions.values())
+    assert len(shown) <= bench_report.MAX_REPLAYS
+
+
+def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError, match="no records of a bench"):
+        read_bench(small / "nowhere")
+    with pytest.raises(InputError, match=r"no records of foo; it has .*mpnet, "):
+        read_bench(small, ["foo"])
+    with pytest.raises(InputError, match="no planner was run that long"):
+        comparison.sections(read_bench(small, ["ompl_rrt_star"]), [60.0])
+    assert main(["bench", "report", str(small), "--limits", "1,x"]) == 2
+    assert "limits are '1,x'" in capsys.readouterr().err
+    (small / "runs.jsonl").write_text('{"date": 1}\n')
+    with pytest.raises(InputError, match=r"runs\.jsonl is damaged"):
+        read_bench(small)
+    with (small / "records" / "mpnet.jsonl").open("a") as stream:
+        stream.write("{broken\n")
+    assert main(["bench", "report", str(small)]) == 2
+    assert re.search(r"mpnet\.jsonl, line 5 is not a JSON object", capsys.readouterr().err)
+
+
+def test_an_empty_folder_says_how_to_go_on(tmp_path: Path) -> None:
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "mpnet.jsonl").touch()
+    with pytest.raises(InputError, match="no records yet"):
+        read_bench(tmp_path)

@@ -1,0 +1,226 @@
+"""The check of a data set: what is wrong is found, by both validators, and named; what is right passes."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.box_arm import box_arm
+from helpers.motion_stores import line, random_motions, record, write_motions
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.core.types import Trajectory
+from robotdiffuse.datasets.rows import motion_of, problem_of
+from robotdiffuse.datasets.shards import pick_rows, read_shard, shard_path, write_shard
+from robotdiffuse.evaluation.checks import check_data
+from robotdiffuse.problems.problem import JointGoal
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Sphere
+
+ARM = box_arm()
+BALL = Scene([Sphere([0.0, 0.9, 0.0], 0.1)])
+"""Where the stretched arm comes by on its way from -1 to 2.5 rad of the first joint."""
+AWAY, BACK = np.array([-1.0, 0.0, 0.0]), np.array([2.5, 0.0, 0.0])
+
+
+@pytest.fixture
+def pybullet():
+    return pytest.importorskip("pybullet")
+
+
+def right(n: int = 3) -> list[dict[str, np.ndarray]]:
+    return random_motions(ARM, n)
+
+
+def found(folder: Path, **options) -> dict[str, int]:
+    """The kinds of what is found, with their numbers."""
+    return {kind: n for kind, n in check_data(folder, ARM, **options).counts.items() if n}
+
+
+@pytest.mark.sim
+def test_what_is_right_passes(tmp_path, pybullet):
+    write_motions(tmp_path, ARM, right(5), shard=2)
+    seen = []
+    check = check_data(tmp_path, ARM, progress=lambda *numbers: seen.append(numbers))
+    assert not check.findings
+    assert (check.shards, check.motions, check.planned, check.checked) == (3, 5, 5, 5)
+    assert seen == [(0, 5), (2, 5), (4, 5), (5, 5)]
+    assert check.least_clearance == min(row["clearance"] for row in right(5))
+
+
+@pytest.mark.sim
+def test_collision_is_found_by_both_validators(tmp_path, pybullet):
+    write_motions(tmp_path, ARM, [*right(3), record(ARM, BALL, line(AWAY, BACK))], shard=3)
+    check = check_data(tmp_path, ARM)
+    assert {kind: n for kind, n in check.counts.items() if n} == {"collision": 1, "pybullet": 1}
+    for example in check.findings:
+        assert (
+            example.where == "shard 1, row 0" and "sphere" in example.message and "inside" in example.message
+        )
+    assert found(tmp_path, pybullet=False) == {"collision": 1}
+
+
+@pytest.mark.sim
+def test_collision_between_frames_is_found(tmp_path, pybullet):
+    thin = Scene([Box([0.0, 1.1, 0.0], [0.01, 0.01, 0.01])])
+    q = line(AWAY, BACK, waypoints=4)
+    row = record(ARM, thin, q)
+    assert row["clearance"] > 0.05
+    write_motions(tmp_path, ARM, [row], waypoints=4)
+    assert found(tmp_path) == {"collision": 1, "pybullet": 1}
+
+
+@pytest.mark.sim
+def test_self_collision_is_found(tmp_path, pybullet):
+    write_motions(tmp_path, ARM, [record(ARM, Scene([]), line(np.zeros(3), np.array([0.0, 2.7, 2.7])))])
+    assert found(tmp_path) == {"collision": 1, "pybullet": 1}
+
+
+@pytest.mark.sim
+def test_limit_violation_is_found(tmp_path, pybullet):
+    q = line(np.array([2.7, 0.0, 0.0]), np.array([2.7, 1.0, 0.0]))
+    q[7, 0] = 2.801
+    write_motions(tmp_path, ARM, [*right(1), record(ARM, Scene([]), q)])
+    check = check_data(tmp_path, ARM)
+    assert {kind: n for kind, n in check.counts.items() if n} == {"limits": 1}
+    (example,) = check.findings
+    assert example.where == "shard 0, row 1" and "j0 is 2.801 at waypoint 7" in example.message
+
+
+@pytest.mark.sim
+def test_continuous_joints_have_no_limits(tmp_path, pybullet):
+    robot = load_robot("gen3")
+    q = line(np.where(robot.continuous, 9.6, 0.0), np.where(robot.continuous, 9.5, 0.1))
+    write_motions(tmp_path, robot, [record(robot, Scene([]), q)])
+    assert any(robot.continuous) and check_data(tmp_path, robot).counts["limits"] == 0
+
+
+@pytest.mark.sim
+def test_start_out_of_limits_is_found(tmp_path, pybullet):
+    q = line(np.array([2.9, 0.0, 0.0]), np.array([2.0, 0.0, 0.0]))
+    write_motions(tmp_path, ARM, [record(ARM, Scene([]), q)])
+    assert found(tmp_path) == {"limits": 1, "motion": 1}
+
+
+WRONG = {
+    "start": ("ends", lambda row: row | {"start": row["start"] + np.float32(1e-6)}),
+    "goal": ("ends", lambda row: row | {"goals": row["goals"] + 1e-6}),
+    "no such goal": ("ends", lambda row: row | {"goal_index": np.array(2)}),
+    "cost": ("cost", lambda row: row | {"cost": 1.1 * row["cost"], "detour": 1.1 * row["detour"]}),
+    "detour": ("cost", lambda row: row | {"detour": 1.01 * row["detour"]}),
+    "clearance": ("clearance", lambda row: row | {"clearance": row["clearance"] - 0.001}),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_recorded_wrongly_is_found(case, tmp_path):
+    kind, spoil = WRONG[case]
+    near = record(ARM, Scene([Sphere([0.0, 1.5, 0.0], 0.1)]), line(AWAY, np.array([1.0, 0.0, 0.0])))
+    write_motions(tmp_path, ARM, [*right(2), spoil(near)])
+    assert found(tmp_path, pybullet=False) == {kind: 1}
+
+
+def test_twitching_is_found(tmp_path):
+    q = line(AWAY, BACK)
+    q[1:-1:2] = q[0]
+    write_motions(tmp_path, ARM, [record(ARM, Scene([]), q)])
+    assert found(tmp_path, pybullet=False) == {"motion": 1}
+
+
+def test_damaged_shard_is_named_and_the_others_are_validated(tmp_path):
+    write_motions(tmp_path, ARM, right(4), shard=2)
+    chunk = next(file for file in (shard_path(tmp_path, 1) / "cost" / "c").rglob("*") if file.is_file())
+    chunk.write_bytes(chunk.read_bytes()[:-1])
+    check = check_data(tmp_path, ARM, pybullet=False)
+    assert check.counts["damaged"] == 1 and check.checked == check.motions == 2
+    (example,) = check.findings
+    assert example.where == "shard 1" and "shard_00001.zarr, array cost" in example.message
+
+
+def test_wrong_robot_is_refused(tmp_path):
+    write_motions(tmp_path, ARM, right())
+    other = replace(ARM, allowed_collisions=frozenset())
+    with pytest.raises(InputError, match="fingerprint"):
+        check_data(tmp_path, other, pybullet=False)
+
+
+def test_no_data_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no data set"):
+        check_data(tmp_path, ARM, pybullet=False)
+    write_motions(tmp_path, ARM, [])
+    with pytest.raises(InputError, match="holds no shards"):
+        check_data(tmp_path, ARM, pybullet=False)
+
+
+def test_random_motions_are_the_same_for_the_same_seed(tmp_path):
+    bent = [record(ARM, BALL, line(AWAY, BACK)) for _ in range(6)]
+    write_motions(tmp_path, ARM, bent, shard=2)
+    a, b, c = (check_data(tmp_path, ARM, 3, seed, pybullet=False) for seed in (1, 1, 2))
+    assert a.checked == a.counts["collision"] == 3
+    assert a.findings == b.findings != c.findings
+
+
+def test_processes_find_the_same(tmp_path):
+    write_motions(tmp_path, ARM, [*right(2), record(ARM, BALL, line(AWAY, BACK))], shard=1)
+    one, two = (check_data(tmp_path, ARM, workers=n, pybullet=False) for n in (1, 2))
+    assert replace(one, seconds=0.0) == replace(two, seconds=0.0)
+    assert one.findings[0].where == "shard 2, row 0"
+
+
+def test_missing_pybullet_is_one_line(tmp_path, monkeypatch):
+    write_motions(tmp_path, ARM, right(1))
+    for name in [name for name in sys.modules if name.startswith("robotdiffuse.simulation")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(InputError, match=r"pip install 'robotdiffuse\[sim\]'.*--no-pybullet"):
+        check_data(tmp_path, ARM)
+    assert not check_data(tmp_path, ARM, pybullet=False).findings
+
+
+def test_rows_are_problems_again(tmp_path):
+    near = record(
+        ARM, Scene([Sphere([0.0, 1.5, 0.0], 0.1), Box([1, 0, 1], [0.1, 0.2, 0.3])]), line(AWAY, BACK)
+    )
+    manifest = write_motions(tmp_path, ARM, [near])
+    shard = read_shard(tmp_path, 0)
+    problem = problem_of(manifest, ARM, shard, 0)
+    assert [shape.kind for shape in problem.scene.shapes] == ["sphere", "box"]
+    assert np.array_equal(problem.start, near["start"])
+    assert isinstance(problem.goal, JointGoal) and np.allclose(problem.goal.positions, near["goals"][:2])
+    motion = motion_of(ARM, shard, 0)
+    assert isinstance(motion, Motion) and np.array_equal(motion.positions, near["trajectories"])
+
+    floor = {"center": [0.0, 0.0, -0.2], "size": [3.0, 2.0, 0.4]}
+    floored = replace(manifest, floors={"rop": floor, "rop_dense": None})
+    first, *others = problem_of(floored, ARM, shard, 0).scene.shapes
+    assert isinstance(first, Box) and first.size.tolist() == floor["size"] and first.name == "floor"
+    assert len(others) == 2
+    with pytest.raises(InputError, match="family is 0; the manifest has 0"):
+        problem_of(replace(manifest, families={}, floors={}), ARM, shard, 0)
+
+
+def test_timed_rows_move_in_time(tmp_path):
+    row = record(ARM, Scene([]), line(AWAY, BACK))
+    times = np.linspace(0, 2, len(row["trajectories"]))
+    write_shard(tmp_path, 0, {k: v[None] for k, v in (row | {"times": times}).items()}, {})
+    motion = motion_of(ARM, read_shard(tmp_path, 0), 0)
+    assert isinstance(motion, Trajectory) and motion.duration == 2
+    assert np.allclose(motion.velocities[:, 0], 1.75, atol=1e-5) and np.allclose(
+        motion.accelerations, 0, atol=1e-4
+    )
+
+
+def test_picked_rows_do_not_repeat():
+    sizes = {0: 5, 2: 0, 7: 9}
+    picked = pick_rows(sizes, 10, seed=3)
+    assert picked.keys() == sizes.keys() and sum(map(len, picked.values())) == 10
+    for index, rows in picked.items():
+        assert len(set(rows.tolist())) == len(rows) and all(0 <= row < sizes[index] for row in rows)
+    assert [rows.tolist() for rows in pick_rows(sizes, None, 0).values()] == [
+        list(range(5)),
+        [],
+        list(range(9)),
+    ]

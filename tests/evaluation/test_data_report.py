@@ -1,0 +1,123 @@
+"""The figures of a data set by hand, and the page that shows them."""
+
+import builtins
+import re
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib")
+
+from helpers.box_arm import box_arm
+from helpers.motion_stores import random_motions, write_motions
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation import data_report as report
+from robotdiffuse.evaluation.data_report import (
+    SAMPLED_WAYPOINTS,
+    facts,
+    read_figures,
+    size_in_words,
+    tables,
+    write_page,
+)
+from robotdiffuse.robots import load_robot
+
+ARM = box_arm()
+
+
+@pytest.fixture
+def rows():
+    return random_motions(ARM, 11)
+
+
+def test_figures(tmp_path, rows):
+    write_motions(tmp_path, ARM, rows, shard=4)
+    found = read_figures(tmp_path)
+    costs = np.array([row["cost"] for row in rows])
+    assert (found.trajectories, found.manifest.trajectories, found.shards) == (11, 11, 3)
+    assert facts(found)[:2] == [("motions", "11"), ("waypoints, evenly spaced in length", "220")]
+    assert found.counts == {"tried": 17, "solved": 11, "unsolved": 3, "refused": 0, "thinned": 3}
+    assert found.success == pytest.approx(11 / 14)
+    assert sum(found.splits.values()) == 11 and list(found.splits) == ["train", "validation", "test"]
+    _, families, spreads = tables(found)
+    assert [row[:2] for row in families.rows] == [("rop", 6), ("rop_dense", 5)]
+    lengths = [costs.mean(), *np.quantile(costs, [0, 0.05, 0.5, 0.95, 1])]
+    assert spreads.texts[0] == ["length [rad]", *(f"{length:.3f}" for length in lengths)]
+    assert spreads.texts[1][1:] == ["1.000"] * 6
+    assert found.trivial == pytest.approx(7 / 11)
+    assert found.safety_distance == pytest.approx(0.05) and found.kept == found.kept_throughout == 1.0
+    assert found.goals_reached == 1
+    assert found.bytes == sum(f.stat().st_size for f in tmp_path.glob("*.zarr/**/*") if f.is_file())
+
+
+def test_large_sets_are_sampled_evenly(tmp_path, rows, monkeypatch):
+    monkeypatch.setattr(report, "SAMPLED_MOTIONS", 4)
+    write_motions(tmp_path, ARM, rows, shard=3)
+    found = read_figures(tmp_path)
+    assert len(found.all["cost"]) == 11
+    chosen = [rows[i] for i in (0, 2, 4, 6, 8, 10)]
+    costs = [row["goal_costs"] for row in chosen]
+    np.testing.assert_allclose(found.sample["goal_costs"], costs, rtol=1e-6)
+    kept = found.sample["trajectories"]
+    assert kept.shape == (6, min(SAMPLED_WAYPOINTS, 20), 3)
+    assert np.array_equal(kept[:, [0, -1]], [row["trajectories"][[0, -1]] for row in chosen])
+
+
+def test_page(tmp_path, rows):
+    data, file = tmp_path / "arm <1>", tmp_path / "report.html"
+    write_motions(data, ARM, rows)
+    write_page(data, file, ARM)
+    page = file.read_text("utf-8")
+    assert page.count("<svg") == 4
+    for text in (
+        "arm &lt;1&gt;",
+        "rop_dense",
+        "91.7 %; of 13 tried 1 unsolved, 0 refused, 1 thinned",
+        "clearance [cm]",
+        "up to 5 % longer",
+        *ARM.joint_names,
+    ):
+        assert text in page, text
+    assert "arm <1>" not in page
+    addresses = set(re.findall(r"""(?:src|href)=["'](.*?)["']""", page))
+    assert all(address.startswith(("data:", "#")) for address in addresses), "it must open without network"
+    before = file.read_bytes()
+    write_page(data, file, ARM)
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_page_of_hardly_any_motions(n, tmp_path, rows):
+    write_motions(tmp_path, ARM, rows[:n])
+    write_page(tmp_path, tmp_path / "report.html", ARM)
+
+
+def test_bad_input(tmp_path, rows):
+    with pytest.raises(InputError, match="no data set"):
+        read_figures(tmp_path)
+    write_motions(tmp_path, ARM, [])
+    with pytest.raises(InputError, match="holds no shards"):
+        read_figures(tmp_path)
+    write_motions(tmp_path, ARM, rows)
+    with pytest.raises(InputError, match=r"unknown ending '\.pdf'"):
+        write_page(tmp_path, tmp_path / "report.pdf", ARM)
+    with pytest.raises(InputError, match="fingerprint"):
+        write_page(tmp_path, tmp_path / "report.html", load_robot("panda"))
+
+
+def test_missing_matplotlib_is_one_line(tmp_path, rows, monkeypatch):
+    write_motions(tmp_path, ARM, rows)
+    real = builtins.__import__
+
+    def refuse(name, *rest):
+        if name.partition(".")[0] == "matplotlib":
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(InputError, match=r'pip install "robotdiffuse\[data\]"'):
+        write_page(tmp_path, tmp_path / "report.html", ARM)
+
+
+def test_sizes_in_words():
+    assert size_in_words(1_234_567) == "1.2 MB" and size_in_words(2_340_000_000) == "2.34 GB"

@@ -1,0 +1,127 @@
+"""The paper's problems with both kinds of goal; Table 1: ComScores by hand, its rows, a page made once."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robotdiffuse.cli import main
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation import paper
+from robotdiffuse.evaluation.paper import (
+    JOINT,
+    PAPER_TABLE_1,
+    POSE,
+    ROWS,
+    Row,
+    Table1Settings,
+    draw_problem,
+    free_lines,
+    goal_configurations,
+    problem_file,
+    write_problems,
+)
+from robotdiffuse.evaluation.runs import read_records
+from robotdiffuse.evaluation.statistics import Indicators, comscores
+from robotdiffuse.learning.denoisers.settings import CrossAttentionSettings
+from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings, PointsSettings
+from robotdiffuse.learning.motion_model import MotionModelSettings
+from robotdiffuse.learning.weight_files import FORMAT
+from robotdiffuse.learning.weights_registry import BUNDLED
+from robotdiffuse.problems.goals import PoseGoal
+from robotdiffuse.problems.held_out import CaseFile
+from robotdiffuse.validation.tolerances import goal_error
+
+ROW_NAMES = {row.paper: row.name for row in ROWS if row.paper}
+
+
+def test_scores_are_the_papers_and_further_rows_replace_its_method() -> None:
+    of = {ROW_NAMES[row.name]: row.indicators for row in PAPER_TABLE_1}
+    printed = comscores([row.indicators for row in PAPER_TABLE_1])
+    further = Indicators(100.0, 0.0, 14.0, 1.0)
+    found = paper.scores(ROWS, of | {"aorrtc": further})
+    for row, score in zip(PAPER_TABLE_1, printed, strict=True):
+        assert found[ROW_NAMES[row.name]] == pytest.approx(score)
+    assert found["aorrtc"] == 1.0  # the best in all four
+
+
+def test_the_papers_method_has_a_row_only_with_weights_that_see_the_code_alone(tmp_path: Path) -> None:
+    assert Table1Settings(tmp_path).rows == ROWS
+    with_weights = Table1Settings(tmp_path, paper_weights=str(BUNDLED / "panda"))
+    with pytest.raises(InputError, match="whose inputs include clearances"):
+        paper.run_table1(with_weights, lambda _: None, lambda *_: None)
+    assert paper.NO_WEIGHTS in paper.notes(Table1Settings(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        (
+            MotionModelSettings(
+                encoder="points",
+                encoder_settings=PointsSettings(),
+                denoiser="cross_attention",
+                denoiser_settings=CrossAttentionSettings(),
+            ),
+            f"{paper.WITHOUT_CLEARANCES}: points, cross_attention, 50 % of 1.6 M samples",
+        ),
+        (
+            MotionModelSettings(
+                waypoints=254,
+                encoder="compression_autoencoder",
+                encoder_settings=CompressionAutoencoderSettings(),
+            ),
+            f"{paper.AS_IN_PAPER}: compression_autoencoder, transformer, 50 % of 1.6 M samples",
+        ),
+    ],
+)
+def test_the_row_of_weights_says_what_they_are(
+    settings: MotionModelSettings, name: str, tmp_path: Path
+) -> None:
+    about = {"format": FORMAT, "settings": settings.to_json(), "training": {"samples": 800_000.0}}
+    (tmp_path / "model.json").write_text(json.dumps(about))
+    row = Table1Settings(tmp_path, paper_weights=str(tmp_path)).rows[5]
+    assert row == Row(name, f"diffusion@{tmp_path}:samples=1:guidance_steps=0:repeat=false")
+
+
+def test_weights_of_the_package_are_named_without_their_folder(tmp_path: Path) -> None:
+    row = Table1Settings(tmp_path, paper_weights="panda_points").rows[5]
+    assert row.name.startswith(f"{paper.WITHOUT_CLEARANCES}: points, cross_attention")
+
+
+@pytest.mark.slow
+def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = Row(ROWS[4].name, "straight_line", paper.OURS), Row("nearest", "straight_line:goals=nearest")
+    monkeypatch.setattr(paper, "ROWS", lines)
+    command = ["reproduce", "table1", "--out", str(tmp_path), "--problems", "3", "--time-limit", "2"]
+    assert main(command) == 0 and main(command) == 0
+    assert [len(records) for records in read_records(tmp_path).values()] == [6, 6]
+    page = (tmp_path / "table1.md").read_text()
+    assert "Goal: a pose with ten configurations; all problems: 3" in page
+    assert "| nearest" in page and "14.218" in page
+
+
+def test_both_goals_are_of_one_problem() -> None:
+    drawn = draw_problem(3)
+    pose, joint = drawn[POSE], drawn[JOINT]
+    assert isinstance(pose.goal, PoseGoal)
+    np.testing.assert_array_equal(pose.start, joint.start)
+    configuration = goal_configurations(joint)[0]
+    assert goal_error(pose.robot, pose.goal, configuration) is None
+    several = goal_configurations(pose)
+    assert 2 <= len(several) <= 10
+    assert all(goal_error(pose.robot, pose.goal, q) is None for q in several)
+    lengths = [length for length in free_lines(pose, several) if length is not None]
+    assert lengths == sorted(lengths)
+
+
+def test_problems_are_written_once(tmp_path: Path) -> None:
+    said: list[str] = []
+    write_problems(tmp_path, 2, said.append)
+    before = problem_file(tmp_path, POSE).read_bytes()
+    write_problems(tmp_path, 2, said.append)
+    assert len(said) == 1 and problem_file(tmp_path, POSE).read_bytes() == before
+    cases = CaseFile(problem_file(tmp_path, POSE)).cases()
+    assert [case.name for case in cases] == ["rop_pose/0", "rop_pose/1"]
+    assert all(case.trivial == (case.reference is not None) for case in cases)
