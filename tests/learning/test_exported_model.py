@@ -13,8 +13,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_completion, load_network
 from robotdiffuse.learning.completion import exported_completion
 from robotdiffuse.learning.completion.samples import BITS
-from robotdiffuse.learning.encoders.compression_autoencoder import CompressionAutoencoder
-from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings
+from robotdiffuse.learning.encoders import CompressionAutoencoderSettings
+from robotdiffuse.learning.encoders.networks import CompressionAutoencoder
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weights_registry import BUNDLED

@@ -29,7 +29,7 @@ from robotdiffuse.learning.completion.export import completion_exports
 from robotdiffuse.learning.completion.network import CompletionNetwork
 from robotdiffuse.learning.completion.volume import CompletionSettings
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
-from robotdiffuse.learning.encoders.base import Encoder
+from robotdiffuse.learning.encoders.networks import Encoder
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.network import Network
 from robotdiffuse.learning.networks import NETWORKS

@@ -11,8 +11,8 @@ from robotdiffuse.evaluation.paper import table1
 from robotdiffuse.evaluation.paper.comscore import PAPER_TABLE_1, Indicators, comscores
 from robotdiffuse.evaluation.paper.table1 import ROWS, Row, Table1Settings
 from robotdiffuse.evaluation.records import Record, read_records
-from robotdiffuse.learning.denoisers.settings import CrossAttentionSettings
-from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings, PointsSettings
+from robotdiffuse.learning.denoisers import CrossAttentionSettings
+from robotdiffuse.learning.encoders import CompressionAutoencoderSettings, PointsSettings
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.weight_files import FORMAT
 from robotdiffuse.learning.weights_registry import BUNDLED
