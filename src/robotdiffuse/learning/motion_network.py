@@ -17,8 +17,7 @@ from robotdiffuse.learning.diffusion import noise_factor
 from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.encoders.networks import Encoder, fp32
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
-from robotdiffuse.learning.network import Network
-from robotdiffuse.learning.onnx_export import exported
+from robotdiffuse.learning.network import Network, exported
 from robotdiffuse.learning.representation import Statistics
 from robotdiffuse.learning.robot_identity import RobotIdentity
 

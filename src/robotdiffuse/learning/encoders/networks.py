@@ -26,9 +26,10 @@ from robotdiffuse.learning.encoders import (
     PointsSettings,
     curve_keys,
 )
+from robotdiffuse.learning.network import SavedModule
 
 
-class Encoder(nn.Module, ABC):
+class Encoder(SavedModule, ABC):
     """A network from a point cloud to z. The order of the points does not matter, and a cloud may be
     empty."""
 
