@@ -43,8 +43,14 @@ from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.evaluation.statistics import compare, wilson_interval
-from robotdiffuse.learning.completion import Completion, exported_completion, predict
-from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
+from robotdiffuse.learning.completion import (
+    CameraPlaces,
+    Completion,
+    exported_completion,
+    pack,
+    predict,
+    true_voxels,
+)
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe

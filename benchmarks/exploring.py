@@ -41,7 +41,7 @@ from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.types import FIRST
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.statistics import wilson_interval
-from robotdiffuse.learning.completion.samples import FINE_VOXEL_SIZE, true_voxels
+from robotdiffuse.learning.completion import FINE_VOXEL_SIZE, true_voxels
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW

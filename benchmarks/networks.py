@@ -16,8 +16,7 @@ import torch
 
 from common import CONVERGED, TIME_LIMIT, header, parse, parts_of, print_table, progress, use_processor_time
 from robotdiffuse.learning.checkpoint import load_completion, load_network
-from robotdiffuse.learning.completion import exported_completion
-from robotdiffuse.learning.completion.samples import BITS
+from robotdiffuse.learning.completion import BITS, exported_completion
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.perception.observed_volume import SHAPE
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings

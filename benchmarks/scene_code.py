@@ -42,15 +42,14 @@ from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.factory import GenerationSettings, generate
 from robotdiffuse.learning.checkpoint import load_encoder, read_tensors, write_tensors
-from robotdiffuse.learning.denoisers.layers import two_layers
-from robotdiffuse.learning.denoisers.settings import (
+from robotdiffuse.learning.denoisers import (
     CrossAttentionSettings,
     DenoiserSettings,
     TransformerSettings,
 )
-from robotdiffuse.learning.encoders import make_encoder
-from robotdiffuse.learning.encoders.base import Encoder, fp32, wave_angles
-from robotdiffuse.learning.encoders.settings import EncoderSettings, PointNetSettings, PointsSettings
+from robotdiffuse.learning.denoisers.networks import two_layers
+from robotdiffuse.learning.encoders import EncoderSettings, PointNetSettings, PointsSettings, make_encoder
+from robotdiffuse.learning.encoders.networks import Encoder, fp32, wave_angles
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.samplers.ddim import ddim

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from helpers.commands import run
-from robotdiffuse.learning.denoisers.settings import UNetSettings
+from robotdiffuse.learning.denoisers import UNetSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
 

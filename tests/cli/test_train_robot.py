@@ -15,7 +15,7 @@ from robotdiffuse.cli.train_robot import data_settings, train_for_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.generation import factory
 from robotdiffuse.generation.factory import GenerationSettings
-from robotdiffuse.learning.denoisers.settings import TransformerSettings
+from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.training.configs import planner_training
 from robotdiffuse.learning.training.loop import TrainingRun
 from robotdiffuse.learning.weights_registry import user_weights, weights_for

@@ -11,7 +11,7 @@ from robotdiffuse.collision.batched_clearances import packed_clearances_and_grad
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.clearance_features import link_clearances
-from robotdiffuse.learning.denoisers.settings import TransformerSettings
+from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.forward_kinematics import ForwardKinematics
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork

@@ -12,7 +12,7 @@ from robotdiffuse.evaluation import ablation
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.transformer import Transformer
+from robotdiffuse.learning.denoisers.networks import TrajectoryTransformer
 from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
@@ -41,7 +41,7 @@ def test_the_papers_config_has_its_figures() -> None:
     model = MotionNetwork(
         RobotIdentity.of(PANDA), model_settings(settings, make_encoder("compression_autoencoder"))
     )
-    assert isinstance(model.denoiser, Transformer)
+    assert isinstance(model.denoiser, TrajectoryTransformer)
     assert (model.denoiser.settings.width, model.denoiser.settings.layers) == (512, 8)
     assert model.settings.code == 60
 

@@ -24,8 +24,8 @@ from robotdiffuse.evaluation.paper import (
 )
 from robotdiffuse.evaluation.runs import read_records
 from robotdiffuse.evaluation.statistics import Indicators, comscores
-from robotdiffuse.learning.denoisers.settings import CrossAttentionSettings
-from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings, PointsSettings
+from robotdiffuse.learning.denoisers import CrossAttentionSettings
+from robotdiffuse.learning.encoders import CompressionAutoencoderSettings, PointsSettings
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.weight_files import FORMAT
 from robotdiffuse.learning.weights_registry import BUNDLED

@@ -9,8 +9,8 @@ import torch
 
 from helpers.box_arm import box_arm
 from robotdiffuse.learning.checkpoint import save_network
-from robotdiffuse.learning.denoisers.settings import TransformerSettings
-from robotdiffuse.learning.encoders.settings import PointAutoencoderSettings
+from robotdiffuse.learning.denoisers import TransformerSettings
+from robotdiffuse.learning.encoders import PointAutoencoderSettings
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity

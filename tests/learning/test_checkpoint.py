@@ -18,7 +18,7 @@ from robotdiffuse.learning.checkpoint import (
     save_encoder,
     save_network,
 )
-from robotdiffuse.learning.encoders.point_autoencoder import (
+from robotdiffuse.learning.encoders.networks import (
     PointAutoencoder,
 )
 from robotdiffuse.learning.training.config import EncoderTraining

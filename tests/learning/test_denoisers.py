@@ -12,17 +12,16 @@ from helpers.box_arm import box_arm
 from helpers.small_model import SMALL_ENCODER, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model, save_network
-from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.base import Denoiser
-from robotdiffuse.learning.denoisers.layers import MAX_UNFUSED_TOKENS, attend
-from robotdiffuse.learning.denoisers.settings import (
+from robotdiffuse.learning.denoisers import (
+    DENOISERS,
     CrossAttentionSettings,
     DecoderOnlySettings,
     EncoderDecoderSettings,
     TransformerSettings,
     UNetSettings,
 )
-from robotdiffuse.learning.encoders.settings import PointsSettings
+from robotdiffuse.learning.denoisers.networks import MAX_UNFUSED_TOKENS, Denoiser, attend
+from robotdiffuse.learning.encoders import PointsSettings
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.motion_network import MotionNetwork
@@ -188,7 +187,7 @@ def test_fused_and_unfused_attention_agree(monkeypatch, causal):
         0
     )
     unfused = attend(q, k, v, causal)
-    monkeypatch.setattr("robotdiffuse.learning.denoisers.layers.MAX_UNFUSED_TOKENS", 0)
+    monkeypatch.setattr("robotdiffuse.learning.denoisers.networks.MAX_UNFUSED_TOKENS", 0)
     torch.testing.assert_close(attend(q, k, v, causal), unfused, atol=1e-6, rtol=1e-5)
 
 

@@ -17,17 +17,22 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
-from robotdiffuse.learning.denoisers.settings import CrossAttentionSettings, TransformerSettings
-from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
-from robotdiffuse.learning.encoders.base import Autoencoder
-from robotdiffuse.learning.encoders.compression_autoencoder import CompressionAutoencoder
-from robotdiffuse.learning.encoders.dgcnn import EdgeConvolution, neighbours
-from robotdiffuse.learning.encoders.settings import (
+from robotdiffuse.learning.denoisers import CrossAttentionSettings, TransformerSettings
+from robotdiffuse.learning.encoders import (
+    ENCODERS,
     CompressionAutoencoderSettings,
     DGCNNSettings,
     PointAutoencoderSettings,
     PointNetSettings,
     PointsSettings,
+    encoder_name,
+    make_encoder,
+)
+from robotdiffuse.learning.encoders.networks import (
+    Autoencoder,
+    CompressionAutoencoder,
+    EdgeConvolution,
+    neighbours,
 )
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModelSettings

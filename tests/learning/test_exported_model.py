@@ -10,11 +10,10 @@ import torch
 from helpers.box_arm import box_arm
 from helpers.small_model import save_small_model, small_model
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.checkpoint import load_completion, load_network
-from robotdiffuse.learning.completion import exported_completion
-from robotdiffuse.learning.completion.samples import BITS
-from robotdiffuse.learning.encoders.compression_autoencoder import CompressionAutoencoder
-from robotdiffuse.learning.encoders.settings import CompressionAutoencoderSettings
+from robotdiffuse.learning.checkpoint import fingerprint, load_completion, load_network, save_network
+from robotdiffuse.learning.completion import BITS, exported_completion
+from robotdiffuse.learning.encoders import CompressionAutoencoderSettings
+from robotdiffuse.learning.encoders.networks import CompressionAutoencoder
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weights_registry import BUNDLED
@@ -94,6 +93,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("weights")
     save_small_model(place)
     return place
+
+
+def test_weights_that_are_trained_anew_are_read(folder: Path, tmp_path: Path, no_export: None) -> None:
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    first = exported_model("model", tmp_path, box_arm())
+    assert exported_model("model", tmp_path, box_arm()) is first
+    about = json.loads((tmp_path / "model.json").read_text())
+    _described(tmp_path, {"settings": about["settings"] | {"sampling_steps": 3}})
+    assert exported_model("model", tmp_path, box_arm()).settings.sampling_steps == 3
+    before = load_network("model", tmp_path, box_arm())
+    assert load_network("model", tmp_path, box_arm()) is before
+    save_network("model", small_model(1), tmp_path, {})
+    assert fingerprint(load_network("model", tmp_path, box_arm())) != fingerprint(before)
 
 
 def _described(folder: Path, change: dict) -> None:

@@ -10,7 +10,7 @@ from helpers.box_arm import box_arm
 from helpers.small_model import SMALL_ENCODER, small_model
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
-from robotdiffuse.learning.encoders.point_autoencoder import (
+from robotdiffuse.learning.encoders.networks import (
     PointAutoencoder,
     chamfer,
     nearest,

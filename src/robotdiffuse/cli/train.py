@@ -61,11 +61,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--workers", type=natural, metavar="N", help="processes that draw samples (default: 1)"
     )
     completion.add_argument(
-        "--views",
-        metavar="NAME",
-        help="cameras of the samples: around the arm (the default), or everywhere, of several resolutions",
-    )
-    completion.add_argument(
         "--weights", metavar="FOLDER", help="weights to begin with; bundled: those that come with the package"
     )
     _add_shared(completion)
@@ -202,9 +197,7 @@ def run_completion(arguments: argparse.Namespace) -> int:
     need_packages("training", "torch")
     from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
 
-    given = _given(
-        arguments, ("families", "robot", "workers", "views", "weights", "device", *TRAINING_OPTIONS)
-    )
+    given = _given(arguments, ("families", "robot", "workers", "weights", "device", *TRAINING_OPTIONS))
     if "minutes" in given:
         given["samples"] = None
     settings = CompletionTraining(**given)  # type: ignore[arg-type]

@@ -9,11 +9,9 @@ import copy
 import hashlib
 import json
 import struct
-from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import cache
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
-from operator import methodcaller
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -25,16 +23,15 @@ from torch import Tensor, nn
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.learning.completion.export import completion_exports
-from robotdiffuse.learning.completion.network import CompletionNetwork
-from robotdiffuse.learning.completion.volume import CompletionSettings
+from robotdiffuse.learning.completion import CompletionSettings
+from robotdiffuse.learning.completion_network import CompletionNetwork
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
-from robotdiffuse.learning.encoders.base import Encoder
+from robotdiffuse.learning.encoders.networks import Encoder
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.network import Network
+from robotdiffuse.learning.network import Network, SavedModule
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.weight_files import FORMAT, checked_bytes, read_description
+from robotdiffuse.learning.weight_files import FORMAT, checked_bytes, read_description, stamp
 from robotdiffuse.learning.weights_registry import completion_folder, folder_of, weights_folder
 from robotdiffuse.robots.robot import Robot
 
@@ -84,19 +81,13 @@ def _pack(module: nn.Module) -> dict[str, Tensor]:
     return {name: t.half() if name in half else t for name, t in module.state_dict().items()}
 
 
-def _save(
-    module: nn.Module,
-    folder: FilePath,
-    stem: str,
-    about: dict[str, Any],
-    exports: Callable[[Any], dict[str, bytes]],
-) -> None:
+def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
     """Write STEM.safetensors, the exported parts, and last STEM.json with the SHA-256 of all."""
     packed = _pack(module)
     digest = write_tensors(folder / f"{stem}.safetensors", packed, {})
     stored = copy.deepcopy(module).cpu()
     stored.load_state_dict(packed)  # exported as it will be read
-    parts = exports(stored)
+    parts = stored.exports()
     for ending, data in parts.items():
         write_atomically(folder / f"{stem}{ending}", data)
     onnx = {ending: hashlib.sha256(data).hexdigest() for ending, data in parts.items()}
@@ -127,7 +118,7 @@ def save_encoder(encoder: Encoder, folder: str | FilePath, training: dict[str, A
         "settings": encoder.settings.to_json(),
         "training": training,
     }
-    _save(encoder, FilePath(folder), "encoder", about, lambda _: {})  # planning runs no encoder alone
+    _save(encoder, FilePath(folder), "encoder", about)
 
 
 def load_encoder(folder: str | FilePath) -> Encoder:
@@ -143,7 +134,7 @@ def load_encoder(folder: str | FilePath) -> Encoder:
 def save_completion(network: CompletionNetwork, folder: str | FilePath, training: dict[str, Any]) -> None:
     """Write completion.safetensors and completion.json. training: a record of the training, for readers."""
     about = {"network": "completion", "settings": network.settings.to_json(), "training": training}
-    _save(network, FilePath(folder), "completion", about, completion_exports)
+    _save(network, FilePath(folder), "completion", about)
 
 
 def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
@@ -170,7 +161,7 @@ def save_network(name: str, network: Network, folder: str | FilePath, training: 
         "settings": network.settings.to_json(),
         "training": training,
     }
-    _save(network, FilePath(folder), name, about, methodcaller("exports"))
+    _save(network, FilePath(folder), name, about)
 
 
 def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
@@ -180,13 +171,13 @@ def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
     made for another robot.
     """
     place = weights_folder(name, folder, robot)
-    network = _loaded(name, place)
+    network = _loaded(name, place, stamp(place, name))
     network.robot.check(robot, str(place / f"{name}.json"))
     return network
 
 
-@cache
-def _loaded(name: str, folder: FilePath) -> Network:
+@lru_cache(maxsize=16)
+def _loaded(name: str, folder: FilePath, _stamp: tuple[int, int] | None) -> Network:
     return _load(name, folder)
 
 
@@ -237,9 +228,9 @@ def export_weights(folder: str | FilePath) -> list[str]:
         about = read_description(place, name)
         about = {key: about[key] for key in about if not key.endswith("_sha256")}
         if name == "completion":
-            _save(load_completion(place), place, name, about, completion_exports)
+            _save(load_completion(place), place, name, about)
         else:
-            _save(_load(name, place), place, name, about, methodcaller("exports"))
+            _save(_load(name, place), place, name, about)
         written.append(name)
     if not written:
         raise InputError(f"{folder} holds no trained network")

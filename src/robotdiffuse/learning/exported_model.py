@@ -1,6 +1,6 @@
 """The diffusion model of trained weights, as planning runs it: by ONNX Runtime, without PyTorch."""
 
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -12,7 +12,7 @@ from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
 from robotdiffuse.learning.onnx_session import OnnxNetwork
 from robotdiffuse.learning.representation import Statistics
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.weight_files import exported_files, read_arrays, read_description
+from robotdiffuse.learning.weight_files import exported_files, read_arrays, read_description, stamp
 from robotdiffuse.learning.weights_registry import weights_folder
 from robotdiffuse.robots.robot import Robot
 
@@ -82,16 +82,17 @@ def exported_model(name: str, folder: str | FilePath | None, robot: Robot) -> Mo
     name: "model" or "trajectory_prior". Raises InputError if there is none, naming the command that trains
     it, and for files that are damaged or made for another robot.
     """
-    return _checked(name, weights_folder(name, folder, robot), robot)
+    place = weights_folder(name, folder, robot)
+    return _checked(name, place, stamp(place, name), robot)
 
 
 @lru_cache(maxsize=16)
-def _checked(name: str, folder: FilePath, robot: Robot) -> MotionModel:
-    model = _loaded(name, folder)
+def _checked(name: str, folder: FilePath, written: tuple[int, int] | None, robot: Robot) -> MotionModel:
+    model = _loaded(name, folder, written)
     model.robot.check(robot, str(folder / f"{name}.json"))
     return model
 
 
-@cache
-def _loaded(name: str, folder: FilePath) -> ExportedModel:
+@lru_cache(maxsize=16)
+def _loaded(name: str, folder: FilePath, _stamp: tuple[int, int] | None) -> ExportedModel:
     return ExportedModel(folder, name)

@@ -16,11 +16,9 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, OneOf, Positive, Settings, SettingsOf
-from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.settings import DenoiserSettings, TransformerSettings
+from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
-from robotdiffuse.learning.encoders import ENCODERS
-from robotdiffuse.learning.encoders.settings import EncoderSettings, PointAutoencoderSettings
+from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings, PointAutoencoderSettings
 from robotdiffuse.learning.objectives import OBJECTIVES, Objective
 from robotdiffuse.learning.representation import TARGETS, Reference, TrajectoryRepresentation
 from robotdiffuse.learning.robot_identity import RobotIdentity

@@ -12,14 +12,12 @@ from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.base import Denoiser
-from robotdiffuse.learning.denoisers.transformer import Transformer
+from robotdiffuse.learning.denoisers.networks import Denoiser, TrajectoryTransformer
 from robotdiffuse.learning.diffusion import noise_factor
 from robotdiffuse.learning.encoders import make_encoder
-from robotdiffuse.learning.encoders.base import Encoder, fp32
+from robotdiffuse.learning.encoders.networks import Encoder, fp32
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
-from robotdiffuse.learning.network import Network
-from robotdiffuse.learning.onnx_export import exported
+from robotdiffuse.learning.network import Network, exported
 from robotdiffuse.learning.representation import Statistics
 from robotdiffuse.learning.robot_identity import RobotIdentity
 
@@ -132,7 +130,7 @@ class MotionNetwork(Network, MotionModel):
         """
         if block == self.block:
             return
-        assert isinstance(self.denoiser, Transformer)
+        assert isinstance(self.denoiser, TrajectoryTransformer)
         self.block = block
         self._means = WaypointMeans.of_blocks(self.waypoints, block).to(self.residual_scale.device)
         self.denoiser.set_positions(self._means.centers)

@@ -1,17 +1,43 @@
-"""The base class of all trained networks of a robot, so that one checkpoint format holds them all."""
+"""The base classes of trained networks, so that one checkpoint format holds them all, and their export.
 
-from typing import Any, TypeVar
+The export is ONNX, the form in which planning runs networks.
+"""
 
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.robots.normalizer import JointNormalizer
 
+if TYPE_CHECKING:
+    from onnx import GraphProto
+
 Module = TypeVar("Module", bound=nn.Module)
+EXPORT_PACKAGES = ("onnx", "onnxscript")
+"""What PyTorch's exporter needs."""
+LEAST_STORED_IN_HALF = 1024
+"""Weights with at least so many numbers are stored in fp16 if that changes none of them."""
 
 
-class Network(nn.Module):
+class SavedModule(nn.Module):
+    """A network in files, see `checkpoint`."""
+
+    def exports(self) -> dict[str, bytes]:
+        """The ONNX files that planning runs, by the ending after the network's name; empty for a network that
+        planning runs by PyTorch."""
+        return {}
+
+
+class Network(SavedModule):
     """A network for one robot, made from a `RobotIdentity` and settings of the class that NETWORKS names."""
 
     robot: RobotIdentity
@@ -22,11 +48,6 @@ class Network(nn.Module):
         """Freeze. Returns self."""
         return self.requires_grad_(False).eval()
 
-    def exports(self) -> dict[str, bytes]:
-        """The ONNX files that planning runs, by the ending after the network's name; empty for a network that
-        planning runs by PyTorch."""
-        return {}
-
     def to_unit(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """`JointNormalizer.to_unit` of a tensor, differentiable."""
         return (q - q.new_tensor(self.normalizer.middle)) / q.new_tensor(self.normalizer.half_range)
@@ -34,3 +55,77 @@ class Network(nn.Module):
     def from_unit(self, x: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """`JointNormalizer.from_unit` of a tensor, differentiable."""
         return x * x.new_tensor(self.normalizer.half_range) + x.new_tensor(self.normalizer.middle)
+
+
+def exported(
+    module: nn.Module, inputs: Mapping[str, Tensor], dynamic: Mapping[str, Mapping[int, str]]
+) -> bytes:
+    """A module, called with the inputs by position, as the bytes of an ONNX file. The module is frozen.
+
+    inputs: examples by the names that the inputs get in the file.
+    dynamic: names of the axes whose sizes may differ from the examples, by input and axis.
+
+    Raises InputError if the packages for it are not installed.
+    """
+    need_packages("saving a network", *EXPORT_PACKAGES)
+    import onnx
+
+    dims = {name: torch.export.Dim(name) for axes in dynamic.values() for name in axes.values()}
+    shapes = tuple({axis: dims[name] for axis, name in dynamic.get(key, {}).items()} for key in inputs)
+    with _quietly(), torch.no_grad():
+        program = torch.onnx.export(
+            module.requires_grad_(False).eval(),
+            tuple(inputs.values()),
+            input_names=list(inputs),
+            output_names=["output"],
+            dynamic_shapes=shapes,
+            dynamo=True,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    for given in model.graph.input:
+        sizes = given.type.tensor_type.shape.dim
+        fixed = [axis for axis in dynamic.get(given.name, {}) if not sizes[axis].dim_param]
+        assert not fixed, f"axes {fixed} of {given.name} have become fixed: use shape[axis], not len or int"
+    _store_in_half(model.graph)
+    for node in model.graph.node:
+        del node.metadata_props[:]  # stack traces with paths of this machine
+        node.doc_string = ""
+    del model.metadata_props[:], model.graph.metadata_props[:]
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def _store_in_half(graph: "GraphProto") -> None:
+    """Store large weights in fp16 where that is exact, as for weights read from a checkpoint: half the size.
+
+    ONNX Runtime converts them back as it loads, so that it computes in fp32.
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    for tensor in graph.initializer:
+        values = numpy_helper.to_array(tensor)
+        if values.dtype != np.float32 or values.size < LEAST_STORED_IN_HALF:
+            continue
+        with np.errstate(over="ignore"):
+            half = values.astype(np.float16)
+        if np.array_equal(half.astype(np.float32), values):
+            name = tensor.name
+            tensor.CopyFrom(numpy_helper.from_array(half, f"{name}.half"))
+            cast = helper.make_node("Cast", [f"{name}.half"], [name], to=TensorProto.FLOAT)
+            graph.node.insert(0, cast)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Without the exporter's warnings about packages that it does not need, and its own deprecations."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

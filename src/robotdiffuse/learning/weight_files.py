@@ -21,6 +21,18 @@ from robotdiffuse.core.input_files import read_bytes, read_json
 FORMAT = 2
 
 
+def stamp(folder: FilePath, name: str) -> tuple[int, int] | None:
+    """Time [ns] and inode of NAME.json, which is written last; None if there is none.
+
+    Loaded networks are kept for as long as it stays the same.
+    """
+    try:
+        status = (folder / f"{name}.json").stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_ino
+
+
 def read_description(folder: FilePath, name: str) -> dict[str, Any]:
     """The contents of NAME.json. Raises InputError if it is missing or damaged."""
     file = folder / f"{name}.json"

@@ -8,6 +8,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import is_file, read_json
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.weight_files import stamp
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.user_data_dir import user_robots
 
@@ -30,18 +31,14 @@ def weights_for(name: str, robot: Robot) -> FilePath | None:
     damaged description.
     """
     for place in (user_weights(robot), BUNDLED / robot.name):
-        file = place / f"{name}.json"
-        try:
-            changed = file.stat().st_mtime_ns
-        except OSError:
-            continue
-        if not _identity(file, changed).difference(robot):
+        written = stamp(place, name)
+        if written and not _identity(place / f"{name}.json", written).difference(robot):
             return place
     return None
 
 
 @lru_cache
-def _identity(file: FilePath, _changed: int) -> RobotIdentity:
+def _identity(file: FilePath, _stamp: tuple[int, int]) -> RobotIdentity:
     try:
         about = read_json(file)["robot"]
     except (ValueError, KeyError, TypeError) as error:

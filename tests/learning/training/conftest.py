@@ -11,8 +11,8 @@ from helpers.stores import WAYPOINTS as STORED
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.learning.checkpoint import save_encoder
-from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoder
-from robotdiffuse.learning.encoders.settings import PointAutoencoderSettings
+from robotdiffuse.learning.encoders import PointAutoencoderSettings
+from robotdiffuse.learning.encoders.networks import PointAutoencoder
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.scenes.scene_arrays import SPHERE
 

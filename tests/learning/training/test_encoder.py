@@ -5,7 +5,7 @@ import torch
 
 from helpers.training_log import read_log
 from robotdiffuse.learning.checkpoint import load_encoder
-from robotdiffuse.learning.encoders.settings import PointAutoencoderSettings
+from robotdiffuse.learning.encoders import PointAutoencoderSettings
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.encoder import train_encoder
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.denoisers.layers import MAX_UNFUSED_TOKENS, attend
-from robotdiffuse.learning.denoisers.settings import TransformerSettings
+from robotdiffuse.learning.denoisers import TransformerSettings
+from robotdiffuse.learning.denoisers.networks import MAX_UNFUSED_TOKENS, attend
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork, WaypointMeans

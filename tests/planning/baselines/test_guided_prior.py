@@ -23,7 +23,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.learning.checkpoint import load_network, save_network
-from robotdiffuse.learning.denoisers.settings import UNetSettings
+from robotdiffuse.learning.denoisers import UNetSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity

@@ -8,7 +8,7 @@ import pytest
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Status
-from robotdiffuse.learning.encoders.settings import DGCNNSettings
+from robotdiffuse.learning.encoders import DGCNNSettings
 from robotdiffuse.learning.exported_model import ExportedModel
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork

@@ -1,4 +1,6 @@
-"""Networks that predict the clean trajectory from a noisy one. A new one is one file and one line.
+"""Denoisers, networks that predict the clean trajectory from a noisy one, and their settings.
+
+Nothing here loads PyTorch, so that planning can read them. The networks are in `denoisers.networks`.
 
 Millions of parameters of the defaults (48 waypoints) and of `paper_size` (254 waypoints) for a Panda, and
 the time of a forward pass of the defaults on a batch of 16, one thread, in units of the transformer's (5.8
@@ -14,34 +16,167 @@ accurate to about 20 %.
 | unet            |   1.7   |     16.4     | 1.1  | 1.3  |
 """
 
-from robotdiffuse.core.registry import Entry, Registry
+from dataclasses import dataclass
+from typing import ClassVar
 
-_PACKAGE = "robotdiffuse.learning.denoisers."
-_SETTINGS = _PACKAGE + "settings:"
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.registry import Entry, Registry
+from robotdiffuse.core.settings import Count, Settings, Sizes
+
+
+@dataclass(frozen=True)
+class DenoiserSettings(Settings):
+    """Settings of a denoiser."""
+
+    @classmethod
+    def paper_size(cls) -> "DenoiserSettings":
+        """Settings of about the size of the paper's network: 8 layers of width 512 and a token per
+        waypoint."""
+        return cls()
+
+
+@dataclass(frozen=True)
+class AttentionSettings(DenoiserSettings):
+    """Settings of all transformers.
+
+    The paper states neither the number of heads nor the size of the hidden layer: `paper_size` has those of
+    the network that the paper follows, the motion diffusion model of Tevet et al. 2023.
+    """
+
+    causal: ClassVar[bool] = False
+    """Whether waypoints attend only to z_tk and the waypoints before them."""
+    points: ClassVar[bool] = False
+    """Whether waypoints also attend to points of the scene, which are its code (encoder `points`)."""
+    width: Count = 160
+    """Size of a token; even (paper: 512)."""
+    layers: Count = 6
+    """Number of blocks (paper: 8)."""
+    heads: Count = 5
+    """Attention heads; a divisor of width."""
+    hidden: Count = 480
+    """Size of the hidden layer of each feed-forward network."""
+    patch: Count = 4
+    """Waypoints per token; a divisor of the number of waypoints (paper: 1)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        kind = self.settings_name
+        if self.width % self.heads:
+            raise InputError(f"{kind}.heads is {self.heads}; it must divide width, which is {self.width}")
+        if self.width % 2:  # sines and cosines
+            raise InputError(f"{kind}.width is {self.width}; it must be even")
+
+    @classmethod
+    def paper_size(cls) -> "AttentionSettings":
+        return cls(512, 8, 4, 1024, patch=1)
+
+    def tokens(self, waypoints: int) -> int:
+        """The number of patches. Raises InputError unless the waypoints can be divided into patches."""
+        if waypoints % self.patch:
+            raise InputError(
+                f"{self.settings_name}.patch is {self.patch}; it must divide the {waypoints} waypoints"
+            )
+        return waypoints // self.patch
+
+
+@dataclass(frozen=True)
+class TransformerSettings(AttentionSettings, name="transformer"):
+    add_z_tk: bool = True
+    """Whether z_tk is also added to every other token, so that the first layer need not distribute it;
+    otherwise it is only a token (the paper's)."""
+
+    @classmethod
+    def paper_size(cls) -> "TransformerSettings":
+        return cls(512, 8, 4, 1024, patch=1, add_z_tk=False)
+
+
+@dataclass(frozen=True)
+class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
+    width: Count = 144
+    """Size of a token; even."""
+    layers: Count = 4
+    """Blocks of the decoder."""
+    encoder_layers: Count = 2
+    """Blocks of the encoder."""
+    heads: Count = 4
+    """Attention heads; a divisor of width."""
+    hidden: Count = 432
+    """Size of the hidden layer of each feed-forward network."""
+
+    @classmethod
+    def paper_size(cls) -> "EncoderDecoderSettings":
+        return cls(512, 4, 4, 1024, patch=1)
+
+
+@dataclass(frozen=True)
+class DecoderOnlySettings(AttentionSettings, name="decoder_only"):
+    """Waypoints of one patch attend to each other."""
+
+    causal = True
+
+
+@dataclass(frozen=True)
+class CrossAttentionSettings(AttentionSettings, name="cross_attention"):
+    points = True
+    patch: Count = 8
+    """Waypoints per token; a divisor of the number of waypoints."""
+
+    @classmethod
+    def paper_size(cls) -> "CrossAttentionSettings":
+        return cls(512, 5, 4, 1024, patch=1)
+
+
+@dataclass(frozen=True)
+class UNetSettings(DenoiserSettings, name="unet"):
+    width: Count = 48
+    """Channels at the full resolution; even."""
+    multiples: Sizes = (1, 2, 4)
+    """Channels at each resolution, in units of `width`; each resolution has half the waypoints of the one
+    before."""
+    kernel: Count = 5
+    """Waypoints that a convolution covers; odd."""
+    condition_width: Count = 128
+    """Size of the vector that carries the condition and the noise level; even."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kernel % 2 == 0:
+            raise InputError(f"unet.kernel is {self.kernel}; it must be odd")
+        for name, width in (("width", self.width), ("condition_width", self.condition_width)):
+            if width % 2:
+                raise InputError(f"unet.{name} is {width}; it must be even")
+
+    @classmethod
+    def paper_size(cls) -> "UNetSettings":
+        return cls(width=144, multiples=(1, 2, 4), kernel=5, condition_width=512)
+
+
+_NETWORKS = "robotdiffuse.learning.denoisers.networks:"
+_SETTINGS = "robotdiffuse.learning.denoisers:"
 DENOISERS = Registry(
     "denoiser",
     {
         "transformer": Entry(
-            _PACKAGE + "transformer:Transformer",
+            _NETWORKS + "TrajectoryTransformer",
             "encoder-only transformer, the paper's",
             _SETTINGS + "TransformerSettings",
         ),
         "encoder_decoder": Entry(
-            _PACKAGE + "encoder_decoder:EncoderDecoder",
+            _NETWORKS + "TrajectoryTransformer",
             "encoder-decoder transformer",
             _SETTINGS + "EncoderDecoderSettings",
         ),
         "decoder_only": Entry(
-            _PACKAGE + "decoder_only:DecoderOnly",
+            _NETWORKS + "TrajectoryTransformer",
             "decoder-only transformer",
             _SETTINGS + "DecoderOnlySettings",
         ),
         "cross_attention": Entry(
-            _PACKAGE + "cross_attention:CrossAttention",
+            _NETWORKS + "TrajectoryTransformer",
             "transformer whose waypoints attend to points of the scene, of the encoder points",
             _SETTINGS + "CrossAttentionSettings",
         ),
-        "unet": Entry(_PACKAGE + "unet:UNet", "temporal U-Net", _SETTINGS + "UNetSettings"),
+        "unet": Entry(_NETWORKS + "UNet", "temporal U-Net", _SETTINGS + "UNetSettings"),
     },
 )
 """By the name in settings and checkpoints."""

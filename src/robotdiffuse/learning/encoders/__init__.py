@@ -1,37 +1,226 @@
-"""Encoders of the scene: from a point cloud to a few numbers. A new one is one file and one line in
-ENCODERS."""
+"""Encoders of the scene, from a point cloud to a few numbers, and their settings.
 
-from typing import TYPE_CHECKING
+Nothing here loads PyTorch, so that planning can read them. The networks are in `encoders.networks`.
+"""
 
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry, Registry
+from robotdiffuse.core.settings import Count, Natural, NotNegative, Settings, Sizes
+from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
 if TYPE_CHECKING:
-    from robotdiffuse.learning.encoders.base import Encoder
-    from robotdiffuse.learning.encoders.settings import EncoderSettings
+    from robotdiffuse.learning.encoders.networks import Encoder
 
-_PACKAGE = "robotdiffuse.learning.encoders."
-_SETTINGS = _PACKAGE + "settings:"
+
+@dataclass(frozen=True)
+class EncoderSettings(Settings, name="encoder"):
+    """Settings that every encoder has."""
+
+    any_size: ClassVar[bool] = True
+    """Whether clouds of any size work well; otherwise they should have about `cloud` points."""
+    ordered: ClassVar[bool] = False
+    """Whether clouds must have exactly `cloud` points, sorted as by `in_order`."""
+    along_curve: ClassVar[bool] = False
+    """Whether they are sorted along a space-filling curve; otherwise by x, then y, then z."""
+    code: Count = 96
+    """Size of z (paper: 60, for two obstacles)."""
+    cloud: Count = 512
+    """Points of an input cloud."""
+    region: VisibleRegion = PANDA_REGION
+    """Points outside are ignored, for the arm does not reach them. Within a large reach whole surfaces
+    count."""
+
+    @classmethod
+    def paper_size(cls) -> "EncoderSettings":
+        """The sizes given by the authors of this encoder, with z of this paper's size."""
+        return cls(code=60)
+
+    def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
+        """Points within the region in the form that the exported encoder takes [m]."""
+        if self.ordered:
+            return in_order(points, self.cloud, self.along_curve)
+        # zeros count for nothing; the exported network needs a point, and exactly `cloud` unless any_size
+        needed = 1 if self.any_size else self.cloud
+        return np.pad(points, ((0, max(needed - len(points), 0)), (0, 0)))
+
+
+ORDER_STEPS = 2**20 - 1
+"""Coordinates are sorted in so many steps from zero to the largest one of a cloud."""
+
+
+CURVE_STEP = 2.0**-16
+"""Coordinates are rounded to this before they are sorted along a curve [m]."""
+SPREADS = (
+    (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
+)  # fmt: skip
+"""Shifts and masks that spread the 21 low bits of an integer to every third bit."""
+
+
+def curve_keys(points: Any) -> Any:
+    """Places of points [..., 3] in metres along the Z-order curve (Morton 1966), as 63-bit integers, of an
+    array or a tensor. Neighbours along the curve are close to each other."""
+    key = 0
+    for axis in range(3):
+        bits = (points[..., axis] / CURVE_STEP).round() + 2**20
+        bits = bits.astype(np.int64) if isinstance(bits, ndarray) else bits.long()
+        bits = bits.clip(0, 2**21 - 1)
+        for shift, mask in SPREADS:
+            bits = (bits | (bits << shift)) & mask
+        key = key | (bits << (2 - axis))
+    return key
+
+
+def in_order(
+    points: Float32[ndarray, "n 3"], count: int, along_curve: bool = False
+) -> Float32[ndarray, "{count} 3"]:
+    """`count` of the points, sorted by x, then y, then z, or along a curve: thinned evenly, or repeated if
+    there are fewer.
+
+    Sorted by x, y and z, coordinates are rounded to a millionth of the largest one. Zeros without any point.
+    See also `Encoder.arrange`, for batches of tensors.
+    """
+    if not len(points):
+        return np.zeros((count, 3), np.float32)
+    thinned = (2 * np.arange(count) + 1) * len(points) // (2 * count)
+    if along_curve:
+        return points[np.argsort(curve_keys(points), kind="stable")[thinned]]
+    scale = np.float32(ORDER_STEPS) / np.float32(max(np.abs(points).max(), 1e-12))
+    steps = np.rint(points * scale)
+    ordered = steps[np.lexsort(steps.T[::-1])] / scale
+    return ordered[thinned].astype(np.float32)
+
+
+@dataclass(frozen=True)
+class PointAutoencoderSettings(EncoderSettings):
+    points: Sizes = (64, 128, 256)
+    """Layers of the perceptron on each point."""
+    octaves: Natural = 4
+    """Wavelengths (4 m, 2 m, ...) of the sines and cosines of its coordinates that each point is given."""
+    hidden: Count = 384
+    """Width of the layer between the pooled features and z, and of the decoder's."""
+    decoded: Count = 192
+    """Points that the decoder reconstructs."""
+    distance_weight: NotNegative = 4.0
+    """In training: weight of the error of the distance field relative to the Chamfer distance, both in
+    metres."""
+
+
+@dataclass(frozen=True)
+class CompressionAutoencoderSettings(EncoderSettings):
+    """The paper's sizes."""
+
+    any_size = False
+    ordered = True
+    along_curve = True
+    code: Count = 60
+    """Size of z."""
+    cloud: Count = 1400
+    """Points of an input cloud; the input has three numbers for each."""
+    hidden: Sizes = (786, 512, 256)
+    """Layers of the encoder between the cloud and z; the decoder has the same in reverse order."""
+
+
+@dataclass(frozen=True)
+class PointsSettings(EncoderSettings, name="points"):
+    any_size = False
+    ordered = True
+    code: Count = 96
+    """Size of z: three numbers for each point."""
+    cloud: Count = 32
+    """Points of an input cloud."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.code != 3 * self.cloud:
+            raise InputError(f"points.code is {self.code}; it must be three times cloud, {3 * self.cloud}")
+
+    @classmethod
+    def paper_size(cls) -> "PointsSettings":
+        return cls(code=60, cloud=20)
+
+
+@dataclass(frozen=True)
+class PointNetSettings(EncoderSettings):
+    """Sizes for training on a CPU; the original's are in brackets."""
+
+    cloud: Count = 256
+    """Points of an input cloud (1024)."""
+    first: Sizes = (32, 32)
+    """Layers on each point before the feature transform (64, 64)."""
+    second: Sizes = (32, 64, 192)
+    """Layers on each point after it (64, 128, 1024)."""
+    transform: Sizes = (16, 32, 64)
+    """Layers on each point within a transform's network (64, 128, 1024)."""
+    transform_head: tuple[Count, ...] = (32,)
+    """Layers of a transform's network after the maximum (512, 256)."""
+    head: tuple[Count, ...] = (192,)
+    """Layers between the maximum and z (512, 256)."""
+
+    @classmethod
+    def paper_size(cls) -> "PointNetSettings":
+        return cls(
+            code=60,
+            cloud=1024,
+            first=(64, 64),
+            second=(64, 128, 1024),
+            transform=(64, 128, 1024),
+            transform_head=(512, 256),
+            head=(512, 256),
+        )
+
+
+@dataclass(frozen=True)
+class DGCNNSettings(EncoderSettings):
+    """Sizes for training on a CPU; the original's are in brackets."""
+
+    any_size = False  # distances to neighbours depend on the density of the cloud
+    cloud: Count = 128
+    """Points of an input cloud (1024)."""
+    neighbours: Count = 8
+    """Nearest points that each point is joined with (20)."""
+    edges: Sizes = (32, 32, 64)
+    """Widths of the layers of edge convolution (64, 64, 128, 256)."""
+    embedding: Count = 192
+    """Features of a point, computed from all these layers, that are pooled (1024)."""
+    head: tuple[Count, ...] = (192,)
+    """Layers between the pooled features and z (512, 256)."""
+
+    @classmethod
+    def paper_size(cls) -> "DGCNNSettings":
+        return cls(
+            code=60, cloud=1024, neighbours=20, edges=(64, 64, 128, 256), embedding=1024, head=(512, 256)
+        )
+
+
+_NETWORKS = "robotdiffuse.learning.encoders.networks:"
+_SETTINGS = "robotdiffuse.learning.encoders:"
 ENCODERS = Registry(
     "encoder",
     {
         "compression_autoencoder": Entry(
-            _PACKAGE + "compression_autoencoder:CompressionAutoencoder",
+            _NETWORKS + "CompressionAutoencoder",
             "the paper's: a perceptron on 1,400 points in a fixed order",
             _SETTINGS + "CompressionAutoencoderSettings",
             "alone",
         ),
         "point_autoencoder": Entry(
-            _PACKAGE + "point_autoencoder:PointAutoencoder",
+            _NETWORKS + "PointAutoencoder",
             "a perceptron on each point, pooled: any number of points in any order",
             _SETTINGS + "PointAutoencoderSettings",
             "alone",
         ),
-        "pointnet": Entry(
-            _PACKAGE + "pointnet:PointNet", "PointNet", _SETTINGS + "PointNetSettings", "jointly"
-        ),
-        "dgcnn": Entry(_PACKAGE + "dgcnn:DGCNN", "DGCNN", _SETTINGS + "DGCNNSettings", "jointly"),
+        "pointnet": Entry(_NETWORKS + "PointNet", "PointNet", _SETTINGS + "PointNetSettings", "jointly"),
+        "dgcnn": Entry(_NETWORKS + "DGCNN", "DGCNN", _SETTINGS + "DGCNNSettings", "jointly"),
         "points": Entry(
-            _PACKAGE + "points:Points",
+            _NETWORKS + "Points",
             "the points themselves, for the denoiser cross_attention",
             _SETTINGS + "PointsSettings",
             "jointly",
@@ -43,7 +232,7 @@ frozen; "jointly" is a part of the planner's network, whose loss trains what wei
 for every batch."""
 
 
-def make_encoder(name: str, settings: "EncoderSettings | None" = None) -> "Encoder":
+def make_encoder(name: str, settings: EncoderSettings | None = None) -> "Encoder":
     """An untrained encoder of that name; None: with its default settings."""
     return ENCODERS.load(name)(settings or ENCODERS.defaults(name))
 

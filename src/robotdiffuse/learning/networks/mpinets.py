@@ -31,11 +31,12 @@ Differences from the paper:
 """
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray
 from torch import Tensor, nn
 
@@ -44,7 +45,6 @@ from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings, S
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.forward_kinematics import ForwardKinematics
 from robotdiffuse.learning.networks.base import BaselineNetwork
-from robotdiffuse.learning.networks.pointnet2 import GroupAll, SetAbstraction
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.losses import ArmDistance, SurfacePoints, hinge
@@ -133,6 +133,78 @@ GROUPS = 16
 """Groups of the group normalisation (the paper's)."""
 
 
+class PooledLayers(nn.Module):
+    """Linear layers with ReLUs on each point by itself, then the maximum over a group's points."""
+
+    def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        *first, last = pairwise((channels, *widths))
+        self.layers = nn.ModuleList(nn.Linear(*sizes) for sizes in first)
+        self.last = nn.Linear(*last)
+
+    def forward(self, x: Float[Tensor, "*groups points channels"]) -> Float[Tensor, "*groups width"]:
+        for layer in self.layers:
+            x = layer(x).relu()
+        return self.last(x).amax(-2).relu()
+
+
+class SetAbstraction(nn.Module):
+    """Selects some of the points, with features computed from the points around each: a layer of PointNet++
+    without normalisation (C. Qi et al., "PointNet++: Deep hierarchical feature learning on point sets in a
+    metric space", NeurIPS 2017).
+
+    Around each centre the nearest points of the ball are taken; the authors take the first in the cloud's
+    order.
+    """
+
+    def __init__(
+        self, channels: int, widths: tuple[int, ...], centres: int, neighbours: int, radius: float
+    ) -> None:
+        """`channels` of each point's features; `widths` of the layers; `radius` of the balls [m]."""
+        super().__init__()
+        self.centres = centres
+        self.neighbours = neighbours
+        self.radius = radius
+        self.layers = PooledLayers(3 + channels, widths)
+
+    def forward(
+        self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n channels"]
+    ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m width"]]:
+        """The centres and their features; points and centres in [m]."""
+        centres, around = group_points(points.detach(), self.centres, self.neighbours, self.radius)
+        at = _rows(points, centres)
+        offsets = (_rows(points, around) - at[:, :, None]) / self.radius
+        return at, self.layers(torch.cat([offsets, _rows(features, around)], -1))
+
+
+def group_points(
+    points: Float[Tensor, "b n 3"], count: int, neighbours: int, radius: float
+) -> tuple[Int64[Tensor, "b m"], Int64[Tensor, "b m k"]]:
+    """Indices of centres, by furthest point sampling, and of the points around each.
+
+    The first centre is the point farthest from the mean, each further one the point farthest from the centres
+    so far. Around a centre: the nearest points within the radius, beginning with the centre itself; where
+    there are fewer, the centre repeats. So the order of the points makes no difference.
+    """
+    distances = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
+    clouds = torch.arange(len(points))
+    chosen = (points - points.mean(1, keepdim=True)).norm(dim=-1).argmax(1)
+    least = torch.full_like(distances[:, 0], torch.inf)
+    found: list[Tensor] = []
+    for _ in range(count):
+        found.append(chosen)
+        least = torch.minimum(least, distances[clouds, chosen])
+        chosen = least.argmax(1)
+    centres = torch.stack(found, 1)
+    nearest = _rows(distances, centres).topk(min(neighbours, points.shape[1]), largest=False)
+    return centres, torch.where(nearest.values < radius, nearest.indices, centres[..., None])
+
+
+def _rows(values: Float[Tensor, "b n c"], at: Int64[Tensor, "b *m"]) -> Float[Tensor, "b *m c"]:
+    """The rows of each cloud with the indices `at`."""
+    return values[torch.arange(len(at)).view(-1, *[1] * (at.dim() - 1)), at]
+
+
 class Steps(NamedTuple):
     """Training samples, each of them one step of a motion."""
 
@@ -172,7 +244,8 @@ class MPiNetsNetwork(BaselineNetwork):
         self.second = SetAbstraction(
             s.first_widths[-1], s.second_widths, s.centres[1], s.neighbours[1], s.radii[1]
         )
-        self.together = GroupAll(s.second_widths[-1], s.all_widths)
+        # all points together; named as in the weights
+        self.together = nn.ModuleDict({"layers": PooledLayers(3 + s.second_widths[-1], s.all_widths)})
         wide, code = s.cloud_widths
         self.cloud_code = nn.Sequential(
             nn.Linear(s.all_widths[-1], wide),
@@ -210,9 +283,9 @@ class MPiNetsNetwork(BaselineNetwork):
         """The next configurations, within limits [rad]; clouds of the scenes [m], q and goal in [rad]."""
         points = torch.cat([clouds, self._surface(q), self._surface(goal)[:, self._target]], 1).detach()
         with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
-            labels = self._labels.to(torch.bfloat16 if fast_bf16() else torch.float32)
-            at, features = self.first(points, labels.expand(len(q), *labels.shape))
-            cloud_code = self.cloud_code(self.together(*self.second(at, features)))
+            layer = self.first(points, self._labels.expand(len(q), -1, -1))
+            together = self.together["layers"](torch.cat(self.second(*layer), -1))
+            cloud_code = self.cloud_code(together)
         # bf16 would round configurations to a hundredth of a radian
         x = self.to_unit(q)
         way = self.to_unit(goal) - x

@@ -43,6 +43,7 @@ from torch import Generator, Tensor, nn
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Share, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
+from robotdiffuse.learning.encoders import curve_keys
 from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
@@ -50,8 +51,9 @@ from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
-CURVE_BITS = 10
-"""Bits of each coordinate that determine a point's position on the space-filling curve."""
+CURVE_REACH = 16.0
+"""The region's reach is scaled to this [m] before points are sorted along the space-filling curve, which
+then fills the region."""
 SUCCESS_PROBLEMS = 64
 """Held-out problems that `success` tries."""
 SUCCESS_STEPS = 24
@@ -189,15 +191,19 @@ class MPNetNetwork(BaselineNetwork):
         wanted = (self.to_unit(following) - x) / self.step_scale
         return (step.float() - wanted).square().mean()
 
+    @torch.enable_grad()
     def autoencoder_loss(
         self, cloud: Float[Tensor, "batch points 3"], generator: Generator
     ) -> Float[Tensor, ""]:
         """The mean squared distance of points to their reconstructions plus lambda |dz / d cloud|^2 [m^2]."""
         flat = sorted_along_curve(cloud, self.region).flatten(1)
-        z, slopes = self.encoder.with_slopes(flat)
-        error = (self.decoder(z).float() - flat).view(len(cloud), -1, 3).square().sum(-1).mean()
+        flat.requires_grad_()
+        z = self.encoder(flat)
+        error = (self.decoder(z).float() - flat.detach()).view(len(cloud), -1, 3).square().sum(-1).mean()
+        # with random signs s the mean of |J^T s|^2 is |J|^2 (M. Hutchinson 1990)
         signs = torch.empty_like(z).bernoulli_(0.5, generator=generator) * 2 - 1
-        return error + self.settings.contraction * squared_slope(self.encoder, slopes, signs).mean()
+        (slope,) = torch.autograd.grad(z, flat, signs, create_graph=True)
+        return error + self.settings.contraction * slope.square().sum(1).mean()
 
     def clouds(
         self, data: TrajectoryData, rows: Int[ndarray, "scenes"], generator: Generator
@@ -281,37 +287,6 @@ class Perceptron(nn.Module):
                 x = x * keep / (1 - self.dropout)
         return self.linear[-1](x)
 
-    def weight(self, layer: int) -> Float[Tensor, "outputs inputs"]:
-        """The weight of the linear layer with this index."""
-        weight = self.linear[layer].weight
-        assert isinstance(weight, Tensor)
-        return weight
-
-    def with_slopes(
-        self, x: Float[Tensor, "batch inputs"]
-    ) -> tuple[Float[Tensor, "batch outputs"], list[Float[Tensor, "batch _"]]]:
-        """The output, and the slopes of the activations at their inputs, from the first layer on."""
-        slopes: list[Tensor] = []
-        for i, activation in enumerate(self.activations):
-            x = self.linear[i](x)
-            assert isinstance(activation, nn.PReLU)
-            slopes.append(torch.where(x > 0, torch.ones_like(x), activation.weight.to(x)))
-            x = activation(x)
-        return self.linear[-1](x), slopes
-
-
-def squared_slope(
-    network: Perceptron, slopes: list[Float[Tensor, "batch _"]], signs: Float[Tensor, "batch outputs"]
-) -> Float[Tensor, "batch"]:
-    """|J^T s|^2 of the Jacobian J at each input; with random signs s its mean is |J|^2, the sum of squares.
-
-    (M. Hutchinson 1990.) It takes one backward pass, where all of J would take one for each output.
-    """
-    v = signs
-    for i in range(len(slopes), 0, -1):
-        v = (v @ network.weight(i)) * slopes[i - 1]
-    return (v @ network.weight(0)).float().square().sum(1)
-
 
 def sorted_along_curve(
     cloud: Float[Tensor, "batch points 3"], region: VisibleRegion
@@ -322,8 +297,5 @@ def sorted_along_curve(
     """
     filled: Bool[Tensor, "batch 1 1"] = (cloud != 0).flatten(1).any(1)[:, None, None]
     local = (cloud - torch.tensor(region.center).to(cloud)) * filled
-    cells = ((local / region.reach + 1) * 2 ** (CURVE_BITS - 1)).long().clamp(0, 2**CURVE_BITS - 1)
-    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
-        cells = (cells | (cells << shift)) & mask
-    place = (cells[..., 0] << 2) | (cells[..., 1] << 1) | cells[..., 2]
-    return local.gather(1, place.argsort(1)[..., None].expand(-1, -1, 3))
+    order = curve_keys(local * (CURVE_REACH / region.reach)).argsort(1)
+    return local.gather(1, order[..., None].expand(-1, -1, 3))

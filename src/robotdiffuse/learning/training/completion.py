@@ -14,9 +14,17 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
 from robotdiffuse.learning.checkpoint import load_completion, save_completion
-from robotdiffuse.learning.completion.network import CompletionNetwork, folded
-from robotdiffuse.learning.completion.samples import FREE, OCCUPIED, VIEWS, Samples, draw_samples, unpack_fine
-from robotdiffuse.learning.completion.volume import CompletionSettings, reachable, voxel_centers
+from robotdiffuse.learning.completion import (
+    FREE,
+    OCCUPIED,
+    CompletionSettings,
+    Samples,
+    draw_samples,
+    reachable,
+    unpack_fine,
+    voxel_centers,
+)
+from robotdiffuse.learning.completion_network import CompletionNetwork, folded
 from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSettings
 from robotdiffuse.learning.training.loop import Validation
 from robotdiffuse.learning.training.prefetch import SEED_LIMIT, SamplePrefetcher
@@ -52,8 +60,6 @@ class CompletionTraining(TrainingSettings):
     """Bundled name, or path to a URDF: the arm in the views."""
     families: Annotated[tuple[Annotated[str, OneOf(FAMILIES)], ...], Filled()] = tuple(FAMILIES)
     """Families of the scenes, in equal parts."""
-    views: Annotated[str, OneOf(VIEWS)] = "around"
-    """Of the samples: "around" the arm, or "everywhere", with noise and several resolutions."""
     weights: str | None = None
     """Folder with weights to begin with; "bundled": those that come with the package; None: random ones."""
     minutes: Positive | None = None
@@ -94,9 +100,7 @@ class CompletionTask(TrainingTask):
         self.robot = load_robot(settings.robot)
         torch.manual_seed(settings.seed)
         self.module = self._trained = self._initial(settings).to(processes.device)
-        self.prefetcher = SamplePrefetcher(
-            settings.families, self.robot, settings.batch, settings.workers, settings.views
-        )
+        self.prefetcher = SamplePrefetcher(settings.families, self.robot, settings.batch, settings.workers)
         self._reachable, self._above = reachable(), voxel_centers()[..., 2] > VOXEL / 2
         self._validation_samples = self._held_out(settings.families, 0, VALIDATION_SAMPLES)
         self._figures: dict[str, Any] = {}
@@ -167,7 +171,7 @@ class CompletionTask(TrainingTask):
             place = list(FAMILIES).index(name)
             rng = np.random.default_rng([HELD_OUT_SEED, place])
             seeds = rng.integers(SEED_LIMIT, size=first + count)[first:]
-            parts.append(draw_samples((name,), self.robot, seeds.tolist(), self.settings.views))
+            parts.append(draw_samples((name,), self.robot, seeds.tolist()))
         return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _counts(self, samples: Samples) -> Bool[ndarray, "n 56 56 32"]:

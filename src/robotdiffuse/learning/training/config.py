@@ -15,10 +15,8 @@ from robotdiffuse.core.settings import (
     SettingsOf,
     Share,
 )
-from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.settings import DenoiserSettings, TransformerSettings
-from robotdiffuse.learning.encoders import ENCODERS
-from robotdiffuse.learning.encoders.settings import EncoderSettings
+from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
+from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings
 from robotdiffuse.learning.motion_model import MAX_WAYPOINTS, ModelParts, check_points
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.training.losses import LossSettings

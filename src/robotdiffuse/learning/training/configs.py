@@ -14,7 +14,7 @@ import math
 from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.learning.denoisers.settings import TransformerSettings, UNetSettings
+from robotdiffuse.learning.denoisers import TransformerSettings, UNetSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import LossSettings

@@ -11,7 +11,7 @@ import numpy as np
 
 from robotdiffuse.core.processes import block_interrupts_in_children, prepare_worker
 from robotdiffuse.core.registry import AddedEntries, added_entries
-from robotdiffuse.learning.completion.samples import Samples, draw_samples
+from robotdiffuse.learning.completion import Samples, draw_samples
 from robotdiffuse.robots.robot import Robot
 
 NICENESS = 5
@@ -28,12 +28,11 @@ class SamplePrefetcher:
     A copy of the generator tells the seeds of the next batches, so a resumed run has the same batches.
     """
 
-    def __init__(self, families: Sequence[str], robot: Robot, batch: int, workers: int, views: str) -> None:
-        """
-        workers: number of worker processes; 0: `next` draws the samples itself.
-        views: of the samples, a name in `samples.VIEWS`.
-        """
-        self._families, self._robot, self._batch, self._views = tuple(families), robot, batch, views
+    def __init__(self, families: Sequence[str], robot: Robot, batch: int, workers: int) -> None:
+        """workers: number of worker processes; 0: `next` draws the samples itself."""
+        self._families = tuple(families)
+        self._robot = robot
+        self._batch = batch
         self._depth = BATCHES_AHEAD * workers
         self._pool: ProcessPoolExecutor | None = None
         if workers:
@@ -45,7 +44,7 @@ class SamplePrefetcher:
         """The batch of samples with the seeds that `rng` draws."""
         seeds = self._seeds(rng)
         if self._pool is None:
-            return draw_samples(self._families, self._robot, seeds, self._views)
+            return draw_samples(self._families, self._robot, seeds)
         if not self._pending or self._pending[0][0] != seeds:
             self._pending.clear()
             self._submit(seeds)
@@ -67,7 +66,7 @@ class SamplePrefetcher:
     def _submit(self, seeds: tuple[int, ...]) -> None:
         assert self._pool is not None
         with block_interrupts_in_children():
-            job = self._pool.submit(draw_samples, self._families, self._robot, seeds, self._views)
+            job = self._pool.submit(draw_samples, self._families, self._robot, seeds)
         self._pending.append((seeds, job))
 
 

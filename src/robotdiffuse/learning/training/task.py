@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.checkpoint import versions
-from robotdiffuse.learning.encoders.base import Encoder
-from robotdiffuse.learning.onnx_export import EXPORT_PACKAGES
+from robotdiffuse.learning.encoders.networks import Encoder
+from robotdiffuse.learning.network import EXPORT_PACKAGES
 from robotdiffuse.learning.training.batches import TrajectoryData, load_data
 from robotdiffuse.learning.training.config import MotionTraining, TrainingSettings
 from robotdiffuse.learning.training.loop import TrainingRun, Validation

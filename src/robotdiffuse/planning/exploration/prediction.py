@@ -20,8 +20,7 @@ def predicted_occupancy(
 ) -> Float32[ndarray, "nx ny nz"] | None:
     """The probability that each voxel is occupied, 0 where the map knows it to be free; None if the network
     does not cover the arm's reach. volume: gives what views observed."""
-    from robotdiffuse.learning.completion import predict
-    from robotdiffuse.learning.completion.coverage import covers
+    from robotdiffuse.learning.completion import covers, predict
 
     if not covers(robot):
         return None

@@ -138,8 +138,7 @@ def policy_for(problem: Problem) -> tuple[str, str]:
     """The problem's policy for unknown space or the default one, and a note where that is not prediction."""
     if problem.unknown is not None:
         return problem.unknown, ""
-    from robotdiffuse.learning.completion.coverage import covers
-    from robotdiffuse.learning.completion.volume import REACH
+    from robotdiffuse.learning.completion import REACH, covers
 
     if covers(problem.robot):
         return PREDICTED, ""

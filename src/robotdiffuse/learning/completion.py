@@ -1,20 +1,28 @@
-"""Training samples of the completion network: random scenes seen by cameras placed as a person would place
-them.
+"""The occupancy completion network, which predicts obstacles where no camera saw.
 
-Nothing here loads PyTorch, so that processes that only draw samples start quickly.
+Its voxels, its use by ONNX Runtime, and the samples that it is trained on: random scenes seen by cameras
+placed as a person would place them.
+
+Nothing here loads PyTorch. The network itself is in `completion_network`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Count, Settings
+from robotdiffuse.learning.weight_files import exported_files, read_description, stamp
+from robotdiffuse.learning.weights_registry import completion_folder
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
@@ -22,9 +30,60 @@ from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_with
 from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import Range, base_spheres
-from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.kinematics import link_poses
+from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
+
+SHOULDER = (0.0, 0.0, 0.33)
+"""Of a Panda, in the base frame [m]."""
+REACH = 1.0
+"""Voxels count within this distance of the shoulder [m]: no point of a Panda gets farther."""
+
+
+@dataclass(frozen=True)
+class CompletionSettings(Settings, name="completion"):
+    """Sizes of the network."""
+
+    channels: tuple[Count, Count, Count] = (32, 64, 128)
+    """Features of cells of 8, 16 and 32 cm."""
+    blocks: tuple[Count, Count, Count] = (1, 1, 2)
+    """Residual blocks at each size: as many on the way down as on the way up; those of the last size occur
+    once."""
+
+
+def voxel_centers() -> Float[ndarray, "56 56 32 3"]:
+    """Centres of the voxels of an observed volume [m]."""
+    axes = [(np.arange(n) + 0.5) * VOXEL + low for n, low in zip(SHAPE, LOW, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+def reachable() -> Bool[ndarray, "56 56 32"]:
+    """The voxels that the arm can reach."""
+    return np.linalg.norm(voxel_centers() - SHOULDER, axis=-1) <= REACH
+
+
+REACH_SAMPLES = 256
+"""Random configurations: they reach within 1 cm as far as thousands do."""
+
+
+@once_per_robot
+def covers(robot: Robot) -> bool:
+    """Whether the network predicts wherever the arm can reach, as random configurations show."""
+    lower, upper = (np.clip(limit, -np.pi, np.pi) for limit in (robot.lower, robot.upper))
+    if any(robot.prismatic):
+        lower, upper = (
+            np.where(robot.prismatic, *pair) for pair in ((robot.lower, lower), (robot.upper, upper))
+        )
+    q = np.random.default_rng(0).uniform(lower, upper, (REACH_SAMPLES, robot.dof))
+    for link, spheres in robot.spheres.items():
+        if robot.link_frame(link) == 0:
+            continue
+        T = link_poses(robot, q, link)
+        centers = np.einsum("nij,mj->nmi", T[:, :3, :3], spheres[:, :3]) + T[:, None, :3, 3]
+        if (np.linalg.norm(centers - SHOULDER, axis=2) + spheres[:, 3]).max(initial=0.0) > REACH:
+            return False
+    return True
+
 
 FINE_VOXEL_SIZE = VOXEL / 2
 """Edge of the voxels that are predicted [m]."""
@@ -70,48 +129,15 @@ class CameraPlaces:
         return T, rng.uniform(*self.field_of_view)
 
 
-@dataclass(frozen=True)
-class Views:
-    """Distribution of the views of a sample."""
-
-    places: tuple[CameraPlaces, ...]
-    """Each camera is at one of these, drawn evenly."""
-    wrist_share: float
-    """Share of the cameras that are on the arm's hand instead."""
-    sizes: tuple[tuple[int, int], ...]
-    """Widths and heights of images, drawn evenly [pixels]."""
-    counts: tuple[int, ...]
-    """Numbers of views, drawn evenly."""
-    noise_share: float
-    """Share of the samples with noise, of up to twice the usual strength."""
-
-
-VIEWS = {
-    "around": Views((CameraPlaces(),), 0.0, ((160, 120),), (1, 1, 1, 2), 0.5),
-    "everywhere": Views(
-        (
-            CameraPlaces(),
-            CameraPlaces(
-                distance=(0.4, 1.3), height=(0.1, 0.9), target_spread=0.3, field_of_view=(0.75, 1.2)
-            ),
-            CameraPlaces(distance=(0.1, 0.8), height=(1.2, 2.2), field_of_view=(0.75, 1.2), roll=0.5),
-            CameraPlaces(distance=(2.0, 3.0), height=(0.3, 2.0), field_of_view=(0.5, 1.0)),
-        ),
-        wrist_share=0.15,
-        sizes=((160, 120), (320, 240), (640, 480)),
-        counts=(1, 1, 1, 2, 3),
-        noise_share=0.65,
-    ),
-}
-"""Views by name: of cameras that stand around the arm; and of those near, low, overhead, far and on the hand,
-of several resolutions."""
+VIEW_COUNTS = (1, 1, 1, 2)
+"""Numbers of views of a sample, drawn evenly."""
+IMAGE_SIZE = (160, 120)
+"""Width and height of images [pixels]."""
+NOISE_SHARE = 0.5
+"""Share of the samples with noise, of up to twice the usual strength."""
 CAMERA_CLEARANCE = 0.05
 """Cameras stand at least this far from obstacles, where a few draws find such a place [m]."""
 CAMERA_DRAWS = 8
-WRIST_TURN = 0.4
-"""Largest angle between the axes of a camera on the hand and the hand [rad]."""
-WRIST_OFFSET = 0.07
-"""Distance of a camera on the hand from the hand's axis [m]."""
 OUT_OF_RANGE_SHARE = 0.5
 """Share of the noisy samples in which surfaces out of range return no depth, as with most real cameras."""
 MISSING_SHARE = 0.02
@@ -165,32 +191,17 @@ def unpack_fine(truth: UInt8[ndarray, "*b"]) -> Bool[ndarray, "*b 8"]:
     return (truth[..., None] >> np.arange(8, dtype=np.uint8) & 1).astype(np.bool_)
 
 
-def camera_view(
-    scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Generator, views: Views
-) -> DepthView:
+def camera_view(scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Generator) -> DepthView:
     """A depth view of the scene from a random pose, without noise."""
-    width, height = views.sizes[int(rng.integers(len(views.sizes)))]
     obstacles = compile_scene_for(robot, scene)
-    on_wrist = rng.random() < views.wrist_share
     for _ in range(CAMERA_DRAWS):
-        places = views.places[int(rng.integers(len(views.places)))]
-        T, angle = _wrist_camera(robot, q, rng) if on_wrist else places.draw(scene, rng)
+        T, angle = CameraPlaces().draw(scene, rng)
         if not near_scene(obstacles, T[None, :3, 3].astype(np.float32), np.float32(CAMERA_CLEARANCE))[0]:
             break
+    width, height = IMAGE_SIZE
     focal = height / 2 / np.tan(angle / 2)
     intrinsics = (focal, focal, (width - 1) / 2, (height - 1) / 2)
-    # a camera on the hand looks past the gripper: the spheres that cover it would hide everything
-    return ray_cast(scene, T, intrinsics, (width, height), None if on_wrist else robot, q)
-
-
-def _wrist_camera(robot: Robot, q: Float[ndarray, "dof"], rng: Generator) -> tuple[ndarray, float]:
-    """T_base_camera of a camera beside the hand that looks about along its axis, and its field of view."""
-    T_base_hand = link_pose(robot, q, robot.tip)
-    turn = rng.uniform(-np.pi, np.pi)
-    aside = WRIST_OFFSET * np.array([np.cos(turn), np.sin(turn), 0.0])
-    aim = np.array([*np.tan(rng.uniform(-WRIST_TURN, WRIST_TURN, 2)), 1.0])
-    T_hand_camera = looking_at(aside, aside + aim, rng.uniform(-np.pi, np.pi))
-    return T_base_hand @ T_hand_camera, rng.uniform(0.75, 1.0)
+    return ray_cast(scene, T, intrinsics, IMAGE_SIZE, robot, q)
 
 
 def random_configuration(checker: CollisionChecker, robot: Robot, rng: Generator) -> Float[ndarray, "dof"]:
@@ -200,16 +211,15 @@ def random_configuration(checker: CollisionChecker, robot: Robot, rng: Generator
     return q[free[0]] if len(free) else q[0]
 
 
-def draw_sample(families: Sequence[str], robot: Robot, rng: Generator, views: Views) -> Sample:
+def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> Sample:
     """A random scene of one of the families, as cameras observe it."""
     family = load_family(families[int(rng.integers(len(families)))])
     scene = family.scene(rng, base_spheres(robot))
     if rng.random() < NO_FLOOR_SHARE:
         scene = Scene([shape for shape in scene.shapes if shape is not family.floor])
     q = random_configuration(CollisionChecker(robot, scene), robot, rng)
-    count = views.counts[int(rng.integers(len(views.counts)))]
-    taken = [camera_view(scene, robot, q, rng, views) for _ in range(count)]
-    if rng.random() < views.noise_share:
+    views = [camera_view(scene, robot, q, rng) for _ in range(rng.choice(VIEW_COUNTS))]
+    if rng.random() < NOISE_SHARE:
         strength, hide_far = 2 * rng.random(), rng.random() < OUT_OF_RANGE_SHARE
         usual = DepthNoise()
         noise = DepthNoise(
@@ -220,8 +230,8 @@ def draw_sample(families: Sequence[str], robot: Robot, rng: Generator, views: Vi
             strength * usual.edge_missing,
             grazing=strength * usual.grazing,
         )
-        taken = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in taken]
-    seen, behind = pack(observe(taken, robot, q))
+        views = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in views]
+    seen, behind = pack(observe(views, robot, q))
     return Sample(seen, behind, pack_fine(true_voxels(scene)))
 
 
@@ -231,9 +241,43 @@ def _without_infinity(view: DepthView) -> DepthView:
     return DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)
 
 
-def draw_samples(
-    families: Sequence[str], robot: Robot, seeds: Sequence[int], views: str = "around"
-) -> Samples:
-    """A sample for each seed; `views` is a name in VIEWS."""
-    drawn = [draw_sample(families, robot, np.random.default_rng(seed), VIEWS[views]) for seed in seeds]
+def draw_samples(families: Sequence[str], robot: Robot, seeds: Sequence[int]) -> Samples:
+    """A sample for each seed."""
+    drawn = [draw_sample(families, robot, np.random.default_rng(seed)) for seed in seeds]
     return Samples(*(np.stack(arrays) for arrays in zip(*drawn, strict=True)))
+
+
+Completion = Callable[[ndarray, ndarray], ndarray]
+"""From a packed volume, as by `pack`, to the probability of each voxel of 2 cm."""
+
+
+def predict(volume: ObservedVolume, network: Completion | None = None) -> Float32[ndarray, "112 112 64"]:
+    """The probability that each voxel of 2 cm holds an obstacle.
+
+    It is 0 in voxels that were seen free, and farther than 1 m from a Panda's shoulder, which training did
+    not cover. The grid begins at the volume's LOW. network: None for the one that comes with the package.
+    """
+    return (network or exported_completion())(*pack(volume))
+
+
+def exported_completion(folder: str | FilePath | None = None) -> Completion:
+    """The network of a folder, loaded once, and again if it was trained anew; None: the one that comes with
+    the package.
+
+    Raises InputError for damaged files, and if there is none, naming the command that trains it.
+    """
+    place = completion_folder(folder)
+    return _exported(place, stamp(place, "completion"))
+
+
+@lru_cache(maxsize=4)
+def _exported(place: FilePath, _stamp: tuple[int, int] | None) -> Completion:
+    from robotdiffuse.learning.onnx_session import OnnxNetwork  # imports ONNX Runtime
+
+    parts = exported_files(place, "completion", read_description(place, "completion"))
+    if parts.keys() != {".onnx"}:
+        raise InputError(
+            f"{place / 'completion.json'} names the ONNX files {sorted(parts)}; it must name .onnx"
+        )
+    network = OnnxNetwork(parts[".onnx"], str(place / "completion.onnx"))
+    return lambda seen, behind: network(seen=seen, behind=behind)

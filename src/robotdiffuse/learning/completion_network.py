@@ -12,8 +12,16 @@ import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor, nn
 
-from robotdiffuse.learning.completion.samples import BITS, DEPTH_STEP, FREE
-from robotdiffuse.learning.completion.volume import CompletionSettings, reachable, voxel_centers
+from robotdiffuse.learning.completion import (
+    BITS,
+    DEPTH_STEP,
+    FREE,
+    CompletionSettings,
+    reachable,
+    voxel_centers,
+)
+from robotdiffuse.learning.network import SavedModule, exported
+from robotdiffuse.perception.observed_volume import SHAPE
 
 CHANNELS = 7
 """Occupied, free, shadow of the arm, out of view, depth behind a surface, height, distance from the base's
@@ -62,7 +70,7 @@ class Block(nn.Module):
         return self.second(self.first(x).relu_()).add_(x)  # in place: 3 % less time
 
 
-class CompletionNetwork(nn.Module):
+class CompletionNetwork(SavedModule):
     """From observed volumes to logits; `probabilities` divides them by a temperature that training fits."""
 
     places: Tensor
@@ -88,7 +96,7 @@ class CompletionNetwork(nn.Module):
     def features(
         self, seen: UInt8[Tensor, "n 56 56 32"], behind: UInt8[Tensor, "n 56 56 32"]
     ) -> Float[Tensor, "n 56 28 28 16"]:
-        """The input channels of volumes packed by `samples.pack`."""
+        """The input channels of volumes packed by `completion.pack`."""
         kind = torch.bfloat16 if torch.is_autocast_enabled(seen.device.type) else torch.float32
         seen, behind = folded(seen), folded(behind)
         out = seen.new_empty((*seen.shape[:4], 8 * CHANNELS), dtype=kind)
@@ -120,6 +128,25 @@ class CompletionNetwork(nn.Module):
         for axis in (1, 2, 3):
             free = free.repeat_interleave(2, axis)
         return torch.sigmoid(logits).masked_fill_(free, 0.0)
+
+    def exports(self) -> dict[str, bytes]:
+        """`probabilities` of one volume."""
+        # two tensors: the exporter takes one tensor for one input
+        inputs = {name: torch.zeros(SHAPE, dtype=torch.uint8) for name in ("seen", "behind")}
+        return {".onnx": exported(_Probabilities(self), inputs, {})}
+
+
+class _Probabilities(nn.Module):
+    """`CompletionNetwork.probabilities` of one volume as a module, for export."""
+
+    def __init__(self, network: CompletionNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, seen: UInt8[Tensor, "56 56 32"], behind: UInt8[Tensor, "56 56 32"]
+    ) -> Float[Tensor, "112 112 64"]:
+        return self.network.probabilities(seen[None], behind[None])[0]
 
 
 def _blocks(channels: int, count: int) -> nn.Sequential:

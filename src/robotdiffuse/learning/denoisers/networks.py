@@ -1,0 +1,362 @@
+"""The denoisers: one transformer over the tokens of a trajectory, with variants, and a temporal U-Net.
+
+The residual stream is fp32; under autocast the linear layers are bf16.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Real
+from numpy import ndarray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from robotdiffuse.learning.denoisers import (
+    AttentionSettings,
+    EncoderDecoderSettings,
+    TransformerSettings,
+    UNetSettings,
+)
+from robotdiffuse.learning.encoders.networks import wave_angles
+
+OCTAVES = 4
+"""Wavelengths of the sines and cosines of a point's coordinates that are inputs too; see `wave_angles`."""
+MAX_UNFUSED_TOKENS = 96
+"""Up to this number of tokens, attention in fp32 on a CPU does without the fused kernel; in bf16 always.
+Measured with torch 2.13 on one thread, forward and backward [ms], unfused in bf16, unfused in fp32, fused in
+fp32. Batch 64, 4 heads of 128 numbers: 31 tokens 13, 30 and 34; 66 tokens 29, 76 and 56; 97 tokens 49, 93 and
+121; 255 tokens 274, 813 and 480. Batch 128, 5 heads of 32 numbers: 13 tokens 4.5, 8.8 and 8.1."""
+
+
+def two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    """A feed-forward network with one hidden layer."""
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU("tanh"), nn.Linear(hidden, outputs))
+
+
+class LevelEmbedding(nn.Sequential):
+    """The noise level t / T as `width` numbers: sines and cosines, then a feed-forward network."""
+
+    frequencies: Tensor
+
+    def __init__(self, width: int) -> None:
+        super().__init__(*two_layers(width, width, width))
+        self.register_buffer(
+            "frequencies", torch.exp(torch.linspace(0.0, np.log(1_000.0), width // 2)), persistent=False
+        )
+
+    def forward(self, input: Float[Tensor, "batch"]) -> Float[Tensor, "batch width"]:
+        angles = input[:, None] * self.frequencies
+        return super().forward(torch.cat([angles.sin(), angles.cos()], -1))
+
+
+def positions(at: Real[ndarray, "tokens"], width: int) -> Float[Tensor, "tokens width"]:
+    """Sinusoidal codes of positions (Vaswani et al. 2017)."""
+    angles = at[:, None] / 10_000 ** (np.arange(0, width, 2) / width)
+    return torch.from_numpy(
+        np.stack([np.sin(angles), np.cos(angles)], -1).reshape(len(at), -1)[:, :width]
+    ).float()
+
+
+def split_heads(x: Tensor, parts: int, heads: int) -> tuple[Tensor, ...]:
+    """[batch, tokens, parts * width] split into `parts` tensors [batch, heads, tokens, width / heads]."""
+    batch, tokens, _ = x.shape
+    x = x.view(batch, tokens, parts, heads, -1).permute(2, 0, 3, 1, 4)
+    return x.contiguous().unbind(0)
+
+
+def attend(
+    q: Float[Tensor, "batch heads tokens size"],
+    k: Float[Tensor, "batch heads others size"],
+    v: Float[Tensor, "batch heads others size"],
+    causal: bool = False,
+) -> Float[Tensor, "batch tokens width"]:
+    """Attention of tokens to others; causal: each token only to those up to itself.
+
+    Plain matrix products serve bf16 and short sequences on a CPU, where the fused kernel is slower; the fused
+    kernel serves the others and GPUs.
+    """
+    batch, heads, tokens, size = q.shape
+    plain = q.dtype == torch.bfloat16 or k.shape[2] <= MAX_UNFUSED_TOKENS
+    if q.is_cuda or not plain:
+        mixed = functional.scaled_dot_product_attention(q, k, v, is_causal=causal)
+    else:
+        scores = (q * size**-0.5) @ k.transpose(-1, -2)
+        if causal:
+            later = torch.ones(tokens, tokens, dtype=torch.bool, device=q.device).triu(1)
+            scores = scores.masked_fill(later, -torch.inf)
+        # padded to a multiple of 16, softmax over few tokens is eight times as fast
+        padded = functional.pad(scores, (0, -scores.shape[-1] % 16), value=-torch.inf)
+        mixed = torch.softmax(padded, dim=-1)[..., : scores.shape[-1]] @ v
+    return mixed.transpose(1, 2).reshape(batch, tokens, heads * size)
+
+
+def start_small(layer: nn.Linear, layers: int) -> None:
+    """Initialise the last layer of a residual branch, one of `layers` in a row."""
+    nn.init.normal_(layer.weight, std=0.02 / (2 * layers) ** 0.5)
+    nn.init.zeros_(layer.bias)
+
+
+def start_at_zero(layer: nn.Linear) -> None:
+    """Initialise the last layer of a network to zero."""
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+
+
+class Denoiser(nn.Module, ABC):
+    """A network from a noisy trajectory to the output that the model's objective defines."""
+
+    out: nn.Linear
+    """The last layer. It starts at zero, so that an untrained network predicts the mean trajectory."""
+
+    def __init__(self, settings: Any, waypoints: int, dof: int, features: int, condition: int) -> None:
+        """settings: of the class that DENOISERS names for the denoiser.
+        features: inputs per waypoint.
+        condition: numbers in [z, start, goal]; start and goal are the last two times `dof`.
+        """
+        super().__init__()
+        self.settings = settings
+        self.waypoints = waypoints
+        self.dof = dof
+
+    @abstractmethod
+    def forward(
+        self,
+        features: Float[Tensor, "batch waypoints features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+    ) -> Float[Tensor, "batch waypoints dof"]:
+        """The output for noisy trajectories; level is t / T in [0, 1]."""
+
+
+class Block(nn.Module):
+    """A transformer block: pre-norm self attention and feed-forward network."""
+
+    def __init__(
+        self, width: int, heads: int, hidden: int, layers: int, causal: bool = False, cross: bool = False
+    ) -> None:
+        """layers: number of blocks in a row; the more, the smaller the initial weights of each.
+        cross: whether the tokens also attend to those of an encoder (the decoder of Vaswani et al. 2017).
+        """
+        super().__init__()
+        self.heads = heads
+        self.causal = causal
+        self.norm_attention = nn.LayerNorm(width)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.merge = nn.Linear(width, width)
+        self.norm_mlp = nn.LayerNorm(width)
+        self.expand = nn.Linear(width, hidden)
+        self.contract = nn.Linear(hidden, width)
+        last = [self.merge, self.contract]
+        if cross:
+            self.norm_cross = nn.LayerNorm(width)
+            self.query = nn.Linear(width, width)
+            self.key_value = nn.Linear(width, 2 * width)
+            self.merge_cross = nn.Linear(width, width)
+            last.append(self.merge_cross)
+        for layer in last:
+            start_small(layer, layers)
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch tokens width"],
+        memory: Float[Tensor, "batch others width"] | None = None,
+    ) -> Float[Tensor, "batch tokens width"]:
+        """memory: the encoder's tokens."""
+        q, k, v = split_heads(self.qkv(self.norm_attention(x)), 3, self.heads)
+        x = x + self.merge(attend(q, k, v, self.causal))
+        if memory is not None:
+            (q,) = split_heads(self.query(self.norm_cross(x)), 1, self.heads)
+            k, v = split_heads(self.key_value(memory), 2, self.heads)
+            x = x + self.merge_cross(attend(q, k, v))
+        return x + self.contract(functional.gelu(self.expand(self.norm_mlp(x))))
+
+
+class TrajectoryTransformer(Denoiser):
+    """A transformer whose tokens are patches of waypoints; its settings tell the variants apart.
+
+    - Encoder-only (the paper's motion predictor), after one more token, z_tk, that carries the condition and
+      the noise level. z_tk may also be added to every other token.
+    - Decoder-only (paper, Table 2; Radford et al. 2018): the same with causal attention. z_tk is the first
+      token, and so the only one that all waypoints attend to. One pass predicts all waypoints.
+    - With points: z_tk carries start, goal and level; each block attends to the points of the scene too.
+    - Encoder-decoder (paper, Table 2; Vaswani et al. 2017, with norms first): the encoder takes the tokens z,
+      start, goal and t, and each block attends to them. There is no z_tk.
+    """
+
+    positions: Tensor
+
+    def __init__(
+        self, settings: AttentionSettings, waypoints: int, dof: int, features: int, condition: int
+    ) -> None:
+        super().__init__(settings, waypoints, dof, features, condition)
+        width = settings.width
+        self.sizes = (condition - 2 * dof, dof, dof)
+        self.encoded = isinstance(settings, EncoderDecoderSettings)
+        self.adds_z_tk = settings.points or (isinstance(settings, TransformerSettings) and settings.add_z_tk)
+        self.embed = nn.Linear(settings.patch * features, width)
+        if isinstance(settings, EncoderDecoderSettings):
+            self.condition = nn.ModuleList(two_layers(size, width, width) for size in self.sizes)
+            self.encoder = self._blocks(settings.encoder_layers)
+            self.norm_encoded = nn.LayerNorm(width)
+        elif settings.points:
+            self.ends = two_layers(2 * dof, 2 * width, width)
+            self.points = two_layers(3 + 6 * OCTAVES, width, width)
+            self.norm_points = nn.LayerNorm(width)
+        else:
+            self.condition = two_layers(condition, 2 * width, width)
+        self.level = LevelEmbedding(width)
+        self.blocks = self._blocks(settings.layers, settings.causal, self.encoded or settings.points)
+        self.norm = nn.LayerNorm(width)
+        self.out = nn.Linear(width, settings.patch * dof)
+        start_at_zero(self.out)
+        tokens = np.arange(settings.tokens(waypoints))
+        self.register_buffer("positions", positions(tokens, width), persistent=False)
+
+    def _blocks(self, count: int, causal: bool = False, cross: bool = False) -> nn.ModuleList:
+        sizes = self.settings.width, self.settings.heads, self.settings.hidden
+        return nn.ModuleList(Block(*sizes, count, causal, cross) for _ in range(count))
+
+    def set_positions(self, at: Float[ndarray, "tokens"]) -> None:
+        """Give the tokens other positions, in waypoints; there may be another number of them."""
+        self.positions = positions(at, self.settings.width).to(self.positions.device)
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch waypoints features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+    ) -> Float[Tensor, "batch waypoints dof"]:
+        """The output for noisy trajectories; level is t / T in [0, 1]."""
+        batch = features.shape[0]
+        count = len(self.positions)
+        x = self.embed(features.reshape(batch, count, -1)) + self.positions
+        z_tk = memory = None
+        if self.encoded:
+            memory = self._encoded(condition, level)
+        elif self.settings.points:
+            memory = self._points(condition[:, : -2 * self.dof].reshape(batch, -1, 3))
+            z_tk = self.ends(condition[:, -2 * self.dof :]) + self.level(level)
+        else:
+            z_tk = self.condition(condition) + self.level(level)
+        if z_tk is not None:
+            z_tk = z_tk[:, None]
+            x = torch.cat([z_tk.to(x.dtype), x + z_tk if self.adds_z_tk else x], 1)
+        for block in self.blocks:
+            x = block(x, memory)
+        return self.out(self.norm(x[:, -count:])).float().reshape(batch, -1, self.dof)
+
+    def _encoded(
+        self, condition: Float[Tensor, "batch condition"], level: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch 4 width"]:
+        parts = zip(self.condition, condition.split(self.sizes, -1), strict=True)
+        memory = torch.stack([*(embed(part) for embed, part in parts), self.level(level)], 1).float()
+        for block in self.encoder:
+            memory = block(memory)
+        return self.norm_encoded(memory)
+
+    def _points(self, points: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch points width"]:
+        angles = torch.cat(wave_angles(points, OCTAVES), -1)
+        return self.norm_points(self.points(torch.cat([points, angles.sin(), angles.cos()], -1)))
+
+
+class Convolution(nn.Linear):
+    """Convolution over the waypoints, with zeros beyond the ends. Weight: [outputs, kernel * inputs]."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
+        super().__init__(kernel * inputs, outputs)
+        self.kernel = kernel
+
+    def forward(
+        self, input: Float[Tensor, "batch waypoints inputs"]
+    ) -> Float[Tensor, "batch waypoints outputs"]:
+        weight = self.weight.unflatten(1, (self.kernel, -1)).mT
+        return functional.conv1d(input.mT, weight, self.bias, padding=self.kernel // 2).mT
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions; between them the condition scales and shifts the channels (FiLM, Perez et al.
+    2018)."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, condition: int, blocks: int) -> None:
+        """blocks: number of residual blocks in a row."""
+        super().__init__()
+        self.norm_first, self.norm_second = nn.LayerNorm(inputs), nn.LayerNorm(outputs)
+        self.first = Convolution(inputs, outputs, kernel)
+        self.second = Convolution(outputs, outputs, kernel)
+        self.film = nn.Linear(condition, 2 * outputs)
+        self.skip = nn.Linear(inputs, outputs) if inputs != outputs else nn.Identity()
+        start_small(self.second, blocks)
+
+    def forward(
+        self, x: Float[Tensor, "batch waypoints inputs"], condition: Float[Tensor, "batch condition"]
+    ) -> Float[Tensor, "batch waypoints outputs"]:
+        scale, shift = self.film(condition)[:, None].float().chunk(2, -1)
+        inner = self.norm_second(self.first(functional.silu(self.norm_first(x))).float())
+        inner = functional.silu(inner * (1 + scale) + shift)
+        return self.skip(x).float() + self.second(inner)
+
+
+class UNet(Denoiser):
+    """After Janner et al. 2022 and Carvalho et al. 2023 (MPD), with layer norms over the channels.
+
+    Two residual blocks per resolution on the way down, and two on the way up, whose input includes the
+    waypoints of the same resolution on the way down. Numbers of waypoints that cannot be halved often enough
+    are extended by repeating the last waypoint, and the result is cut.
+    """
+
+    def __init__(
+        self, settings: UNetSettings, waypoints: int, dof: int, features: int, condition: int
+    ) -> None:
+        super().__init__(settings, waypoints, dof, features, condition)
+        widths = [settings.width * multiple for multiple in settings.multiples]
+        halvings, token = len(widths) - 1, settings.condition_width
+        self.padding = -waypoints % 2**halvings
+
+        def blocks(inputs: int, outputs: int) -> nn.ModuleList:
+            count = 2 * (2 * halvings + 1)
+            first = ResidualBlock(inputs, outputs, settings.kernel, token, count)
+            return nn.ModuleList([first, ResidualBlock(outputs, outputs, settings.kernel, token, count)])
+
+        self.condition = two_layers(condition, 2 * token, token)
+        self.level = LevelEmbedding(token)
+        self.embed = nn.Linear(features, widths[0])
+        self.down = nn.ModuleList(blocks(width, width) for width in widths[:-1])
+        self.halving = nn.ModuleList(nn.Linear(2 * widths[i], widths[i + 1]) for i in range(halvings))
+        self.middle = blocks(widths[-1], widths[-1])
+        self.doubling = nn.ModuleList(nn.Linear(widths[i + 1], 2 * widths[i]) for i in range(halvings))
+        self.up = nn.ModuleList(blocks(2 * width, width) for width in widths[:-1])
+        self.norm = nn.LayerNorm(widths[0])
+        self.out = nn.Linear(widths[0], dof)
+        start_at_zero(self.out)
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch waypoints features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+    ) -> Float[Tensor, "batch waypoints dof"]:
+        """The output for noisy trajectories; level is t / T in [0, 1]."""
+        token = functional.silu(self.condition(condition) + self.level(level))
+        if self.padding:
+            features = torch.cat([features, features[:, -1:].expand(-1, self.padding, -1)], 1)
+        x = self.embed(features).float()
+        skips: list[Tensor] = []
+        for blocks, halve in zip(self.down, self.halving, strict=True):
+            x = _through(blocks, x, token)
+            skips.append(x)
+            x = halve(x.reshape(x.shape[0], x.shape[1] // 2, -1)).float()
+        x = _through(self.middle, x, token)
+        for blocks, double, before in zip(
+            reversed(self.up), reversed(self.doubling), reversed(skips), strict=True
+        ):
+            x = double(x).float().reshape(before.shape)
+            x = _through(blocks, torch.cat([x, before], -1), token)
+        return self.out(self.norm(x[:, : self.waypoints])).float()
+
+
+def _through(blocks: nn.Module, x: Tensor, token: Tensor) -> Tensor:
+    for block in blocks.children():
+        x = block(x, token)
+    return x

@@ -1,0 +1,509 @@
+"""The encoders: auto-encoders that are trained alone, and networks that are trained with the planner.
+
+PointNet and DGCNN normalise features over the channels of a point (layer norm), unlike the originals, and not
+over the batch: a code must not depend on the other clouds, clouds may hold points that do not count, and
+averaged weights have no averaged batch statistics.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from numpy.random import Generator
+from torch import Tensor, nn
+from torch.nn import functional
+
+from robotdiffuse.datasets.surface_clouds import sort_points
+from robotdiffuse.learning.encoders import (
+    CompressionAutoencoderSettings,
+    DGCNNSettings,
+    EncoderSettings,
+    PointAutoencoderSettings,
+    PointNetSettings,
+    PointsSettings,
+    curve_keys,
+)
+from robotdiffuse.learning.network import SavedModule
+
+
+class Encoder(SavedModule, ABC):
+    """A network from a point cloud to z. The order of the points does not matter, and a cloud may be
+    empty."""
+
+    settings: EncoderSettings
+    center: Tensor
+
+    def __init__(self, settings: EncoderSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.register_buffer("center", torch.tensor(settings.region.center), persistent=False)
+
+    @abstractmethod
+    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z of each cloud [m], float32.
+
+        Points outside the region are ignored, so that clouds of different size can share a batch.
+        """
+
+    def code_of_ordered(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z of clouds that already have the size and order that the settings ask for; for export."""
+        return self(cloud)
+
+    def near(self, cloud: Float[Tensor, "batch points 3"]) -> Bool[Tensor, "batch points"]:
+        """The points that count: those in the region, without the zeros that `surface_clouds` pads with."""
+        region = self.settings.region
+        inside = (cloud - self.center).square().sum(-1) < region.reach**2
+        return inside & (cloud[..., 2] > region.floor) & (cloud != 0).any(-1)
+
+    def arrange(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch cloud 3"]:
+        """`settings.cloud` points, sorted by x, then y, then z, or along a curve.
+
+        More points are thinned evenly in that order, fewer are repeated, and an empty cloud becomes zeros.
+        Without a curve, clouds of that size by `surface_clouds(..., ordered=True)` stay as they are, up to
+        rounding.
+        """
+        batch, points, _ = cloud.shape
+        wanted = self.settings.cloud
+        if points == 0:
+            return cloud.new_zeros(batch, wanted, 3)
+        near = self.near(cloud)
+        counted = cloud * near[..., None]
+        if self.settings.along_curve:
+            order = curve_keys(counted).argsort(stable=True, dim=1)
+            ordered = counted.gather(1, order[..., None].expand(-1, -1, 3))
+        else:
+            coordinates = list(counted.unbind(-1))
+            sort_points(coordinates)
+            ordered = torch.stack(coordinates, -1)
+        # points that do not count are zeros now: move them behind the others, which keep their order
+        filled = (ordered != 0).any(-1)
+        ordered = ordered.gather(1, (~filled).byte().argsort(stable=True, dim=1)[..., None].expand(-1, -1, 3))
+        at = (torch.arange(wanted, device=cloud.device) * 2 + 1) * filled.sum(1, keepdim=True)
+        index = at.div(2 * wanted, rounding_mode="floor")
+        return ordered.gather(1, index[..., None].expand(-1, -1, 3))
+
+
+class Autoencoder(Encoder):
+    """An encoder that is trained alone, to reconstruct its input."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, settings: EncoderSettings) -> None:
+        super().__init__(settings)
+        self.register_buffer("mean", torch.zeros(settings.code))
+        self.register_buffer("scale", torch.ones(settings.code))
+
+    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z of each cloud, standardised once `standardize` was called. A cloud may be empty.
+
+        Points outside the region are ignored, so that clouds of different size can share a batch.
+        """
+        return (self.encode(cloud) - self.mean) / self.scale
+
+    @abstractmethod
+    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z before standardisation."""
+
+    def standardize(self, codes: Float[Tensor, "batch code"]) -> None:
+        """Scale z so that each number of these codes has mean 0 and variance 1."""
+        self.mean.copy_(codes.mean(0))
+        self.scale.copy_(codes.std(0).clamp(min=1e-4))
+
+    @abstractmethod
+    def loss(
+        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
+    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        """Loss of the reconstruction, and its errors by name [m]."""
+
+    @abstractmethod
+    def penalised(self) -> Iterable[Tensor]:
+        """The weights theta of the paper's regulariser, lambda * sum theta^2."""
+
+
+def fp32(tensor: Tensor) -> torch.autocast:
+    """A context without bf16, which would round coordinates to 4 mm."""
+    return torch.autocast(tensor.device.type, enabled=False)
+
+
+def wave_angles(points: Float[Tensor, "*batch 3"], octaves: int) -> list[Float[Tensor, "*batch 3"]]:
+    """Coordinates as angles at the wavelengths 4 m, 2 m, ...: with their sines and cosines a small perceptron
+    distinguishes positions."""
+    return [points * (torch.pi / 2 * 2**octave) for octave in range(octaves)]
+
+
+def pool_max(
+    features: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
+) -> Float[Tensor, "batch channels"]:
+    """Maximum feature over the points that count; zeros for clouds without any."""
+    low = torch.finfo(features.dtype).min
+    best = features.masked_fill(~near[..., None], low).amax(1)
+    return best.masked_fill(~near.any(1, keepdim=True), 0.0)
+
+
+def pool_mean(
+    features: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
+) -> Float[Tensor, "batch channels"]:
+    """Mean feature over the points that count; zeros for clouds without any."""
+    return (features.float() * near[..., None]).sum(1) / near.sum(1, keepdim=True).clamp(min=1)
+
+
+class CompressionAutoencoder(Autoencoder):
+    """The paper's compression auto-encoder (section Condition embedding); its encoder is PointEnet.
+
+    A perceptron on 1,400 points in a fixed order, 4200 -> 786 -> 512 -> 256 -> 60, and its mirror image. The
+    paper states neither the order nor the activation. Here the points are sorted along a space-filling curve,
+    so that a place in the order belongs to a small part of the surfaces. Sorted by x, then y, then z, its y
+    and z could be those of any obstacle. The activation is PReLU, as in MPNet (Qureshi et al. 2019), whose
+    encoder has the same form and loss.
+    """
+
+    settings: CompressionAutoencoderSettings
+
+    def __init__(self, settings: CompressionAutoencoderSettings) -> None:
+        super().__init__(settings)
+        sizes = (3 * settings.cloud, *settings.hidden, settings.code)
+        self.encoder, self.decoder = _perceptron(sizes), _perceptron(sizes[::-1])
+
+    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        with fp32(cloud):
+            return self.encoder(self.arrange(cloud.float()).flatten(1))
+
+    def code_of_ordered(self, cloud: Float[Tensor, "batch cloud 3"]) -> Float[Tensor, "batch code"]:
+        return (self.encoder(cloud.flatten(1)) - self.mean) / self.scale
+
+    def decode(self, code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch cloud 3"]:
+        """Reconstructed points [m], in the order of `arrange`, from z before standardisation."""
+        with fp32(code):
+            return self.decoder(code.float()).view(len(code), -1, 3)
+
+    def loss(
+        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
+    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        """The first term of l_AE: the mean over points of the squared distance to the reconstruction [m^2].
+
+        The equation does not define K: it is taken as the number of points, and i-hat as the text's x-hat.
+        The error `reconstruction` is the root of the loss [m].
+        """
+        with fp32(cloud):
+            points = self.arrange(cloud.float())
+            error = (self.decode(self.encoder(points.flatten(1))) - points).square().sum(-1).mean()
+        return error, {"reconstruction": error.item() ** 0.5}
+
+    def penalised(self) -> Iterable[Tensor]:
+        """The encoder's weights.
+
+        The equation has (theta^2_ij)^2, which literally is a sum of fourth powers. MPNet's equation has the
+        square of theta^e_ij, the encoder's weights, in that place; this is taken to be meant.
+        """
+        return (layer.weight for layer in self.encoder if isinstance(layer, nn.Linear))
+
+
+def _perceptron(sizes: tuple[int, ...]) -> nn.Sequential:
+    parts = [part for a, b in pairwise(sizes) for part in (nn.Linear(a, b), nn.PReLU())]
+    return nn.Sequential(*parts[:-1])
+
+
+DISTANCE_QUERIES = 96
+"""Positions per cloud at which the distance field is reconstructed."""
+DISTANCE_CAP = 0.5
+"""Reconstructed distances are capped at this [m]."""
+
+
+class PointAutoencoder(Autoencoder):
+    """z = MLP(max-pool and mean-pool of MLP(point)); decoded to points and to a distance field.
+
+    The paper's encoder is a perceptron over 1,400 points in a fixed order. This one applies a perceptron to
+    each point and pools (Qi et al. 2017, PointNet), so that neither the order nor the number of points
+    matters.
+    """
+
+    settings: PointAutoencoderSettings
+
+    def __init__(self, settings: PointAutoencoderSettings) -> None:
+        super().__init__(settings)
+        sizes = (3 + 6 * settings.octaves, *settings.points)
+        self.points = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        self.empty = nn.Parameter(torch.zeros(2 * sizes[-1]))
+        hidden, code = settings.hidden, settings.code
+        self.head = nn.Sequential(
+            nn.LayerNorm(2 * sizes[-1]), nn.Linear(2 * sizes[-1], hidden), nn.GELU("tanh"),
+            nn.Linear(hidden, code),
+        )  # fmt: skip
+        self.decoder = nn.Sequential(
+            nn.Linear(code, hidden), nn.GELU("tanh"), nn.Linear(hidden, hidden), nn.GELU("tanh"),
+            nn.Linear(hidden, 3 * settings.decoded),
+        )  # fmt: skip
+        self.query_code = nn.Linear(code, 192)
+        self.query_point = nn.Linear(sizes[0], 192)
+        self.query = nn.Sequential(
+            nn.GELU("tanh"), nn.Linear(192, 192), nn.GELU("tanh"), nn.Linear(192, 192), nn.GELU("tanh"),
+            nn.Linear(192, 1),
+        )  # fmt: skip
+
+    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z before standardisation."""
+        empty = self.empty.expand(len(cloud), -1)
+        if cloud.shape[1] == 0:
+            return self.head(empty).float()
+        near = self.near(cloud)[..., None]
+        with fp32(cloud):
+            x = functional.relu(self.points[0](self._waves(cloud)))
+        for layer in list(self.points)[1:]:
+            x = functional.relu(layer(x))
+        x = x * near  # features are not negative, so zeros never change a maximum
+        count = near.sum(1)
+        pooled = torch.cat([x.amax(1).float(), x.float().sum(1) / count.clamp(min=1)], -1)
+        return self.head(torch.where(count > 0, pooled, empty)).float()
+
+    def _waves(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch waves"]:
+        """Coordinates with the sines and cosines of `wave_angles`."""
+        angles = wave_angles(points, self.settings.octaves)
+        return torch.cat([points, *(part for a in angles for part in (a.sin(), a.cos()))], -1)
+
+    def decode(self, code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch decoded 3"]:
+        """Reconstructed points [m], from z before standardisation."""
+        return self.decoder(code).float().view(len(code), -1, 3)
+
+    def distance(
+        self, code: Float[Tensor, "batch code"], at: Float[Tensor, "batch queries 3"]
+    ) -> Float[Tensor, "batch queries"]:
+        """Reconstructed distance [m] of positions to the cloud, from z before standardisation."""
+        return (
+            self.query(self.query_code(code)[:, None] + self.query_point(self._waves(at))).float().squeeze(-1)
+        )
+
+    def loss(
+        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
+    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        """Chamfer distance plus the weighted error of the distance field.
+
+        Errors: `chamfer`, both ways added; `distance`, mean error of the distance field;
+        `distance_of_constant`, that of a constant, all [m].
+        """
+        near = self.near(cloud)
+        at = self._query_positions(cloud, rng)
+        index, _ = nearest(at, cloud, near)
+        truth = (at - pick(cloud, index)).norm(dim=-1).clamp(max=DISTANCE_CAP)
+        truth = torch.where(near.any(1)[:, None], truth, DISTANCE_CAP)
+        code = self.encode(cloud)
+        guess = self.distance(code, at)
+        apart = chamfer(self.decode(code), cloud, near)
+        field = functional.smooth_l1_loss(guess, truth, beta=0.01)
+        errors = {
+            "chamfer": apart.item(),
+            "distance": (guess - truth).abs().mean().item(),
+            "distance_of_constant": (truth - truth.median()).abs().mean().item(),
+        }
+        return apart + self.settings.distance_weight * field, errors
+
+    def _query_positions(
+        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
+    ) -> Float[Tensor, "batch queries 3"]:
+        """Positions at which the distance is reconstructed: half of them close to the surfaces."""
+        batch, points, _ = cloud.shape
+        low, high = np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.3])
+        positions = torch.from_numpy(rng.uniform(low, high, (batch, DISTANCE_QUERIES, 3)).astype(np.float32))
+        chosen = torch.from_numpy(rng.integers(0, points, DISTANCE_QUERIES // 2))
+        spread = torch.from_numpy(
+            0.1 * rng.standard_normal((batch, DISTANCE_QUERIES // 2, 3), dtype=np.float32)
+        )
+        positions, close = positions.to(cloud.device), cloud[:, chosen] + spread.to(cloud.device)
+        away = ~self.near(close)[..., None]
+        return torch.cat(
+            [
+                torch.where(away, positions[:, : DISTANCE_QUERIES // 2], close),
+                positions[:, DISTANCE_QUERIES // 2 :],
+            ],
+            1,
+        )
+
+    def penalised(self) -> Iterable[Tensor]:
+        """All parameters."""
+        return self.parameters()
+
+
+def nearest(
+    a: Float[Tensor, "batch n 3"], b: Float[Tensor, "batch m 3"], allowed: Tensor
+) -> tuple[Tensor, Tensor]:
+    """For each point of a, the index [batch n] of the nearest point of b that is allowed ([batch m] of bool);
+    and for each point of b the index [batch m] of the nearest point of a.
+    """
+    with torch.no_grad(), fp32(a):
+        b = torch.where(allowed[..., None], b, 100.0).float()
+        # |a - b|^2 without |a|^2, which is constant over b, and so is needed for the reverse only
+        squared = torch.baddbmm(b.square().sum(-1)[:, None], a.float(), b.mT, alpha=-2.0)
+        forth = squared.argmin(2)
+        return forth, squared.add_(a.float().square().sum(-1)[..., None]).argmin(1)
+
+
+def pick(points: Float[Tensor, "batch n 3"], index: Tensor) -> Float[Tensor, "batch m 3"]:
+    """The points with these indices [batch m]."""
+    return points.gather(1, index[..., None].expand(-1, -1, 3))
+
+
+def chamfer(
+    decoded: Float[Tensor, "batch n 3"], cloud: Float[Tensor, "batch m 3"], near: Tensor
+) -> Float[Tensor, ""]:
+    """Chamfer distance [m]: root mean square distance to the nearest point of the other set, both ways.
+
+    near: which points of the cloud count [batch m]; clouds without any are left out.
+    """
+    to_cloud, to_decoded = nearest(decoded, cloud, near)
+    forth = (decoded - pick(cloud, to_cloud)).square().sum(-1)
+    back = (cloud - pick(decoded, to_decoded)).square().sum(-1)
+    filled = near.any(1)
+    forth = forth.mean(1)[filled].mean()
+    back = (back * near).sum() / near.sum().clamp(min=1)
+    return (forth + 1e-8).sqrt() + (back + 1e-8).sqrt()
+
+
+def layers(sizes: tuple[int, ...], activation: nn.Module | None = None) -> nn.Sequential:
+    """Linear layer, layer norm and activation (None: ReLU) for each size after the first."""
+    parts = [(nn.Linear(a, b), nn.LayerNorm(b), activation or nn.ReLU()) for a, b in pairwise(sizes)]
+    return nn.Sequential(*(layer for part in parts for layer in part))
+
+
+class Transform(nn.Module):
+    """T-Net: a square matrix for each cloud, close to the identity at first."""
+
+    def __init__(self, size: int, settings: PointNetSettings) -> None:
+        super().__init__()
+        self.size = size
+        self.points = layers((size, *settings.transform))
+        sizes = (settings.transform[-1], *settings.transform_head)
+        self.head = layers(sizes)
+        self.out = nn.Linear(sizes[-1], size * size)
+        nn.init.normal_(self.out.weight, std=1e-3)
+        with torch.no_grad():
+            self.out.bias.copy_(torch.eye(size).flatten())
+
+    def forward(
+        self, x: Float[Tensor, "batch points size"], near: Bool[Tensor, "batch points"]
+    ) -> Float[Tensor, "batch points size"]:
+        matrix = self.out(self.head(pool_max(self.points(x), near)))
+        return x @ matrix.view(-1, self.size, self.size).to(x.dtype)
+
+
+class PointNet(Encoder):
+    """z = MLP(max over points of MLP(T2 MLP(T1 point))) (Qi et al. 2017, "PointNet: Deep Learning on Point
+    Sets").
+
+    Unlike the original it has no dropout, and no loss that keeps the feature transform orthogonal, since the
+    planner's loss is the only one; the transforms start close to the identity.
+    """
+
+    def __init__(self, settings: PointNetSettings) -> None:
+        super().__init__(settings)
+        self.turn_input = Transform(3, settings)
+        self.first = layers((3, *settings.first))
+        self.turn_features = Transform(settings.first[-1], settings)
+        self.second = layers((settings.first[-1], *settings.second))
+        self.empty = nn.Parameter(torch.zeros(settings.second[-1]))
+        sizes = (settings.second[-1], *settings.head)
+        self.head = nn.Sequential(layers(sizes), nn.Linear(sizes[-1], settings.code))
+
+    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        if cloud.shape[1] == 0:
+            return self.head(self.empty.expand(len(cloud), -1)).float()
+        near = self.near(cloud)
+        with fp32(cloud):
+            x = self.first(self.turn_input(cloud, near))
+        pooled = pool_max(self.second(self.turn_features(x, near)), near).float()
+        return self.head(torch.where(near.any(1, keepdim=True), pooled, self.empty)).float()
+
+
+NEGATIVE_SLOPE = 0.2
+"""Slope of the leaky ReLU below zero, as in the original."""
+IGNORED_DISTANCE = 1e9
+"""Squared distance that is given to points that do not count."""
+
+
+def neighbours(
+    x: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"], count: int
+) -> Int64[Tensor, "batch points neighbours"]:
+    """Indices of each point's `count` nearest neighbours, itself included; where there are fewer, itself
+    again."""
+    with torch.no_grad(), fp32(x):
+        x = x.detach().float()
+        squared = x.square().sum(-1)
+        # |a - b|^2 without |a|^2, which is the same for all neighbours of a
+        apart = torch.baddbmm(squared[:, None], x, x.mT, alpha=-2.0)
+        apart = apart.masked_fill(~near[:, None], IGNORED_DISTANCE)
+        found = apart.topk(min(count, x.shape[1]), dim=-1, largest=False, sorted=False)
+        itself = torch.arange(x.shape[1], device=x.device)[:, None]
+        return torch.where(found.values < IGNORED_DISTANCE, found.indices, itself)
+
+
+class EdgeConvolution(nn.Module):
+    """max over neighbours j of h(x_i, x_j - x_i).
+
+    The original's h is a linear layer, batch norm and leaky ReLU. Here the norm comes after the maximum. So
+    the maximum commutes with the rest: with h = W [x_i, x_j - x_i] = (A - B) x_i + B x_j, it is over B x_j
+    alone, and the layer costs two matrix products per point instead of one per edge.
+    """
+
+    def __init__(self, channels: int, out: int, count: int) -> None:
+        super().__init__()
+        self.count = count
+        self.own = nn.Linear(channels, out)
+        self.other = nn.Linear(channels, out, bias=False)
+        self.norm = nn.LayerNorm(out)
+
+    def forward(
+        self, x: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
+    ) -> Float[Tensor, "batch points out"]:
+        index = neighbours(x, near, self.count)
+        other = self.other(x)
+        offset = other.shape[1] * torch.arange(len(other), device=x.device)[:, None, None]
+        joined = other.flatten(0, 1)[(index + offset).flatten(0, 1)]
+        pooled = joined.amax(1).view_as(other)
+        return functional.leaky_relu(self.norm(self.own(x) + pooled), NEGATIVE_SLOPE)
+
+
+class DGCNN(Encoder):
+    """z = MLP(max-pool and mean-pool of MLP(outputs of all edge convolutions)).
+
+    After Wang et al. 2019, "Dynamic Graph CNN for Learning on Point Clouds": each layer joins every point
+    with its nearest neighbours, in the space of that layer's own input.
+    """
+
+    def __init__(self, settings: DGCNNSettings) -> None:
+        super().__init__(settings)
+        self.edges = nn.ModuleList(
+            EdgeConvolution(a, b, settings.neighbours) for a, b in pairwise((3, *settings.edges))
+        )
+        activation = nn.LeakyReLU(NEGATIVE_SLOPE)
+        self.embed = layers((sum(settings.edges), settings.embedding), activation)
+        sizes = (2 * settings.embedding, *settings.head)
+        self.empty = nn.Parameter(torch.zeros(sizes[0]))
+        self.head = nn.Sequential(*layers(sizes, activation), nn.Linear(sizes[-1], settings.code))
+
+    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        if cloud.shape[1] == 0:
+            return self.head(self.empty.expand(len(cloud), -1)).float()
+        near = self.near(cloud)
+        first, *others = self.edges
+        with fp32(cloud):
+            features = [first(cloud, near)]
+        for layer in others:
+            features.append(layer(features[-1], near))
+        x = self.embed(torch.cat(features, -1))
+        pooled = torch.cat([pool_max(x, near).float(), pool_mean(x, near)], -1)
+        return self.head(torch.where(near.any(1, keepdim=True), pooled, self.empty)).float()
+
+
+class Points(Encoder):
+    """z = the coordinates of all points [m]. It has no weights."""
+
+    settings: PointsSettings
+
+    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        with fp32(cloud):
+            return self.code_of_ordered(self.arrange(cloud.float()))
+
+    def code_of_ordered(self, cloud: Float[Tensor, "batch cloud 3"]) -> Float[Tensor, "batch code"]:
+        return cloud.flatten(1)
