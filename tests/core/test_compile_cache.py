@@ -64,49 +64,73 @@ def test_importing_the_package_touches_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-KERNEL = """
+FILES = {
+    "__init__": "",
+    "sizes": "SIZE = 1",
+    "called": """
+from arm.sizes import SIZE
+from robotdiffuse.core.kernels import kernel
+
+@kernel()
+def second(pair):
+    return pair.a * SIZE
+""",
+    "kernel": """
+from arm.called import second
 from robotdiffuse.core.kernels import kernel
 
 @kernel()
 def first(pair):
-    return pair.a
-"""
-PAIR = """
+    return second(pair)
+""",
+    "pairs": """
 from typing import NamedTuple
 
 class Pair(NamedTuple):
     a: int
     b: int
-"""
+""",
+}
 CALL = """
 import re
 from pathlib import Path
 from robotdiffuse.core import kernels
 kernels.PACKAGE = Path("arm").resolve()
 kernels.MODULE = re.compile(rb"\\barm(?:\\.\\w+)+")
+kernels.IMPORT = re.compile(kernels.IMPORT.pattern.replace(b"robotdiffuse", b"(?:arm|robotdiffuse)"), re.M)
 from arm.{module} import Pair
 from arm.kernel import first
 print(first(Pair(a=1, b=2)), sum(first.stats.cache_hits.values()))
 """
 
 
-def test_compiled_code_of_an_older_layout_is_not_used(tmp_path: Path) -> None:
-    """Numba raised ModuleNotFoundError after modules had moved, and kept the layout of a changed class."""
-    package = tmp_path / "arm"
-    package.mkdir()
-    for name, text in {"__init__": "", "kernel": KERNEL, "pairs": PAIR}.items():
-        (package / f"{name}.py").write_text(text)
+def test_what_compiled_code_depends_on_makes_it_compile_anew(tmp_path: Path) -> None:
+    """Numba raised ModuleNotFoundError after modules had moved, and kept the layout of a changed class and
+    the code and constants of other modules."""
+    package = tmp_path / "here" / "arm"
 
-    def answer(module: str) -> str:
+    def write(**files: str) -> None:
+        package.mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            (package / f"{name}.py").write_text(text)
+
+    def answer(module: str = "pairs") -> str:
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
         command = [sys.executable, "-c", CALL.format(module=module)]
-        ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        ended = subprocess.run(command, cwd=package.parent, env=environment, capture_output=True, text=True)
         assert ended.returncode == 0, ended.stderr
         return ended.stdout.strip()
 
-    assert answer("pairs") == "1 0"
+    write(**FILES)
+    assert [answer(), answer()] == ["1 0", "1 1"]
+    write(sizes="SIZE = 3")
+    assert [answer(), answer()] == ["3 0", "3 1"]
+    write(called=FILES["called"].replace("*", "+"))
+    assert [answer(), answer()] == ["4 0", "4 1"]
     (package / "pairs.py").rename(package / "moved.py")
-    assert answer("moved") == "1 0"
-    (package / "moved.py").write_text(PAIR.replace("    a: int\n    b: int", "    b: int\n    a: int"))
-    assert answer("moved") == "1 0"
-    assert answer("moved") == "1 1"
+    assert answer("moved") == "4 0"
+    write(moved=FILES["pairs"].replace("    a: int\n    b: int", "    b: int\n    a: int"))
+    assert [answer("moved"), answer("moved")] == ["4 0", "4 1"]
+    package.parent.rename(tmp_path / "there")
+    package = tmp_path / "there" / "arm"
+    assert answer("moved") == "4 1"

@@ -6,9 +6,10 @@ import sys
 import tempfile
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
+from hashlib import blake2b
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
@@ -42,6 +43,8 @@ errors.ColorShell = nullcontext  # type: ignore[misc]
 CHECKSUM = b"crc32"
 PACKAGE = Path(__file__).parents[1]
 MODULE = re.compile(rb"\b%s(?:\.\w+)+" % PACKAGE.name.encode())
+IMPORT = re.compile(rb"^from (%s[\w.]*) import (\([^)]*\)|[^\n]*)" % PACKAGE.name.encode(), re.MULTILINE)
+NAME = re.compile(rb"\w+")
 
 
 @cache
@@ -82,18 +85,71 @@ def is_writable(folder: Path) -> bool:
 
 
 class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):
-    """Numba's place for the compiled code of one module: a folder named by a hash of the module's path."""
+    """Numba's place for the compiled code of one module: a folder named by the module and a digest of what it
+    is compiled from, so that installations of one version share it and others do not."""
 
     def __init__(self, function: Callable, file: str) -> None:
         self._py_file = file
         self._lineno = function.__code__.co_firstlineno
+        self._module = function.__module__
 
     @classmethod
     def from_function(cls, py_func: Callable, py_file: str) -> "_Locator":
         return cls(py_func, py_file)
 
     def get_cache_path(self) -> str:
-        return str(cache_folder() / self.get_suitable_cache_subpath(self._py_file))
+        return str(cache_folder() / _folder_name(self._module))
+
+    def get_source_stamp(self) -> str:
+        return ""
+
+
+@cache
+def _folder_name(module: str) -> str:
+    return f"{module.removeprefix(f'{PACKAGE.name}.')}-{_digest(_compiled_from(module))}"
+
+
+def _compiled_from(module: str) -> set[str]:
+    """The modules whose code or constants are compiled into a module: itself, what it imports of the package
+    and, where that is compiled too, what those import."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        found.add(name)
+        if b".core.kernels import" in _source(name):
+            waiting.extend(_imported(name))
+    return found
+
+
+@cache
+def _imported(module: str) -> frozenset[str]:
+    """Modules of the package that a module imports as a whole."""
+    imports = [match.groups() for match in IMPORT.finditer(_source(module))]
+    parts = {(source + b"." + name).decode() for source, names in imports for name in NAME.findall(names)}
+    return frozenset(source.decode() for source, _ in imports).union(filter(_source, parts))
+
+
+@cache
+def _source(module: str) -> bytes:
+    """The text of a module of the package; empty if there is none of that name."""
+    file = PACKAGE.parent.joinpath(*module.split("."))
+    for source in (file.with_suffix(".py"), file / "__init__.py"):
+        with suppress(OSError):
+            return source.read_bytes()
+    return b""
+
+
+def _digest(modules: Iterable[str]) -> str:
+    """A digest of the texts of modules."""
+    return blake2b(b"".join(map(_text_digest, sorted(modules))), digest_size=12).hexdigest()
+
+
+@cache
+def _text_digest(module: str) -> bytes:
+    return blake2b(_source(module)).digest()
 
 
 class _CacheImpl(caching.CompileResultCacheImpl):
@@ -114,27 +170,21 @@ class _CacheFile(caching.IndexDataCacheFile):
             raise ValueError(f"{name} is damaged")
         return super()._load_data(name)
 
+    def _save_index(self, overloads: dict) -> None:
+        self._source_stamp = _named_in(self._dump(overloads))
+        super()._save_index(overloads)
+
     def _load_index(self) -> dict:
-        """The index, or an empty one if it names a module that is missing or newer: Numba would fail where a
-        class in it has moved, and load code that was compiled for an older definition of a class."""
+        """The index, or an empty one if a module that it names has changed: its classes may have other
+        fields, or be gone."""
         index = Path(self._index_path)
-        if not index.is_file():
-            return {}
-        written = index.stat().st_mtime
-        named = set(MODULE.findall(index.read_bytes()))
-        if any(_changed(name.decode()) > written for name in named):
-            return {}
+        self._source_stamp = _named_in(index.read_bytes()) if index.is_file() else ""
         return super()._load_index()
 
 
-@cache
-def _changed(module: str) -> float:
-    """The time at which a module's file was changed; infinite if there is no such module."""
-    file = PACKAGE.parent.joinpath(*module.split("."))
-    for source in (file.with_suffix(".py"), file / "__init__.py"):
-        with suppress(OSError):
-            return source.stat().st_mtime
-    return float("inf")
+def _named_in(index: bytes) -> str:
+    """A digest of the modules whose classes are named in the index of a file of compiled code."""
+    return _digest({name.decode() for name in MODULE.findall(index)})
 
 
 class _Cache(caching.FunctionCache):
@@ -144,8 +194,7 @@ class _Cache(caching.FunctionCache):
 
     def __init__(self, function: Callable) -> None:
         super().__init__(function)
-        stamp = self._impl.locator.get_source_stamp()
-        self._cache_file = _CacheFile(self._cache_path, self._impl.filename_base, stamp)
+        self._cache_file = _CacheFile(self._cache_path, self._impl.filename_base, "")
 
     @contextmanager
     def _guard_against_spurious_io_errors(self) -> Iterator[None]:
