@@ -99,7 +99,7 @@ def plan_with_unknown_space(
         unknown = unknown_space_of(problem, volume, predicted)
     prepared = context.elapsed
     if problem.views and all(view.is_blind for view in problem.views):
-        context.notes.append(BLIND)
+        context.note(BLIND)
     attempts = _Attempts(solver, context, unknown)
     as_seen, limit = replace(problem, views=()), request.time_limit
     failed = list[str]()

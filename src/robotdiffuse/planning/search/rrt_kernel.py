@@ -93,7 +93,7 @@ def keep(limits, q):
     """Move q to where it keeps the path constraints; returns whether it does. Compiled code only."""
 
 
-def extended(space, limits, trees, tree, near, q, longest, scratch):
+def extended(space, limits, trees, tree, near, q, longest, scratch) -> int:  # type: ignore[return]
     """`extended_straight` with edges that keep the path constraints. Compiled code only."""
 
 
