@@ -162,6 +162,60 @@ def test_rerun_recordings_hold_the_joints(planned: tuple[Problem, Trajectory], t
         np.testing.assert_array_equal(values, trajectory.positions[:, j])
 
 
+@pytest.mark.parametrize("name", ["m.mcap", "bag"])
+@pytest.mark.parametrize("compression", ["ZSTD", "LZ4"])
+def test_a_recording_that_unpacks_to_gigabytes_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, compression: str
+) -> None:
+    """A file of 105 kB took 6 GB."""
+    from mcap.writer import CompressionType, Writer
+
+    from robotdiffuse.interop import mcap_file
+
+    monkeypatch.setattr(mcap_file, "MAX_UNPACKED", 100_000)
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}")
+    with (folder / "m.mcap").open("wb") as stream:
+        writer = Writer(stream, chunk_size=200_000, compression=CompressionType[compression])
+        writer.start()
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channel = writer.register_channel("/joint_trajectory", "cdr", schema)
+        writer.add_message(channel, 0, bytes(150_000), 0)
+        writer.finish()
+    assert (folder / "m.mcap").stat().st_size < 5_000
+    (tmp_path / "m.mcap").write_bytes((folder / "m.mcap").read_bytes())
+    with pytest.raises(InputError, match=r"m\.mcap has a chunk of 150,\d+ bytes; 100,000 are allowed"):
+        read_motion(tmp_path / name)
+
+
+def test_a_motion_of_too_many_messages_is_refused(
+    planned: tuple[Problem, Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from robotdiffuse.interop import mcap_file, rosbag
+
+    write_motion(*planned, tmp_path / "m.mcap")
+    write_motion(*planned, tmp_path / "bag.rosbag2")
+    monkeypatch.setattr(mcap_file, "check_chunks", lambda *given: None)
+    monkeypatch.setattr(mcap_file, "MAX_UNPACKED", 100)
+    monkeypatch.setattr(rosbag, "MAX_UNPACKED", 100)
+    for name in ("m.mcap", "bag.rosbag2"):
+        with pytest.raises(InputError, match="the messages of /joint_trajectory take more than 100 bytes"):
+            read_motion(tmp_path / name, "/joint_trajectory")
+
+
+def test_a_compressed_bag_is_refused(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+    write_motion(*planned, tmp_path / "bag.rosbag2")
+    metadata = tmp_path / "bag.rosbag2" / "metadata.yaml"
+    text = metadata.read_text()
+    metadata.write_text(text.replace("compression_mode: ''", "compression_mode: FILE"))
+    assert metadata.read_text() != text
+    with pytest.raises(
+        InputError, match=r"bag\.rosbag2 is compressed \(mode 'FILE'\); write it anew with"
+    ):
+        read_motion(tmp_path / "bag.rosbag2")
+
+
 def test_a_bag_is_not_read_from_a_pipe(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
     bag = tmp_path / "m.rosbag2"
     write_motion(*planned, bag)

@@ -20,7 +20,13 @@ from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.interop.mcap_file import McapWriter, make_reader, messages_in, topics_in
+from robotdiffuse.interop.mcap_file import (
+    McapWriter,
+    check_chunks,
+    make_reader,
+    messages_in,
+    topics_in,
+)
 from robotdiffuse.interop.ros_types import JOINT_STATE, header_seconds, to_plain
 from robotdiffuse.interop.transform_history import TransformHistory, insert_by_time, neighbours
 from robotdiffuse.perception.depth_view import DepthView
@@ -141,6 +147,7 @@ def read_depth_views(
 def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> Iterator[StampedView]:
     with path.open("rb") as stream:
         reader = make_reader(stream)
+        check_chunks(stream, reader, str(path))
         kinds = topics_in(reader, str(path))
         images = _image_topics(kinds, topics)
         states, transforms, infos = _States(robot), TransformHistory(), {}

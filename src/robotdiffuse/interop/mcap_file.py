@@ -7,6 +7,8 @@ messages; the last is the URDF, if the robot was read from one. The URDF and the
 
 import io
 import json
+import struct
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shortened
-from robotdiffuse.core.input_files import input_file, parse_json
+from robotdiffuse.core.input_files import MEGABYTE, input_file, parse_json
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory
@@ -50,6 +52,8 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_poses
 
 try:
+    import lz4.frame
+    import zstandard
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
     from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -65,6 +69,12 @@ except ImportError:
 
 FLOAT32 = 7
 """foxglove.PackedElementField.FLOAT32"""
+MAX_UNPACKED = 128 * MEGABYTE
+"""Of a chunk, and of the messages of a motion [bytes]."""
+CHUNK_HEADER = 1 + 8 + 3 * 8 + 4
+"""Bytes of a chunk before the name of its compression: opcode, length, times, size and checksum."""
+FRAME_HEADER = 32
+"""Bytes that hold the header of a compressed frame."""
 PROBLEM_ATTACHMENT = "problem.json"
 """Name of the attachment that holds the problem."""
 
@@ -230,9 +240,10 @@ def read(file: Path, topic: str | None = None) -> RecordedMotion:
     try:
         with path.open("rb") as stream:
             reader = make_reader(stream)
+            check_chunks(stream, reader, str(file))
             ros = topics_in(reader, str(file))
             name = choose_topic({topic: schema.name for topic, schema in ros.items()}, topic, str(file))
-            messages = [(at, message) for _, at, message in messages_in(reader, ros, [name])]
+            messages = [(at, message) for _, at, message in messages_in(reader, ros, [name], MAX_UNPACKED)]
         return motion_from_messages(ros[name].name, messages, f"{file}, {name}")
     except InputError:
         raise
@@ -253,15 +264,40 @@ def topics_in(reader: McapReader, where: str) -> dict[str, Schema]:
     }
 
 
+def check_chunks(stream: io.BufferedReader, reader: McapReader, where: str) -> None:
+    """Raise InputError, naming `where`, for a file with a chunk that unpacks to more than MAX_UNPACKED bytes;
+    small files may unpack to gigabytes."""
+    summary = reader.get_summary()
+    for chunk in summary.chunk_indexes if summary else ():
+        stream.seek(chunk.chunk_start_offset + CHUNK_HEADER)
+        (length,) = struct.unpack("<I", stream.read(4))
+        compression = stream.read(length)
+        stream.seek(8, io.SEEK_CUR)
+        start = stream.read(FRAME_HEADER)
+        size = chunk.uncompressed_size
+        if compression == b"zstd":
+            size = max(size, zstandard.frame_content_size(start))
+        elif compression == b"lz4":
+            size = max(size, lz4.frame.get_frame_info(start)["content_size"])
+        if size > MAX_UNPACKED:
+            raise InputError(f"{where} has a chunk of {size:,} bytes; {MAX_UNPACKED:,} are allowed")
+
+
 def messages_in(
-    reader: McapReader, kinds: Mapping[str, Schema], topics: Sequence[str]
+    reader: McapReader, kinds: Mapping[str, Schema], topics: Sequence[str], allowed: int = sys.maxsize
 ) -> Iterator[tuple[str, int, Any]]:
     """Topic, log time [ns] and message of all messages on some topics, in the order of their log times.
-    kinds: see `topics_in`."""
+
+    kinds: see `topics_in`.
+    allowed: size of all the messages together [bytes].
+    """
     if not topics:
         return
     stores = {topic: _typestore(kinds[topic]) for topic in topics}
     for _, channel, found in reader.iter_messages(topics=topics):
+        allowed -= len(found.data)
+        if allowed < 0:
+            raise InputError(f"the messages of {', '.join(topics)} take more than {MAX_UNPACKED:,} bytes")
         store, kind = stores[channel.topic], kinds[channel.topic].name
         yield channel.topic, found.log_time, store.deserialize_cdr(found.data, kind)
 

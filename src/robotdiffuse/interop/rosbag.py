@@ -6,10 +6,11 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core.errors import InputError, OutputError, shortened
-from robotdiffuse.core.input_files import input_file
+from robotdiffuse.core.errors import InputError, OutputError, shortened, shown
+from robotdiffuse.core.input_files import input_file, read_yaml
 from robotdiffuse.core.output_files import write_error
 from robotdiffuse.core.types import Trajectory
+from robotdiffuse.interop.mcap_file import MAX_UNPACKED, check_chunks, make_reader
 from robotdiffuse.interop.plain_messages import joint_trajectory
 from robotdiffuse.interop.recorded_motion import RecordedMotion
 from robotdiffuse.interop.ros_messages import motion_from_messages
@@ -80,17 +81,30 @@ def read(file: Path, topic: str | None = None) -> RecordedMotion:
         if not part.is_dir():
             input_file(part, largest=sys.maxsize)
     try:
+        _check_unpacking(file)
         with AnyReader([file], default_typestore=typestore()) as reader:
             topics = {connection.topic: connection.msgtype for connection in reader.connections}
             name = choose_topic(topics, topic, str(file))
-            messages = [
-                (at, reader.deserialize(raw, connection.msgtype))
-                for connection, at, raw in reader.messages(
-                    [connection for connection in reader.connections if connection.topic == name]
-                )
-            ]
+            connections = [connection for connection in reader.connections if connection.topic == name]
+            messages = []
+            size = 0
+            for connection, at, raw in reader.messages(connections):
+                size += len(raw)
+                if size > MAX_UNPACKED:
+                    raise InputError(f"the messages of {name} take more than {MAX_UNPACKED:,} bytes")
+                messages.append((at, reader.deserialize(raw, connection.msgtype)))
             return motion_from_messages(topics[name], messages, f"{file}, {name}")
     except InputError:
         raise
     except Exception as error:  # rosbags, SQLite and YAML raise many kinds of errors for a damaged bag
         raise InputError(f"{file} is damaged: {shortened(str(error))}") from None
+
+
+def _check_unpacking(bag: Path) -> None:
+    """Refuse what may unpack to gigabytes."""
+    information = read_yaml(bag / "metadata.yaml")["rosbag2_bagfile_information"]
+    if mode := information.get("compression_mode"):
+        raise InputError(f"{bag} is compressed (mode {shown(mode)}); write it anew with: ros2 bag convert")
+    for part in bag.glob("*.mcap"):
+        with part.open("rb") as stream:
+            check_chunks(stream, make_reader(stream), str(part))
