@@ -210,9 +210,7 @@ def test_a_compressed_bag_is_refused(planned: tuple[Problem, Trajectory], tmp_pa
     text = metadata.read_text()
     metadata.write_text(text.replace("compression_mode: ''", "compression_mode: FILE"))
     assert metadata.read_text() != text
-    with pytest.raises(
-        InputError, match=r"bag\.rosbag2 is compressed \(mode 'FILE'\); write it anew with"
-    ):
+    with pytest.raises(InputError, match=r"bag\.rosbag2 is compressed \(mode 'FILE'\); write it anew with"):
         read_motion(tmp_path / "bag.rosbag2")
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_text
+from robotdiffuse.core.types import FORMULA
 from robotdiffuse.interop.recorded_motion import RecordedMotion, checked_motion
 
 TIMES = ("time", "t", "time_from_start", "timestamp")
@@ -30,6 +31,7 @@ def _read(text: str) -> RecordedMotion:
     if not rows:
         raise InputError("it is empty; it must have a header and rows of numbers")
     header = [cell.strip() for cell in rows[0][1]]
+    header = [cell[1:] if cell.startswith("'") and cell[1:].startswith(FORMULA) else cell for cell in header]
     if len(rows) == 1:
         raise InputError("it has a header and no rows")
     columns: list[list[float]] = [[] for _ in header]
