@@ -48,8 +48,8 @@ from robotdiffuse.learning.denoisers import (
     TransformerSettings,
 )
 from robotdiffuse.learning.denoisers.networks import two_layers
-from robotdiffuse.learning.encoders import EncoderSettings, PointNetSettings, PointsSettings, make_encoder
-from robotdiffuse.learning.encoders.networks import Encoder, fp32, wave_angles
+from robotdiffuse.learning.encoders import EncoderSettings, PointNetSettings, PointsSettings
+from robotdiffuse.learning.encoders.networks import Encoder, fp32, make_encoder, wave_angles
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.samplers.ddim import ddim

@@ -84,14 +84,14 @@ def test_the_encoder_of_the_config_is_that_of_an_arm_too(
 ) -> None:
     trained: list[PlannerTraining] = []
 
-    def generate(*_: object) -> None:
+    def generate(*_: object, **__: object) -> None:
         pass
 
     def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
         trained.append(settings)
         return {}
 
-    monkeypatch.setattr("robotdiffuse.cli.data.generate_with_progress", generate)
+    monkeypatch.setattr("robotdiffuse.generation.generate", generate)
     monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
     assert run("train", "planner", "--robot", "panda", "--out", "o", "--config", config) == 0
     assert trained[0].encoder == encoder and not Path("o", "encoder").exists()

@@ -53,7 +53,7 @@ def test_links_that_may_touch_an_obstacle_are_compared_a_few_times_each(names: l
     scene = Scene([Box([1, 0, 0], [0.1, 0.1, 0.1])], [("box", [name]) for name in few])
     assert Name.compared < 5 * COUNT
     assert scene.allowed_contacts == (("box", tuple(few)),)
-    with pytest.raises(InputError, match=f"'box' has more than {MAX_CONTACT_LINKS} links; write all"):
+    with pytest.raises(InputError, match=f"'box' has over {MAX_CONTACT_LINKS} links; write all"):
         Scene(scene.shapes, [("box", names)])
 
 

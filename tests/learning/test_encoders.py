@@ -25,13 +25,13 @@ from robotdiffuse.learning.encoders import (
     PointAutoencoderSettings,
     PointNetSettings,
     PointsSettings,
-    encoder_name,
-    make_encoder,
 )
 from robotdiffuse.learning.encoders.networks import (
     Autoencoder,
     CompressionAutoencoder,
     EdgeConvolution,
+    encoder_name,
+    make_encoder,
     neighbours,
 )
 from robotdiffuse.learning.exported_model import exported_model

@@ -95,6 +95,8 @@ def read_triangles(
         raise InputError(f"mesh file {file} cannot be read: {shortened(str(error))}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"mesh file {file} holds no triangles")
+    if mesh.vertices.shape[1:] != (3,):
+        raise InputError(f"mesh file {file} cannot be read: its vertices do not have three coordinates")
     if notes is not None and up != "Z_UP":
         notes.append(f"{path.name} has {up[0].lower()} up; it is turned to z up")
     if notes is not None and metres != 1:

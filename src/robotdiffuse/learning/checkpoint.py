@@ -25,8 +25,8 @@ from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning.completion import CompletionSettings
 from robotdiffuse.learning.completion_network import CompletionNetwork
-from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
-from robotdiffuse.learning.encoders.networks import Encoder
+from robotdiffuse.learning.encoders import ENCODERS
+from robotdiffuse.learning.encoders.networks import Encoder, encoder_name, make_encoder
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.network import Network, SavedModule
 from robotdiffuse.learning.networks import NETWORKS

@@ -14,8 +14,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.networks import Denoiser, TrajectoryTransformer
 from robotdiffuse.learning.diffusion import noise_factor
-from robotdiffuse.learning.encoders import make_encoder
-from robotdiffuse.learning.encoders.networks import Encoder, fp32
+from robotdiffuse.learning.encoders.networks import Encoder, fp32, make_encoder
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
 from robotdiffuse.learning.network import Network, exported
 from robotdiffuse.learning.representation import Statistics

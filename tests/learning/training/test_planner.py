@@ -20,7 +20,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors
 from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
-from robotdiffuse.learning.encoders import PointAutoencoderSettings, make_encoder
+from robotdiffuse.learning.encoders import PointAutoencoderSettings
+from robotdiffuse.learning.encoders.networks import make_encoder
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.objectives import OBJECTIVES

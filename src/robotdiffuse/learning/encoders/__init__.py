@@ -4,7 +4,7 @@ Nothing here loads PyTorch, so that planning can read them. The networks are in 
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float32
@@ -14,9 +14,6 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Settings, Sizes
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
-
-if TYPE_CHECKING:
-    from robotdiffuse.learning.encoders.networks import Encoder
 
 
 @dataclass(frozen=True)
@@ -230,13 +227,3 @@ ENCODERS = Registry(
 """By the name in settings and checkpoints. Two kinds: "alone" is trained with a loss of its own and then
 frozen; "jointly" is a part of the planner's network, whose loss trains what weights it has, on fresh clouds
 for every batch."""
-
-
-def make_encoder(name: str, settings: EncoderSettings | None = None) -> "Encoder":
-    """An untrained encoder of that name; None: with its default settings."""
-    return ENCODERS.load(name)(settings or ENCODERS.defaults(name))
-
-
-def encoder_name(encoder: "Encoder") -> str:
-    """The name of an encoder's class in ENCODERS."""
-    return next(name for name in ENCODERS if ENCODERS.load(name) is type(encoder))

@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from robotdiffuse.datasets.surface_clouds import sort_points
 from robotdiffuse.learning.encoders import (
+    ENCODERS,
     CompressionAutoencoderSettings,
     DGCNNSettings,
     EncoderSettings,
@@ -507,3 +508,13 @@ class Points(Encoder):
 
     def code_of_ordered(self, cloud: Float[Tensor, "batch cloud 3"]) -> Float[Tensor, "batch code"]:
         return cloud.flatten(1)
+
+
+def make_encoder(name: str, settings: EncoderSettings | None = None) -> Encoder:
+    """An untrained encoder of that name; None: with its default settings."""
+    return ENCODERS.load(name)(settings or ENCODERS.defaults(name))
+
+
+def encoder_name(encoder: Encoder) -> str:
+    """The name of an encoder's class in ENCODERS."""
+    return next(name for name in ENCODERS if ENCODERS.load(name) is type(encoder))

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from robotdiffuse.learning.checkpoint import save_encoder
-from robotdiffuse.learning.encoders import make_encoder
-from robotdiffuse.learning.encoders.networks import Autoencoder, Encoder
+from robotdiffuse.learning.encoders.networks import Autoencoder, Encoder, make_encoder
 from robotdiffuse.learning.training.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.loop import Validation

@@ -13,8 +13,7 @@ from torch import Tensor
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_network
 from robotdiffuse.learning.clearance_features import packed_clearances
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.encoders import encoder_name, make_encoder
-from robotdiffuse.learning.encoders.networks import Encoder
+from robotdiffuse.learning.encoders.networks import Encoder, encoder_name, make_encoder
 from robotdiffuse.learning.forward_kinematics import ForwardKinematics
 from robotdiffuse.learning.motion_model import ModelParts, MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
