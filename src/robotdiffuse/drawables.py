@@ -140,10 +140,12 @@ class Drawable:
         """The pose of its own frame in the base frame at a time [s]."""
         return own_frame(self.shape) if self.moving is None else self.moving.pose(time)
 
-    @cached_property
-    def own_shape(self) -> Shape:
-        """The shape in its own frame."""
-        return self.shape.moved(inverse(self.frame()))
+    @property
+    def fixed(self) -> "Drawable":
+        """The obstacle in the frame that it is fixed to: the base, or its own if it moves."""
+        if self.moving is None:
+            return self
+        return Drawable(self.shape.moved(inverse(self.frame())), self.color)
 
     def surface_at(self, time: float) -> Surface:
         """The surface where it is at a time [s], in the base frame."""

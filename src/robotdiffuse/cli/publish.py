@@ -42,7 +42,7 @@ def address(text: str) -> tuple[str, int]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.interop.rosbridge import publish
+    from robotdiffuse.interop.plain_messages import publish
 
     host, port = arguments.to
     _, trajectory = validated_motion(arguments.result)

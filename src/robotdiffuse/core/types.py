@@ -241,7 +241,9 @@ class Trajectory(Value):
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
         kinds = ("position", "velocity", "acceleration")
-        writer.writerow(["time", *(f"{name}_{kind}" for kind in kinds for name in self.joint_names)])
+        # a spreadsheet would read names that begin with these as formulas
+        names = [f"'{name}" if name[0] in "=+-@" else name for name in self.joint_names]
+        writer.writerow(["time", *(f"{name}_{kind}" for kind in kinds for name in names)])
         columns = (self.times[:, None], *(getattr(self, rows) for rows in ROWS))
         writer.writerows([repr(value) for value in row] for row in np.concatenate(columns, axis=1).tolist())
         return stream.getvalue()

@@ -6,18 +6,18 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core.errors import InputError, OutputError, shortened
+from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import write_error
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop.plain_messages import joint_trajectory
-from robotdiffuse.interop.recorded_motion import RecordedMotion
-from robotdiffuse.interop.ros_messages import motion_from_messages
-from robotdiffuse.interop.ros_types import (
+from robotdiffuse.interop.recorded_motion import RecordedMotion, reading
+from robotdiffuse.interop.ros_messages import (
     DISPLAY_TRAJECTORY,
     JOINT_TRAJECTORY,
     choose_topic,
     display_trajectory,
+    motion_from_messages,
     to_message,
     typestore,
 )
@@ -73,24 +73,18 @@ def _replace(file: Path, new: Path, old: Path) -> None:
 
 
 def read(file: Path, topic: str | None = None) -> RecordedMotion:
-    """Read the motion on a topic; see `ros_types.choose_topic`."""
+    """Read the motion on a topic; see `choose_topic`."""
     if not (file / "metadata.yaml").is_file():
         raise InputError(f"{file} is not a ROS 2 bag: it has no metadata.yaml")
     for part in file.iterdir():
         if not part.is_dir():
             input_file(part, largest=sys.maxsize)
-    try:
-        with AnyReader([file], default_typestore=typestore()) as reader:
-            topics = {connection.topic: connection.msgtype for connection in reader.connections}
-            name = choose_topic(topics, topic, str(file))
-            messages = [
-                (at, reader.deserialize(raw, connection.msgtype))
-                for connection, at, raw in reader.messages(
-                    [connection for connection in reader.connections if connection.topic == name]
-                )
-            ]
-            return motion_from_messages(topics[name], messages, f"{file}, {name}")
-    except InputError:
-        raise
-    except Exception as error:  # rosbags, SQLite and YAML raise many kinds of errors for a damaged bag
-        raise InputError(f"{file} is damaged: {shortened(str(error))}") from None
+    with reading(file), AnyReader([file], default_typestore=typestore()) as reader:
+        topics = {connection.topic: connection.msgtype for connection in reader.connections}
+        name = choose_topic(topics, topic, str(file))
+        chosen = [connection for connection in reader.connections if connection.topic == name]
+        messages = [
+            (at, reader.deserialize(raw, connection.msgtype))
+            for connection, at, raw in reader.messages(chosen)
+        ]
+        return motion_from_messages(topics[name], messages, f"{file}, {name}")
