@@ -184,12 +184,13 @@ def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
 
 
 def _add_triangles(entity: Any, surface: Surface, color: Color, opacity: float) -> None:
-    """Add a surface in the frame of an entity. Coordinates in single precision compress better."""
+    """Add a surface in the frame of an entity; equal vertices once, in single precision, to save space."""
+    points, number = np.unique(surface.vertices.astype(np.float32), axis=0, return_inverse=True)
     triangles = entity.triangles.add()
     triangles.pose.orientation.w = 1.0
-    for x, y, z in surface.vertices.astype(np.float32).tolist():
+    for x, y, z in points.tolist():
         triangles.points.add(x=x, y=y, z=z)
-    triangles.indices.extend(surface.faces.ravel().tolist())
+    triangles.indices.extend(number.reshape(-1)[surface.faces.ravel()].tolist())
     _set_color(triangles.color, color, opacity)
 
 

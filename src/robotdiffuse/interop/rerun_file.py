@@ -103,6 +103,5 @@ def _mesh(surface: Surface) -> rr.Mesh3D:
     return rr.Mesh3D(
         vertex_positions=surface.vertices,
         triangle_indices=surface.faces,
-        vertex_normals=surface.normals,
         vertex_colors=colors,
     )
