@@ -141,11 +141,14 @@ class Drawable:
         return own_frame(self.shape) if self.moving is None else self.moving.pose(time)
 
     @property
+    def own(self) -> "Drawable":
+        """The obstacle at rest in its own frame."""
+        return Drawable(self.shape.moved(inverse(self.frame())), self.color)
+
+    @property
     def fixed(self) -> "Drawable":
         """The obstacle in the frame that it is fixed to: the base, or its own if it moves."""
-        if self.moving is None:
-            return self
-        return Drawable(self.shape.moved(inverse(self.frame())), self.color)
+        return self if self.moving is None else self.own
 
     def surface_at(self, time: float) -> Surface:
         """The surface where it is at a time [s], in the base frame."""

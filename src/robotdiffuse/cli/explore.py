@@ -114,15 +114,13 @@ def show_live(arguments: argparse.Namespace, settings: "ExplorerSettings") -> No
     """Serve the page of an exploration until Ctrl-C."""
     require_viser("explore --live")
     from robotdiffuse.problems.files import load_problem
-    from robotdiffuse.visualization.live.access import listen, token_for
-    from robotdiffuse.visualization.live.exploration_page import ExplorationPage
-    from robotdiffuse.visualization.live.exploration_session import ExplorationSession
+    from robotdiffuse.visualization.live.exploration import ExplorationPage, ExplorationSession
+    from robotdiffuse.visualization.live.server import PageServer, free_port
 
-    listening = listen(arguments.host, arguments.port)
+    number = free_port(arguments.host, arguments.port)
     problem = load_problem(arguments.problem)
     session = ExplorationSession(problem, settings, arguments.noise, arguments.seed, arguments.speed)
-    token = token_for(listening)
-    serve_until_stopped(ExplorationPage(session, listening, token), listening, token)
+    serve_until_stopped(ExplorationPage(session, PageServer(arguments.host, number)))
 
 
 def simulate(
@@ -154,9 +152,9 @@ def print_event(number: int, event: "Event", explorer: "RecordedExplorer") -> No
 def draw_exploration(explorer: "RecordedExplorer", problem: "Problem", file: Path) -> None:
     """Draw an exploration as a replay or a strip of pictures, as the ending of the file says."""
     if file.suffix.lower() == ".html":
-        from robotdiffuse.visualization.exploration_page import write_exploration as write
+        from robotdiffuse.visualization.exploration import write_exploration as write
     else:
-        from robotdiffuse.visualization.exploration_picture import write_exploration_picture as write
+        from robotdiffuse.visualization.exploration import write_exploration_picture as write
     write(explorer, problem.scene, file)
 
 

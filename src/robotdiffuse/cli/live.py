@@ -3,7 +3,6 @@
 import argparse
 import os
 import signal
-import socket
 import sys
 import threading
 from typing import TYPE_CHECKING, NoReturn
@@ -13,7 +12,7 @@ from robotdiffuse.cli.exit_status import STOPPED
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
-    from robotdiffuse.visualization.live.exploration_page import ExplorationPage
+    from robotdiffuse.visualization.live.exploration import ExplorationPage
     from robotdiffuse.visualization.live.page import Page
 
 LOOPBACK = "127.0.0.1"
@@ -66,20 +65,18 @@ def run(arguments: argparse.Namespace) -> NoReturn:
     from rich.console import Console
 
     from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
-    from robotdiffuse.visualization.live.access import listen, token_for
     from robotdiffuse.visualization.live.files import first_problem
     from robotdiffuse.visualization.live.page import Page
+    from robotdiffuse.visualization.live.server import PageServer, free_port
     from robotdiffuse.visualization.live.session import PageOptions, Session
 
     planner = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(planner)
     options = PageOptions(planner, arguments.time_limit)
-    listening = listen(arguments.host, arguments.port)
+    number = free_port(arguments.host, arguments.port)
     with Console(stderr=True).status("loading the robot (preparing a new URDF takes a minute)"):
         problem = first_problem(arguments.problem, arguments.robot)
-    token = token_for(listening)
-    page = Page(Session(problem, options), listening, token)
-    serve_until_stopped(page, listening, token)
+    serve_until_stopped(Page(Session(problem, options), PageServer(arguments.host, number)))
 
 
 def require_viser(command: str) -> None:
@@ -92,14 +89,12 @@ def require_viser(command: str) -> None:
         raise InputError(f"{command} needs viser: pip install 'robotdiffuse[live]'") from None
 
 
-def serve_until_stopped(page: "Page | ExplorationPage", listening: socket.socket, token: str) -> NoReturn:
+def serve_until_stopped(page: "Page | ExplorationPage") -> NoReturn:
     """Print the address of a page, serve it until Ctrl-C, and end the process."""
-    host, number = listening.getsockname()[:2]
     ended = threading.Event()
     for stop_signal in (signal.SIGINT, signal.SIGTERM):
         signal.signal(stop_signal, lambda *_: ended.set())
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-    print(f"the page is at http://{name}:{number}/{token} (stop with Ctrl-C)", flush=True)
+    print(f"the page is at {page.server.url} (stop with Ctrl-C)", flush=True)
     ended.wait()
     page.close()
     print("robotdiffuse: stopped", file=sys.stderr, flush=True)

@@ -119,8 +119,7 @@ def replay_page(problem: Problem, result: PlanResult, candidates: tuple[JointPat
     """The replay of a solved result as a self-contained HTML page."""
     motion = result.trajectory or result.path
     assert motion is not None
-    robot, scene = problem.standing()
     with TemporaryDirectory() as folder:
         file = Path(folder) / "replay.html"
-        write_replay(robot, scene, motion, file, result=result, candidates=candidates)
+        write_replay(*problem.standing(), motion, file, result=result, candidates=candidates)
         return file.read_bytes()

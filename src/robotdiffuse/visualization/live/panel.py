@@ -15,9 +15,21 @@ from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.visualization.live.files import problem_text, replay_page, uploaded_problem
-from robotdiffuse.visualization.live.obstacles import MAX_DIMENSION, MIN_DIMENSION, NEW_OBSTACLES, dimensions
-from robotdiffuse.visualization.live.session import TREE_SETTINGS, Session, State
-from robotdiffuse.visualization.live.validity import INVALID, NO_MOTION, PENDING, VALID, Validity
+from robotdiffuse.visualization.live.session import (
+    INVALID,
+    MAX_DIMENSION,
+    MIN_DIMENSION,
+    NEW_OBSTACLES,
+    NO_MOTION,
+    PENDING,
+    TREE_SETTINGS,
+    VALID,
+    Session,
+    State,
+    Validity,
+    dimensions,
+)
+from robotdiffuse.visualization.live.threads import Changes
 
 BADGE_COLORS = {VALID: "#0f8f6f", INVALID: "#c92f2f", NO_MOTION: "#b26a00", PENDING: "#6b7684"}
 JOINT_COLORS = ("#4f7fd9", "#10a37f", "#d97b5c", "#8a63d2", "#c2a23a", "#4fa3b8", "#c96a9a", "#7a8794")
@@ -44,7 +56,7 @@ class Panel:
     def __init__(self, server: viser.ViserServer, session: Session, callbacks: PanelCallbacks) -> None:
         self._server, self._session, self._callbacks = server, session, callbacks
         gui = server.gui
-        self._shown: dict[str, Any] = {}
+        self._changes = Changes()
         self._badge = gui.add_html("")
         self._slider = gui.add_slider("Time", min=0.0, max=1.0, step=0.01, initial_value=0.0)
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
@@ -83,34 +95,29 @@ class Panel:
 
     def _plan_tab(self) -> None:
         gui, session, options = self._server.gui, self._session, self._session.state.options
-        self._planner = gui.add_dropdown("Planner", tuple(PLANNERS), initial_value=options.planner)
-        self._limit = gui.add_slider(
+        hints = {
+            "follow": "Plan again after each change",
+            "candidates": "Motions proposed by the network: red in collision, green from 5 cm clearance",
+            "trees": "Search trees from the start (blue) and the goal (green); planners: "
+            + ", ".join(TREE_SETTINGS),
+        }
+        labels = {"follow": "Plan automatically", "candidates": "Candidates", "trees": "Search trees"}
+        self._options: dict[str, Any] = {
+            "planner": gui.add_dropdown("Planner", tuple(PLANNERS), initial_value=options.planner)
+        }
+        limit = gui.add_slider(
             "Time limit [s]", min=0.05, max=10.0, step=0.05, initial_value=min(options.time_limit, 10.0)
         )
-        self._follow = gui.add_checkbox(
-            "Plan automatically", initial_value=options.follow, hint="Plan again after each change"
-        )
-        self._candidates = gui.add_checkbox(
-            "Candidates",
-            initial_value=options.candidates,
-            hint="Motions proposed by the network: red in collision, green from 5 cm clearance",
-        )
-        self._trees = gui.add_checkbox(
-            "Search trees",
-            initial_value=options.trees,
-            hint="Search trees from the start (blue) and the goal (green); planners: "
-            + ", ".join(TREE_SETTINGS),
-        )
+        for name, hint in hints.items():
+            value = getattr(options, name)
+            self._options[name] = gui.add_checkbox(labels[name], initial_value=value, hint=hint)
         self._now = gui.add_button("Plan now", icon=viser.Icon.ROUTE)
         self._stages = gui.add_html("")
         self._kind = gui.add_dropdown("Plot", PLOTS, initial_value=PLOTS[0])
         self._plot_box = gui.add_folder("Joint values relative to limits")
         self._plot: viser.GuiUplotHandle | None = None
-        self._on(self._planner, lambda event: session.set_options(planner=event.target.value))
-        self._on(self._limit, lambda event: session.set_options(time_limit=event.target.value))
-        self._on(self._follow, lambda event: session.set_options(follow=event.target.value))
-        self._on(self._candidates, lambda event: session.set_options(candidates=event.target.value))
-        self._on(self._trees, lambda event: session.set_options(trees=event.target.value))
+        for name, widget in {**self._options, "time_limit": limit}.items():
+            self._on(widget, lambda event, name=name: session.set_options(**{name: event.target.value}))
         self._on(self._kind, lambda _event: self._show_plot(session.state))
         self._now.on_click(lambda event: self.guarded(event, session.plan_now))
 
@@ -143,62 +150,43 @@ class Panel:
             file, robot = load.value, session.state.problem.robot
             self.guarded(event, lambda: session.open(uploaded_problem(file.content, file.name, robot)))
 
-        @save.on_click
-        def _(event: viser.GuiEvent) -> None:
-            def send() -> None:
-                _send(event, "problem.yaml", problem_text(session.state.problem))
+        save.on_click(lambda event: self.guarded(event, lambda: _send(event, *self._problem_file())))
+        share.on_click(lambda event: self.guarded(event, lambda: _send(event, *self._replay_file())))
 
-            self.guarded(event, send)
+    def _problem_file(self) -> tuple[str, bytes]:
+        return "problem.yaml", problem_text(self._session.state.problem)
 
-        @share.on_click
-        def _(event: viser.GuiEvent) -> None:
-            def send() -> None:
-                state = session.state
-                if state.motion is None:
-                    raise InputError("there is no motion to save yet")
-                names = state.problem.robot.joint_names
-                fan = () if state.candidates is None else state.candidates.positions
-                paths = tuple(Path(names, q) for q in fan)
-                _send(event, "replay.html", replay_page(state.problem, state.motion, paths))
-
-            self.guarded(event, send)
+    def _replay_file(self) -> tuple[str, bytes]:
+        state = self._session.state
+        if state.motion is None:
+            raise InputError("there is no motion to save yet")
+        candidates = () if state.candidates is None else state.candidates.positions
+        paths = tuple(Path(state.problem.robot.joint_names, q) for q in candidates)
+        return "replay.html", replay_page(state.problem, state.motion, paths)
 
     # display
 
     def show(self, state: State, validity: Validity, selected: str) -> None:
         """Update the widgets to a state."""
-        if self._new_value("validity", (validity, state.planning)):
+        if self._changes.new("validity", (validity.kind, validity.headline, validity.lines), state.planning):
             self._badge.content = badge_html(validity, state.planning)
-        if self._new_value("seconds", state.seconds):
+        if self._changes.new("seconds", state.seconds):
             self._stages.content = _stages_html(state.seconds)
-        for widget, value in (
-            (self._planner, state.options.planner),
-            (self._follow, state.options.follow),
-            (self._candidates, state.options.candidates),
-            (self._trees, state.options.trees),
-        ):
-            set_value(widget, value)
-        if self._new_value("motion", state.motion):
+        for name, widget in self._options.items():
+            set_value(widget, getattr(state.options, name))
+        if self._changes.new("motion", state.motion):
             self._show_plot(state)
-        if self._new_value("robot", state.problem.robot):
+        if self._changes.new("robot", state.problem.robot):
             self._new_joints(state.problem.robot)
-        if self._new_value("start", state.problem.start):
+        if self._changes.new("start", state.problem.start):
             for widget, value in zip(self._joints, state.problem.start, strict=True):
                 set_value(widget, round(float(value), 3))
         self._show_obstacle(state, selected)
 
-    def _new_value(self, what: str, value: object) -> bool:
-        """Whether a value has changed since the last call."""
-        known = self._shown.get(what)
-        if known is value or (isinstance(value, tuple) and known == value):
-            return False
-        self._shown[what] = value
-        return True
-
     def _show_obstacle(self, state: State, selected: str) -> None:
         shapes = {shape.name: shape for shape in state.problem.known_scene.shapes}
         options: tuple[str, ...] = (NO_OBSTACLE, *shapes)
-        if self._new_value("options", options):
+        if self._changes.new("options", options):
             self._selected.options = options
         name = selected if selected in shapes else NO_OBSTACLE
         set_value(self._selected, name)
@@ -206,7 +194,7 @@ class Panel:
         self._delete.visible = shape is not None
         sizes = {} if shape is None else dimensions(shape)
         self._sizes_box.visible = bool(sizes)
-        if self._new_value("sizes of", (name, *sizes)):
+        if self._changes.new("sizes of", (name, *sizes)):
             for widget in self._sizes.values():
                 widget.remove()
             with self._sizes_box:
@@ -259,13 +247,12 @@ class Panel:
             return
         data = plotted(robot, motion.trajectory, self._kind.value)
         names = tuple(robot.joint_names)
-        if self._plot is not None and self._new_value("joints of the plot", names):
-            self._plot.remove()
-            self._plot = None
-        if self._plot is not None:
+        if self._plot is not None and not self._changes.new("joints of the plot", names):
             self._plot.data = data
             return
-        self._shown["joints of the plot"] = names
+        if self._plot is not None:
+            self._plot.remove()
+        self._changes.new("joints of the plot", names)
         joints = [
             uplot.Series(label=name, stroke=JOINT_COLORS[i % len(JOINT_COLORS)], width=1.5)
             for i, name in enumerate(names)
