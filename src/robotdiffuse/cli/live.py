@@ -65,10 +65,9 @@ def run(arguments: argparse.Namespace) -> NoReturn:
     from rich.console import Console
 
     from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
-    from robotdiffuse.visualization.live.files import first_problem
     from robotdiffuse.visualization.live.page import Page
     from robotdiffuse.visualization.live.server import PageServer, free_port
-    from robotdiffuse.visualization.live.session import PageOptions, Session
+    from robotdiffuse.visualization.live.session import PageOptions, Session, first_problem
 
     planner = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(planner)

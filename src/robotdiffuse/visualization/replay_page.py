@@ -152,7 +152,7 @@ def _track(obstacle: Drawable, motion: Path | Trajectory) -> list[list[float]]:
     return rows
 
 
-def _spheres(robot: Robot) -> list[list[float]]:
+def _spheres(robot: Robot) -> list[list[float | int]]:
     """Frame, x, y, z and radius of each covering sphere."""
     rows = []
     for link, spheres in robot.spheres.items():

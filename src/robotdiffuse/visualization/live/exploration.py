@@ -47,7 +47,7 @@ from robotdiffuse.visualization.live.drawing import (
     draw_lines,
     draw_trace,
 )
-from robotdiffuse.visualization.live.panel import badge_html, set_value
+from robotdiffuse.visualization.live.page import badge_html, set_value
 from robotdiffuse.visualization.live.server import PageServer
 from robotdiffuse.visualization.live.session import INVALID, NO_MOTION, PENDING, VALID, Validity
 from robotdiffuse.visualization.live.threads import FRAME_RATE, Changes, LatestTask

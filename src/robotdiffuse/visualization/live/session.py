@@ -9,6 +9,9 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from importlib.resources import as_file, files
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,25 +19,32 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
-from robotdiffuse.core.errors import InputError, distinct, shortened, unknown_name
+from robotdiffuse.core.errors import InputError, distinct, shortened, shown, unknown_name
+from robotdiffuse.core.input_files import parse_json, parse_yaml
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.transforms import inverse, transform
+from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner, planner_settings
 from robotdiffuse.planning.diffusion.candidates import Candidates, draw_candidates
 from robotdiffuse.planning.planner import Planner
+from robotdiffuse.problems.families import load_family
+from robotdiffuse.problems.files import load_problem, problem_from_record, save_problem
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import known_robots, load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
 from robotdiffuse.scenes.mesh import Mesh
+from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from robotdiffuse.validation.report import Report
-from robotdiffuse.validation.validator import verify_trajectory
+from robotdiffuse.validation.validator import verify, verify_trajectory
 from robotdiffuse.visualization.live.threads import LatestTask
+from robotdiffuse.visualization.replay_page import write_replay
 
 NEW_OBSTACLES: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
     "sphere": lambda center, size: Sphere(center, size),
@@ -60,6 +70,15 @@ QUICK_IK = InverseKinematicsSettings(max_rounds=2, patience=1)
 """Inverse kinematics while dragging: few attempts, because many poses are out of reach."""
 
 
+DEMO_FILE = "shelf.yaml"
+FAMILY = "shelf"
+MAX_UPLOAD_SIZE = 5_000_000
+"""Largest problem file [bytes]."""
+FILE_FIELDS = ("file", "request", "views")
+"""Fields of a problem that name files on the server."""
+MAX_SAMPLES = 1000
+"""Most random configurations that are tried for a free start and goal."""
+NO_FILES = "the page reads no other files; open this problem with `robotdiffuse live PROBLEM`"
 VALID, INVALID, NO_MOTION, PENDING = "valid", "invalid", "none", "pending"
 """Kinds of badges: green, red, no motion, not validated yet."""
 COLLISIONS = ("scene_collision", "self_collision")
@@ -493,3 +512,96 @@ def _distance(metres: float | None) -> str:
     if metres > CLEARANCE_CAP - 1e-4:
         return f"more than {CLEARANCE_CAP:g} m"
     return f"{100 * metres:.1f} cm" if metres >= 0.01 else f"{1000 * metres:.1f} mm"
+
+
+def first_problem(file: str | None, robot: str | None) -> Problem:
+    """The first problem of the page: from a file, for a robot, or the demo.
+
+    Raises InputError if both are given, and for a bad file or robot.
+    """
+    if file is not None and robot is not None:
+        raise InputError(f"{file} names its robot; give a problem or --robot {robot}, not both")
+    if file is not None:
+        return load_problem(file)
+    if robot is not None:
+        return problem_for(load_robot(robot))
+    with as_file(files("robotdiffuse") / "examples" / DEMO_FILE) as demo:
+        return load_problem(demo)
+
+
+def problem_for(robot: Robot) -> Problem:
+    """A problem of the family shelf for the arm; if there is none, between two free configurations in an
+    empty scene."""
+    rng = np.random.default_rng(0)
+    try:
+        return load_family(FAMILY).draw(robot, rng).problem(robot)
+    except InputError:
+        pass
+    lower, upper = (np.clip(limit, -np.pi, np.pi) for limit in (robot.lower, robot.upper))
+    free: list[np.ndarray] = []
+    for q in rng.uniform(lower, upper, (MAX_SAMPLES, robot.dof)):
+        alone = Problem(robot, Scene(), q, JointGoal(q))
+        if verify(alone, JointPath(robot.joint_names, q[None])).valid:
+            free.append(q)
+        if len(free) == 2:
+            return Problem(robot, Scene(), free[0], JointGoal(free[1]))
+    raise InputError(f"of {MAX_SAMPLES} random configurations of {robot.name} fewer than 2 are free")
+
+
+def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
+    """The problem in an uploaded file.
+
+    It may name known robots and the one on the page, but no files on the server. Raises InputError, which
+    begins with the name of the file.
+    """
+    if len(content) > MAX_UPLOAD_SIZE:
+        raise InputError(f"{name} has {len(content)} bytes; at most {MAX_UPLOAD_SIZE} are read")
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{name} is not UTF-8 text") from None
+    data = parse_json(text, name) if name.lower().endswith(".json") else parse_yaml(text, name)
+    try:
+        _check_contained(data, robot)
+        return problem_from_record(data)
+    except InputError as error:
+        raise InputError(f"{name}: {str(error).removeprefix('problem: ')}") from None
+
+
+def _check_contained(data: object, robot: Robot) -> None:
+    """Raises InputError if the data of a problem file names files."""
+    if not isinstance(data, dict):
+        return  # the problem reader rejects it
+    given, known = data.get("robot"), known_robots()
+    if isinstance(given, str) and given not in known and given != robot.source:
+        raise unknown_name("robot", given, known)
+    if isinstance(data.get("scene"), str):
+        raise InputError(f"scene is {shown(data['scene'])}; {NO_FILES}")
+    parts: list[object] = [data]
+    while parts:
+        part = parts.pop()
+        if isinstance(part, dict):
+            for field in FILE_FIELDS:
+                if field in part:
+                    raise InputError(f"{field} is {shown(part[field])}; {NO_FILES}")
+            parts += part.values()
+        elif isinstance(part, list):
+            parts += part
+
+
+def problem_text(problem: Problem) -> bytes:
+    """The problem as a YAML file."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "problem.yaml"
+        save_problem(problem, file)
+        return file.read_bytes()
+
+
+def replay_page(problem: Problem, result: PlanResult, candidates: tuple[JointPath, ...] = ()) -> bytes:
+    """The replay of a solved result as a self-contained HTML page."""
+    motion = result.trajectory or result.path
+    assert motion is not None
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "replay.html"
+        write_replay(*problem.standing(), motion, file, result=result, candidates=candidates)
+        return file.read_bytes()
