@@ -3,6 +3,8 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.arguments import option
+
 HOLDS, FAILS = 0, 1
 MAX_CHANGES = 4
 """Differences from the bundled robot in a line at most."""
@@ -24,12 +26,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         description="Re-check a certificate with code that shares nothing with the validator. Exit status: "
         "0 if it holds, 1 if not, 2 for bad input.",
     )
-    check.add_argument("file", metavar="FILE", help="certificate of `robotdiffuse verify --certificate`")
-    check.add_argument(
-        "--problem",
-        metavar="FILE",
-        help="problem file to check it for (default: the problem in the certificate)",
-    )
+    option(check, "file FILE", "certificate of `robotdiffuse verify --certificate`")
+    option(check, "--problem FILE", "problem file to check it for (default: the problem in the certificate)")
     check.set_defaults(run=run_check)
 
 

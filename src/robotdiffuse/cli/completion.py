@@ -4,6 +4,8 @@ import argparse
 import json
 from collections.abc import Iterator
 
+from robotdiffuse.cli.arguments import option
+
 SHELLS = ("bash", "zsh")
 SCRIPT = """_robotdiffuse() {{
   local word="${{COMP_WORDS[COMP_CWORD]}}" command="" words="" options="" i
@@ -40,7 +42,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         description="Print a script that completes commands and options: "
         'eval "$(robotdiffuse completion bash)" in ~/.bashrc, or with zsh in ~/.zshrc.',
     )
-    parser.add_argument("shell", choices=SHELLS, help="the shell")
+    option(parser, "shell", "the shell", choices=SHELLS)
     parser.set_defaults(run=run, parsers=commands.choices)
 
 

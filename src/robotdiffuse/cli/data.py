@@ -10,6 +10,7 @@ from robotdiffuse.cli.arguments import (
     count,
     natural,
     not_negative,
+    option,
     positive,
     share,
     shares,
@@ -49,53 +50,33 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
         "write the motions that pass the validator to shards. Ctrl-C or a crash loses at most the "
         "unfinished shards; run the same command again to continue.",
     )
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")
-    parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF (default: panda)")
-    parser.add_argument("--trajectories", type=count, metavar="N", help="motions to make (default: 140000)")
-    parser.add_argument("--seed", type=natural, metavar="N", help="random seed (default: 0)")
-    parser.add_argument(
-        "--mix",
-        type=shares,
-        metavar="NAME=P,...",
-        help=f"fractions of the problem families {', '.join(FAMILIES)} (default: rop=1)",
+    option(parser, "--out FOLDER !", "folder for the data")
+    option(parser, "--robot NAME", "bundled name or URDF (default: panda)")
+    option(parser, "--trajectories N", "motions to make (default: 140000)", count)
+    option(parser, "--seed N", "random seed (default: 0)", natural)
+    option(
+        parser,
+        "--mix NAME=P,...",
+        f"fractions of the problem families {', '.join(FAMILIES)} (default: rop=1)",
+        shares,
     )
-    parser.add_argument(
-        "--trivial-share",
-        type=share,
-        metavar="P",
-        help="fraction to keep of the problems that a straight line solves (default: 1, as in the paper)",
+    option(
+        parser,
+        "--trivial-share P",
+        "fraction to keep of the problems that a straight line solves (default: 1, as in the paper)",
+        share,
     )
-    parser.add_argument(
-        "--target", metavar="KIND", help="what targets give: position (default) or pose of the tip"
-    )
-    parser.add_argument(
-        "--goals", type=count, metavar="N", help="most goal configurations per target (default: 10)"
-    )
+    option(parser, "--target KIND", "what targets give: position (default) or pose of the tip")
+    option(parser, "--goals N", "most goal configurations per target (default: 10)", count)
     parser.add_argument(
         "--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion (default: 254)"
     )
-    parser.add_argument(
-        "--timing",
-        metavar="KIND",
-        help="waypoints equally spaced in arc length (arc, default) or in time (time)",
-    )
-    parser.add_argument(
-        "--safety-distance",
-        type=not_negative,
-        metavar="M",
-        help="distance to keep to obstacles [m] (default: 0.05)",
-    )
-    parser.add_argument(
-        "--planner", metavar="NAME", help="shared_tree_rrt_star (default, as in the paper) or aorrtc"
-    )
-    parser.add_argument("--shard", type=count, metavar="N", help="motions per shard (default: 500)")
-    parser.add_argument(
-        "--workers",
-        type=count,
-        metavar="N",
-        help="processes (default: all cores)",
-    )
-    parser.add_argument("--cluster", metavar="NAME", help="ray: use the Ray cluster at RAY_ADDRESS")
+    option(parser, "--timing KIND", "waypoints equally spaced in arc length (arc, default) or in time (time)")
+    option(parser, "--safety-distance M", "distance to keep to obstacles [m] (default: 0.05)", not_negative)
+    option(parser, "--planner NAME", "shared_tree_rrt_star (default, as in the paper) or aorrtc")
+    option(parser, "--shard N", "motions per shard (default: 500)", count)
+    option(parser, "--workers N", "processes (default: all cores)", count)
+    option(parser, "--cluster NAME", "ray: use the Ray cluster at RAY_ADDRESS")
     add_import_option(parser)
     parser.set_defaults(run=run_generate)
 
@@ -106,9 +87,9 @@ def add_info(actions: argparse._SubParsersAction) -> None:
         help="print statistics and write a page of plots",
         description="Print the statistics of a data set and write a page of plots.",
     )
-    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
-    parser.add_argument("--page", metavar="FILE.html", help="page of plots (default: FOLDER/report.html)")
-    parser.add_argument("--robot", metavar="NAME", help=ROBOT_HELP)
+    option(parser, "folder FOLDER", FOLDER_HELP)
+    option(parser, "--page FILE.html", "page of plots (default: FOLDER/report.html)")
+    option(parser, "--robot NAME", ROBOT_HELP)
     parser.set_defaults(run=run_info)
 
 
@@ -119,18 +100,12 @@ def add_check(actions: argparse._SubParsersAction) -> None:
         description="Check the structure of all shards and validate their motions again, with RobotDiffuse's "
         "validator and with PyBullet on meshes. Exit status: 0 clean, 1 violations found, 2 bad input.",
     )
-    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
-    parser.add_argument("--count", type=count, metavar="N", help="validate N random motions (default: all)")
-    parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
-    parser.add_argument(
-        "--workers",
-        type=count,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="processes (default: all cores)",
-    )
-    parser.add_argument("--no-pybullet", action="store_true", help="do not validate with PyBullet")
-    parser.add_argument("--robot", metavar="NAME", help=ROBOT_HELP)
+    option(parser, "folder FOLDER", FOLDER_HELP)
+    option(parser, "--count N", "validate N random motions (default: all)", count)
+    option(parser, "--seed N", "random seed (default: 0)", natural, 0)
+    option(parser, "--workers N", "processes (default: all cores)", count, os.cpu_count() or 1)
+    option(parser, "--no-pybullet", "do not validate with PyBullet")
+    option(parser, "--robot NAME", ROBOT_HELP)
     parser.set_defaults(run=run_check)
 
 
@@ -141,11 +116,11 @@ def add_view(actions: argparse._SubParsersAction) -> None:
         description="Write random motions of a data set as 3D replays in one page. Without --out, the page "
         "opens in the browser.",
     )
-    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
-    parser.add_argument("--count", type=count, default=6, metavar="N", help="motions (default: 6)")
-    parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
-    parser.add_argument("--out", metavar="FILE.html", help="page (default: FOLDER/samples.html)")
-    parser.add_argument("--robot", metavar="NAME", help=ROBOT_HELP)
+    option(parser, "folder FOLDER", FOLDER_HELP)
+    option(parser, "--count N", "motions (default: 6)", count, 6)
+    option(parser, "--seed N", "random seed (default: 0)", natural, 0)
+    option(parser, "--out FILE.html", "page (default: FOLDER/samples.html)")
+    option(parser, "--robot NAME", ROBOT_HELP)
     parser.set_defaults(run=run_view)
 
 
@@ -156,8 +131,8 @@ def add_export(actions: argparse._SubParsersAction) -> None:
         description="Write the motions among exactly two spheres in the layout of the paper's robot.npz: "
         "x_train n x 254 x 7, y_train n x 23.",
     )
-    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
-    parser.add_argument("file", metavar="FILE.npz", help="file to write")
+    option(parser, "folder FOLDER", FOLDER_HELP)
+    option(parser, "file FILE.npz", "file to write")
     parser.set_defaults(run=run_export)
 
 
@@ -168,14 +143,10 @@ def add_import(actions: argparse._SubParsersAction) -> None:
         description="Make a data set from a file in the layout of the paper's robot.npz, to check and "
         "train on like any other. The file does not contain the radius of its spheres.",
     )
-    parser.add_argument("file", metavar="FILE.npz", help="x_train n x 254 x 7, y_train n x 23")
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")
-    parser.add_argument(
-        "--robot", default="panda", metavar="NAME", help="bundled name or URDF (default: panda)"
-    )
-    parser.add_argument(
-        "--radius", type=positive, default=0.25, metavar="M", help="radius of the spheres [m] (default: 0.25)"
-    )
+    option(parser, "file FILE.npz", "x_train n x 254 x 7, y_train n x 23")
+    option(parser, "--out FOLDER !", "folder for the data")
+    option(parser, "--robot NAME", "bundled name or URDF (default: panda)", default="panda")
+    option(parser, "--radius M", "radius of the spheres [m] (default: 0.25)", positive, 0.25)
     parser.set_defaults(run=run_import)
 
 

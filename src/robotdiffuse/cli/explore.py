@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from robotdiffuse.cli.arguments import positive
+from robotdiffuse.cli.arguments import option, positive
 from robotdiffuse.cli.drawing import ENDINGS, show
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
 from robotdiffuse.cli.live import LOOPBACK, PORT, add_address, require_viser, serve_until_stopped
@@ -30,46 +30,43 @@ def add(commands: argparse._SubParsersAction) -> None:
         "named floor are known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 "
         "not, 2 bad input.",
     )
-    parser.add_argument("problem", metavar="PROBLEM", help="problem file")
-    parser.add_argument(
-        "--policy",
-        default="strict",
-        help="strict: only through space seen free; chance: where the stated confidence is high; "
+    option(parser, "problem PROBLEM", "problem file")
+    option(
+        parser,
+        "--policy POLICY",
+        "strict: only through space seen free; chance: where the stated confidence is high; "
         "strict_then_chance (default: strict)",
+        default="strict",
     )
-    parser.add_argument("--confidence", type=float, default=0.98, metavar="P", help="least, of chance (0.98)")
-    parser.add_argument(
+    option(parser, "--confidence P", "least, of chance (0.98)", float, 0.98)
+    option(
+        parser,
         "--see-goal",
-        action="store_true",
-        help="go only to goals at which all of the arm's surface was seen to be free (policy strict)",
+        "go only to goals at which all of the arm's surface was seen to be free (policy strict)",
     )
-    parser.add_argument("--time-limit", type=float, default=1.0, metavar="S", help="of each search (1)")
-    parser.add_argument("--noise", action="store_true", help="simulate the noise of depth cameras")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed")
-    parser.add_argument(
-        "--out",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
+    option(parser, "--time-limit S", "of each search (1)", float, 1.0)
+    option(parser, "--noise", "simulate the noise of depth cameras")
+    option(parser, "--seed N", "random seed", int, 0)
+    option(
+        parser,
+        "--out FILE *",
+        "replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
         "repeatable",
     )
-    parser.add_argument("--view", action="store_true", help="write a replay (.html) and open it")
-    parser.add_argument(
-        "--record",
-        metavar="FILE",
-        help="write the depth images with camera parameters, poses and joint states to this .mcap file",
+    option(parser, "--view", "write a replay (.html) and open it")
+    option(
+        parser,
+        "--record FILE",
+        "write the depth images with camera parameters, poses and joint states to this .mcap file",
     )
     live = parser.add_argument_group("live page")
-    live.add_argument(
+    option(
+        live,
         "--live",
-        action="store_true",
-        help="serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
+        "serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
         "page is first opened",
     )
-    live.add_argument(
-        "--speed", type=positive, default=1.0, metavar="X", help="speed of the motions on it (1: real time)"
-    )
+    option(live, "--speed X", "speed of the motions on it (1: real time)", positive, 1.0)
     add_address(live)
     parser.set_defaults(run=run)
 

@@ -3,6 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.arguments import option
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,13 +19,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         "scene that Foxglove opens, with ROS 2 messages), .rosbag2 (a ROS 2 bag, a folder), .rrd (Rerun), "
         ".yaml (a ROS 2 JointTrajectory), .csv and .json.",
     )
-    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
-    parser.add_argument(
-        "--out", action="append", required=True, metavar="FILE", help="file to write; repeatable"
-    )
-    parser.add_argument(
-        "--rate", type=float, metavar="HZ", help="resample the motion, and validate it so, for a controller"
-    )
+    option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
+    option(parser, "--out FILE * !", "file to write; repeatable")
+    option(parser, "--rate HZ", "resample the motion, and validate it so, for a controller", float)
     parser.set_defaults(run=run)
 
 

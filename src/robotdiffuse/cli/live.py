@@ -7,7 +7,7 @@ import sys
 import threading
 from typing import TYPE_CHECKING, NoReturn
 
-from robotdiffuse.cli.arguments import positive
+from robotdiffuse.cli.arguments import option, positive
 from robotdiffuse.cli.exit_status import STOPPED
 from robotdiffuse.core.errors import InputError
 
@@ -27,30 +27,24 @@ def add(commands: argparse._SubParsersAction) -> None:
         "page plans again after each change and shows at once whether the current motion is still valid. "
         "Without PROBLEM, it shows the demo problem.",
     )
-    parser.add_argument("problem", metavar="PROBLEM", nargs="?", help="problem file (.yaml or .json) to open")
-    parser.add_argument("--robot", metavar="NAME", help="instead of PROBLEM: name or URDF file of an arm")
-    parser.add_argument(
-        "--planner", metavar="NAME", help="planner; see `robotdiffuse planners` (default: robotdiffuse)"
-    )
-    parser.add_argument(
-        "--time-limit", type=positive, default=1.0, metavar="S", help="time limit of each plan (default: 1 s)"
-    )
+    option(parser, "problem PROBLEM", "problem file (.yaml or .json) to open", nargs="?")
+    option(parser, "--robot NAME", "instead of PROBLEM: name or URDF file of an arm")
+    option(parser, "--planner NAME", "planner; see `robotdiffuse planners` (default: robotdiffuse)")
+    option(parser, "--time-limit S", "time limit of each plan (default: 1 s)", positive, 1.0)
     add_address(parser)
     parser.set_defaults(run=run)
 
 
 def add_address(parser: argparse._ActionsContainer) -> None:
     """Add the options that say where a page is served."""
-    parser.add_argument(
-        "--host",
-        default=LOOPBACK,
-        metavar="ADDRESS",
-        help="address to listen on (default: 127.0.0.1, this machine only); on other addresses the URL of "
+    option(
+        parser,
+        "--host ADDRESS",
+        "address to listen on (default: 127.0.0.1, this machine only); on other addresses the URL of "
         "the page ends with a secret token that every visitor needs",
+        default=LOOPBACK,
     )
-    parser.add_argument(
-        "--port", type=port, default=PORT, metavar="N", help=f"port; 0 for any free one (default: {PORT})"
-    )
+    option(parser, "--port N", f"port; 0 for any free one (default: {PORT})", port, PORT)
 
 
 def port(text: str) -> int:

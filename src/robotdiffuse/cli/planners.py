@@ -2,7 +2,7 @@
 
 import argparse
 
-from robotdiffuse.cli.arguments import add_import_option
+from robotdiffuse.cli.arguments import add_import_option, option
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -11,7 +11,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="list the planners, or the settings of one",
         description="List the planners, or the settings of one for `robotdiffuse plan --set`.",
     )
-    parser.add_argument("planner", nargs="?", metavar="NAME", help="list the settings of this planner")
+    option(parser, "planner NAME", "list the settings of this planner", nargs="?")
     add_import_option(parser)
     parser.set_defaults(run=run)
 

@@ -4,6 +4,7 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.arguments import option
 from robotdiffuse.cli.drawing import ENDINGS, draw
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
 from robotdiffuse.cli.view import read_solved
@@ -20,14 +21,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         description="Replay the motion of a result file in PyBullet with position control, and print "
         "tracking errors and contacts. Exit status: 0 no contacts, 1 contacts, 2 bad input.",
     )
-    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
-    parser.add_argument(
-        "--out",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="replay (.html) or picture (.png) of the simulated motion; repeatable",
-    )
+    option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
+    option(parser, "--out FILE *", "replay (.html) or picture (.png) of the simulated motion; repeatable")
     parser.set_defaults(run=run)
 
 
