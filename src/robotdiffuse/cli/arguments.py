@@ -10,6 +10,19 @@ IGNORE_JOINTS = (
 )
 
 
+def command(
+    commands: argparse._SubParsersAction,
+    name: str,
+    help: str,
+    description: str,
+    run: Callable[[argparse.Namespace], int] | None = None,
+) -> argparse.ArgumentParser:
+    """The parser of a command. run: what the command does; None: it has commands of its own."""
+    parser = commands.add_parser(name, help=help, description=description)
+    parser.set_defaults(run=run)
+    return parser
+
+
 def option(
     parser: argparse._ActionsContainer,
     spec: str,

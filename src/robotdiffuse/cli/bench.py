@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import add_import_option, count, option, positive
+from robotdiffuse.cli.arguments import add_import_option, command, count, option, positive
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.ray_cluster import CLUSTERS
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "bench", help="benchmark planners", description="Benchmark planners and networks."
-    )
+    parser = command(commands, "bench", "benchmark planners", "Benchmark planners and networks.")
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    run = actions.add_parser(
+    run = command(
+        actions,
         "run",
-        help="run planners on problems and record every call",
-        description="Run planners on the same problems, in turns, each planner in a process of its own. "
+        "run planners on problems and record every call",
+        "Run planners on the same problems, in turns, each planner in a process of its own. "
         "Results are lines of JSON in the folder. Ctrl-C or a crash loses at most the running calls; run "
         "the same command again to continue. A call whose result a longer time limit cannot change is not "
         "repeated.",
+        run_run,
     )
     option(
         run,
@@ -63,12 +63,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     option(run, "--workers N", "planners that run at once (default: half of the cores)", count)
     option(run, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
     add_import_option(run)
-    run.set_defaults(run=run_run)
-    report = actions.add_parser(
+    report = command(
+        actions,
         "report",
-        help="write tables, plots and replays of a run",
-        description="Write report.md with its plots as .svg, the same as index.html, and replays.html "
+        "write tables, plots and replays of a run",
+        "Write report.md with its plots as .svg, the same as index.html, and replays.html "
         "(motions in 3D), and print the table of each problem set.",
+        run_report,
     )
     option(report, "folder FOLDER", "folder of `robotdiffuse bench run`")
     option(
@@ -78,16 +79,16 @@ def add(commands: argparse._SubParsersAction) -> None:
     option(report, "--out OUT", "folder to write to (default: FOLDER)")
     option(report, "--no-replays", "do not write replays.html")
     add_import_option(report)
-    report.set_defaults(run=run_report)
-    confirm = actions.add_parser(
+    confirm = command(
+        actions,
         "confirm",
-        help="check the motions of a run with PyBullet",
-        description="Check every solved motion of `bench run` with PyBullet, on meshes, as a second "
+        "check the motions of a run with PyBullet",
+        "Check every solved motion of `bench run` with PyBullet, on meshes, as a second "
         "validator. The exit status is 1 if it finds a collision.",
+        run_confirm,
     )
     option(confirm, "folder FOLDER", "folder of `bench run`")
     option(confirm, "--count N", "check only the first N problems of each set (default: all)", count)
-    confirm.set_defaults(run=run_confirm)
 
 
 def run_run(arguments: argparse.Namespace) -> int:

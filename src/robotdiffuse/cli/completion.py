@@ -4,7 +4,7 @@ import argparse
 import json
 from collections.abc import Iterator
 
-from robotdiffuse.cli.arguments import option
+from robotdiffuse.cli.arguments import command, option
 
 SHELLS = ("bash", "zsh")
 SCRIPT = """_robotdiffuse() {{
@@ -27,12 +27,13 @@ Where no word fits, the shell completes names of files."""
 
 
 def add_schema(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    command(
+        commands,
         "schema",
-        help="print the JSON schema of problem files",
-        description="Print the JSON schema of problem files, by which editors complete and check them.",
+        "print the JSON schema of problem files",
+        "Print the JSON schema of problem files, by which editors complete and check them.",
+        run_schema,
     )
-    parser.set_defaults(run=run_schema)
 
 
 def add(commands: argparse._SubParsersAction) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import (
     add_import_option,
+    command,
     count,
     natural,
     not_negative,
@@ -32,10 +33,8 @@ ROBOT_HELP = "the robot of the data, if the name in the manifest is not known he
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "data",
-        help="generate and inspect training data",
-        description="Generate and inspect training data.",
+    parser = command(
+        commands, "data", "generate and inspect training data", "Generate and inspect training data."
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for add_action in (add_generate, add_info, add_check, add_view, add_export, add_import):
@@ -43,12 +42,14 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def add_generate(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "generate",
-        help="plan motions for many random problems",
-        description="Solve many random problems with Shared-Tree Informed RRT* or another planner, and "
+        "plan motions for many random problems",
+        "Solve many random problems with Shared-Tree Informed RRT* or another planner, and "
         "write the motions that pass the validator to shards. Ctrl-C or a crash loses at most the "
         "unfinished shards; run the same command again to continue.",
+        run_generate,
     )
     option(parser, "--out FOLDER !", "folder for the data")
     option(parser, "--robot NAME", "bundled name or URDF (default: panda)")
@@ -78,27 +79,29 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
     option(parser, "--workers N", "processes (default: all cores)", count)
     option(parser, "--cluster NAME", "ray: use the Ray cluster at RAY_ADDRESS")
     add_import_option(parser)
-    parser.set_defaults(run=run_generate)
 
 
 def add_info(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "info",
-        help="print statistics and write a page of plots",
-        description="Print the statistics of a data set and write a page of plots.",
+        "print statistics and write a page of plots",
+        "Print the statistics of a data set and write a page of plots.",
+        run_info,
     )
     option(parser, "folder FOLDER", FOLDER_HELP)
     option(parser, "--page FILE.html", "page of plots (default: FOLDER/report.html)")
     option(parser, "--robot NAME", ROBOT_HELP)
-    parser.set_defaults(run=run_info)
 
 
 def add_check(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "check",
-        help="check all shards and validate their motions again",
-        description="Check the structure of all shards and validate their motions again, with RobotDiffuse's "
+        "check all shards and validate their motions again",
+        "Check the structure of all shards and validate their motions again, with RobotDiffuse's "
         "validator and with PyBullet on meshes. Exit status: 0 clean, 1 violations found, 2 bad input.",
+        run_check,
     )
     option(parser, "folder FOLDER", FOLDER_HELP)
     option(parser, "--count N", "validate N random motions (default: all)", count)
@@ -106,48 +109,50 @@ def add_check(actions: argparse._SubParsersAction) -> None:
     option(parser, "--workers N", "processes (default: all cores)", count, os.cpu_count() or 1)
     option(parser, "--no-pybullet", "do not validate with PyBullet")
     option(parser, "--robot NAME", ROBOT_HELP)
-    parser.set_defaults(run=run_check)
 
 
 def add_view(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "view",
-        help="show random motions as 3D replays",
-        description="Write random motions of a data set as 3D replays in one page. Without --out, the page "
+        "show random motions as 3D replays",
+        "Write random motions of a data set as 3D replays in one page. Without --out, the page "
         "opens in the browser.",
+        run_view,
     )
     option(parser, "folder FOLDER", FOLDER_HELP)
     option(parser, "--count N", "motions (default: 6)", count, 6)
     option(parser, "--seed N", "random seed (default: 0)", natural, 0)
     option(parser, "--out FILE.html", "page (default: FOLDER/samples.html)")
     option(parser, "--robot NAME", ROBOT_HELP)
-    parser.set_defaults(run=run_view)
 
 
 def add_export(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "export",
-        help="write the data in the format of the paper's robot.npz",
-        description="Write the motions among exactly two spheres in the layout of the paper's robot.npz: "
+        "write the data in the format of the paper's robot.npz",
+        "Write the motions among exactly two spheres in the layout of the paper's robot.npz: "
         "x_train n x 254 x 7, y_train n x 23.",
+        run_export,
     )
     option(parser, "folder FOLDER", FOLDER_HELP)
     option(parser, "file FILE.npz", "file to write")
-    parser.set_defaults(run=run_export)
 
 
 def add_import(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "import",
-        help="make a data set from the paper's robot.npz",
-        description="Make a data set from a file in the layout of the paper's robot.npz, to check and "
+        "make a data set from the paper's robot.npz",
+        "Make a data set from a file in the layout of the paper's robot.npz, to check and "
         "train on like any other. The file does not contain the radius of its spheres.",
+        run_import,
     )
     option(parser, "file FILE.npz", "x_train n x 254 x 7, y_train n x 23")
     option(parser, "--out FOLDER !", "folder for the data")
     option(parser, "--robot NAME", "bundled name or URDF (default: panda)", default="panda")
     option(parser, "--radius M", "radius of the spheres [m] (default: 0.25)", positive, 0.25)
-    parser.set_defaults(run=run_import)
 
 
 def _robot(name: str | None) -> "Robot | None":

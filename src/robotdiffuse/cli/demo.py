@@ -6,7 +6,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import option
+from robotdiffuse.cli.arguments import command, option
 from robotdiffuse.cli.console import Spinner, print_result
 from robotdiffuse.cli.drawing import ENDINGS, draw
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
@@ -32,11 +32,13 @@ IMAGE_SIZE, FOCAL_LENGTH = (640, 480), 460.0
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "demo",
-        help="plan a bundled problem and draw the motion",
-        description="Plan a bundled problem with obstacles, and write demo.png and demo.html to the current "
+        "plan a bundled problem and draw the motion",
+        "Plan a bundled problem with obstacles, and write demo.png and demo.html to the current "
         "folder; with --explore, see the obstacles by cameras on the way.",
+        run,
     )
     seen = parser.add_mutually_exclusive_group()
     option(
@@ -56,7 +58,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--robot NAME",
         "plan with another arm, between shelves of its size; see `robotdiffuse robot list`",
     )
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

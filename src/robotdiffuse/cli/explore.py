@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from robotdiffuse.cli.arguments import option, positive
+from robotdiffuse.cli.arguments import command, option, positive
 from robotdiffuse.cli.drawing import ENDINGS, show
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
 from robotdiffuse.cli.live import LOOPBACK, PORT, add_address, require_viser, serve_until_stopped
@@ -22,13 +22,15 @@ RECORDING = ".mcap"
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "explore",
-        help="simulate an arm that sees its scene by a camera at its tip",
-        description="Simulate an arm that goes from a problem's start to its goal and knows of the scene "
+        "simulate an arm that sees its scene by a camera at its tip",
+        "Simulate an arm that goes from a problem's start to its goal and knows of the scene "
         "only what depth cameras have seen: one at its tip, and one beside it that takes one image. Shapes "
         "named floor are known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 "
         "not, 2 bad input.",
+        run,
     )
     option(parser, "problem PROBLEM", "problem file")
     option(
@@ -68,7 +70,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     option(live, "--speed X", "speed of the motions on it (1: real time)", positive, 1.0)
     add_address(live)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import sys
 import threading
 from typing import TYPE_CHECKING, NoReturn
 
-from robotdiffuse.cli.arguments import option, positive
+from robotdiffuse.cli.arguments import command, option, positive
 from robotdiffuse.cli.exit_status import STOPPED
 from robotdiffuse.core.errors import InputError
 
@@ -20,19 +20,20 @@ PORT = 8080
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "live",
-        help="plan interactively in the browser",
-        description="Serve an interactive page until Ctrl-C. Drag the target, the start and obstacles: the "
+        "plan interactively in the browser",
+        "Serve an interactive page until Ctrl-C. Drag the target, the start and obstacles: the "
         "page plans again after each change and shows at once whether the current motion is still valid. "
         "Without PROBLEM, it shows the demo problem.",
+        run,
     )
     option(parser, "problem PROBLEM", "problem file (.yaml or .json) to open", nargs="?")
     option(parser, "--robot NAME", "instead of PROBLEM: name or URDF file of an arm")
     option(parser, "--planner NAME", "planner; see `robotdiffuse planners` (default: robotdiffuse)")
     option(parser, "--time-limit S", "time limit of each plan (default: 1 s)", positive, 1.0)
     add_address(parser)
-    parser.set_defaults(run=run)
 
 
 def add_address(parser: argparse._ActionsContainer) -> None:

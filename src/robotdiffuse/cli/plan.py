@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from robotdiffuse.cli.arguments import (
     IGNORE_JOINTS,
     add_import_option,
+    command,
     jerk_limit,
     natural,
     not_negative,
@@ -43,11 +44,13 @@ REQUEST = (
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "plan",
-        help="plan a motion for a problem file",
-        description="Plan a motion for a problem file; every motion found is verified. Exit status: 0 "
+        "plan a motion for a problem file",
+        "Plan a motion for a problem file; every motion found is verified. Exit status: 0 "
         "solved, 1 no plan, 2 bad input.",
+        run,
     )
     option(parser, "problem PROBLEM", "problem file (.yaml, .json or .jsonl)")
     option(parser, "--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0)
@@ -128,7 +131,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     option(parser, "--view", "write a replay (.html) and open it")
     add_import_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -2,7 +2,7 @@
 
 import argparse
 
-from robotdiffuse.cli.arguments import option, positive
+from robotdiffuse.cli.arguments import command, option, positive
 from robotdiffuse.cli.export import validated_motion
 
 PORT = 9090
@@ -10,10 +10,12 @@ PORT = 9090
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "publish",
-        help="publish a result to ROS through rosbridge",
-        description="Validate the motion of a result file again, and publish it as a ROS JointTrajectory.",
+        "publish a result to ROS through rosbridge",
+        "Validate the motion of a result file again, and publish it as a ROS JointTrajectory.",
+        run,
     )
     option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
     option(parser, "--to HOST[:PORT] !", f"rosbridge server (port: {PORT})", address)
@@ -24,7 +26,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         default="/joint_trajectory",
     )
     option(parser, "--timeout S", "timeout of the connection (default: 5 s)", positive, 5.0)
-    parser.set_defaults(run=run)
 
 
 def address(text: str) -> tuple[str, int]:

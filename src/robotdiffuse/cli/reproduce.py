@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import count, option, positive
+from robotdiffuse.cli.arguments import command, count, option, positive
 from robotdiffuse.core.ray_cluster import CLUSTERS
 
 if TYPE_CHECKING:
@@ -20,25 +20,29 @@ FIGURE_AZIMUTH = -0.9
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "reproduce",
-        help="make the paper's tables and figures again, beside the printed ones",
-        description="Draw the paper's problems, plan, validate, and write one page. Ctrl-C stops; run the "
+        "make the paper's tables and figures again, beside the printed ones",
+        "Draw the paper's problems, plan, validate, and write one page. Ctrl-C stops; run the "
         "same command again to continue.",
     )
     actions = parser.add_subparsers(title="parts", metavar="PART", required=True)
-    table1 = actions.add_parser(
+    table1 = command(
+        actions,
         "table1",
-        help="planners on ROP, with poses and with configurations as goals",
-        description="Write table1.md in the folder, which is one of `bench run` too.",
+        "planners on ROP, with poses and with configurations as goals",
+        "Write table1.md in the folder, which is one of `bench run` too.",
+        run_table1,
     )
     _add_planning(table1)
-    table1.set_defaults(run=run_table1)
-    table2 = actions.add_parser(
+    table2 = command(
+        actions,
         "table2",
-        help="train and compare the rows of the ablation",
-        description="Train every row of the paper's Table 2 on the same number of samples, test it on the "
+        "train and compare the rows of the ablation",
+        "Train every row of the paper's Table 2 on the same number of samples, test it on the "
         "same held-out problems, and write table2.md in the folder.",
+        run_table2,
     )
     option(table2, "--data DATA !", "data set of `data generate`")
     option(table2, "--out FOLDER !", "folder for networks and page")
@@ -51,15 +55,15 @@ def add(commands: argparse._SubParsersAction) -> None:
     option(table2, "--rows NAME,...", "rows to train (default: all ten)")
     option(table2, "--seeds N", "trainings of each row, with different seeds (default: 1)", count)
     option(table2, "--workers N", "processes (default: all cores)", count, os.cpu_count() or 1)
-    table2.set_defaults(run=run_table2)
-    figures = actions.add_parser(
+    figures = command(
+        actions,
         "figures",
-        help="denoising, success over time, motions of two planners",
-        description="Write figures.md and its pictures in the folder of `reproduce table1`; calls that are "
+        "denoising, success over time, motions of two planners",
+        "Write figures.md and its pictures in the folder of `reproduce table1`; calls that are "
         "missing there are made first.",
+        run_figures,
     )
     _add_planning(figures)
-    figures.set_defaults(run=run_figures)
 
 
 def _add_planning(parser: argparse.ArgumentParser) -> None:

@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import assignment, folder, natural, option
+from robotdiffuse.cli.arguments import assignment, command, folder, natural, option
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,32 +20,36 @@ MAX_PAIRS = 8
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "robot", help="list, show or prepare robots", description="List or show robots, or prepare a new one."
+    parser = command(
+        commands, "robot", "list, show or prepare robots", "List or show robots, or prepare a new one."
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
 
-    listing = actions.add_parser(
+    command(
+        actions,
         "list",
-        help="list the robots that problems can name",
-        description="List the bundled robots and those added by `robot add`.",
+        "list the robots that problems can name",
+        "List the bundled robots and those added by `robot add`.",
+        run_list,
     )
-    listing.set_defaults(run=run_list)
 
-    info = actions.add_parser(
+    info = command(
+        actions,
         "info",
-        help="show joints, limits and collision model",
-        description="Show joints, limits and collision model of a robot.",
+        "show joints, limits and collision model",
+        "Show joints, limits and collision model of a robot.",
+        run_info,
     )
     option(info, "robot ROBOT", "a bundled name, a prepared folder or a URDF file")
-    info.set_defaults(run=run_info)
 
-    make = actions.add_parser(
+    make = command(
+        actions,
         "add",
-        help="prepare a robot from its URDF",
-        description="Prepare a robot for planning: fit covering spheres to the collision meshes of its "
+        "prepare a robot from its URDF",
+        "Prepare a robot for planning: fit covering spheres to the collision meshes of its "
         "URDF, find the pairs of links that need no collision check, and write a folder that problems can "
         "name.",
+        run_add,
     )
     option(make, "urdf URDF", "URDF of an arm, or xacro file, which is compiled: this runs code in it")
     option(make, "--name NAME", "name that problems use (default: the URDF's)")
@@ -83,7 +87,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     option(make, "--limits FILE", "file of joint limits, as MoveIt's joint_limits.yaml")
     option(make, "--licence TEXT", "licence of the URDF's geometry, to keep in the folder")
     option(make, "--seed N", "random seed (default: 0)", natural, 0)
-    make.set_defaults(run=run_add)
 
 
 def run_list(arguments: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import count, natural, option, positive
+from robotdiffuse.cli.arguments import command, count, natural, option, positive
 
 if TYPE_CHECKING:
     from robotdiffuse.robots.robot import Robot
@@ -14,12 +14,14 @@ TOKEN = "ROBOTDIFFUSE_TOKEN"
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "serve",
-        help="plan and validate over HTTP",
-        description="Plan and validate over HTTP until SIGTERM or Ctrl-C. Running requests then finish; "
+        "plan and validate over HTTP",
+        "Plan and validate over HTTP until SIGTERM or Ctrl-C. Running requests then finish; "
         "waiting ones are answered with 503. The server's address in a browser lists all endpoints. A server "
         f"that other machines can reach needs a token in the environment variable {TOKEN}.",
+        run,
     )
     option(
         parser,
@@ -45,7 +47,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         count,
         2048,
     )
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

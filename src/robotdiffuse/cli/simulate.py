@@ -4,7 +4,7 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import option
+from robotdiffuse.cli.arguments import command, option
 from robotdiffuse.cli.drawing import ENDINGS, draw
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
 from robotdiffuse.cli.view import read_solved
@@ -15,15 +15,16 @@ if TYPE_CHECKING:
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "simulate",
-        help="replay a result in the PyBullet simulator",
-        description="Replay the motion of a result file in PyBullet with position control, and print "
+        "replay a result in the PyBullet simulator",
+        "Replay the motion of a result file in PyBullet with position control, and print "
         "tracking errors and contacts. Exit status: 0 no contacts, 1 contacts, 2 bad input.",
+        run,
     )
     option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
     option(parser, "--out FILE *", "replay (.html) or picture (.png) of the simulated motion; repeatable")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

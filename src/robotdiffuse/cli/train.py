@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.cli.arguments import count, names, natural, option, positive, share
+from robotdiffuse.cli.arguments import command, count, names, natural, option, positive, share
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.learning import need_packages
 
@@ -22,32 +22,35 @@ MODEL_OPTIONS = (
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "train",
-        help="train networks",
-        description="Train a network. Ctrl-C stops after writing a checkpoint; run the same command again to "
+        "train networks",
+        "Train a network. Ctrl-C stops after writing a checkpoint; run the same command again to "
         "continue. To train with N processes, on a GPU each if there are enough: "
         "torchrun --nproc-per-node N -m robotdiffuse train ...",
     )
     kinds = parser.add_subparsers(title="networks", metavar="NETWORK", required=True)
 
-    encoder = kinds.add_parser(
+    encoder = command(
+        kinds,
         "encoder",
-        help="train an auto-encoder of point clouds",
-        description="Train an auto-encoder of point clouds on random scenes. The planner's training keeps "
-        "it frozen.",
+        "train an auto-encoder of point clouds",
+        "Train an auto-encoder of point clouds on random scenes. The planner's training keeps it frozen.",
+        run_encoder,
     )
     option(encoder, "--encoder NAME", "encoder to train (default: point_autoencoder)", dest="name")
     option(encoder, "--scenes NAME", "training scenes: mixed (default), or rop, those of the paper's data")
     _add_shared(encoder)
     _add_device(encoder)
-    encoder.set_defaults(run=run_encoder)
 
-    completion = kinds.add_parser(
+    completion = command(
+        kinds,
         "completion",
-        help="train the occupancy completion network",
-        description="Train the occupancy completion network, which predicts the obstacles that depth "
+        "train the occupancy completion network",
+        "Train the occupancy completion network, which predicts the obstacles that depth "
         "cameras do not see, on random scenes.",
+        run_completion,
     )
     option(completion, "--families NAMES", "families of the scenes (default: all)", names)
     option(completion, "--robot NAME", "bundled name or URDF of the arm in the images")
@@ -55,14 +58,15 @@ def add(commands: argparse._SubParsersAction) -> None:
     option(completion, "--weights FOLDER", "weights to begin with; bundled: those that come with the package")
     _add_shared(completion)
     _add_device(completion)
-    completion.set_defaults(run=run_completion)
 
-    planner = kinds.add_parser(
+    planner = command(
+        kinds,
         "planner",
-        help="train the network that predicts motions",
-        description="Train the network that predicts motions, on planned trajectories. With --robot and "
+        "train the network that predicts motions",
+        "Train the network that predicts motions, on planned trajectories. With --robot and "
         "without --data, generate data for the arm, train on them, and install the weights where planners "
         "find them; this takes about two hours on two cores.",
+        run_planner,
     )
     option(
         planner, "--data FOLDER", "folder with shards of trajectories (default: generate them for --robot)"
@@ -106,27 +110,28 @@ def add(commands: argparse._SubParsersAction) -> None:
         share,
     )
     option(parts, "--waypoints N", "waypoints of a motion", count)
-    planner.set_defaults(run=run_planner)
 
-    baseline = kinds.add_parser(
+    baseline = command(
+        kinds,
         "baseline",
-        help="train the network of a learned baseline: mpnet, mpinets, trajectory_prior",
-        description="Train the network of a learned baseline on planned trajectories.",
+        "train the network of a learned baseline: mpnet, mpinets, trajectory_prior",
+        "Train the network of a learned baseline on planned trajectories.",
+        run_baseline,
     )
     option(baseline, "name NAME", "mpnet, mpinets or trajectory_prior (for MPD and EDMP)")
     option(baseline, "--data FOLDER !", "data set of `data generate`")
     option(baseline, "--robot NAME", "bundled name or URDF of the data's robot")
     _add_shared(baseline)
-    baseline.set_defaults(run=run_baseline)
 
-    export = kinds.add_parser(
+    export = command(
+        kinds,
         "export",
-        help="write the ONNX files of trained weights anew",
-        description="Write the ONNX files that planning runs, from trained weights. Training writes them "
+        "write the ONNX files of trained weights anew",
+        "Write the ONNX files that planning runs, from trained weights. Training writes them "
         "too; weights of earlier versions lack them.",
+        run_export,
     )
     option(export, "folder FOLDER", "folder with weights")
-    export.set_defaults(run=run_export)
 
 
 def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> None:

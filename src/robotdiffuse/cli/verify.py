@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import IGNORE_JOINTS, natural, option
+from robotdiffuse.cli.arguments import IGNORE_JOINTS, command, natural, option
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError
 
@@ -17,12 +17,14 @@ VALID, NOT_VALID = 0, 1
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "verify",
-        help="validate a motion from any source",
-        description="Validate a motion from any planner: a RobotDiffuse result, CSV, JSON, YAML of a ROS "
+        "validate a motion from any source",
+        "Validate a motion from any planner: a RobotDiffuse result, CSV, JSON, YAML of a ROS "
         "JointTrajectory or MoveIt RobotTrajectory, a ROS 2 bag or MCAP. Exit status: 0 valid, 1 not valid, "
         "2 bad input.",
+        run,
     )
     option(parser, "motion MOTION", "file (.json, .csv, .yaml, .mcap), or the folder of a ROS 2 bag")
     where = parser.add_mutually_exclusive_group()
@@ -42,7 +44,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--certificate FILE.json",
         "write a proof that the motion is valid, for `robotdiffuse certificate check`",
     )
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import not_negative, option
+from robotdiffuse.cli.arguments import command, not_negative, option
 from robotdiffuse.cli.drawing import ENDINGS, draw, draw_several, show
 from robotdiffuse.core.errors import InputError
 
@@ -15,12 +15,14 @@ if TYPE_CHECKING:
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "view",
-        help="draw results and problems as a replay (.html) or a picture (.png)",
-        description="Draw the motions of result files, of several in one picture; of a problem, or a "
+        "draw results and problems as a replay (.html) or a picture (.png)",
+        "Draw the motions of result files, of several in one picture; of a problem, or a "
         "result without a motion, the start, the goal and the links that collide. Without --out, write a "
         "page and open it in the browser.",
+        run,
     )
     option(
         parser,
@@ -42,7 +44,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         not_negative,
         0.0,
     )
-    parser.set_defaults(run=run)
 
 
 def read_result(file: str) -> "tuple[PlanResult, Problem]":
