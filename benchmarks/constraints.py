@@ -26,7 +26,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 from numpy import ndarray
 
 import robotdiffuse as rd
@@ -235,9 +234,7 @@ def _excess(problem: Problem, frames: ndarray) -> float:
         def pose(q: ndarray) -> ndarray:
             world.place(q)
             link = world.links[one.frame]
-            state = pybullet.getLinkState(
-                world.body, link, computeForwardKinematics=1, physicsClientId=world.client
-            )
+            state = world.bullet.getLinkState(world.body, link, computeForwardKinematics=1)
             x, y, z, w = state[5]
             return transform(np.array(state[4]), rotation_from_quaternion(np.array([w, x, y, z])))
 

@@ -34,7 +34,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pybullet
 from numpy import ndarray
 from scipy.interpolate import CubicHermiteSpline
 
@@ -205,11 +204,10 @@ def checked(named: NamedProblem, result: PlanResult) -> Checked:
 
 def _off(problem: Problem, pose: PoseGoal, simulated: World) -> float:
     """How far a link of the simulated robot is off its pose beyond the tolerance [m]."""
-    state = pybullet.getLinkState(
+    state = simulated.bullet.getLinkState(
         simulated.body,
         simulated.links[pose.frame],
         computeForwardKinematics=1,
-        physicsClientId=simulated.client,
     )
     T = np.eye(4) if problem.T_world_base is None else problem.T_world_base
     there = inverse(T @ pose.T_base_frame) @ [*state[4], 1.0]

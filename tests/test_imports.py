@@ -14,7 +14,8 @@ SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 MODULES = sorted(SOURCE.rglob("*.py"))
 
 ORDER = (
-    *("core", "robots", "scenes", "collision", "perception", "problems", "trajectories", "validation"),
+    *("core", "robots", "scenes", "collision", "perception", "drawables", "problems", "trajectories"),
+    "validation",
     *("certificates", "interop", "datasets", "learning", "planning", "generation", "simulation"),
     *("evaluation", "visualization", "server", "cli"),
 )

@@ -1,18 +1,17 @@
 """The command `robotdiffuse live`."""
 
-import http.client
 import re
 import signal
 import socket
 import subprocess
 import sys
-from urllib.parse import urlsplit
 
 import pytest
 
 from robotdiffuse.cli import main
 
 pytest.importorskip("viser", reason="live needs viser: pip install 'robotdiffuse[live]'")
+from websockets.exceptions import ConnectionClosed
 
 
 @pytest.fixture
@@ -48,51 +47,46 @@ def test_bad_input_is_one_line(wrong, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "live needs viser: pip install 'robotdiffuse[live]'" in wrong()
 
 
-def status(url: str, **fields: str) -> int:
-    address = urlsplit(url)
-    connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=20)
-    connection.request("GET", address.path, headers=fields)
-    return connection.getresponse().status
+def hears(url: str, token: str = "", **fields: str) -> bool:
+    """Whether a browser gets data of the page at this address."""
+    websockets = pytest.importorskip("websockets.sync.client")
+    speaks = [f"viser-v{pytest.importorskip('viser').__version__}"]
+    with websockets.connect(f"{url}{token}", subprotocols=speaks, additional_headers=fields) as browser:
+        try:
+            return bool(browser.recv(timeout=20))
+        except ConnectionClosed:
+            return False
 
 
-def test_elsewhere_nothing_is_served_without_the_token() -> None:
+def test_elsewhere_no_browser_gets_data_without_the_token() -> None:
     command = [sys.executable, "-m", "robotdiffuse", "live", "--host", "0.0.0.0", "--port", "0"]
     server = subprocess.Popen([*command, "--planner", "aorrtc"], stdout=subprocess.PIPE, text=True)
     try:
         assert server.stdout is not None
-        found = re.search(r"http://\S+:(\d+)/([\w-]{20,}) ", server.stdout.readline())
-        assert found is not None
-        home = f"http://127.0.0.1:{found[1]}"
-        assert status(f"{home}/") == 403
-        assert status(f"{home}/{found[2][:-1]}/") == 403
-        assert status(f"{home}/{found[2]}/") == 200
-        assert status(f"{home}/{found[2]}/", Origin="http://evil.example") == 403
+        printed = re.search(r"http://\S+/\?websocket=ws://\S+:(\d+)/([\w-]{20,}) ", server.stdout.readline())
+        assert printed is not None
+        url, token = f"ws://127.0.0.1:{printed[1]}/", printed[2]
+        assert hears(url, token)
+        assert not hears(url)
+        assert not hears(url, token[:-1])
+        assert not hears(url, token, Origin="http://evil.example")
     finally:
         server.send_signal(signal.SIGINT)
         assert server.wait(timeout=30) == 130
 
 
-def test_viser_itself_lets_no_one_in_but_through_the_door() -> None:
-    """A page of another site may find viser's own port; its connection is closed before any data is sent."""
-    websockets = pytest.importorskip("websockets.sync.client")
-    viser = pytest.importorskip("viser")
-    from websockets.exceptions import ConnectionClosed
-
-    from robotdiffuse.visualization.live.access import listen
-    from robotdiffuse.visualization.live.files import first_problem
+def test_on_this_machine_pages_of_other_origins_get_no_data() -> None:
+    """A page of another site may find the port; its connection is closed before any data is sent."""
     from robotdiffuse.visualization.live.page import Page
-    from robotdiffuse.visualization.live.session import PageOptions, Session
+    from robotdiffuse.visualization.live.server import PageServer, free_port
+    from robotdiffuse.visualization.live.session import PageOptions, Session, first_problem
 
-    listening = listen("127.0.0.1", 0)
-    page = Page(Session(first_problem(None, None), PageOptions("aorrtc")), listening)
+    server = PageServer("127.0.0.1", free_port("127.0.0.1", 0))
+    page = Page(Session(first_problem(None, None), PageOptions("aorrtc")), server)
     try:
-        speaks = [f"viser-v{viser.__version__}"]
-        outer, inner = listening.getsockname()[1], page.server.get_port()
-        with websockets.connect(f"ws://127.0.0.1:{outer}/", subprotocols=speaks) as guest:
-            assert guest.recv(timeout=20)
-        stranger = websockets.connect(f"ws://127.0.0.1:{inner}/", subprotocols=speaks)
-        with stranger, pytest.raises(ConnectionClosed):
-            assert not stranger.recv(timeout=20)
-        assert page.server.request_share_url() is None
+        url = f"ws://127.0.0.1:{server.get_port()}/"
+        assert hears(url)
+        assert not hears(url, Origin="http://evil.example")
+        assert server.request_share_url() is None
     finally:
         page.close()

@@ -431,6 +431,15 @@ def test_bad_csv(text: str, wanted: str, tmp_path: Path) -> None:
     assert str(error.value).startswith(str(tmp_path / "m.csv"))
 
 
+def test_names_of_joints_are_no_formulas_for_a_spreadsheet(tmp_path: Path) -> None:
+    names, rows = ("=1+1", "-a", "+b", "@c", "plain"), np.arange(10.0).reshape(2, 5) - 4
+    Trajectory(names, np.array([0.0, 1.0]), rows, rows, rows).save(tmp_path / "m.csv")
+    header = (tmp_path / "m.csv").read_text().partition("\n")[0].split(",")
+    assert not [cell for cell in header if cell[0] in "=+-@"] and "plain_position" in header
+    again = read_motion(tmp_path / "m.csv")
+    assert again.joint_names == names and (again.positions == rows).all()
+
+
 def test_yaml_as_ros2_topic_echo_prints_it(tmp_path: Path) -> None:
     (tmp_path / "m.yaml").write_text(
         "header:\n  stamp: {sec: 0, nanosec: 0}\n  frame_id: ''\njoint_names: [a, b]\npoints:\n"
@@ -472,10 +481,15 @@ def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: 
     import subprocess
     import sys
 
-    modules = {"rosbags": "rosbag", "mcap": "mcap_file", "rerun": "rerun_file", "roslibpy": "rosbridge"}
+    uses = {
+        "rosbags": "import robotdiffuse.interop.rosbag",
+        "mcap": "import robotdiffuse.interop.mcap_file",
+        "rerun": "import robotdiffuse.interop.rerun_file",
+        "roslibpy": "from robotdiffuse.interop.plain_messages import publish; publish(None, '')",
+    }
     code = (
         f"import sys; sys.modules[{module!r}] = None\n"
-        f"try: import robotdiffuse.interop.{modules[module]}\nexcept ValueError as error: print(error)"
+        f"try: {uses[module]}\nexcept ValueError as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert package in done.stdout, done.stderr
@@ -505,7 +519,7 @@ def test_motions_are_published_to_a_rosbridge(
     """Subscribers had no time to match the publisher, which sent and ended at once."""
     import time
 
-    from robotdiffuse.interop import rosbridge as module
+    from robotdiffuse.interop import plain_messages as module
 
     _, trajectory = planned
     waited: list[str] = []
@@ -529,7 +543,7 @@ def test_motions_are_published_to_a_rosbridge(
 
 
 def test_no_rosbridge_is_one_line(planned: tuple[Problem, Trajectory]) -> None:
-    from robotdiffuse.interop.rosbridge import publish
+    from robotdiffuse.interop.plain_messages import publish
 
     with pytest.raises(InputError, match=r"no rosbridge answers at 127\.0\.0\.1:1 within 1 s"):
         publish(planned[1], "127.0.0.1", 1, timeout=1.0)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.interop.transform_history import TransformHistory
+from robotdiffuse.interop.depth_recording import TransformHistory
 
 
 def message(parent: str, child: str, at: float, turn: float = 0.0, x: float = 0.0) -> dict[str, Any]:

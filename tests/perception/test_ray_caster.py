@@ -93,8 +93,7 @@ def test_cameras_look_where_they_are_told_and_stand_upright() -> None:
 
 def test_pybullets_camera_sees_the_same() -> None:
     pytest.importorskip("pybullet")
-    from robotdiffuse.simulation.camera import DepthCamera, render
-    from robotdiffuse.simulation.world import World
+    from robotdiffuse.simulation.world import DepthCamera, World, render
 
     q = np.array([0.3, -0.5, 0.0, -2.0, 0.0, 1.5, 0.8])
     scene = Scene(

@@ -69,13 +69,13 @@ def test_points_lie_on_what_the_camera_sees_of_a_shape(kind: str) -> None:
         cloud = point_cloud(world, [CAMERA], np.random.default_rng(0), voxel=1e-4)
     assert len(cloud.points) > 1000
     # what is left is the facets of round shapes
-    assert np.abs(signed_distance(shape, cloud.points)).max() < 4e-4
+    assert np.abs(signed_distance(shape, cloud.points)).max() < 1e-3
     # a little farther along its ray, a point is inside, or at a rim: only the near side is seen
     rays = cloud.points - EYE
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     assert (signed_distance(shape, cloud.points + 0.002 * rays) < 0).mean() > 0.98
     if isinstance(shape, Sphere):
-        assert ((cloud.points - shape.center) @ (EYE - shape.center) > 0.25**2 - 1e-3).all()
+        assert ((cloud.points - shape.center) @ (EYE - shape.center) > 0.25**2 - 1e-2).all()
         assert cloud.points.min(axis=0)[0] > shape.bounds[0, 0] + 0.05
 
 
@@ -155,7 +155,7 @@ def test_a_point_cloud_is_seen_as_points() -> None:
         ({"up": (1.5, -1.2, 1.0)}, "up is .* must not lie along the line of sight"),
         ({"target": EYE}, "must not lie along the line of sight"),
         ({"target": (0.0, np.nan, 0.0)}, "target is .* 3 finite numbers"),
-        ({"width": 0}, "0 x 240 pixels"),
+        ({"width": 0}, "width is 0; it must be between 1 and 4096"),
         ({"field_of_view": 3.2}, "field_of_view is 3.2"),
         ({"near": 5.0}, "near is 5.0 and far 4.0"),
         ({"noise": -0.1}, "noise is -0.1"),

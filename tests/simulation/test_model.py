@@ -8,7 +8,7 @@ pytest.importorskip("pybullet")
 
 from helpers.box_arm import box_mesh
 from robotdiffuse.robots.robot import ConvexMesh
-from robotdiffuse.simulation.model import mass_properties
+from robotdiffuse.simulation.world import mass_properties
 
 pytestmark = pytest.mark.sim
 

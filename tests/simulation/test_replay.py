@@ -122,7 +122,7 @@ def test_what_cannot_be_replayed() -> None:
     trajectory = motion(robot, np.zeros(3), np.ones(3))
     with pytest.raises(InputError, match="the trajectory moves a, b, c; planar plans j0, j1, j2"):
         replay(robot, Scene(), replace(trajectory, joint_names=("a", "b", "c")))
-    for name, value in (("time_step", 0.01), ("position_gain", 0.0), ("force", -1.0), ("gravity", np.nan)):
+    for name, value in (("time_step", 0.01), ("force", -1.0), ("gravity", np.nan)):
         with pytest.raises(InputError, match=f"replay.{name} is {value}"):
             ReplaySettings(**{name: value})
 
@@ -172,7 +172,9 @@ def test_command(tmp_path: FilePath, capsys: pytest.CaptureFixture[str]) -> None
     printed = capsys.readouterr().out
     assert "panda: free" in printed and "panda_joint7" in printed and "mrad" in printed
     assert main(["simulate", file, "--out", str(tmp_path / "film.avi")]) == 2
-    assert "known: .gif, .png" in capsys.readouterr().err
+    assert "known: .html, .png" in capsys.readouterr().err
+    assert main(["simulate", file, "--out", str(tmp_path / "page.html")]) == 0
+    assert "panda_joint7" in (tmp_path / "page.html").read_text("utf-8")
     end = link_pose(load_robot("panda"), PANDA_START + 0.2, "panda_hand")[:3, 3]
     file = result_file(tmp_path, Scene([Sphere(end, 0.05)]))
     assert main(["simulate", file]) == 1

@@ -11,9 +11,7 @@ import pytest
 
 from helpers.explorations import FLOOR, recorded
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.visualization.exploration import READING_TIME
-from robotdiffuse.visualization.exploration_page import write_exploration
-from robotdiffuse.visualization.voxel_faces import faces_between
+from robotdiffuse.visualization.exploration import READING_TIME, faces_between, write_exploration
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = ["--no-sandbox", "--disable-background-networking", "--use-angle=swiftshader"]

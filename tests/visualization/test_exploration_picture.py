@@ -8,8 +8,7 @@ from PIL import Image
 
 from helpers.explorations import recorded
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.visualization.exploration import moments
-from robotdiffuse.visualization.exploration_picture import GAP, write_exploration_picture
+from robotdiffuse.visualization.exploration import GAP, moments, write_exploration_picture
 from robotdiffuse.visualization.picture import PictureSettings
 
 SMALL = PictureSettings(width=240, height=150, ghosts=1)

@@ -11,11 +11,12 @@ import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status
+from robotdiffuse.drawables import decimated
 from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud
 from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
-from robotdiffuse.visualization.style import decimated, robot_surfaces
+from robotdiffuse.visualization.arm import DrawnArm
 
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
 
@@ -73,7 +74,7 @@ def test_replay_loads_nothing(arm, scene, motion, tmp_path):
 def test_replay_geometry_decodes_to_the_meshes(arm, scene, motion, tmp_path):
     write_replay(arm, scene, motion, tmp_path / "replay.html")
     data = page_data((tmp_path / "replay.html").read_text("utf-8"))
-    for surface, part in zip(robot_surfaces(arm), data["robot"]["frames"], strict=True):
+    for surface, part in zip(DrawnArm(arm).surfaces, data["robot"]["frames"], strict=True):
         raw = np.frombuffer(base64.b64decode(part["vertices"]), "<u2").reshape(-1, 3)
         np.testing.assert_allclose(part["low"] + raw * part["step"], surface.vertices, atol=1e-5)
         faces = np.frombuffer(base64.b64decode(part["faces"]), "<u2").reshape(-1, 3)

@@ -9,15 +9,15 @@ from helpers.three_bars import CORNERS, CUBE
 from helpers.visual_bundles import visual_meshes, write_visual
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path
+from robotdiffuse.drawables import creased
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.visual_meshes import VisualMesh, has_visual, load_visual
-from robotdiffuse.visualization.style import creased, dense, facts, robot_surfaces, tool_point, trace
+from robotdiffuse.visualization.arm import DrawnArm, dense, facts
 
 
 def test_trace_follows_the_outer_end_of_the_tip(arm, motion):
-    tool = tool_point(arm, robot_surfaces(arm))
-    points = trace(arm, tool, motion.positions[::100])
+    points = DrawnArm(arm).tool_points(motion.positions[::100])
     for q, point in zip(motion.positions[::100], points, strict=True):
         np.testing.assert_allclose(point, (link_pose(arm, q, "tip") @ [0, 0, 0.2, 1])[:3], atol=1e-12)
 

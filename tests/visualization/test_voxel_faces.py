@@ -3,7 +3,7 @@
 import numpy as np
 
 from robotdiffuse.perception.occupancy_map import MAP
-from robotdiffuse.visualization.voxel_faces import faces_between, faces_surface
+from robotdiffuse.visualization.exploration import faces_between, faces_surface
 
 
 def test_a_cube_has_six_faces_around_it() -> None:

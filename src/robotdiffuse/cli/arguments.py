@@ -2,22 +2,63 @@
 
 import argparse
 import math
+from collections.abc import Callable
+from typing import Any
 
 IGNORE_JOINTS = (
     "note joints of MoveIt files that the robot lacks rather than refuse them; what they move is ignored"
 )
 
 
+def command(
+    commands: argparse._SubParsersAction,
+    name: str,
+    help: str,
+    description: str,
+    run: Callable[[argparse.Namespace], int] | None = None,
+) -> argparse.ArgumentParser:
+    """The parser of a command. run: what the command does; None: it has commands of its own."""
+    parser = commands.add_parser(name, help=help, description=description)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def option(
+    parser: argparse._ActionsContainer,
+    spec: str,
+    help: str,
+    kind: Callable[[str], Any] | None = None,
+    default: Any = None,
+    **more: Any,
+) -> None:
+    """Add an option, or an argument.
+
+    spec: its name and what its value is called: "--seed N". Without a value it is a flag; with "*" it may be
+    repeated, and with "!" it is required. kind: reads the value; None: text. more: as of argparse.
+    """
+    name, *words = spec.split()
+    values = [word for word in words if word not in ("*", "!")]
+    if values:
+        more |= {"metavar": values[0], "type": kind, "default": default}
+    elif name.startswith("-") and "choices" not in more:
+        more["action"] = "store_true"
+    else:
+        more["default"] = default
+    if "*" in words:
+        more |= {"action": "append", "default": []}
+    if "!" in words:
+        more["required"] = True
+    parser.add_argument(name, help=help, **more)
+
+
 def add_import_option(parser: argparse.ArgumentParser) -> None:
     """Add the option --import; `main` imports the modules before it runs the command."""
-    parser.add_argument(
-        "--import",
-        dest="modules",
-        action="append",
-        default=[],
-        metavar="MODULE",
-        help="import a module first, of the current folder too, which may add planners, families, "
+    option(
+        parser,
+        "--import MODULE *",
+        "import a module first, of the current folder too, which may add planners, families, "
         "costs or metrics to their tables; repeatable",
+        dest="modules",
     )
 
 

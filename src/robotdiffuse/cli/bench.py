@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import add_import_option, count, positive
+from robotdiffuse.cli.arguments import add_import_option, command, count, option, positive
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.ray_cluster import CLUSTERS
@@ -20,85 +20,75 @@ if TYPE_CHECKING:
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "bench", help="benchmark planners", description="Benchmark planners and networks."
-    )
+    parser = command(commands, "bench", "benchmark planners", "Benchmark planners and networks.")
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    run = actions.add_parser(
+    run = command(
+        actions,
         "run",
-        help="run planners on problems and record every call",
-        description="Run planners on the same problems, in turns, each planner in a process of its own. "
+        "run planners on problems and record every call",
+        "Run planners on the same problems, in turns, each planner in a process of its own. "
         "Results are lines of JSON in the folder. Ctrl-C or a crash loses at most the running calls; run "
         "the same command again to continue. A call whose result a longer time limit cannot change is not "
         "repeated.",
+        run_run,
     )
-    run.add_argument(
-        "--planners",
-        metavar="NAME,...",
-        help="names from `robotdiffuse planners`, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
+    option(
+        run,
+        "--planners NAME,...",
+        "names from `robotdiffuse planners`, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
         "or until=first|converged|time_limit, objective=length|time and clearance=M of the calls; "
         "NAME@FOLDER uses other weights",
     )
-    run.add_argument(
-        "--problems",
-        metavar="SET,...",
-        help=f"{', '.join(FAMILIES)}, each also with _nontrivial; or files or folders of problems; with "
+    option(
+        run,
+        "--problems SET,...",
+        f"{', '.join(FAMILIES)}, each also with _nontrivial; or files or folders of problems; with "
         "--preset, sets in addition to its own",
     )
-    run.add_argument(
-        "--preset",
-        metavar="NAME",
-        help="a stored comparison with its planners, limits and seeds (benchmarks/README.md): equal_time, "
+    option(
+        run,
+        "--preset NAME",
+        "a stored comparison with its planners, limits and seeds (benchmarks/README.md): equal_time, "
         "learning, durations, anytime or restarts",
     )
-    run.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems and results")
-    run.add_argument("--time-limit", type=positive, metavar="S", help="time limit of a call [s] (default: 1)")
-    run.add_argument(
-        "--seeds", type=count, metavar="N", help="calls per problem, with different seeds (default: 1)"
-    )
-    run.add_argument(
-        "--count", type=count, metavar="N", help="problems per set (default: 100; all of a folder)"
-    )
-    run.add_argument(
+    option(run, "--out FOLDER !", "folder for problems and results")
+    option(run, "--time-limit S", "time limit of a call [s] (default: 1)", positive)
+    option(run, "--seeds N", "calls per problem, with different seeds (default: 1)", count)
+    option(run, "--count N", "problems per set (default: 100; all of a folder)", count)
+    option(
+        run,
         "--equal-time",
-        action="store_true",
-        help="also call planners that end early again until the time limit, as extra rows, to compare "
-        "lengths",
+        "also call planners that end early again until the time limit, as extra rows, to compare lengths",
     )
-    run.add_argument(
-        "--workers", type=count, metavar="N", help="planners that run at once (default: half of the cores)"
-    )
-    run.add_argument("--cluster", choices=CLUSTERS, help="use the Ray cluster at RAY_ADDRESS")
+    option(run, "--workers N", "planners that run at once (default: half of the cores)", count)
+    option(run, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
     add_import_option(run)
-    run.set_defaults(run=run_run)
-    report = actions.add_parser(
+    report = command(
+        actions,
         "report",
-        help="write tables, plots and replays of a run",
-        description="Write report.md with its plots as .svg, the same as index.html, and replays.html "
+        "write tables, plots and replays of a run",
+        "Write report.md with its plots as .svg, the same as index.html, and replays.html "
         "(motions in 3D), and print the table of each problem set.",
+        run_report,
     )
-    report.add_argument("folder", metavar="FOLDER", help="folder of `robotdiffuse bench run`")
-    report.add_argument(
-        "--limits",
-        metavar="S,...",
-        help="time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)",
+    option(report, "folder FOLDER", "folder of `robotdiffuse bench run`")
+    option(
+        report, "--limits S,...", "time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)"
     )
-    report.add_argument("--planners", metavar="NAME,...", help="planners to include (default: all)")
-    report.add_argument("--out", metavar="OUT", help="folder to write to (default: FOLDER)")
-    report.add_argument("--no-replays", action="store_true", help="do not write replays.html")
+    option(report, "--planners NAME,...", "planners to include (default: all)")
+    option(report, "--out OUT", "folder to write to (default: FOLDER)")
+    option(report, "--no-replays", "do not write replays.html")
     add_import_option(report)
-    report.set_defaults(run=run_report)
-    confirm = actions.add_parser(
+    confirm = command(
+        actions,
         "confirm",
-        help="check the motions of a run with PyBullet",
-        description="Check every solved motion of `bench run` with PyBullet, on meshes, as a second "
+        "check the motions of a run with PyBullet",
+        "Check every solved motion of `bench run` with PyBullet, on meshes, as a second "
         "validator. The exit status is 1 if it finds a collision.",
+        run_confirm,
     )
-    confirm.add_argument("folder", metavar="FOLDER", help="folder of `bench run`")
-    confirm.add_argument(
-        "--count", type=count, metavar="N", help="check only the first N problems of each set (default: all)"
-    )
-    confirm.set_defaults(run=run_confirm)
+    option(confirm, "folder FOLDER", "folder of `bench run`")
+    option(confirm, "--count N", "check only the first N problems of each set (default: all)", count)
 
 
 def run_run(arguments: argparse.Namespace) -> int:

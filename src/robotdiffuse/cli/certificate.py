@@ -3,6 +3,8 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.arguments import command, option
+
 HOLDS, FAILS = 0, 1
 MAX_CHANGES = 4
 """Differences from the bundled robot in a line at most."""
@@ -12,25 +14,20 @@ if TYPE_CHECKING:
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "certificate",
-        help="re-check a certificate of a motion",
-        description="Re-check the certificate of a motion.",
+    parser = command(
+        commands, "certificate", "re-check a certificate of a motion", "Re-check the certificate of a motion."
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
-    check = actions.add_parser(
+    check = command(
+        actions,
         "check",
-        help="re-check a certificate, without search",
-        description="Re-check a certificate with code that shares nothing with the validator. Exit status: "
+        "re-check a certificate, without search",
+        "Re-check a certificate with code that shares nothing with the validator. Exit status: "
         "0 if it holds, 1 if not, 2 for bad input.",
+        run_check,
     )
-    check.add_argument("file", metavar="FILE", help="certificate of `robotdiffuse verify --certificate`")
-    check.add_argument(
-        "--problem",
-        metavar="FILE",
-        help="problem file to check it for (default: the problem in the certificate)",
-    )
-    check.set_defaults(run=run_check)
+    option(check, "file FILE", "certificate of `robotdiffuse verify --certificate`")
+    option(check, "--problem FILE", "problem file to check it for (default: the problem in the certificate)")
 
 
 def run_check(arguments: argparse.Namespace) -> int:

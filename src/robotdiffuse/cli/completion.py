@@ -4,6 +4,8 @@ import argparse
 import json
 from collections.abc import Iterator
 
+from robotdiffuse.cli.arguments import command, option
+
 SHELLS = ("bash", "zsh")
 SCRIPT = """_robotdiffuse() {{
   local word="${{COMP_WORDS[COMP_CWORD]}}" command="" words="" options="" i
@@ -25,12 +27,13 @@ Where no word fits, the shell completes names of files."""
 
 
 def add_schema(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    command(
+        commands,
         "schema",
-        help="print the JSON schema of problem files",
-        description="Print the JSON schema of problem files, by which editors complete and check them.",
+        "print the JSON schema of problem files",
+        "Print the JSON schema of problem files, by which editors complete and check them.",
+        run_schema,
     )
-    parser.set_defaults(run=run_schema)
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -40,7 +43,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         description="Print a script that completes commands and options: "
         'eval "$(robotdiffuse completion bash)" in ~/.bashrc, or with zsh in ~/.zshrc.',
     )
-    parser.add_argument("shell", choices=SHELLS, help="the shell")
+    option(parser, "shell", "the shell", choices=SHELLS)
     parser.set_defaults(run=run, parsers=commands.choices)
 
 

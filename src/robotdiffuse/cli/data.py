@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import (
     add_import_option,
+    command,
     count,
     natural,
     not_negative,
+    option,
     positive,
     share,
     shares,
@@ -31,10 +33,8 @@ ROBOT_HELP = "the robot of the data, if the name in the manifest is not known he
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "data",
-        help="generate and inspect training data",
-        description="Generate and inspect training data.",
+    parser = command(
+        commands, "data", "generate and inspect training data", "Generate and inspect training data."
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for add_action in (add_generate, add_info, add_check, add_view, add_export, add_import):
@@ -42,141 +42,117 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def add_generate(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "generate",
-        help="plan motions for many random problems",
-        description="Solve many random problems with Shared-Tree Informed RRT* or another planner, and "
+        "plan motions for many random problems",
+        "Solve many random problems with Shared-Tree Informed RRT* or another planner, and "
         "write the motions that pass the validator to shards. Ctrl-C or a crash loses at most the "
         "unfinished shards; run the same command again to continue.",
+        run_generate,
     )
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")
-    parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF (default: panda)")
-    parser.add_argument("--trajectories", type=count, metavar="N", help="motions to make (default: 140000)")
-    parser.add_argument("--seed", type=natural, metavar="N", help="random seed (default: 0)")
-    parser.add_argument(
-        "--mix",
-        type=shares,
-        metavar="NAME=P,...",
-        help=f"fractions of the problem families {', '.join(FAMILIES)} (default: rop=1)",
+    option(parser, "--out FOLDER !", "folder for the data")
+    option(parser, "--robot NAME", "bundled name or URDF (default: panda)")
+    option(parser, "--trajectories N", "motions to make (default: 140000)", count)
+    option(parser, "--seed N", "random seed (default: 0)", natural)
+    option(
+        parser,
+        "--mix NAME=P,...",
+        f"fractions of the problem families {', '.join(FAMILIES)} (default: rop=1)",
+        shares,
     )
-    parser.add_argument(
-        "--trivial-share",
-        type=share,
-        metavar="P",
-        help="fraction to keep of the problems that a straight line solves (default: 1, as in the paper)",
+    option(
+        parser,
+        "--trivial-share P",
+        "fraction to keep of the problems that a straight line solves (default: 1, as in the paper)",
+        share,
     )
-    parser.add_argument(
-        "--target", metavar="KIND", help="what targets give: position (default) or pose of the tip"
-    )
-    parser.add_argument(
-        "--goals", type=count, metavar="N", help="most goal configurations per target (default: 10)"
-    )
+    option(parser, "--target KIND", "what targets give: position (default) or pose of the tip")
+    option(parser, "--goals N", "most goal configurations per target (default: 10)", count)
     parser.add_argument(
         "--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion (default: 254)"
     )
-    parser.add_argument(
-        "--timing",
-        metavar="KIND",
-        help="waypoints equally spaced in arc length (arc, default) or in time (time)",
-    )
-    parser.add_argument(
-        "--safety-distance",
-        type=not_negative,
-        metavar="M",
-        help="distance to keep to obstacles [m] (default: 0.05)",
-    )
-    parser.add_argument(
-        "--planner", metavar="NAME", help="shared_tree_rrt_star (default, as in the paper) or aorrtc"
-    )
-    parser.add_argument("--shard", type=count, metavar="N", help="motions per shard (default: 500)")
-    parser.add_argument(
-        "--workers",
-        type=count,
-        metavar="N",
-        help="processes (default: all cores)",
-    )
-    parser.add_argument("--cluster", metavar="NAME", help="ray: use the Ray cluster at RAY_ADDRESS")
+    option(parser, "--timing KIND", "waypoints equally spaced in arc length (arc, default) or in time (time)")
+    option(parser, "--safety-distance M", "distance to keep to obstacles [m] (default: 0.05)", not_negative)
+    option(parser, "--planner NAME", "shared_tree_rrt_star (default, as in the paper) or aorrtc")
+    option(parser, "--shard N", "motions per shard (default: 500)", count)
+    option(parser, "--workers N", "processes (default: all cores)", count)
+    option(parser, "--cluster NAME", "ray: use the Ray cluster at RAY_ADDRESS")
     add_import_option(parser)
-    parser.set_defaults(run=run_generate)
 
 
 def add_info(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "info",
-        help="print statistics and write a page of plots",
-        description="Print the statistics of a data set and write a page of plots.",
+        "print statistics and write a page of plots",
+        "Print the statistics of a data set and write a page of plots.",
+        run_info,
     )
-    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
-    parser.add_argument("--page", metavar="FILE.html", help="page of plots (default: FOLDER/report.html)")
-    parser.add_argument("--robot", metavar="NAME", help=ROBOT_HELP)
-    parser.set_defaults(run=run_info)
+    option(parser, "folder FOLDER", FOLDER_HELP)
+    option(parser, "--page FILE.html", "page of plots (default: FOLDER/report.html)")
+    option(parser, "--robot NAME", ROBOT_HELP)
 
 
 def add_check(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "check",
-        help="check all shards and validate their motions again",
-        description="Check the structure of all shards and validate their motions again, with RobotDiffuse's "
+        "check all shards and validate their motions again",
+        "Check the structure of all shards and validate their motions again, with RobotDiffuse's "
         "validator and with PyBullet on meshes. Exit status: 0 clean, 1 violations found, 2 bad input.",
+        run_check,
     )
-    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
-    parser.add_argument("--count", type=count, metavar="N", help="validate N random motions (default: all)")
-    parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
-    parser.add_argument(
-        "--workers",
-        type=count,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="processes (default: all cores)",
-    )
-    parser.add_argument("--no-pybullet", action="store_true", help="do not validate with PyBullet")
-    parser.add_argument("--robot", metavar="NAME", help=ROBOT_HELP)
-    parser.set_defaults(run=run_check)
+    option(parser, "folder FOLDER", FOLDER_HELP)
+    option(parser, "--count N", "validate N random motions (default: all)", count)
+    option(parser, "--seed N", "random seed (default: 0)", natural, 0)
+    option(parser, "--workers N", "processes (default: all cores)", count, os.cpu_count() or 1)
+    option(parser, "--no-pybullet", "do not validate with PyBullet")
+    option(parser, "--robot NAME", ROBOT_HELP)
 
 
 def add_view(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "view",
-        help="show random motions as 3D replays",
-        description="Write random motions of a data set as 3D replays in one page. Without --out, the page "
+        "show random motions as 3D replays",
+        "Write random motions of a data set as 3D replays in one page. Without --out, the page "
         "opens in the browser.",
+        run_view,
     )
-    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
-    parser.add_argument("--count", type=count, default=6, metavar="N", help="motions (default: 6)")
-    parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
-    parser.add_argument("--out", metavar="FILE.html", help="page (default: FOLDER/samples.html)")
-    parser.add_argument("--robot", metavar="NAME", help=ROBOT_HELP)
-    parser.set_defaults(run=run_view)
+    option(parser, "folder FOLDER", FOLDER_HELP)
+    option(parser, "--count N", "motions (default: 6)", count, 6)
+    option(parser, "--seed N", "random seed (default: 0)", natural, 0)
+    option(parser, "--out FILE.html", "page (default: FOLDER/samples.html)")
+    option(parser, "--robot NAME", ROBOT_HELP)
 
 
 def add_export(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "export",
-        help="write the data in the format of the paper's robot.npz",
-        description="Write the motions among exactly two spheres in the layout of the paper's robot.npz: "
+        "write the data in the format of the paper's robot.npz",
+        "Write the motions among exactly two spheres in the layout of the paper's robot.npz: "
         "x_train n x 254 x 7, y_train n x 23.",
+        run_export,
     )
-    parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
-    parser.add_argument("file", metavar="FILE.npz", help="file to write")
-    parser.set_defaults(run=run_export)
+    option(parser, "folder FOLDER", FOLDER_HELP)
+    option(parser, "file FILE.npz", "file to write")
 
 
 def add_import(actions: argparse._SubParsersAction) -> None:
-    parser = actions.add_parser(
+    parser = command(
+        actions,
         "import",
-        help="make a data set from the paper's robot.npz",
-        description="Make a data set from a file in the layout of the paper's robot.npz, to check and "
+        "make a data set from the paper's robot.npz",
+        "Make a data set from a file in the layout of the paper's robot.npz, to check and "
         "train on like any other. The file does not contain the radius of its spheres.",
+        run_import,
     )
-    parser.add_argument("file", metavar="FILE.npz", help="x_train n x 254 x 7, y_train n x 23")
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")
-    parser.add_argument(
-        "--robot", default="panda", metavar="NAME", help="bundled name or URDF (default: panda)"
-    )
-    parser.add_argument(
-        "--radius", type=positive, default=0.25, metavar="M", help="radius of the spheres [m] (default: 0.25)"
-    )
-    parser.set_defaults(run=run_import)
+    option(parser, "file FILE.npz", "x_train n x 254 x 7, y_train n x 23")
+    option(parser, "--out FOLDER !", "folder for the data")
+    option(parser, "--robot NAME", "bundled name or URDF (default: panda)", default="panda")
+    option(parser, "--radius M", "radius of the spheres [m] (default: 0.25)", positive, 0.25)
 
 
 def _robot(name: str | None) -> "Robot | None":

@@ -6,6 +6,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.arguments import command, option
 from robotdiffuse.cli.console import Spinner, print_result
 from robotdiffuse.cli.drawing import ENDINGS, draw
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
@@ -31,31 +32,32 @@ IMAGE_SIZE, FOCAL_LENGTH = (640, 480), 460.0
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "demo",
-        help="plan a bundled problem and draw the motion",
-        description="Plan a bundled problem with obstacles, and write demo.png and demo.html to the current "
+        "plan a bundled problem and draw the motion",
+        "Plan a bundled problem with obstacles, and write demo.png and demo.html to the current "
         "folder; with --explore, see the obstacles by cameras on the way.",
+        run,
     )
     seen = parser.add_mutually_exclusive_group()
-    seen.add_argument(
+    option(
+        seen,
         "--camera",
-        action="store_true",
-        help="plan with the view of one depth camera instead of the scene; demo_true.png shows the motion in "
+        "plan with the view of one depth camera instead of the scene; demo_true.png shows the motion in "
         "the true scene",
     )
-    seen.add_argument(
+    option(
+        seen,
         "--explore",
-        action="store_true",
-        help="simulate an arm that sees the shelf by a camera at its tip and looks before it moves; writes "
+        "simulate an arm that sees the shelf by a camera at its tip and looks before it moves; writes "
         "explore.png and explore.html",
     )
-    parser.add_argument(
-        "--robot",
-        metavar="NAME",
-        help="plan with another arm, between shelves of its size; see `robotdiffuse robot list`",
+    option(
+        parser,
+        "--robot NAME",
+        "plan with another arm, between shelves of its size; see `robotdiffuse robot list`",
     )
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from robotdiffuse.cli.arguments import positive
+from robotdiffuse.cli.arguments import command, option, positive
 from robotdiffuse.cli.drawing import ENDINGS, show
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
 from robotdiffuse.cli.live import LOOPBACK, PORT, add_address, require_viser, serve_until_stopped
@@ -22,56 +22,54 @@ RECORDING = ".mcap"
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "explore",
-        help="simulate an arm that sees its scene by a camera at its tip",
-        description="Simulate an arm that goes from a problem's start to its goal and knows of the scene "
+        "simulate an arm that sees its scene by a camera at its tip",
+        "Simulate an arm that goes from a problem's start to its goal and knows of the scene "
         "only what depth cameras have seen: one at its tip, and one beside it that takes one image. Shapes "
         "named floor are known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 "
         "not, 2 bad input.",
+        run,
     )
-    parser.add_argument("problem", metavar="PROBLEM", help="problem file")
-    parser.add_argument(
-        "--policy",
-        default="strict",
-        help="strict: only through space seen free; chance: where the stated confidence is high; "
+    option(parser, "problem PROBLEM", "problem file")
+    option(
+        parser,
+        "--policy POLICY",
+        "strict: only through space seen free; chance: where the stated confidence is high; "
         "strict_then_chance (default: strict)",
+        default="strict",
     )
-    parser.add_argument("--confidence", type=float, default=0.98, metavar="P", help="least, of chance (0.98)")
-    parser.add_argument(
+    option(parser, "--confidence P", "least, of chance (0.98)", float, 0.98)
+    option(
+        parser,
         "--see-goal",
-        action="store_true",
-        help="go only to goals at which all of the arm's surface was seen to be free (policy strict)",
+        "go only to goals at which all of the arm's surface was seen to be free (policy strict)",
     )
-    parser.add_argument("--time-limit", type=float, default=1.0, metavar="S", help="of each search (1)")
-    parser.add_argument("--noise", action="store_true", help="simulate the noise of depth cameras")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed")
-    parser.add_argument(
-        "--out",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
+    option(parser, "--time-limit S", "of each search (1)", float, 1.0)
+    option(parser, "--noise", "simulate the noise of depth cameras")
+    option(parser, "--seed N", "random seed", int, 0)
+    option(
+        parser,
+        "--out FILE *",
+        "replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
         "repeatable",
     )
-    parser.add_argument("--view", action="store_true", help="write a replay (.html) and open it")
-    parser.add_argument(
-        "--record",
-        metavar="FILE",
-        help="write the depth images with camera parameters, poses and joint states to this .mcap file",
+    option(parser, "--view", "write a replay (.html) and open it")
+    option(
+        parser,
+        "--record FILE",
+        "write the depth images with camera parameters, poses and joint states to this .mcap file",
     )
     live = parser.add_argument_group("live page")
-    live.add_argument(
+    option(
+        live,
         "--live",
-        action="store_true",
-        help="serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
+        "serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
         "page is first opened",
     )
-    live.add_argument(
-        "--speed", type=positive, default=1.0, metavar="X", help="speed of the motions on it (1: real time)"
-    )
+    option(live, "--speed X", "speed of the motions on it (1: real time)", positive, 1.0)
     add_address(live)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -114,15 +112,13 @@ def show_live(arguments: argparse.Namespace, settings: "ExplorerSettings") -> No
     """Serve the page of an exploration until Ctrl-C."""
     require_viser("explore --live")
     from robotdiffuse.problems.files import load_problem
-    from robotdiffuse.visualization.live.access import listen, token_for
-    from robotdiffuse.visualization.live.exploration_page import ExplorationPage
-    from robotdiffuse.visualization.live.exploration_session import ExplorationSession
+    from robotdiffuse.visualization.live.exploration import ExplorationPage, ExplorationSession
+    from robotdiffuse.visualization.live.server import PageServer, free_port
 
-    listening = listen(arguments.host, arguments.port)
+    number = free_port(arguments.host, arguments.port)
     problem = load_problem(arguments.problem)
     session = ExplorationSession(problem, settings, arguments.noise, arguments.seed, arguments.speed)
-    token = token_for(listening)
-    serve_until_stopped(ExplorationPage(session, listening, token), listening, token)
+    serve_until_stopped(ExplorationPage(session, PageServer(arguments.host, number)))
 
 
 def simulate(
@@ -154,9 +150,9 @@ def print_event(number: int, event: "Event", explorer: "RecordedExplorer") -> No
 def draw_exploration(explorer: "RecordedExplorer", problem: "Problem", file: Path) -> None:
     """Draw an exploration as a replay or a strip of pictures, as the ending of the file says."""
     if file.suffix.lower() == ".html":
-        from robotdiffuse.visualization.exploration_page import write_exploration as write
+        from robotdiffuse.visualization.exploration import write_exploration as write
     else:
-        from robotdiffuse.visualization.exploration_picture import write_exploration_picture as write
+        from robotdiffuse.visualization.exploration import write_exploration_picture as write
     write(explorer, problem.scene, file)
 
 

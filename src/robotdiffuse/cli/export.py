@@ -3,6 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.arguments import command, option
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -11,21 +12,18 @@ if TYPE_CHECKING:
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "export",
-        help="write a result for ROS 2, Foxglove or Rerun",
-        description="Validate the motion of a result file again, and write it for other programs: .mcap (a "
+        "write a result for ROS 2, Foxglove or Rerun",
+        "Validate the motion of a result file again, and write it for other programs: .mcap (a "
         "scene that Foxglove opens, with ROS 2 messages), .rosbag2 (a ROS 2 bag, a folder), .rrd (Rerun), "
         ".yaml (a ROS 2 JointTrajectory), .csv and .json.",
+        run,
     )
-    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
-    parser.add_argument(
-        "--out", action="append", required=True, metavar="FILE", help="file to write; repeatable"
-    )
-    parser.add_argument(
-        "--rate", type=float, metavar="HZ", help="resample the motion, and validate it so, for a controller"
-    )
-    parser.set_defaults(run=run)
+    option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
+    option(parser, "--out FILE * !", "file to write; repeatable")
+    option(parser, "--rate HZ", "resample the motion, and validate it so, for a controller", float)
 
 
 def run(arguments: argparse.Namespace) -> int:

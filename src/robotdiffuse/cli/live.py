@@ -3,17 +3,16 @@
 import argparse
 import os
 import signal
-import socket
 import sys
 import threading
 from typing import TYPE_CHECKING, NoReturn
 
-from robotdiffuse.cli.arguments import positive
+from robotdiffuse.cli.arguments import command, option, positive
 from robotdiffuse.cli.exit_status import STOPPED
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
-    from robotdiffuse.visualization.live.exploration_page import ExplorationPage
+    from robotdiffuse.visualization.live.exploration import ExplorationPage
     from robotdiffuse.visualization.live.page import Page
 
 LOOPBACK = "127.0.0.1"
@@ -21,37 +20,32 @@ PORT = 8080
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "live",
-        help="plan interactively in the browser",
-        description="Serve an interactive page until Ctrl-C. Drag the target, the start and obstacles: the "
+        "plan interactively in the browser",
+        "Serve an interactive page until Ctrl-C. Drag the target, the start and obstacles: the "
         "page plans again after each change and shows at once whether the current motion is still valid. "
         "Without PROBLEM, it shows the demo problem.",
+        run,
     )
-    parser.add_argument("problem", metavar="PROBLEM", nargs="?", help="problem file (.yaml or .json) to open")
-    parser.add_argument("--robot", metavar="NAME", help="instead of PROBLEM: name or URDF file of an arm")
-    parser.add_argument(
-        "--planner", metavar="NAME", help="planner; see `robotdiffuse planners` (default: robotdiffuse)"
-    )
-    parser.add_argument(
-        "--time-limit", type=positive, default=1.0, metavar="S", help="time limit of each plan (default: 1 s)"
-    )
+    option(parser, "problem PROBLEM", "problem file (.yaml or .json) to open", nargs="?")
+    option(parser, "--robot NAME", "instead of PROBLEM: name or URDF file of an arm")
+    option(parser, "--planner NAME", "planner; see `robotdiffuse planners` (default: robotdiffuse)")
+    option(parser, "--time-limit S", "time limit of each plan (default: 1 s)", positive, 1.0)
     add_address(parser)
-    parser.set_defaults(run=run)
 
 
 def add_address(parser: argparse._ActionsContainer) -> None:
     """Add the options that say where a page is served."""
-    parser.add_argument(
-        "--host",
-        default=LOOPBACK,
-        metavar="ADDRESS",
-        help="address to listen on (default: 127.0.0.1, this machine only); on other addresses the URL of "
+    option(
+        parser,
+        "--host ADDRESS",
+        "address to listen on (default: 127.0.0.1, this machine only); on other addresses the URL of "
         "the page ends with a secret token that every visitor needs",
+        default=LOOPBACK,
     )
-    parser.add_argument(
-        "--port", type=port, default=PORT, metavar="N", help=f"port; 0 for any free one (default: {PORT})"
-    )
+    option(parser, "--port N", f"port; 0 for any free one (default: {PORT})", port, PORT)
 
 
 def port(text: str) -> int:
@@ -66,20 +60,17 @@ def run(arguments: argparse.Namespace) -> NoReturn:
     from rich.console import Console
 
     from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
-    from robotdiffuse.visualization.live.access import listen, token_for
-    from robotdiffuse.visualization.live.files import first_problem
     from robotdiffuse.visualization.live.page import Page
-    from robotdiffuse.visualization.live.session import PageOptions, Session
+    from robotdiffuse.visualization.live.server import PageServer, free_port
+    from robotdiffuse.visualization.live.session import PageOptions, Session, first_problem
 
     planner = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(planner)
     options = PageOptions(planner, arguments.time_limit)
-    listening = listen(arguments.host, arguments.port)
+    number = free_port(arguments.host, arguments.port)
     with Console(stderr=True).status("loading the robot (preparing a new URDF takes a minute)"):
         problem = first_problem(arguments.problem, arguments.robot)
-    token = token_for(listening)
-    page = Page(Session(problem, options), listening, token)
-    serve_until_stopped(page, listening, token)
+    serve_until_stopped(Page(Session(problem, options), PageServer(arguments.host, number)))
 
 
 def require_viser(command: str) -> None:
@@ -92,14 +83,12 @@ def require_viser(command: str) -> None:
         raise InputError(f"{command} needs viser: pip install 'robotdiffuse[live]'") from None
 
 
-def serve_until_stopped(page: "Page | ExplorationPage", listening: socket.socket, token: str) -> NoReturn:
+def serve_until_stopped(page: "Page | ExplorationPage") -> NoReturn:
     """Print the address of a page, serve it until Ctrl-C, and end the process."""
-    host, number = listening.getsockname()[:2]
     ended = threading.Event()
     for stop_signal in (signal.SIGINT, signal.SIGTERM):
         signal.signal(stop_signal, lambda *_: ended.set())
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-    print(f"the page is at http://{name}:{number}/{token} (stop with Ctrl-C)", flush=True)
+    print(f"the page is at {page.server.url} (stop with Ctrl-C)", flush=True)
     ended.wait()
     page.close()
     print("robotdiffuse: stopped", file=sys.stderr, flush=True)

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 from robotdiffuse.cli.arguments import (
     IGNORE_JOINTS,
     add_import_option,
+    command,
     jerk_limit,
     natural,
     not_negative,
+    option,
     positive,
     share,
 )
@@ -42,60 +44,55 @@ REQUEST = (
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "plan",
-        help="plan a motion for a problem file",
-        description="Plan a motion for a problem file; every motion found is verified. Exit status: 0 "
+        "plan a motion for a problem file",
+        "Plan a motion for a problem file; every motion found is verified. Exit status: 0 "
         "solved, 1 no plan, 2 bad input.",
+        run,
     )
-    parser.add_argument("problem", metavar="PROBLEM", help="problem file (.yaml, .json or .jsonl)")
-    parser.add_argument(
-        "--index", type=natural, default=0, help="which problem of a .jsonl file (default: 0)"
-    )
-    parser.add_argument(
-        "--planner", metavar="NAME", help="see `robotdiffuse planners` (default: robotdiffuse)"
-    )
-    parser.add_argument(
-        "--weights",
-        metavar="FOLDER",
-        help="weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
+    option(parser, "problem PROBLEM", "problem file (.yaml, .json or .jsonl)")
+    option(parser, "--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0)
+    option(parser, "--planner NAME", "see `robotdiffuse planners` (default: robotdiffuse)")
+    option(
+        parser,
+        "--weights FOLDER",
+        "weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
         "without clearances as inputs (default: the bundled ones)",
     )
-    parser.add_argument(
-        "--set",
+    option(
+        parser,
+        "--set NAME=VALUE *",
+        "a setting of the planner; see `robotdiffuse planners NAME`; repeatable",
         dest="settings",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a setting of the planner; see `robotdiffuse planners NAME`; repeatable",
     )
-    parser.add_argument(
-        "--time-limit", type=positive, default=1.0, metavar="S", help="time limit for planning (default: 1 s)"
-    )
-    parser.add_argument(
+    option(parser, "--time-limit S", "time limit for planning (default: 1 s)", positive, 1.0)
+    option(
+        parser,
         "--until",
-        choices=UNTIL,
+        "stop at the first motion, when more time hardly improves it (default), or at the time limit",
         default=CONVERGED,
-        help="stop at the first motion, when more time hardly improves it (default), or at the time limit",
+        choices=UNTIL,
     )
-    parser.add_argument(
-        "--clearance",
-        type=not_negative,
-        metavar="M",
-        help="distance to obstacles to keep where possible, up to 0.5 m (default: the problem's, or 0.01 m)",
+    option(
+        parser,
+        "--clearance M",
+        "distance to obstacles to keep where possible, up to 0.5 m (default: the problem's, or 0.01 m)",
+        not_negative,
     )
-    parser.add_argument(
-        "--unknown",
-        metavar="POLICY",
-        help="policy for space that the problem's views do not show: optimistic (free), padded, predicted or "
+    option(
+        parser,
+        "--unknown POLICY",
+        "policy for space that the problem's views do not show: optimistic (free), padded, predicted or "
         "occupied (default: the problem's; else predicted where the network covers the arm's reach, or "
         "padded)",
     )
-    parser.add_argument("--ignore-joints", action="store_true", help=IGNORE_JOINTS)
-    parser.add_argument(
+    option(parser, "--ignore-joints", IGNORE_JOINTS)
+    option(
+        parser,
         "--next-view",
-        action="store_true",
-        help="propose a camera pose that shows most of the unknown space that the motion crosses",
+        "propose a camera pose that shows most of the unknown space that the motion crosses",
     )
     for what in ("velocity", "acceleration"):
         parser.add_argument(
@@ -105,37 +102,35 @@ def add(commands: argparse._SubParsersAction) -> None:
             metavar="X",
             help=f"fraction of the robot's {what} limits to use, from 0.001 to 1 (default: 1)",
         )
-    parser.add_argument(
-        "--jerk",
-        type=jerk_limit,
-        metavar="J",
-        help="jerk limit of each joint, at least 0.01 rad/s³, or none (default: the robot's limits)",
+    option(
+        parser,
+        "--jerk J",
+        "jerk limit of each joint, at least 0.01 rad/s³, or none (default: the robot's limits)",
+        jerk_limit,
     )
-    parser.add_argument(
+    option(
+        parser,
         "--objective",
-        choices=OBJECTIVES,
+        "what searches minimize: the path's length or the motion's duration (default: time)",
         default=TIME,
-        help="what searches minimize: the path's length or the motion's duration (default: time)",
+        choices=OBJECTIVES,
     )
-    parser.add_argument(
-        "--blend",
-        type=positive,
-        metavar="R",
-        help="pass the problem's waypoints without stopping, within this distance: in rad for "
+    option(
+        parser,
+        "--blend R",
+        "pass the problem's waypoints without stopping, within this distance: in rad for "
         "configurations, in m for poses (default: the problem's, or stop)",
+        positive,
     )
-    parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
-    parser.add_argument(
-        "--out",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="file to write: result (.json), trajectory (.csv), replay (.html), picture (.png), or for other "
+    option(parser, "--seed N", "random seed (default: 0)", natural, 0)
+    option(
+        parser,
+        "--out FILE *",
+        "file to write: result (.json), trajectory (.csv), replay (.html), picture (.png), or for other "
         "programs .mcap (Foxglove, ROS 2), .rosbag2, .rrd (Rerun) or .yaml (JointTrajectory); repeatable",
     )
-    parser.add_argument("--view", action="store_true", help="write a replay (.html) and open it")
+    option(parser, "--view", "write a replay (.html) and open it")
     add_import_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

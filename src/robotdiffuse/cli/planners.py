@@ -2,18 +2,19 @@
 
 import argparse
 
-from robotdiffuse.cli.arguments import add_import_option
+from robotdiffuse.cli.arguments import add_import_option, command, option
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "planners",
-        help="list the planners, or the settings of one",
-        description="List the planners, or the settings of one for `robotdiffuse plan --set`.",
+        "list the planners, or the settings of one",
+        "List the planners, or the settings of one for `robotdiffuse plan --set`.",
+        run,
     )
-    parser.add_argument("planner", nargs="?", metavar="NAME", help="list the settings of this planner")
+    option(parser, "planner NAME", "list the settings of this planner", nargs="?")
     add_import_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

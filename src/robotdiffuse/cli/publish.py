@@ -2,7 +2,7 @@
 
 import argparse
 
-from robotdiffuse.cli.arguments import positive
+from robotdiffuse.cli.arguments import command, option, positive
 from robotdiffuse.cli.export import validated_motion
 
 PORT = 9090
@@ -10,25 +10,22 @@ PORT = 9090
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "publish",
-        help="publish a result to ROS through rosbridge",
-        description="Validate the motion of a result file again, and publish it as a ROS JointTrajectory.",
+        "publish a result to ROS through rosbridge",
+        "Validate the motion of a result file again, and publish it as a ROS JointTrajectory.",
+        run,
     )
-    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
-    parser.add_argument(
-        "--to", required=True, type=address, metavar="HOST[:PORT]", help=f"rosbridge server (port: {PORT})"
-    )
-    parser.add_argument(
-        "--topic",
+    option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
+    option(parser, "--to HOST[:PORT] !", f"rosbridge server (port: {PORT})", address)
+    option(
+        parser,
+        "--topic NAME",
+        "topic to publish on (default: /joint_trajectory)",
         default="/joint_trajectory",
-        metavar="NAME",
-        help="topic to publish on (default: /joint_trajectory)",
     )
-    parser.add_argument(
-        "--timeout", type=positive, default=5.0, metavar="S", help="timeout of the connection (default: 5 s)"
-    )
-    parser.set_defaults(run=run)
+    option(parser, "--timeout S", "timeout of the connection (default: 5 s)", positive, 5.0)
 
 
 def address(text: str) -> tuple[str, int]:
@@ -42,7 +39,7 @@ def address(text: str) -> tuple[str, int]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.interop.rosbridge import publish
+    from robotdiffuse.interop.plain_messages import publish
 
     host, port = arguments.to
     _, trajectory = validated_motion(arguments.result)

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import count, positive
+from robotdiffuse.cli.arguments import command, count, option, positive
 from robotdiffuse.core.ray_cluster import CLUSTERS
 
 if TYPE_CHECKING:
@@ -20,83 +20,64 @@ FIGURE_AZIMUTH = -0.9
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "reproduce",
-        help="make the paper's tables and figures again, beside the printed ones",
-        description="Draw the paper's problems, plan, validate, and write one page. Ctrl-C stops; run the "
+        "make the paper's tables and figures again, beside the printed ones",
+        "Draw the paper's problems, plan, validate, and write one page. Ctrl-C stops; run the "
         "same command again to continue.",
     )
     actions = parser.add_subparsers(title="parts", metavar="PART", required=True)
-    table1 = actions.add_parser(
+    table1 = command(
+        actions,
         "table1",
-        help="planners on ROP, with poses and with configurations as goals",
-        description="Write table1.md in the folder, which is one of `bench run` too.",
+        "planners on ROP, with poses and with configurations as goals",
+        "Write table1.md in the folder, which is one of `bench run` too.",
+        run_table1,
     )
     _add_planning(table1)
-    table1.set_defaults(run=run_table1)
-    table2 = actions.add_parser(
+    table2 = command(
+        actions,
         "table2",
-        help="train and compare the rows of the ablation",
-        description="Train every row of the paper's Table 2 on the same number of samples, test it on the "
+        "train and compare the rows of the ablation",
+        "Train every row of the paper's Table 2 on the same number of samples, test it on the "
         "same held-out problems, and write table2.md in the folder.",
+        run_table2,
     )
-    table2.add_argument("--data", required=True, metavar="DATA", help="data set of `data generate`")
-    table2.add_argument("--out", required=True, metavar="FOLDER", help="folder for networks and page")
-    table2.add_argument(
-        "--samples", type=count, metavar="N", help="training samples per row (default: 300000)"
+    option(table2, "--data DATA !", "data set of `data generate`")
+    option(table2, "--out FOLDER !", "folder for networks and page")
+    option(table2, "--samples N", "training samples per row (default: 300000)", count)
+    option(
+        table2, "--encoder-samples N", "point clouds to train the frozen encoder on (default: 300000)", count
     )
-    table2.add_argument(
-        "--encoder-samples",
-        type=count,
-        metavar="N",
-        help="point clouds to train the frozen encoder on (default: 300000)",
-    )
-    table2.add_argument("--problems", type=count, metavar="N", help="held-out problems (default: 500)")
-    table2.add_argument("--family", metavar="NAME", help="family of these problems (default: rop)")
-    table2.add_argument("--rows", metavar="NAME,...", help="rows to train (default: all ten)")
-    table2.add_argument(
-        "--seeds", type=count, metavar="N", help="trainings of each row, with different seeds (default: 1)"
-    )
-    table2.add_argument(
-        "--workers",
-        type=count,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="processes (default: all cores)",
-    )
-    table2.set_defaults(run=run_table2)
-    figures = actions.add_parser(
+    option(table2, "--problems N", "held-out problems (default: 500)", count)
+    option(table2, "--family NAME", "family of these problems (default: rop)")
+    option(table2, "--rows NAME,...", "rows to train (default: all ten)")
+    option(table2, "--seeds N", "trainings of each row, with different seeds (default: 1)", count)
+    option(table2, "--workers N", "processes (default: all cores)", count, os.cpu_count() or 1)
+    figures = command(
+        actions,
         "figures",
-        help="denoising, success over time, motions of two planners",
-        description="Write figures.md and its pictures in the folder of `reproduce table1`; calls that are "
+        "denoising, success over time, motions of two planners",
+        "Write figures.md and its pictures in the folder of `reproduce table1`; calls that are "
         "missing there are made first.",
+        run_figures,
     )
     _add_planning(figures)
-    figures.set_defaults(run=run_figures)
 
 
 def _add_planning(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems, results, page")
-    parser.add_argument(
-        "--problems",
-        type=count,
-        default=300,
-        metavar="N",
-        help="problems of each kind of goal (default: 300)",
-    )
-    parser.add_argument(
-        "--time-limit", type=positive, default=10.0, metavar="S", help="of a call [s] (default: 10)"
-    )
-    parser.add_argument(
-        "--paper-weights",
-        metavar="FOLDER",
-        help="weights of `train planner --config paper`, or points, for a row of the diffusion model without "
+    option(parser, "--out FOLDER !", "folder for problems, results, page")
+    option(parser, "--problems N", "problems of each kind of goal (default: 300)", count, 300)
+    option(parser, "--time-limit S", "of a call [s] (default: 10)", positive, 10.0)
+    option(
+        parser,
+        "--paper-weights FOLDER",
+        "weights of `train planner --config paper`, or points, for a row of the diffusion model without "
         "clearances, guidance and further samples (default: a note says how to train them)",
     )
-    parser.add_argument(
-        "--workers", type=count, metavar="N", help="planners that run at once (default: half of the cores)"
-    )
-    parser.add_argument("--cluster", choices=CLUSTERS, help="use the Ray cluster at RAY_ADDRESS")
+    option(parser, "--workers N", "planners that run at once (default: half of the cores)", count)
+    option(parser, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
 
 
 def run_table1(arguments: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import assignment, folder, natural
+from robotdiffuse.cli.arguments import assignment, command, folder, natural, option
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,60 +20,53 @@ MAX_PAIRS = 8
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "robot", help="list, show or prepare robots", description="List or show robots, or prepare a new one."
+    parser = command(
+        commands, "robot", "list, show or prepare robots", "List or show robots, or prepare a new one."
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
 
-    listing = actions.add_parser(
+    command(
+        actions,
         "list",
-        help="list the robots that problems can name",
-        description="List the bundled robots and those added by `robot add`.",
+        "list the robots that problems can name",
+        "List the bundled robots and those added by `robot add`.",
+        run_list,
     )
-    listing.set_defaults(run=run_list)
 
-    info = actions.add_parser(
+    info = command(
+        actions,
         "info",
-        help="show joints, limits and collision model",
-        description="Show joints, limits and collision model of a robot.",
+        "show joints, limits and collision model",
+        "Show joints, limits and collision model of a robot.",
+        run_info,
     )
-    info.add_argument("robot", metavar="ROBOT", help="a bundled name, a prepared folder or a URDF file")
-    info.set_defaults(run=run_info)
+    option(info, "robot ROBOT", "a bundled name, a prepared folder or a URDF file")
 
-    make = actions.add_parser(
+    make = command(
+        actions,
         "add",
-        help="prepare a robot from its URDF",
-        description="Prepare a robot for planning: fit covering spheres to the collision meshes of its "
+        "prepare a robot from its URDF",
+        "Prepare a robot for planning: fit covering spheres to the collision meshes of its "
         "URDF, find the pairs of links that need no collision check, and write a folder that problems can "
         "name.",
+        run_add,
     )
-    make.add_argument(
-        "urdf", metavar="URDF", help="URDF of an arm, or xacro file, which is compiled: this runs code in it"
-    )
-    make.add_argument("--name", metavar="NAME", help="name that problems use (default: the URDF's)")
-    make.add_argument("--out", metavar="FOLDER", help="folder to write (default: one in the user's robots)")
-    make.add_argument(
-        "--group",
-        metavar="NAME",
-        help="group of the SRDF, or arm, to plan for; both or all: several arms as one robot (default: the "
+    option(make, "urdf URDF", "URDF of an arm, or xacro file, which is compiled: this runs code in it")
+    option(make, "--name NAME", "name that problems use (default: the URDF's)")
+    option(make, "--out FOLDER", "folder to write (default: one in the user's robots)")
+    option(
+        make,
+        "--group NAME",
+        "group of the SRDF, or arm, to plan for; both or all: several arms as one robot (default: the "
         "only arm)",
     )
-    make.add_argument("--base", metavar="LINK", help="first link of the arm (default: the root)")
-    make.add_argument(
-        "--tip", metavar="LINK", help="last link of the arm (default: the link where a gripper begins)"
-    )
-    make.add_argument(
-        "--lock",
-        type=assignment,
-        action="append",
-        default=[],
-        metavar="JOINT=VALUE",
-        help="lock a joint at a value [rad or m]; repeatable",
-    )
-    make.add_argument(
-        "--srdf",
-        metavar="FILE",
-        help="SRDF with groups, poses, passive joints and allowed pairs of links (default: the SRDF beside "
+    option(make, "--base LINK", "first link of the arm (default: the root)")
+    option(make, "--tip LINK", "last link of the arm (default: the link where a gripper begins)")
+    option(make, "--lock JOINT=VALUE *", "lock a joint at a value [rad or m]; repeatable", assignment)
+    option(
+        make,
+        "--srdf FILE",
+        "SRDF with groups, poses, passive joints and allowed pairs of links (default: the SRDF beside "
         "the URDF, without its pairs)",
     )
     make.add_argument(
@@ -84,21 +77,16 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar=("LINK", "LINK"),
         help="two links not to check against each other; repeatable",
     )
-    make.add_argument(
-        "--package",
-        type=folder,
-        action="append",
-        default=[],
-        metavar="NAME=FOLDER",
-        help="folder of a ROS package (default: search ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders "
+    option(
+        make,
+        "--package NAME=FOLDER *",
+        "folder of a ROS package (default: search ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders "
         "above the URDF)",
+        folder,
     )
-    make.add_argument("--limits", metavar="FILE", help="file of joint limits, as MoveIt's joint_limits.yaml")
-    make.add_argument(
-        "--licence", metavar="TEXT", help="licence of the URDF's geometry, to keep in the folder"
-    )
-    make.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
-    make.set_defaults(run=run_add)
+    option(make, "--limits FILE", "file of joint limits, as MoveIt's joint_limits.yaml")
+    option(make, "--licence TEXT", "licence of the URDF's geometry, to keep in the folder")
+    option(make, "--seed N", "random seed (default: 0)", natural, 0)
 
 
 def run_list(arguments: argparse.Namespace) -> int:

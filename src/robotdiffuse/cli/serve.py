@@ -5,7 +5,7 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import count, natural, positive
+from robotdiffuse.cli.arguments import command, count, natural, option, positive
 
 if TYPE_CHECKING:
     from robotdiffuse.robots.robot import Robot
@@ -14,54 +14,39 @@ TOKEN = "ROBOTDIFFUSE_TOKEN"
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "serve",
-        help="plan and validate over HTTP",
-        description="Plan and validate over HTTP until SIGTERM or Ctrl-C. Running requests then finish; "
+        "plan and validate over HTTP",
+        "Plan and validate over HTTP until SIGTERM or Ctrl-C. Running requests then finish; "
         "waiting ones are answered with 503. The server's address in a browser lists all endpoints. A server "
         f"that other machines can reach needs a token in the environment variable {TOKEN}.",
+        run,
     )
-    parser.add_argument(
-        "--robot",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="another robot that requests may name: one of `robot add`, or a URDF file; repeatable",
+    option(
+        parser,
+        "--robot NAME *",
+        "another robot that requests may name: one of `robot add`, or a URDF file; repeatable",
     )
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
-    parser.add_argument("--port", type=natural, default=8000, help="port; 0 for any free one (default: 8000)")
-    parser.add_argument(
-        "--workers", type=count, metavar="N", help="processes that plan (default: one per core)"
+    option(parser, "--host HOST", "address to listen on (default: 127.0.0.1)", default="127.0.0.1")
+    option(parser, "--port PORT", "port; 0 for any free one (default: 8000)", natural, 8000)
+    option(parser, "--workers N", "processes that plan (default: one per core)", count)
+    option(
+        parser,
+        "--queue N",
+        "requests that may wait for a worker; further ones are answered with 429 (default: 16)",
+        natural,
+        16,
     )
-    parser.add_argument(
-        "--queue",
-        type=natural,
-        default=16,
-        metavar="N",
-        help="requests that may wait for a worker; further ones are answered with 429 (default: 16)",
+    option(parser, "--max-time-limit S", "largest time limit of a request (default: 10 s)", positive, 10.0)
+    option(parser, "--max-request-size MB", "largest size of a request (default: 8 MB)", count, 8)
+    option(
+        parser,
+        "--max-worker-memory MB",
+        "a worker that holds more memory than this after an answer is replaced (default: 2048 MB)",
+        count,
+        2048,
     )
-    parser.add_argument(
-        "--max-time-limit",
-        type=positive,
-        default=10.0,
-        metavar="S",
-        help="largest time limit of a request (default: 10 s)",
-    )
-    parser.add_argument(
-        "--max-request-size",
-        type=count,
-        default=8,
-        metavar="MB",
-        help="largest size of a request (default: 8 MB)",
-    )
-    parser.add_argument(
-        "--max-worker-memory",
-        type=count,
-        default=2048,
-        metavar="MB",
-        help="a worker that holds more memory than this after an answer is replaced (default: 2048 MB)",
-    )
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

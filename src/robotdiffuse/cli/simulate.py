@@ -1,8 +1,11 @@
 """The command `robotdiffuse simulate`."""
 
 import argparse
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.arguments import command, option
+from robotdiffuse.cli.drawing import ENDINGS, draw
 from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
 from robotdiffuse.cli.view import read_solved
 from robotdiffuse.core.errors import InputError
@@ -10,34 +13,28 @@ from robotdiffuse.core.errors import InputError
 if TYPE_CHECKING:
     from robotdiffuse.simulation.replay import Replay
 
-ENDINGS = (".gif", ".png")
-
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "simulate",
-        help="replay a result in the PyBullet simulator",
-        description="Replay the motion of a result file in PyBullet with position control, and print "
+        "replay a result in the PyBullet simulator",
+        "Replay the motion of a result file in PyBullet with position control, and print "
         "tracking errors and contacts. Exit status: 0 no contacts, 1 contacts, 2 bad input.",
+        run,
     )
-    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
-    parser.add_argument(
-        "--out",
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="film (.gif) or picture (.png) of the replay; repeatable",
-    )
-    parser.set_defaults(run=run)
+    option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
+    option(parser, "--out FILE *", "replay (.html) or picture (.png) of the simulated motion; repeatable")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
+    import numpy as np
 
     from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.core.types import Trajectory
 
     try:
-        from robotdiffuse.simulation import replay, write_gif, write_png
+        from robotdiffuse.simulation import replay
     except ModuleNotFoundError as error:
         if error.name != "pybullet":
             raise
@@ -53,10 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
     for name in (one.name for one in problem.moving if not one.known):
         print(f"note: the motion of {name} is not known; it stands still here")
     print_replay(problem.robot.name, result.trajectory.duration, done)
+    rates = np.gradient(done.positions, done.times, axis=0)
+    motion = Trajectory(done.joint_names, done.times, done.positions, rates, 0 * rates)
     for file in outputs:
-        write = write_gif if file.suffix.lower() == ".gif" else write_png
-        with Console(stderr=True).status(f"drawing {file}"):
-            write(robot, scene, done, file)
+        draw(problem, replace(result, trajectory=motion), file)
         print(f"wrote {file}")
     return SOLVED if done.free else NO_PLAN
 

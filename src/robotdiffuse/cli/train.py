@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.cli.arguments import count, names, natural, positive, share
+from robotdiffuse.cli.arguments import command, count, names, natural, option, positive, share
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.learning import need_packages
 
@@ -22,132 +22,116 @@ MODEL_OPTIONS = (
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "train",
-        help="train networks",
-        description="Train a network. Ctrl-C stops after writing a checkpoint; run the same command again to "
+        "train networks",
+        "Train a network. Ctrl-C stops after writing a checkpoint; run the same command again to "
         "continue. To train with N processes, on a GPU each if there are enough: "
         "torchrun --nproc-per-node N -m robotdiffuse train ...",
     )
     kinds = parser.add_subparsers(title="networks", metavar="NETWORK", required=True)
 
-    encoder = kinds.add_parser(
+    encoder = command(
+        kinds,
         "encoder",
-        help="train an auto-encoder of point clouds",
-        description="Train an auto-encoder of point clouds on random scenes. The planner's training keeps "
-        "it frozen.",
+        "train an auto-encoder of point clouds",
+        "Train an auto-encoder of point clouds on random scenes. The planner's training keeps it frozen.",
+        run_encoder,
     )
-    encoder.add_argument(
-        "--encoder", dest="name", metavar="NAME", help="encoder to train (default: point_autoencoder)"
-    )
-    encoder.add_argument(
-        "--scenes", metavar="NAME", help="training scenes: mixed (default), or rop, those of the paper's data"
-    )
+    option(encoder, "--encoder NAME", "encoder to train (default: point_autoencoder)", dest="name")
+    option(encoder, "--scenes NAME", "training scenes: mixed (default), or rop, those of the paper's data")
     _add_shared(encoder)
     _add_device(encoder)
-    encoder.set_defaults(run=run_encoder)
 
-    completion = kinds.add_parser(
+    completion = command(
+        kinds,
         "completion",
-        help="train the occupancy completion network",
-        description="Train the occupancy completion network, which predicts the obstacles that depth "
+        "train the occupancy completion network",
+        "Train the occupancy completion network, which predicts the obstacles that depth "
         "cameras do not see, on random scenes.",
+        run_completion,
     )
-    completion.add_argument(
-        "--families", type=names, metavar="NAMES", help="families of the scenes (default: all)"
-    )
-    completion.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the arm in the images")
-    completion.add_argument(
-        "--workers", type=natural, metavar="N", help="processes that draw samples (default: 1)"
-    )
-    completion.add_argument(
-        "--weights", metavar="FOLDER", help="weights to begin with; bundled: those that come with the package"
-    )
+    option(completion, "--families NAMES", "families of the scenes (default: all)", names)
+    option(completion, "--robot NAME", "bundled name or URDF of the arm in the images")
+    option(completion, "--workers N", "processes that draw samples (default: 1)", natural)
+    option(completion, "--weights FOLDER", "weights to begin with; bundled: those that come with the package")
     _add_shared(completion)
     _add_device(completion)
-    completion.set_defaults(run=run_completion)
 
-    planner = kinds.add_parser(
+    planner = command(
+        kinds,
         "planner",
-        help="train the network that predicts motions",
-        description="Train the network that predicts motions, on planned trajectories. With --robot and "
+        "train the network that predicts motions",
+        "Train the network that predicts motions, on planned trajectories. With --robot and "
         "without --data, generate data for the arm, train on them, and install the weights where planners "
         "find them; this takes about two hours on two cores.",
+        run_planner,
     )
-    planner.add_argument(
-        "--data",
-        metavar="FOLDER",
-        help="folder with shards of trajectories (default: generate them for --robot)",
+    option(
+        planner, "--data FOLDER", "folder with shards of trajectories (default: generate them for --robot)"
     )
-    planner.add_argument(
-        "--config",
-        default="compact",
-        metavar="NAME",
-        help="compact (default), paper, points (no clearances as inputs), trajectory_prior (for MPD and "
+    option(
+        planner,
+        "--config NAME",
+        "compact (default), paper, points (no clearances as inputs), trajectory_prior (for MPD and "
         "EDMP), or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
+        default="compact",
     )
-    planner.add_argument(
-        "--encoder",
-        metavar="FOLDER",
-        help="folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
+    option(
+        planner,
+        "--encoder FOLDER",
+        "folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
         "for the denoiser cross_attention (default: that of the config, or the bundled one)",
     )
-    planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (default: panda)")
-    planner.add_argument(
-        "--trajectories",
-        type=count,
-        metavar="N",
-        help="motions to generate, without --data (default: 60,000)",
-    )
-    planner.add_argument(
-        "--workers", type=count, metavar="N", help="processes that generate data without --data (all cores)"
-    )
+    option(planner, "--robot NAME", "bundled name or URDF of the robot (default: panda)")
+    option(planner, "--trajectories N", "motions to generate, without --data (default: 60,000)", count)
+    option(planner, "--workers N", "processes that generate data without --data (all cores)", count)
     _add_shared(planner, out_required=False)
     _add_device(planner)
     parts = planner.add_argument_group("parts of the model that replace those of the config")
-    parts.add_argument(
-        "--denoiser",
-        metavar="NAME",
-        help="transformer, encoder_decoder, decoder_only, unet, or cross_attention for the encoder points",
+    option(
+        parts,
+        "--denoiser NAME",
+        "transformer, encoder_decoder, decoder_only, unet, or cross_attention for the encoder points",
     )
-    parts.add_argument("--sampler", metavar="NAME", help="sampler for planning: ddim or ddpm")
-    parts.add_argument("--objective", metavar="NAME", help="what the denoiser predicts: clean or noise")
-    parts.add_argument(
-        "--target",
-        metavar="NAME",
-        help="what motions are relative to: residual (the straight line), absolute or limits",
+    option(parts, "--sampler NAME", "sampler for planning: ddim or ddpm")
+    option(parts, "--objective NAME", "what the denoiser predicts: clean or noise")
+    option(
+        parts,
+        "--target NAME",
+        "what motions are relative to: residual (the straight line), absolute or limits",
     )
-    parts.add_argument("--sampling-steps", type=count, metavar="N", help="denoising steps for planning")
-    parts.add_argument(
-        "--condition-drop",
-        type=share,
-        metavar="P",
-        help="fraction of samples without condition, for classifier-free guidance",
+    option(parts, "--sampling-steps N", "denoising steps for planning", count)
+    option(
+        parts,
+        "--condition-drop P",
+        "fraction of samples without condition, for classifier-free guidance",
+        share,
     )
-    parts.add_argument("--waypoints", type=count, metavar="N", help="waypoints of a motion")
-    planner.set_defaults(run=run_planner)
+    option(parts, "--waypoints N", "waypoints of a motion", count)
 
-    baseline = kinds.add_parser(
+    baseline = command(
+        kinds,
         "baseline",
-        help="train the network of a learned baseline: mpnet, mpinets, trajectory_prior",
-        description="Train the network of a learned baseline on planned trajectories.",
+        "train the network of a learned baseline: mpnet, mpinets, trajectory_prior",
+        "Train the network of a learned baseline on planned trajectories.",
+        run_baseline,
     )
-    baseline.add_argument(
-        "name", metavar="NAME", help="mpnet, mpinets or trajectory_prior (for MPD and EDMP)"
-    )
-    baseline.add_argument("--data", required=True, metavar="FOLDER", help="data set of `data generate`")
-    baseline.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the data's robot")
+    option(baseline, "name NAME", "mpnet, mpinets or trajectory_prior (for MPD and EDMP)")
+    option(baseline, "--data FOLDER !", "data set of `data generate`")
+    option(baseline, "--robot NAME", "bundled name or URDF of the data's robot")
     _add_shared(baseline)
-    baseline.set_defaults(run=run_baseline)
 
-    export = kinds.add_parser(
+    export = command(
+        kinds,
         "export",
-        help="write the ONNX files of trained weights anew",
-        description="Write the ONNX files that planning runs, from trained weights. Training writes them "
+        "write the ONNX files of trained weights anew",
+        "Write the ONNX files that planning runs, from trained weights. Training writes them "
         "too; weights of earlier versions lack them.",
+        run_export,
     )
-    export.add_argument("folder", metavar="FOLDER", help="folder with weights")
-    export.set_defaults(run=run_export)
+    option(export, "folder FOLDER", "folder with weights")
 
 
 def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> None:
@@ -159,19 +143,17 @@ def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> N
         help=f"folder for weights, settings and checkpoints{default}",
     )
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--minutes", type=positive, metavar="MIN", help="length of the training [minutes]")
-    length.add_argument("--samples", type=count, metavar="N", help="length of the training [samples]")
-    parser.add_argument("--seed", type=natural, metavar="N", help="random seed")
-    parser.add_argument("--batch", type=count, metavar="N", help="samples per step")
-    parser.add_argument("--learning-rate", type=positive, metavar="X", help="largest learning rate")
-    parser.add_argument("--threads", type=count, metavar="N", help="number of PyTorch threads")
-    parser.add_argument(
-        "--checkpoint-seconds", type=positive, metavar="S", help="time between checkpoints [s] (default: 120)"
-    )
+    option(length, "--minutes MIN", "length of the training [minutes]", positive)
+    option(length, "--samples N", "length of the training [samples]", count)
+    option(parser, "--seed N", "random seed", natural)
+    option(parser, "--batch N", "samples per step", count)
+    option(parser, "--learning-rate X", "largest learning rate", positive)
+    option(parser, "--threads N", "number of PyTorch threads", count)
+    option(parser, "--checkpoint-seconds S", "time between checkpoints [s] (default: 120)", positive)
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--device", metavar="NAME", help="cpu or cuda (default: cuda if there is one)")
+    option(parser, "--device NAME", "cpu or cuda (default: cuda if there is one)")
 
 
 def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, object]:
@@ -232,9 +214,9 @@ def run_planner(arguments: argparse.Namespace) -> int:
         return _run_for_robot(arguments, given)
     if arguments.out is None:
         raise InputError("--data needs --out, a folder for the weights")
-    for option in ("trajectories", "workers"):
-        if getattr(arguments, option) is not None:
-            raise InputError(f"--{option} is for data to be generated; --data names existing data")
+    for name in ("trajectories", "workers"):
+        if getattr(arguments, name) is not None:
+            raise InputError(f"--{name} is for data to be generated; --data names existing data")
     # several processes would write it at once
     bundled = "encoder" not in given and int(os.environ.get("WORLD_SIZE", "1")) == 1
     if bundled:

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import IGNORE_JOINTS, natural
+from robotdiffuse.cli.arguments import IGNORE_JOINTS, command, natural, option
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError
 
@@ -17,43 +17,33 @@ VALID, NOT_VALID = 0, 1
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "verify",
-        help="validate a motion from any source",
-        description="Validate a motion from any planner: a RobotDiffuse result, CSV, JSON, YAML of a ROS "
+        "validate a motion from any source",
+        "Validate a motion from any planner: a RobotDiffuse result, CSV, JSON, YAML of a ROS "
         "JointTrajectory or MoveIt RobotTrajectory, a ROS 2 bag or MCAP. Exit status: 0 valid, 1 not valid, "
         "2 bad input.",
+        run,
     )
-    parser.add_argument(
-        "motion", metavar="MOTION", help="file (.json, .csv, .yaml, .mcap), or the folder of a ROS 2 bag"
-    )
+    option(parser, "motion MOTION", "file (.json, .csv, .yaml, .mcap), or the folder of a ROS 2 bag")
     where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "--problem",
-        metavar="FILE",
-        help="problem file (default: the problem in the result or .mcap file)",
+    option(where, "--problem FILE", "problem file (default: the problem in the result or .mcap file)")
+    option(
+        where,
+        "--scene FILE",
+        "MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs --robot",
     )
-    where.add_argument(
-        "--scene",
-        metavar="FILE",
-        help="MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs "
-        "--robot",
+    option(parser, "--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0)
+    option(parser, "--robot NAME", "bundled name or URDF, with --scene")
+    option(parser, "--ignore-joints", IGNORE_JOINTS)
+    option(parser, "--topic NAME", "topic of the motion in a bag or MCAP file with several")
+    option(parser, "--all", "print all violations, not only the first")
+    option(
+        parser,
+        "--certificate FILE.json",
+        "write a proof that the motion is valid, for `robotdiffuse certificate check`",
     )
-    parser.add_argument(
-        "--index", type=natural, default=0, help="which problem of a .jsonl file (default: 0)"
-    )
-    parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF, with --scene")
-    parser.add_argument("--ignore-joints", action="store_true", help=IGNORE_JOINTS)
-    parser.add_argument(
-        "--topic", metavar="NAME", help="topic of the motion in a bag or MCAP file with several"
-    )
-    parser.add_argument("--all", action="store_true", help="print all violations, not only the first")
-    parser.add_argument(
-        "--certificate",
-        metavar="FILE.json",
-        help="write a proof that the motion is valid, for `robotdiffuse certificate check`",
-    )
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

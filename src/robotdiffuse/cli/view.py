@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import not_negative
+from robotdiffuse.cli.arguments import command, not_negative, option
 from robotdiffuse.cli.drawing import ENDINGS, draw, draw_several, show
 from robotdiffuse.core.errors import InputError
 
@@ -15,35 +15,35 @@ if TYPE_CHECKING:
 
 
 def add(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
+    parser = command(
+        commands,
         "view",
-        help="draw results and problems as a replay (.html) or a picture (.png)",
-        description="Draw the motions of result files, of several in one picture; of a problem, or a "
+        "draw results and problems as a replay (.html) or a picture (.png)",
+        "Draw the motions of result files, of several in one picture; of a problem, or a "
         "result without a motion, the start, the goal and the links that collide. Without --out, write a "
         "page and open it in the browser.",
+        run,
     )
-    parser.add_argument(
-        "results",
-        nargs="+",
-        metavar="RESULT",
-        help="result file (.json) of `robotdiffuse plan --out`, or a problem file; several results must be "
+    option(
+        parser,
+        "results RESULT",
+        "result file (.json) of `robotdiffuse plan --out`, or a problem file; several results must be "
         "of one problem",
+        nargs="+",
     )
-    parser.add_argument(
-        "--out",
-        action="append",
-        metavar="FILE",
-        help="replay (.html) or picture (.png); repeatable (default: the name of RESULT with .html)",
+    option(
+        parser,
+        "--out FILE *",
+        "replay (.html) or picture (.png); repeatable (default: the name of RESULT with .html)",
     )
-    parser.add_argument(
-        "--shell",
-        type=not_negative,
-        default=0.0,
-        metavar="M",
-        help="with several results: thickness of the safety shell that pictures show about the arm [m] "
+    option(
+        parser,
+        "--shell M",
+        "with several results: thickness of the safety shell that pictures show about the arm [m] "
         "(default: 0, none)",
+        not_negative,
+        0.0,
     )
-    parser.set_defaults(run=run)
 
 
 def read_result(file: str) -> "tuple[PlanResult, Problem]":

@@ -20,8 +20,6 @@ from robotdiffuse.core.splines import spline_rows
 
 ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
-FORMULA = ("=", "+", "-", "@")
-"""Spreadsheets run a cell that begins so; in .csv an apostrophe stands before it."""
 REST = 1e-3
 """Speed, as a share of a motion's greatest one, at which the arm rests."""
 MAX_SAMPLE_RATE = 1e5
@@ -243,9 +241,9 @@ class Trajectory(Value):
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
         kinds = ("position", "velocity", "acceleration")
-        cells = [f"{name}_{kind}" for kind in kinds for name in self.joint_names]
-        safe = [f"'{cell}" if cell.startswith(FORMULA) else cell for cell in cells]
-        writer.writerow(["time", *safe])
+        # a spreadsheet would read names that begin with these as formulas
+        names = [f"'{name}" if name[0] in "=+-@" else name for name in self.joint_names]
+        writer.writerow(["time", *(f"{name}_{kind}" for kind in kinds for name in names)])
         columns = (self.times[:, None], *(getattr(self, rows) for rows in ROWS))
         writer.writerows([repr(value) for value in row] for row in np.concatenate(columns, axis=1).tolist())
         return stream.getvalue()

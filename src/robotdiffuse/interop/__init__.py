@@ -21,7 +21,7 @@ WRITERS = Registry(
         ".mcap": Entry("robotdiffuse.interop.mcap_file:write", "a Foxglove scene, and ROS 2 messages"),
         ".rosbag2": Entry("robotdiffuse.interop.rosbag:write", "a ROS 2 bag (a folder)"),
         ".rrd": Entry("robotdiffuse.interop.rerun_file:write", "a Rerun recording"),
-        ".yaml": Entry("robotdiffuse.interop.ros_yaml:write", "a ROS 2 JointTrajectory"),
+        ".yaml": Entry("robotdiffuse.interop.plain_messages:write_yaml", "a ROS 2 JointTrajectory"),
     },
 )
 """Functions of problem, trajectory and file, by the ending of the file."""
@@ -31,9 +31,11 @@ READERS = Registry(
         ".json": Entry(
             "robotdiffuse.interop.plain_messages:read_json_file", "results, trajectories, ROS messages"
         ),
-        ".csv": Entry("robotdiffuse.interop.csv_file:read", "a column for time and for each joint"),
-        ".yaml": Entry("robotdiffuse.interop.ros_yaml:read", "ROS JointTrajectory, MoveIt RobotTrajectory"),
-        ".yml": Entry("robotdiffuse.interop.ros_yaml:read", "the same"),
+        ".csv": Entry("robotdiffuse.interop.plain_messages:read_csv", "a column for time and for each joint"),
+        ".yaml": Entry(
+            "robotdiffuse.interop.plain_messages:read_yaml", "ROS JointTrajectory, MoveIt RobotTrajectory"
+        ),
+        ".yml": Entry("robotdiffuse.interop.plain_messages:read_yaml", "the same"),
         ".mcap": Entry("robotdiffuse.interop.mcap_file:read", "ROS 2 messages"),
         ".rosbag2": Entry("robotdiffuse.interop.rosbag:read", "a ROS 2 bag (a folder)"),
     },

@@ -8,27 +8,24 @@ configuration is in sensor_msgs/JointState.
 """
 
 import io
+from bisect import bisect_left, insort
 from collections.abc import Iterator, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.spatial.transform import Rotation, Slerp
 
-from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.interop.mcap_file import (
-    McapWriter,
-    check_chunks,
-    make_reader,
-    messages_in,
-    topics_in,
-)
-from robotdiffuse.interop.ros_types import JOINT_STATE, header_seconds, to_plain
-from robotdiffuse.interop.transform_history import TransformHistory, insert_by_time, neighbours
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.interop.mcap_file import McapWriter, check_chunks, make_reader, messages_in, topics_in
+from robotdiffuse.interop.recorded_motion import reading
+from robotdiffuse.interop.ros_messages import JOINT_STATE, header_seconds, to_plain
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.robots.robot import Robot
 
@@ -37,6 +34,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001)}
 """Types of the pixels of depth images, and metres per unit (REP 118)."""
+Stamped = TypeVar("Stamped", bound=tuple[float, Any])
 MAX_SIZE = 64 * 10**9
 """Of recordings [bytes]."""
 MAX_GAP = 0.1
@@ -135,13 +133,8 @@ def read_depth_views(
     or transforms within 0.1 s of an image, and for distorted or compressed images.
     """
     path = input_file(file, largest=MAX_SIZE)
-    try:
+    with reading(file):
         yield from _read(path, robot, topics, base or robot.base)
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(str(file)) else f"{file}: {text}") from None
-    except Exception as error:  # mcap, zstandard and rosbags raise many kinds of errors for a damaged file
-        raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
 
 
 def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> Iterator[StampedView]:
@@ -222,6 +215,78 @@ def _depth(where: str, image: Any) -> Float[ndarray, "h w"]:
     size = np.dtype(kind).itemsize * image.width
     pixels = np.ascontiguousarray(rows[:, :size]).view((">" if image.is_bigendian else "<") + kind)
     return scale * pixels.astype(np.float32)
+
+
+def insert_by_time(history: list[Stamped], stamped: Stamped) -> None:
+    """Add an entry to a history, which may have later ones: messages may be logged in another order."""
+    insort(history, stamped, key=itemgetter(0))
+
+
+def neighbours(history: list[Stamped], stamp: float, gap: float) -> list[Stamped]:
+    """The entries on both sides of a time, without those more than `gap` from it [s]; one at the very time
+    counts alone."""
+    i = bisect_left(history, stamp, key=itemgetter(0))
+    near = [history[k] for k in (i - 1, i) if 0 <= k < len(history) and abs(history[k][0] - stamp) <= gap]
+    return near[-1:] if near and near[-1][0] <= stamp else near
+
+
+class TransformHistory:
+    """Poses of frames in their parents', at the times when they were published."""
+
+    def __init__(self) -> None:
+        self._parent: dict[str, str] = {}
+        self._static: set[str] = set()
+        self._poses: dict[str, list[tuple[float, Float[ndarray, "4 4"]]]] = {}
+
+    def add(self, message: Mapping[str, Any], static: bool) -> None:
+        """Take a geometry_msgs/TransformStamped, in plain data, into account."""
+        child = message["child_frame_id"].lstrip("/")
+        place, turn = message["transform"]["translation"], message["transform"]["rotation"]
+        quaternion = np.array([turn[axis] for axis in "wxyz"])
+        length = np.linalg.norm(quaternion)
+        if not length > 0:
+            raise InputError(f"the transform of {child} has the rotation {quaternion.tolist()}")
+        rotation = rotation_from_quaternion(quaternion / length)
+        T = transform(np.array([place[axis] for axis in "xyz"]), rotation)
+        self._parent[child] = message["header"]["frame_id"].lstrip("/")
+        if static:
+            self._static.add(child)
+        stamped = header_seconds(message["header"]["stamp"]), T
+        insert_by_time(self._poses.setdefault(child, []), stamped)
+
+    def at(self, base: str, frame: str, stamp: float, gap: float, where: str) -> Float[ndarray, "4 4"]:
+        """T_base_frame at a time, interpolated between two transforms at most `gap` from it [s].
+
+        Raises InputError, naming `where`, if no chain of transforms leads from the base to the frame, or if
+        one of them is not near in time.
+        """
+        T, at = np.eye(4), frame.lstrip("/")
+        passed = [at]
+        while at != base.lstrip("/"):
+            if at not in self._parent or len(passed) > len(self._parent) + 1:
+                raise InputError(
+                    f"no transforms lead from {base} to {frame}, the frame of {where}; from there they lead"
+                    f" to {', '.join(passed[1:]) or 'nothing'}"
+                )
+            T = self._one(at, stamp, gap, where) @ T
+            at = self._parent[at]
+            passed.append(at)
+        return T
+
+    def _one(self, frame: str, stamp: float, gap: float, where: str) -> Float[ndarray, "4 4"]:
+        """The pose of a frame in its parent's."""
+        poses = self._poses[frame]
+        if frame in self._static:
+            return poses[-1][1]
+        near = neighbours(poses, stamp, gap)
+        if not near:
+            raise InputError(f"there is no transform of {frame} within {gap:g} s of {where}")
+        if len(near) == 1:
+            return near[0][1]
+        (t0, first), (t1, last) = near
+        share = (stamp - t0) / (t1 - t0)
+        turn = Slerp([0, 1], Rotation.from_matrix([first[:3, :3], last[:3, :3]]))(share).as_matrix()
+        return transform((1 - share) * first[:3, 3] + share * last[:3, 3], turn)
 
 
 class _States:

@@ -13,55 +13,47 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import MEGABYTE, input_file, parse_json
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory
+from robotdiffuse.drawables import Color, Drawable, Surface, drawables, link_surfaces
 from robotdiffuse.interop import missing_package
 from robotdiffuse.interop.plain_messages import joint_trajectory
-from robotdiffuse.interop.recorded_motion import RecordedMotion
-from robotdiffuse.interop.ros_messages import motion_from_messages
-from robotdiffuse.interop.ros_types import (
+from robotdiffuse.interop.recorded_motion import RecordedMotion, reading
+from robotdiffuse.interop.ros_messages import (
     DISPLAY_TRAJECTORY,
     JOINT_STATE,
     JOINT_TRAJECTORY,
     STRING,
     choose_topic,
     display_trajectory,
+    motion_from_messages,
     to_message,
     typestore,
-)
-from robotdiffuse.interop.scene_primitives import (
-    OBSTACLE_COLOR,
-    BoxPrimitive,
-    CylinderPrimitive,
-    MeshPrimitive,
-    PointsPrimitive,
-    Primitive,
-    SpherePrimitive,
-    arm,
-    moving_frames,
-    obstacles,
 )
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_poses
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Sphere
 
 try:
     import lz4.frame
     import zstandard
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudMessage
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
     from mcap.reader import McapReader, make_reader
     from mcap.records import Schema
     from mcap.writer import Writer
     from mcap_protobuf.schema import register_schema
-    from rosbags.typesys import get_types_from_msg
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 except ImportError:
     raise missing_package(
         "mcap, mcap-protobuf-support, foxglove-schemas-protobuf and rosbags", "ros"
@@ -75,6 +67,7 @@ CHUNK_HEADER = 1 + 8 + 3 * 8 + 4
 """Bytes of a chunk before the name of its compression: opcode, length, times, size and checksum."""
 FRAME_HEADER = 32
 """Bytes that hold the header of a compressed frame."""
+OBSTACLE_OPACITY = 0.8
 PROBLEM_ATTACHMENT = "problem.json"
 """Name of the attachment that holds the problem."""
 
@@ -108,9 +101,11 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     """Write the scene and the motion; see `interop.write_motion` and this module's description."""
     robot, stream = problem.robot, io.BytesIO()
     out = McapWriter(stream)
-    out.protobuf("/scene", _scene(problem), 0)
-    for cloud in _clouds(problem):
-        out.protobuf(f"/points/{cloud[0]}", cloud[1], 0)
+    obstacles = drawables(problem.scene, problem.moving)
+    clouds = [one for one in obstacles if isinstance(one.shape, PointCloud)]
+    out.protobuf("/scene", _scene(robot, [one for one in obstacles if one not in clouds]), 0)
+    for one in clouds:
+        out.protobuf(f"/points/{one.name}", _cloud(one.shape, robot.base), 0)
     record = joint_trajectory(trajectory.joint_names, trajectory)
     out.ros("/joint_trajectory", JOINT_TRAJECTORY, record, 0)
     out.ros("/display_planned_path", DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record), 0)
@@ -128,7 +123,8 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     poses = {link: link_poses(robot, trajectory.positions, link) for link in links}
     for i, t in enumerate(trajectory.times.tolist()):
         at = round(1e9 * t)
-        frames = {link: T[i] for link, T in poses.items()} | moving_frames(problem, t)
+        frames = {link: T[i] for link, T in poses.items()}
+        frames |= {_frame(one, robot): one.frame(t) for one in obstacles if one.moving is not None}
         out.protobuf("/tf", _transforms(problem, frames, at), at)
         stamp = {"sec": at // 10**9, "nanosec": at % 10**9}
         values = [*trajectory.positions[i].tolist(), *robot.locked.values()]
@@ -149,57 +145,77 @@ def _urdf(source: str | None) -> bytes | None:
         return None
 
 
-def _set_pose(pose: Any, T: Float[ndarray, "4 4"]) -> None:
-    pose.position.x, pose.position.y, pose.position.z = T[:3, 3].tolist()
-    w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
-    pose.orientation.w, pose.orientation.x, pose.orientation.y, pose.orientation.z = w, x, y, z
+def _frame(obstacle: Drawable, robot: Robot) -> str:
+    """The frame that an obstacle is fixed to."""
+    return robot.base if obstacle.moving is None else f"moving/{obstacle.name}"
 
 
-def _scene(problem: Problem) -> SceneUpdate:
+def _set(vector: Any, values: Sequence[float]) -> None:
+    """Set x, y and z, or x, y, z and w."""
+    for axis, value in zip("xyzw", values, strict=False):
+        setattr(vector, axis, value)
+
+
+def _turn(T: Float[ndarray, "4 4"]) -> list[float]:
+    """The quaternion xyzw."""
+    return np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
+
+
+def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
     update = SceneUpdate()
-    for name, frame, drawn in (*obstacles(problem), *arm(problem.robot)):
-        if isinstance(drawn, PointsPrimitive):
-            continue
-        entity = update.entities.add()
-        entity.id, entity.frame_id, entity.frame_locked = name, frame, True
-        _add(entity, drawn)
+
+    def entity(name: str, frame: str) -> Any:
+        return update.entities.add(id=name, frame_id=frame, frame_locked=True)
+
+    for one in obstacles:
+        drawn = entity(one.name, _frame(one, robot))
+        shape = one.fixed.shape
+        match shape:
+            case Box():
+                size = shape.size.tolist()
+                solid = drawn.cubes.add()
+            case Sphere():
+                size = [2 * shape.radius] * 3
+                solid = drawn.spheres.add()
+            case Cylinder():
+                size = [2 * shape.radius, 2 * shape.radius, shape.height]
+                solid = drawn.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+            case _:
+                _add_triangles(drawn, one.fixed.surface, one.color, OBSTACLE_OPACITY)
+                continue
+        _set(solid.size, size)
+        _set(solid.pose.position, shape.T_base_shape[:3, 3].tolist())
+        _set(solid.pose.orientation, _turn(shape.T_base_shape))
+        _set_color(solid.color, one.color, OBSTACLE_OPACITY)
+    for link, surface in link_surfaces(robot).items():
+        for color, part in surface.by_color:
+            _add_triangles(entity("{}/{:02x}{:02x}{:02x}".format(link, *color), link), part, color, 1.0)
     return update
 
 
-def _add(entity: Any, drawn: Primitive) -> None:
-    match drawn:
-        case BoxPrimitive(T, size, color):
-            primitive = entity.cubes.add()
-            primitive.size.x, primitive.size.y, primitive.size.z = size.tolist()
-        case SpherePrimitive(T, radius, color):
-            primitive = entity.spheres.add()
-            primitive.size.x = primitive.size.y = primitive.size.z = 2 * radius
-        case CylinderPrimitive(T, radius, height, color):
-            primitive = entity.cylinders.add()
-            primitive.size.x = primitive.size.y = 2 * radius
-            primitive.size.z = height
-            primitive.bottom_scale = primitive.top_scale = 1.0
-        case MeshPrimitive(T, vertices, faces, color):
-            primitive = entity.triangles.add()
-            for x, y, z in vertices.tolist():
-                primitive.points.add(x=x, y=y, z=z)
-            primitive.indices.extend(faces.ravel().tolist())
-        case _:
-            raise TypeError(f"no primitive for {type(drawn).__name__}")
-    _set_pose(primitive.pose, T)
-    primitive.color.r, primitive.color.g, primitive.color.b = (part / 255 for part in color)
-    primitive.color.a = 0.8 if color == OBSTACLE_COLOR else 1.0
+def _add_triangles(entity: Any, surface: Surface, color: Color, opacity: float) -> None:
+    """Add a surface in the frame of an entity; equal vertices once, in single precision, to save space."""
+    points, number = np.unique(surface.vertices.astype(np.float32), axis=0, return_inverse=True)
+    triangles = entity.triangles.add()
+    triangles.pose.orientation.w = 1.0
+    for x, y, z in points.tolist():
+        triangles.points.add(x=x, y=y, z=z)
+    triangles.indices.extend(number.reshape(-1)[surface.faces.ravel()].tolist())
+    _set_color(triangles.color, color, opacity)
 
 
-def _clouds(problem: Problem) -> Iterator[tuple[str, PointCloud]]:
-    for name, frame, drawn in obstacles(problem):
-        if isinstance(drawn, PointsPrimitive):
-            cloud = PointCloud(frame_id=frame, point_stride=12)
-            cloud.pose.orientation.w = 1.0
-            for k, axis in enumerate("xyz"):
-                cloud.fields.add(name=axis, offset=4 * k, type=FLOAT32)
-            cloud.data = drawn.points.astype("<f4").tobytes()
-            yield name, cloud
+def _set_color(message: Any, color: Color, opacity: float) -> None:
+    message.r, message.g, message.b = (part / 255 for part in color)
+    message.a = opacity
+
+
+def _cloud(cloud: PointCloud, frame: str) -> PointCloudMessage:
+    message = PointCloudMessage(frame_id=frame, point_stride=12)
+    message.pose.orientation.w = 1.0
+    for k, axis in enumerate("xyz"):
+        message.fields.add(name=axis, offset=4 * k, type=FLOAT32)
+    message.data = cloud.points.astype("<f4").tobytes()
+    return message
 
 
 def _transforms(problem: Problem, poses: dict[str, Float[ndarray, "4 4"]], at: int) -> FrameTransforms:
@@ -211,44 +227,32 @@ def _transforms(problem: Problem, poses: dict[str, Float[ndarray, "4 4"]], at: i
     for frame, (parent, T) in frames.items():
         transform = update.transforms.add(parent_frame_id=parent, child_frame_id=frame)
         transform.timestamp.FromNanoseconds(at)
-        transform.translation.x, transform.translation.y, transform.translation.z = T[:3, 3].tolist()
-        w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
-        turn = transform.rotation
-        turn.w, turn.x, turn.y, turn.z = w, x, y, z
+        _set(transform.translation, T[:3, 3].tolist())
+        _set(transform.rotation, _turn(T))
     return update
 
 
 def problem_in(file: Path) -> Problem | None:
     """The problem that `write` attached; None if there is none."""
     path = input_file(file)
-    try:
-        with path.open("rb") as stream:
-            attached = {found.name: found.data for found in make_reader(stream).iter_attachments()}
+    with reading(file), path.open("rb") as stream:
+        attached = {found.name: found.data for found in make_reader(stream).iter_attachments()}
         if PROBLEM_ATTACHMENT not in attached:
             return None
         record = parse_json(attached[PROBLEM_ATTACHMENT].decode(), f"{file}, {PROBLEM_ATTACHMENT}")
-    except InputError:
-        raise
-    except Exception as error:  # mcap and zstandard raise many kinds of errors for a damaged file
-        raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
     return problem_from_record(record)
 
 
 def read(file: Path, topic: str | None = None) -> RecordedMotion:
-    """Read the motion from the ROS 2 messages of a topic; see `ros_types.choose_topic`."""
+    """Read the motion from the ROS 2 messages of a topic; see `choose_topic`."""
     path = input_file(file)
-    try:
-        with path.open("rb") as stream:
-            reader = make_reader(stream)
-            check_chunks(stream, reader, str(file))
-            ros = topics_in(reader, str(file))
-            name = choose_topic({topic: schema.name for topic, schema in ros.items()}, topic, str(file))
-            messages = [(at, message) for _, at, message in messages_in(reader, ros, [name], MAX_UNPACKED)]
+    with reading(file), path.open("rb") as stream:
+        reader = make_reader(stream)
+        check_chunks(stream, reader, str(file))
+        ros = topics_in(reader, str(file))
+        name = choose_topic({topic: schema.name for topic, schema in ros.items()}, topic, str(file))
+        messages = [(at, message) for _, at, message in messages_in(reader, ros, [name], MAX_UNPACKED)]
         return motion_from_messages(ros[name].name, messages, f"{file}, {name}")
-    except InputError:
-        raise
-    except Exception as error:  # mcap, zstandard and rosbags raise many kinds of errors for a damaged file
-        raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
 
 
 def topics_in(reader: McapReader, where: str) -> dict[str, Schema]:
@@ -304,8 +308,6 @@ def messages_in(
 
 def _typestore(schema: Any) -> Any:
     """A store with the message types that the file defines."""
-    from rosbags.typesys import Stores, get_typestore
-
     if schema.encoding != "ros2msg":
         return typestore()
     store = get_typestore(Stores.EMPTY)

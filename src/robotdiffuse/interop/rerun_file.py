@@ -10,19 +10,11 @@ from numpy import ndarray
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory
+from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces
 from robotdiffuse.interop import missing_package
-from robotdiffuse.interop.scene_primitives import (
-    BoxPrimitive,
-    CylinderPrimitive,
-    MeshPrimitive,
-    PointsPrimitive,
-    Primitive,
-    SpherePrimitive,
-    arm,
-    obstacles,
-)
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_poses
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
 try:
     import rerun as rr
@@ -45,10 +37,10 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         T, turn = problem.T_world_base, _quaternion(problem.T_world_base)
         for part in ("scene", "robot"):
             recording.log(part, rr.Transform3D(translation=T[:3, 3], quaternion=turn), static=True)
-    for name, _, drawn in obstacles(problem):
-        recording.log(_entity(name), *_archetypes(drawn), static=True)
-    for name, link, drawn in arm(robot):
-        recording.log(f"robot/{link}/{name.partition('/')[2]}", *_archetypes(drawn), static=True)
+    for obstacle in drawables(problem.scene, problem.moving):
+        recording.log(_entity(obstacle.name), _archetype(obstacle.fixed), static=True)
+    for link, surface in link_surfaces(robot).items():
+        recording.log(f"robot/{link}/surface", _mesh(surface), static=True)
     _motion(recording, problem, trajectory)
     write_atomically(file, content.drain_as_bytes())
 
@@ -84,20 +76,32 @@ def _quaternion(T: Float[ndarray, "4 4"]) -> rr.Quaternion:
     return rr.Quaternion(xyzw=quaternion_from_rotation(T[:3, :3])[[1, 2, 3, 0]])
 
 
-def _archetypes(drawn: Primitive) -> tuple[rr.AsComponents, ...]:
-    if isinstance(drawn, PointsPrimitive):
-        return (rr.Points3D(drawn.points, radii=drawn.radius, colors=[drawn.color]),)
-    x, y, z = drawn.T[:3, 3].tolist()
-    placed = {"centers": [[x, y, z]], "quaternions": [_quaternion(drawn.T)], "colors": [drawn.color]}
-    solid = rr.components.FillMode.Solid
-    match drawn:
-        case BoxPrimitive(_, size, _):
-            return (rr.Boxes3D(half_sizes=[size / 2], fill_mode=solid, **placed),)
-        case SpherePrimitive(_, radius, _):
-            return (rr.Ellipsoids3D(half_sizes=[[radius] * 3], fill_mode=solid, **placed),)
-        case CylinderPrimitive(_, radius, height, _):
-            return (rr.Cylinders3D(radii=[radius], lengths=[height], fill_mode=solid, **placed),)
-        case MeshPrimitive(T, vertices, faces, color):
-            points = vertices @ T[:3, :3].T + T[:3, 3]
-            return (rr.Mesh3D(vertex_positions=points, triangle_indices=faces, albedo_factor=color),)
-    raise TypeError(f"no archetype for {type(drawn).__name__}")
+def _archetype(obstacle: Drawable) -> rr.AsComponents:
+    shape = obstacle.shape
+    if isinstance(shape, PointCloud):
+        return rr.Points3D(shape.points, radii=shape.point_radius, colors=[obstacle.color])
+    if not isinstance(shape, Box | Sphere | Cylinder | Capsule):
+        return _mesh(
+            obstacle.surface if obstacle.moving is None else obstacle.surface.moved(inverse(obstacle.frame()))
+        )
+    T, solid = shape.T_base_shape, rr.components.FillMode.Solid
+    placed = {"quaternions": [_quaternion(T)], "colors": [obstacle.color], "fill_mode": solid}
+    match shape:
+        case Box():
+            return rr.Boxes3D(half_sizes=[shape.size / 2], centers=[T[:3, 3]], **placed)
+        case Sphere():
+            return rr.Ellipsoids3D(half_sizes=[[shape.radius] * 3], centers=[T[:3, 3]], **placed)
+        case Cylinder():
+            return rr.Cylinders3D(radii=[shape.radius], lengths=[shape.height], centers=[T[:3, 3]], **placed)
+        case _:
+            begin = (T @ [0.0, 0.0, -0.5 * shape.height, 1.0])[:3]  # Rerun's capsules begin at an end
+            return rr.Capsules3D(radii=[shape.radius], lengths=[shape.height], translations=[begin], **placed)
+
+
+def _mesh(surface: Surface) -> rr.Mesh3D:
+    colors = np.round(255 * surface.colors).astype(np.uint8)
+    return rr.Mesh3D(
+        vertex_positions=surface.vertices,
+        triangle_indices=surface.faces,
+        vertex_colors=colors,
+    )

@@ -6,19 +6,19 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core.errors import InputError, OutputError, shortened, shown
+from robotdiffuse.core.errors import InputError, OutputError, shown
 from robotdiffuse.core.input_files import input_file, read_yaml
 from robotdiffuse.core.output_files import write_error
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop.mcap_file import MAX_UNPACKED, check_chunks, make_reader
 from robotdiffuse.interop.plain_messages import joint_trajectory
-from robotdiffuse.interop.recorded_motion import RecordedMotion
-from robotdiffuse.interop.ros_messages import motion_from_messages
-from robotdiffuse.interop.ros_types import (
+from robotdiffuse.interop.recorded_motion import RecordedMotion, reading
+from robotdiffuse.interop.ros_messages import (
     DISPLAY_TRAJECTORY,
     JOINT_TRAJECTORY,
     choose_topic,
     display_trajectory,
+    motion_from_messages,
     to_message,
     typestore,
 )
@@ -74,30 +74,26 @@ def _replace(file: Path, new: Path, old: Path) -> None:
 
 
 def read(file: Path, topic: str | None = None) -> RecordedMotion:
-    """Read the motion on a topic; see `ros_types.choose_topic`."""
+    """Read the motion on a topic; see `choose_topic`."""
     if not (file / "metadata.yaml").is_file():
         raise InputError(f"{file} is not a ROS 2 bag: it has no metadata.yaml")
     for part in file.iterdir():
         if not part.is_dir():
             input_file(part, largest=sys.maxsize)
-    try:
+    with reading(file):
         _check_unpacking(file)
         with AnyReader([file], default_typestore=typestore()) as reader:
             topics = {connection.topic: connection.msgtype for connection in reader.connections}
             name = choose_topic(topics, topic, str(file))
-            connections = [connection for connection in reader.connections if connection.topic == name]
+            chosen = [connection for connection in reader.connections if connection.topic == name]
             messages = []
             size = 0
-            for connection, at, raw in reader.messages(connections):
+            for connection, at, raw in reader.messages(chosen):
                 size += len(raw)
                 if size > MAX_UNPACKED:
                     raise InputError(f"the messages of {name} take more than {MAX_UNPACKED:,} bytes")
                 messages.append((at, reader.deserialize(raw, connection.msgtype)))
             return motion_from_messages(topics[name], messages, f"{file}, {name}")
-    except InputError:
-        raise
-    except Exception as error:  # rosbags, SQLite and YAML raise many kinds of errors for a damaged bag
-        raise InputError(f"{file} is damaged: {shortened(str(error))}") from None
 
 
 def _check_unpacking(bag: Path) -> None:

@@ -32,16 +32,19 @@ def _import_pybullet() -> None:
 
 _import_pybullet()
 
-from robotdiffuse.simulation.camera import DepthCamera, DepthImage, point_cloud, render  # noqa: E402
-from robotdiffuse.simulation.recording import FilmSettings, write_gif, write_png  # noqa: E402
 from robotdiffuse.simulation.replay import Replay, ReplayContact, ReplaySettings, replay  # noqa: E402
 from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle  # noqa: E402
-from robotdiffuse.simulation.world import World  # noqa: E402
+from robotdiffuse.simulation.world import (  # noqa: E402
+    DepthCamera,
+    DepthImage,
+    World,
+    point_cloud,
+    render,
+)
 
 __all__ = [
     "DepthCamera",
     "DepthImage",
-    "FilmSettings",
     "OracleContact",
     "PyBulletOracle",
     "Replay",
@@ -51,6 +54,4 @@ __all__ = [
     "point_cloud",
     "render",
     "replay",
-    "write_gif",
-    "write_png",
 ]

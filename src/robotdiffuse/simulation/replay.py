@@ -19,17 +19,20 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
+from robotdiffuse.core.settings import Bound, Positive, Settings
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.simulation.world import DENSITY, World
+from robotdiffuse.simulation.world import World
 
 SOLVER_ITERATIONS = 500
 """Iterations of Bullet's constraint solver in a time step. With its default of 50, motors miss their targets
 by up to 0.6 mm at the tip, whatever the motion; with 500 by a few micrometres."""
-Gain = Annotated[float, Bound(above=0.0, most=1.0)]
+POSITION_GAIN, VELOCITY_GAIN = 0.3, 1.0
+"""Fractions of a position and a velocity error that a motor corrects in one time step."""
+REST_TIME = 0.25
+"""Time for which the motors hold the last configuration after the motion [s]."""
 
 
 @dataclass(frozen=True)
@@ -38,18 +41,10 @@ class ReplaySettings(Settings, name="replay"):
 
     time_step: Annotated[float, Bound(least=1e-5, most=1 / 240)] = 1 / 240
     """Time step of the simulation [s]; the default is PyBullet's own."""
-    position_gain: Gain = 0.3
-    """Fraction of a position error that a motor corrects in one time step, in (0, 1]."""
-    velocity_gain: Gain = 1.0
-    """Fraction of a velocity error that a motor corrects in one time step, in (0, 1]."""
     force: Positive = 500.0
     """Largest motor torque [N m], or force [N] for a prismatic joint."""
     gravity: Annotated[float, Bound()] = 9.81
     """Gravity along -z of the base [m/s^2]."""
-    density: Positive = DENSITY
-    """Density of all links [kg/m^3]."""
-    settle: NotNegative = 0.25
-    """Time for which the motors hold the last configuration after the motion [s]."""
 
 
 DEFAULT = ReplaySettings()
@@ -86,8 +81,6 @@ class Replay:
     """Distance of the robot's tip from its reference position [m]."""
     contacts: tuple[ReplayContact, ...]
     """Contacts in order of their first time."""
-    moving: tuple[MovingObstacle, ...] = ()
-    """The moving obstacles."""
 
     @property
     def free(self) -> bool:
@@ -112,7 +105,7 @@ def replay(
     settings: ReplaySettings = DEFAULT,
     moving: Sequence[MovingObstacle] = (),
 ) -> Replay:
-    """Simulate a trajectory, and then `settings.settle` seconds of rest.
+    """Simulate a trajectory, and then REST_TIME of rest.
 
     An obstacle that the arm hits blocks it; the simulation continues to the end. Moving obstacles move until
     the trajectory ends; those of unknown motion stand still. Raises InputError for a
@@ -123,13 +116,13 @@ def replay(
             f"the trajectory moves {', '.join(trajectory.joint_names)}; "
             f"{robot.name} plans {', '.join(robot.joint_names)}"
         )
-    count = int(np.ceil((trajectory.duration + settings.settle) / settings.time_step))
+    count = int(np.ceil((trajectory.duration + REST_TIME) / settings.time_step))
     times = settings.time_step * np.arange(count + 1)
     reference = trajectory.at(np.minimum(times, trajectory.duration)).positions
-    with World(robot, scene, density=settings.density, moving=moving) as world:
+    with World(robot, scene, moving=moving) as world:
         positions, contacts = _simulate(world, np.minimum(times, trajectory.duration), reference, settings)
         tip_errors = np.linalg.norm(_tips(world, positions) - _tips(world, reference), axis=1)
-    return Replay(robot.joint_names, times, positions, reference, tip_errors, contacts, tuple(moving))
+    return Replay(robot.joint_names, times, positions, reference, tip_errors, contacts)
 
 
 def _simulate(
@@ -138,44 +131,33 @@ def _simulate(
     reference: Float[ndarray, "n dof"],
     settings: ReplaySettings,
 ) -> tuple[Float[ndarray, "n dof"], tuple[ReplayContact, ...]]:
-    client, body, dof = world.client, world.body, len(world.joints)
-    pybullet.setPhysicsEngineParameter(
-        fixedTimeStep=settings.time_step, numSolverIterations=SOLVER_ITERATIONS, physicsClientId=client
-    )
-    pybullet.setGravity(0, 0, -settings.gravity, physicsClientId=client)
+    bullet, body, dof = world.bullet, world.body, len(world.joints)
+    bullet.setPhysicsEngineParameter(fixedTimeStep=settings.time_step, numSolverIterations=SOLVER_ITERATIONS)
+    bullet.setGravity(0, 0, -settings.gravity)
     world.place(reference[0])
     for index, value in world.held.items():
-        pybullet.setJointMotorControl2(
-            body,
-            index,
-            pybullet.POSITION_CONTROL,
-            targetPosition=value,
-            force=settings.force,
-            physicsClientId=client,
+        bullet.setJointMotorControl2(
+            body, index, pybullet.POSITION_CONTROL, targetPosition=value, force=settings.force
         )
-    gains = {
-        "forces": [settings.force] * dof,
-        "positionGains": [settings.position_gain] * dof,
-        "velocityGains": [settings.velocity_gain] * dof,
-        "physicsClientId": client,
-    }
     contacts: dict[tuple[str, str], ReplayContact] = {}
     velocities = np.diff(reference, axis=0) / settings.time_step
     positions = np.empty_like(reference)
     positions[0] = reference[0]
     for k in range(1, len(times)):
-        pybullet.setJointMotorControlArray(
+        bullet.setJointMotorControlArray(
             body,
             world.joints,
             pybullet.POSITION_CONTROL,
             # the position for now, and the velocity that leads to the next position
             targetPositions=reference[k - 1].tolist(),
             targetVelocities=velocities[k - 1].tolist(),
-            **gains,
+            forces=[settings.force] * dof,
+            positionGains=[POSITION_GAIN] * dof,
+            velocityGains=[VELOCITY_GAIN] * dof,
         )
         world.move(times[k - 1])
-        pybullet.stepSimulation(physicsClientId=client)
-        states = pybullet.getJointStates(body, world.joints, physicsClientId=client)
+        bullet.stepSimulation()
+        states = bullet.getJointStates(body, world.joints)
         positions[k] = [state[0] for state in states]
         # a step detects contacts at its beginning
         for link, other, distance in world.touching():
@@ -190,8 +172,5 @@ def _tips(world: World, positions: Float[ndarray, "n dof"]) -> Float[ndarray, "n
     tip, at = world.links[world.robot.tip], []
     for q in positions:
         world.place(q)
-        state = pybullet.getLinkState(
-            world.body, tip, computeForwardKinematics=1, physicsClientId=world.client
-        )
-        at.append(state[4])
+        at.append(world.bullet.getLinkState(world.body, tip, computeForwardKinematics=1)[4])
     return np.array(at)

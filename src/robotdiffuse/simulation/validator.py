@@ -8,7 +8,6 @@ which is subtracted here; the remaining difference to exact distances is below 1
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pybullet
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -68,9 +67,8 @@ class PyBulletOracle:
         best: OracleContact | None = None
         for link in world.moving:
             for name, body in world.obstacles.items():
-                if world.scene.may_touch(link, name):
-                    continue
-                best = self._closer(best, within, link, name, body, -1)
+                if not world.scene.may_touch(link, name):
+                    best = self._closer(best, within, link, name, body, -1)
         for a, b in world.pairs:
             best = self._closer(best, within, a, b, world.body, world.links[b])
         return best
@@ -94,15 +92,14 @@ class PyBulletOracle:
         if tolerance < 0:
             raise InputError(f"tolerance is {tolerance}; it must not be negative")
         world = self._world
-        body, joints, client = world.body, world.joints, world.client
-        for i, row in enumerate(np.asarray(q, np.float64)[:, :, None].tolist()):
-            pybullet.resetJointStatesMultiDof(body, joints, row, physicsClientId=client)
-            pybullet.performCollisionDetection(physicsClientId=client)
-            points = pybullet.getContactPoints(body, physicsClientId=client)
+        for i, row in enumerate(q):
+            world.place(row)
+            world.bullet.performCollisionDetection()
+            points = world.bullet.getContactPoints(world.body)
             if points and min(map(world.gap, points)) <= -tolerance:
-                found = self.nearest(q[i], -tolerance)
-                if found is not None:
-                    return replace(found, at=float(i))
+                contact = self.nearest(row, -tolerance)
+                if contact is not None:
+                    return replace(contact, at=float(i))
         return None
 
     def check_path(self, path: Path, step: float = 0.01, tolerance: float = 0.001) -> OracleContact | None:
@@ -119,16 +116,14 @@ class PyBulletOracle:
         first = np.minimum(places.astype(np.int64), max(len(q) - 2, 0))
         last = np.minimum(first + 1, len(q) - 1)
         frames = q[first] + (places - first)[:, None] * (q[last] - q[first])
-        found = self.check_frames(frames, tolerance)
-        return None if found is None else replace(found, at=float(places[int(found.at)]))
+        contact = self.check_frames(frames, tolerance)
+        return None if contact is None else replace(contact, at=float(places[int(contact.at)]))
 
     def _closer(
         self, best: OracleContact | None, within: float, link: str, other: str, body: int, index: int
     ) -> OracleContact | None:
         world = self._world
         nearest = within if best is None else best.distance
-        points = pybullet.getClosestPoints(
-            world.body, body, max(nearest, 0.0), world.links[link], index, physicsClientId=world.client
-        )
+        points = world.bullet.getClosestPoints(world.body, body, max(nearest, 0.0), world.links[link], index)
         distance = min(map(world.gap, points), default=np.inf)
         return OracleContact(link, other, float(distance)) if distance <= nearest else best

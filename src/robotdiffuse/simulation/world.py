@@ -1,20 +1,29 @@
-"""World: a robot and obstacles in a PyBullet simulation without a window."""
+"""A robot and obstacles in a PyBullet simulation without a window, and depth cameras that see them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+from xml.etree import ElementTree as Xml
 
 import numpy as np
 import pybullet
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.core.bounds import vector
+from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
+from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, rpy_from_rotation
+from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.scenes.mesh import Mesh, Triangulated
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
+from robotdiffuse.scenes.point_cloud import voxel_thin
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, PointCloud, Shape, Sphere
-from robotdiffuse.simulation.model import write_obj, write_points_urdf, write_shaded, write_urdf
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
 COLLISION_MARGIN = 0.001
 """Margin that Bullet adds around each convex mesh [m]; Bullet's call to change it has no effect."""
@@ -23,10 +32,23 @@ DENSITY = 1000.0
 has 18."""
 OTHER, LINK, OTHER_LINK, DISTANCE, FORCE = 2, 3, 4, 8, 9
 """Columns of PyBullet's contact points: second body, link of each body, distance, normal force."""
-OBSTACLE_COLORS = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
-FURNITURE_COLOR = (0xCD, 0xC0, 0xAC)
-FURNITURE_SIZE = 0.7
-"""Obstacles with a longer side than this count as furniture, with its own colour [m]."""
+MIN_MASS, MIN_INERTIA = 0.01, 1e-4
+"""Smallest mass and inertia of a link [kg], [kg m^2]; PyBullet cannot move a link without mass."""
+SAMPLE_OFFSET = (0.0, 1.0)
+"""Position within a pixel, in columns and rows from its upper left corner, that PyBullet's renderer samples.
+
+Measured by rendering a sphere: its points then lie on it within 0.1 mm; half a pixel off, within 2 mm.
+"""
+
+
+class _Simulation:
+    """PyBullet's functions for a simulation of its own."""
+
+    def __init__(self) -> None:
+        self._client = pybullet.connect(pybullet.DIRECT)
+
+    def __getattr__(self, name: str) -> Any:
+        return partial(getattr(pybullet, name), physicsClientId=self._client)
 
 
 class World:
@@ -41,37 +63,34 @@ class World:
         robot: Robot,
         scene: Scene,
         visuals: bool = False,
-        density: float = DENSITY,
         moving: Sequence[MovingObstacle] = (),
     ) -> None:
-        """visuals: add coloured surfaces for cameras and pictures, which takes longer to load. density: of
-        all links [kg/m^3]. moving: further obstacles, where they are at time 0 until `move`."""
+        """visuals: add coloured surfaces for cameras, which takes longer to load. moving: further
+        obstacles, where they are at time 0 until `move`."""
         self.robot = robot
         self.visuals = visuals
-        self._moving = tuple(moving)
-        scene = scene.with_shapes([*scene.shapes, *(one.shape for one in moving)]) if moving else scene
-        self.client = pybullet.connect(pybullet.DIRECT)
+        self.bullet = _Simulation()
+        """PyBullet's functions for this simulation."""
         self._folder = TemporaryDirectory()
         try:
-            self._load(scene, density)
+            self._load()
+            self.set_scene(scene, moving)
         except BaseException:
             self.close()
             raise
 
-    def _load(self, scene: Scene, density: float) -> None:
-        robot = self.robot
+    def _load(self) -> None:
+        robot, bullet = self.robot, self.bullet
         # otherwise Bullet takes a file of the same name for the same mesh
-        pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self.client)
+        bullet.setPhysicsEngineParameter(enableFileCaching=0)
         flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
-        urdf = write_urdf(robot, Path(self._folder.name), density, self.visuals)
-        self.body: int = pybullet.loadURDF(
-            str(urdf), useFixedBase=True, flags=flags, physicsClientId=self.client
-        )
+        urdf = write_urdf(robot, Path(self._folder.name), self.visuals)
+        self.body: int = bullet.loadURDF(str(urdf), useFixedBase=True, flags=flags)
         self.links: dict[str, int] = {robot.base: -1}
         """PyBullet's index of each link, which is also that of the joint above it."""
         indices: dict[str, int] = {}
-        for index in range(pybullet.getNumJoints(self.body, physicsClientId=self.client)):
-            info = pybullet.getJointInfo(self.body, index, physicsClientId=self.client)
+        for index in range(bullet.getNumJoints(self.body)):
+            info = bullet.getJointInfo(self.body, index)
             indices[info[1].decode()] = index
             self.links[info[12].decode()] = index
         self.joints: list[int] = [indices[name] for name in robot.joint_names]
@@ -84,24 +103,22 @@ class World:
         solid = [link for link in robot.link_names if robot.meshes.get(link)]
         self.moving: list[str] = [link for link in solid if robot.link_frame(link) > 0]
         """Links with geometry that a planned joint moves."""
-        self.pairs: list[tuple[str, str]] = [
-            (a, b)
-            for i, a in enumerate(solid)
-            for b in solid[i + 1 :]
-            if robot.link_frame(a) != robot.link_frame(b)
-            and frozenset((a, b)) not in robot.allowed_collisions
-        ]
+        self.pairs: list[tuple[str, str]] = []
         """Pairs of links that are checked against each other."""
-        self._filter_links(solid)
+        for i, a in enumerate(solid):
+            for b in solid[i + 1 :]:
+                apart = robot.link_frame(a) != robot.link_frame(b)
+                if apart and frozenset((a, b)) not in robot.allowed_collisions:
+                    self.pairs.append((a, b))
+                else:
+                    bullet.setCollisionFilterPair(self.body, self.body, self.links[a], self.links[b], 0)
         for index, value in self.held.items():
-            pybullet.resetJointState(self.body, index, value, physicsClientId=self.client)
-        self.scene = scene
+            bullet.resetJointState(self.body, index, value)
         self.obstacles: dict[str, int] = {}
         """PyBullet's body index of each obstacle, by name."""
         self.mesh_shapes: dict[tuple[bytes, bytes], int] = {}
         """PyBullet's collision shape of each mesh; reused because PyBullet never frees the memory of a
         mesh."""
-        self.set_scene(scene)
 
     def __enter__(self) -> "World":
         return self
@@ -111,36 +128,31 @@ class World:
 
     def close(self) -> None:
         """Close the simulation and delete its files."""
-        if pybullet.isConnected(self.client):
-            pybullet.disconnect(self.client)
+        if self.bullet.isConnected():
+            self.bullet.disconnect()
             self._folder.cleanup()
 
-    def set_scene(self, scene: Scene) -> None:
+    def set_scene(self, scene: Scene, moving: Sequence[MovingObstacle] = ()) -> None:
         """Replace all obstacles; the robot stays loaded."""
         for body in self.obstacles.values():
-            pybullet.removeBody(body, physicsClientId=self.client)
-        self.scene, self.obstacles = scene, {}
-        unmoved = [index for link, index in self.links.items() if self.robot.link_frame(link) == 0]
-        for i, shape in enumerate(scene.shapes):
-            body = self._add(shape, OBSTACLE_COLORS[i % len(OBSTACLE_COLORS)])
-            self.obstacles[shape.name] = body
-            allowed = [index for link, index in self.links.items() if scene.may_touch(link, shape.name)]
-            for index in {*unmoved, *allowed}:
-                pybullet.setCollisionFilterPair(self.body, body, index, -1, 0, physicsClientId=self.client)
+            self.bullet.removeBody(body)
+        self.scene = scene
+        drawn = drawables(scene, moving)
+        self._moving = [one for one in drawn if one.moving is not None]
+        self.obstacles = {one.name: self._add(one) for one in drawn}
+        for link, index in self.links.items():
+            for name, body in self.obstacles.items():
+                if self.robot.link_frame(link) == 0 or scene.may_touch(link, name):
+                    self.bullet.setCollisionFilterPair(self.body, body, index, -1, 0)
 
     def place(self, q: Float[ndarray, "dof"]) -> None:
         """Place the arm in a configuration, at rest."""
-        pybullet.resetJointStatesMultiDof(
-            self.body, self.joints, q[:, None].tolist(), physicsClientId=self.client
-        )
+        self.bullet.resetJointStatesMultiDof(self.body, self.joints, q[:, None].tolist())
 
     def move(self, time: float) -> None:
         """Place the moving obstacles where they are at a time [s]; one of unknown motion stays."""
         for one in self._moving:
-            xyz, wxyz = _pose(one.at(time))
-            pybullet.resetBasePositionAndOrientation(
-                self.obstacles[one.name], xyz.tolist(), [*wxyz[1:], wxyz[0]], physicsClientId=self.client
-            )
+            self.bullet.resetBasePositionAndOrientation(self.obstacles[one.name], *_pose(one.frame(time)))
 
     def touching(self) -> list[tuple[str, str, float]]:
         """Contacts of the last step: link, obstacle or other link, signed distance [m]."""
@@ -152,131 +164,315 @@ class World:
                 links[point[OTHER_LINK]] if point[OTHER] == self.body else obstacles[point[OTHER]],
                 self.gap(point),
             )
-            for point in pybullet.getContactPoints(self.body, physicsClientId=self.client)
+            for point in self.bullet.getContactPoints(self.body)
             if point[FORCE] > 0 or self.gap(point) < 0
         ]
 
     def gap(self, point: tuple) -> float:
         """Signed distance [m] of a PyBullet contact point, corrected for the margins of meshes."""
-        return float(
-            point[DISTANCE] + (2 * COLLISION_MARGIN if point[OTHER] == self.body else COLLISION_MARGIN)
-        )
+        margins = 2 if point[OTHER] == self.body else 1
+        return float(point[DISTANCE] + margins * COLLISION_MARGIN)
 
-    def _filter_links(self, solid: list[str]) -> None:
-        checked = {frozenset(pair) for pair in self.pairs}
-        for i, a in enumerate(solid):
-            for b in solid[i + 1 :]:
-                if frozenset((a, b)) not in checked:
-                    indices = self.links[a], self.links[b]
-                    pybullet.setCollisionFilterPair(
-                        self.body, self.body, *indices, 0, physicsClientId=self.client
-                    )
-
-    def _add(self, shape: Shape, color: tuple[int, int, int]) -> int:
+    def _add(self, drawn: Drawable) -> int:
+        """PyBullet's body of an obstacle."""
+        shape, folder, bullet = drawn.shape, Path(self._folder.name), self.bullet
         if isinstance(shape, PointCloud):
-            return self._add_points(shape, color)
-        what: dict[str, object] = {}
-        if isinstance(shape, Sphere):
-            what = {"shapeType": pybullet.GEOM_SPHERE, "radius": shape.radius}
-        elif isinstance(shape, Box):
-            what = {"shapeType": pybullet.GEOM_BOX, "halfExtents": (shape.size / 2).tolist()}
-        elif isinstance(shape, Cylinder | Capsule):
-            kind = pybullet.GEOM_CYLINDER if isinstance(shape, Cylinder) else pybullet.GEOM_CAPSULE
-            what = {"shapeType": kind, "radius": shape.radius, "height": shape.height}
-        xyz, wxyz = _pose(shape)
+            # loaded from a URDF because PyBullet otherwise allows only 16 spheres
+            urdf = write_points_urdf(shape, drawn.surface if self.visuals else None, folder)
+            return bullet.loadURDF(str(urdf), useFixedBase=True)
+        match shape:
+            case Sphere():
+                solid = bullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=shape.radius)
+            case Box():
+                half = (shape.size / 2).tolist()
+                solid = bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
+            case Cylinder() | Capsule():
+                kind = pybullet.GEOM_CYLINDER if isinstance(shape, Cylinder) else pybullet.GEOM_CAPSULE
+                solid = bullet.createCollisionShape(kind, radius=shape.radius, height=shape.height)
+            case _:
+                assert isinstance(shape, Triangulated)
+                solid = self._mesh(shape.mesh)
         visual = -1
         if self.visuals:
-            # PyBullet's own spheres and cylinders are too coarse
-            vertices, faces = _surface(shape)
-            large = np.ptp(vertices, axis=0).max() > FURNITURE_SIZE
-            visual = self._add_visual(vertices, faces, FURNITURE_COLOR if large else color)
-        solid = (
-            self._mesh(shape.mesh)
-            if isinstance(shape, Triangulated)
-            else pybullet.createCollisionShape(**what, physicsClientId=self.client)
-        )
-        return pybullet.createMultiBody(
-            baseCollisionShapeIndex=solid,
-            baseVisualShapeIndex=visual,
-            basePosition=xyz.tolist(),
-            baseOrientation=[*wxyz[1:], wxyz[0]],
-            physicsClientId=self.client,
-        )
+            file = folder / "visual.obj"  # PyBullet reads it when a body is created
+            write_obj(file, drawn.surface.moved(inverse(drawn.frame())))
+            color = [*(channel / 255 for channel in drawn.color), 1.0]
+            visual = bullet.createVisualShape(pybullet.GEOM_MESH, fileName=str(file), rgbaColor=color)
+        xyz, xyzw = _pose(drawn.frame())
+        return bullet.createMultiBody(0.0, solid, visual, basePosition=xyz, baseOrientation=xyzw)
 
     def _mesh(self, mesh: Mesh) -> int:
         """PyBullet's collision shape of a mesh, which may be hollow, at the origin."""
         key = mesh.vertices.tobytes(), mesh.faces.tobytes()
         if key not in self.mesh_shapes:
             file = Path(self._folder.name) / "obstacle.obj"
-            write_obj(file, mesh.vertices, mesh.faces)
-            self.mesh_shapes[key] = pybullet.createCollisionShape(
-                pybullet.GEOM_MESH,
-                fileName=str(file),
-                flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
-                physicsClientId=self.client,
+            write_obj(file, mesh)
+            self.mesh_shapes[key] = self.bullet.createCollisionShape(
+                pybullet.GEOM_MESH, fileName=str(file), flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH
             )
         return self.mesh_shapes[key]
 
-    def _add_points(self, cloud: PointCloud, color: tuple[int, int, int]) -> int:
-        """One body with a sphere for each point, loaded from a URDF because PyBullet otherwise allows only
-        16."""
-        file = write_points_urdf(
-            cloud.points, cloud.point_radius, color if self.visuals else None, Path(self._folder.name)
-        )
-        return pybullet.loadURDF(str(file), useFixedBase=True, physicsClientId=self.client)
 
-    def add_surface(
-        self,
-        vertices: Float[ndarray, "v 3"],
-        faces: Int[ndarray, "f 3"],
-        color: tuple[int, int, int],
-        xyz: Float[ndarray, "3"],
-    ) -> None:
-        """Add a surface without collision, which stays until the world is closed; `color` in sRGB, 0 to
-        255."""
-        visual = self._add_visual(vertices, faces, color)
-        pybullet.createMultiBody(
-            baseVisualShapeIndex=visual, basePosition=xyz.tolist(), physicsClientId=self.client
-        )
-
-    def _add_visual(
-        self, vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"], color: tuple[int, int, int]
-    ) -> int:
-        file = Path(self._folder.name) / "visual.obj"  # PyBullet reads it when a body is created
-        write_shaded(file, vertices, faces)
-        return pybullet.createVisualShape(
-            pybullet.GEOM_MESH,
-            fileName=str(file),
-            rgbaColor=[*(channel / 255 for channel in color), 1.0],
-            physicsClientId=self.client,
-        )
+def _pose(T: Float[ndarray, "4 4"]) -> tuple[list[float], list[float]]:
+    """Position and quaternion xyzw."""
+    w, *xyz = quaternion_from_rotation(T[:3, :3]).tolist()
+    return T[:3, 3].tolist(), [*xyz, w]
 
 
-def _pose(shape: Shape) -> tuple[Float[ndarray, "3"], Float[ndarray, "4"]]:
-    """Position and quaternion of the body of a shape that is no point cloud."""
-    if isinstance(shape, Triangulated):
-        return shape.mesh.xyz, shape.mesh.wxyz
-    if isinstance(shape, Sphere):
-        return shape.center, np.array(IDENTITY)
-    assert isinstance(shape, Box | Cylinder | Capsule)
-    return shape.center, shape.wxyz
+def write_urdf(robot: Robot, folder: Path, visuals: bool) -> Path:
+    """Write the robot as a URDF with its convex meshes and masses by DENSITY; returns the file in `folder`.
+
+    With `visuals`, links also get the surfaces that are drawn elsewhere. Joints that planning does not move
+    keep their kind but lose their limits, because published problems open grippers wider than their URDF
+    allows.
+    """
+    root = Xml.Element("robot", name="robot")
+    surfaces = link_surfaces(robot) if visuals else {}
+    for link in robot.link_names:
+        element = Xml.SubElement(root, "link", name=link)
+        meshes = robot.meshes.get(link, ())
+        _add_inertia(element, meshes)
+        for i, mesh in enumerate(meshes):
+            file = folder / f"{link}_{i}.obj"
+            write_obj(file, mesh)
+            _add_mesh(element, "collision", file)
+        if link in surfaces:
+            _add_visual(element, surfaces[link], folder / link)
+    for joint in robot.joints:
+        _add_joint(root, joint, joint.name in robot.joint_names)
+    return _write_tree(root, folder / "robot.urdf")
 
 
-def _surface(shape: Shape) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
-    """Vertices and faces in the shape's own frame, accurate to 0.2 mm for a round shape of radius 0.25 m."""
+def write_points_urdf(cloud: PointCloud, surface: Surface | None, folder: Path) -> Path:
+    """Write one link with a sphere for each point, and the surface for cameras if it is given. Returns the
+    file."""
+    root = Xml.Element("robot", name="points")
+    element = Xml.SubElement(root, "link", name="points")
+    _add_inertia(element, ())
+    for point in cloud.points:
+        collision = Xml.SubElement(element, "collision")
+        Xml.SubElement(collision, "origin", xyz=_numbers(point))
+        Xml.SubElement(Xml.SubElement(collision, "geometry"), "sphere", radius=_numbers([cloud.point_radius]))
+    if surface is not None:
+        _add_visual(element, surface, folder / "points")
+    return _write_tree(root, folder / "points.urdf")
+
+
+def write_obj(file: Path, mesh: Surface | ConvexMesh | Mesh) -> None:
+    """Write triangles as a Wavefront file; the normals of a surface shade it smoothly."""
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
+    corner = "{0}"
+    if isinstance(mesh, Surface):
+        lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.normals.tolist()]
+        corner = "{0}//{0}"
+    corners = [corner.format(i) for i in range(1, len(mesh.vertices) + 1)]
+    lines += [f"f {corners[a]} {corners[b]} {corners[c]}" for a, b, c in mesh.faces.tolist()]
+    file.write_text("\n".join(lines) + "\n")
+
+
+def mass_properties(
+    meshes: tuple[ConvexMesh, ...], density: float
+) -> tuple[float, Float[ndarray, "3"], Float[ndarray, "3 3"]]:
+    """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of solids in the link frame.
+
+    Overlapping solids count twice where they overlap.
+    """
     import trimesh
 
-    match shape:
-        case Sphere():
-            solid = trimesh.creation.icosphere(subdivisions=5, radius=shape.radius)
-        case Box():
-            solid = trimesh.creation.box(shape.size)
-        case Cylinder():
-            solid = trimesh.creation.cylinder(shape.radius, shape.height, sections=96)
-        case Capsule():
-            solid = trimesh.creation.capsule(shape.height, shape.radius, count=(64, 64))
-            solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
-        case _:
-            assert isinstance(shape, Triangulated)
-            return shape.mesh.vertices, shape.mesh.faces
-    return np.array(solid.vertices, np.float64), np.array(solid.faces, np.int64)
+    parts = []
+    for mesh in meshes:
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).mass_properties
+        sign = np.sign(solid.volume)  # negative if the faces point inwards
+        parts.append((sign * density * solid.volume, solid.center_mass, sign * density * solid.inertia))
+    total = float(sum(mass for mass, _, _ in parts))
+    if total < MIN_MASS:
+        return MIN_MASS, np.zeros(3), MIN_INERTIA * np.eye(3)
+    center = sum((mass * at for mass, at, _ in parts), np.zeros(3)) / total
+    inertia = MIN_INERTIA * np.eye(3)
+    for mass, at, own in parts:
+        arm = at - center
+        inertia = inertia + own + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return total, center, inertia
+
+
+def _add_inertia(element: Xml.Element, meshes: tuple[ConvexMesh, ...]) -> None:
+    mass, center, inertia = mass_properties(meshes, DENSITY)
+    inertial = Xml.SubElement(element, "inertial")
+    Xml.SubElement(inertial, "origin", xyz=_numbers(center))
+    Xml.SubElement(inertial, "mass", value=_numbers([mass]))
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    entries = zip(names, inertia[np.triu_indices(3)], strict=True)
+    Xml.SubElement(inertial, "inertia", {name: _numbers([value]) for name, value in entries})
+
+
+def _add_mesh(element: Xml.Element, use: str, file: Path) -> Xml.Element:
+    parent = Xml.SubElement(element, use)
+    Xml.SubElement(Xml.SubElement(parent, "geometry"), "mesh", filename=str(file))
+    return parent
+
+
+def _add_visual(element: Xml.Element, surface: Surface, stem: Path) -> None:
+    """Add one visual for each colour, because PyBullet's renderer has no face colours."""
+    for i, (rgb, part) in enumerate(surface.by_color):
+        file = stem.with_name(f"{stem.name}_visual_{i}.obj")
+        write_obj(file, part)
+        name = "color_{}_{}_{}".format(*rgb)
+        material = Xml.SubElement(_add_mesh(element, "visual", file), "material", name=name)
+        Xml.SubElement(material, "color", rgba=_numbers([*(channel / 255 for channel in rgb), 1.0]))
+
+
+def _write_tree(root: Xml.Element, file: Path) -> Path:
+    Xml.indent(root)  # PyBullet misreads lines of more than 8 kB
+    Xml.ElementTree(root).write(file)
+    return file
+
+
+def _add_joint(root: Xml.Element, joint: Joint, planned: bool) -> None:
+    element = Xml.SubElement(root, "joint", name=joint.name, type=joint.kind)
+    Xml.SubElement(element, "parent", link=joint.parent)
+    Xml.SubElement(element, "child", link=joint.child)
+    T = joint.T_parent_joint
+    Xml.SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(rpy_from_rotation(T[:3, :3])))
+    if joint.kind in MOVING_KINDS:
+        Xml.SubElement(element, "axis", xyz=_numbers(joint.axis))
+        # in Bullet, a lower limit above the upper one means no limits
+        lower, upper = (joint.lower, joint.upper) if planned else (1.0, -1.0)
+        limits = {"lower": lower, "upper": upper, "velocity": 1.0, "effort": 1.0}
+        Xml.SubElement(element, "limit", {key: _numbers([value]) for key, value in limits.items()})
+
+
+def _numbers(values: object) -> str:
+    return " ".join(f"{value:.17g}" for value in np.asarray(values, float))
+
+
+@dataclass(frozen=True)
+class DepthCamera(Settings, name="camera"):
+    """A pinhole camera with the noise of a depth sensor, in the base frame of the robot."""
+
+    position: tuple[float, ...]
+    """x y z [m]"""
+    target: tuple[float, ...]
+    """The point at the centre of the image [m]."""
+    up: tuple[float, ...] = (0.0, 0.0, 1.0)
+    """Upward direction in the image; not along the line of sight."""
+    width: Annotated[int, Bound(least=1.0, most=4096.0)] = 320
+    """[pixels]"""
+    height: Annotated[int, Bound(least=1.0, most=4096.0)] = 240
+    """[pixels]"""
+    field_of_view: Annotated[float, Bound(above=0.0, below=np.pi)] = 0.96
+    """Vertical angle [rad]; the default is about that of common stereo depth cameras."""
+    near: Positive = 0.1
+    """Near clipping distance [m]."""
+    far: Positive = 4.0
+    """Far clipping distance [m]."""
+    noise: NotNegative = 0.0
+    """Standard deviation of the distance along the ray [m]."""
+    dropout: Annotated[float, Bound(least=0.0, below=1.0)] = 0.0
+    """Fraction of pixels without a measurement."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        position, target, up = (
+            vector("camera", name, getattr(self, name), 3) for name in ("position", "target", "up")
+        )
+        sight = target - position
+        if np.linalg.norm(np.cross(sight, up)) <= 1e-6 * np.linalg.norm(sight):
+            raise InputError(
+                f"camera.up is {self.up}; it must not lie along the line of sight {tuple(sight)}"
+            )
+        if self.near >= self.far:
+            raise InputError(f"camera.near is {self.near} and far {self.far}; it must be 0 < near < far")
+
+    @property
+    def rotation(self) -> Float[ndarray, "3 3"]:
+        """Unit vectors to the right, upwards and forwards in the base frame, as columns."""
+        forward = np.subtract(self.target, self.position)
+        forward = forward / np.linalg.norm(forward)
+        right = np.cross(forward, self.up)
+        right = right / np.linalg.norm(right)
+        return np.stack([right, np.cross(right, forward), forward], axis=1)
+
+    def rays(self) -> Float[ndarray, "height width 3"]:
+        """Vectors from the camera through each pixel, in the base frame, 1 m long along the optical axis."""
+        slope = np.tan(self.field_of_view / 2)
+        wide = slope * self.width / self.height
+        x = (2 * (np.arange(self.width) + SAMPLE_OFFSET[0]) / self.width - 1) * wide
+        y = (1 - 2 * (np.arange(self.height) + SAMPLE_OFFSET[1]) / self.height) * slope
+        return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=-1) @ self.rotation.T
+
+
+def _capture(
+    world: World, camera: DepthCamera
+) -> tuple[Float[ndarray, "height width"], Int[ndarray, "height width"]]:
+    """Depth along the optical axis [m], infinite where nothing is visible, and PyBullet's body at each pixel,
+    -1 where there is none; by PyBullet's software renderer, without noise.
+
+    Raises InputError for a world that was made without visuals.
+    """
+    if not world.visuals:
+        raise InputError("this world has no visuals for cameras; create it with World(..., visuals=True)")
+    view = pybullet.computeViewMatrix(camera.position, camera.target, camera.up)
+    near, far = camera.near, camera.far
+    projection = pybullet.computeProjectionMatrixFOV(
+        np.degrees(camera.field_of_view), camera.width / camera.height, near, far
+    )
+    *_, buffer, bodies = world.bullet.getCameraImage(
+        camera.width, camera.height, view, projection, shadow=0, renderer=pybullet.ER_TINY_RENDERER
+    )
+    shape = (camera.height, camera.width)
+    bodies = np.asarray(bodies, np.int64).reshape(shape)
+    buffer = np.asarray(buffer, np.float64).reshape(shape)
+    return np.where(bodies >= 0, far * near / (far - (far - near) * buffer), np.inf), bodies
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """A depth image without noise."""
+
+    depth: Float[ndarray, "height width"]
+    """Along the optical axis [m]; infinite where nothing is visible."""
+    labels: Int[ndarray, "height width"]
+    """Index into `names`; -1 where nothing is visible."""
+    names: tuple[str, ...]
+    """Name of the robot, then of the obstacles."""
+
+
+def render(world: World, camera: DepthCamera) -> DepthImage:
+    """The depth image and the label of each pixel. The world must have visuals."""
+    depth, bodies = _capture(world, camera)
+    labels = np.full(bodies.shape, -1)
+    for label, body in enumerate((world.body, *world.obstacles.values())):
+        labels[bodies == body] = label
+    return DepthImage(depth, labels, (world.robot.name, *world.obstacles))
+
+
+def point_cloud(
+    world: World,
+    cameras: Sequence[DepthCamera],
+    rng: np.random.Generator,
+    voxel: float = 0.01,
+    point_radius: float = 0.01,
+    without: Sequence[str] = (),
+) -> PointCloud:
+    """A point cloud of the obstacles as the cameras see them, in the base frame, to plan with.
+
+    The arm stays in its last configuration. Its pixels and those of the obstacles in `without` (such as the
+    floor) are removed, but they still hide what is behind them. Each ray gets the noise and dropout of its
+    camera; then one point is kept per voxel of edge length `voxel` [m]. `point_radius` [m] becomes that of
+    the cloud.
+
+    The world must have visuals. Raises InputError for a name in `without` that is not an obstacle.
+    """
+    for name in without:
+        if name not in world.obstacles:
+            raise unknown_name("obstacle in without:", name, world.obstacles)
+    kept = [body for name, body in world.obstacles.items() if name not in without]
+    clouds = [np.zeros((0, 3))]
+    for camera in cameras:
+        depth, bodies = _capture(world, camera)
+        seen = np.isin(bodies, kept) & (rng.random(bodies.shape) >= camera.dropout)
+        rays = camera.rays()[seen]
+        lengths = np.linalg.norm(rays, axis=1)
+        distances = depth[seen] * lengths + camera.noise * rng.standard_normal(len(rays))
+        clouds.append(np.array(camera.position) + rays * (distances / lengths)[:, None])
+    return PointCloud(voxel_thin(np.concatenate(clouds), voxel), point_radius)

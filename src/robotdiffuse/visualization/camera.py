@@ -1,25 +1,22 @@
 """Camera placement: the view that shows most of the arm and its trace, framed tightly."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial import ConvexHull
 
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.visualization import style
+from robotdiffuse.drawables import Drawable, Surface, join
+from robotdiffuse.visualization.arm import TRACE_POINTS, DrawnArm, dense
 from robotdiffuse.visualization.rasterizer import draw
-from robotdiffuse.visualization.style import Surface
 
 AZIMUTHS = 18
 ELEVATIONS = np.radians((15.0, 25.0))
 """Candidate views: number of azimuths, and elevations [rad]."""
 VERTICAL_FIELD = np.radians(28)
 """Vertical field of view [rad]."""
-TRACE_POINTS = 120
-"""Number of configurations along a motion that views are scored with."""
 MAX_FRAMING_DISTANCE = 1.3
 """Obstacles are framed up to this distance from the middle of the arm [m]."""
 
@@ -60,6 +57,17 @@ class Camera:
         return self.rotation.T @ pixel
 
 
+def drawn_by(
+    camera: Camera, surface: Surface
+) -> tuple[Float[ndarray, "h w"], Int[ndarray, "h w"], Float[ndarray, "v 3"]]:
+    """Nearness and face at each pixel, and the vertices on the screen; see `rasterizer.draw`."""
+    near = np.zeros((camera.height, camera.width), np.float32)
+    ident = np.zeros(near.shape, np.int32)
+    screen = camera.project(surface.vertices)
+    draw(near, ident, screen, surface.faces)
+    return near, ident, screen
+
+
 def _direction(azimuth: float, elevation: float) -> Float[ndarray, "3"]:
     c = np.cos(elevation)
     return np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
@@ -68,30 +76,27 @@ def _direction(azimuth: float, elevation: float) -> Float[ndarray, "3"]:
 def framed(
     points: Float[ndarray, "n 3"],
     toward: Float[ndarray, "3"],
-    width: int,
-    height: int,
+    size: tuple[int, int],
     free: tuple[float, float],
 ) -> Camera:
     """A camera in the direction `toward`, as close as all points fit.
 
-    free: fractions of the height to leave free above and below.
+    size: width and height [pixels]. free: fractions of the height to leave free above and below.
     """
     target = 0.5 * (points.min(0) + points.max(0))
     distance = 1.0
     tangent = np.tan(VERTICAL_FIELD / 2)
-    top, bottom, side = (
-        -(1 - 2 * free[0]) * tangent,
-        (1 - 2 * free[1]) * tangent,
-        0.93 * tangent * width / height,
-    )
+    top = -(1 - 2 * free[0]) * tangent
+    bottom = (1 - 2 * free[1]) * tangent
+    side = 0.93 * tangent * size[0] / size[1]
     for _ in range(4):
-        rotation = Camera(target + toward, target, width, height).rotation
+        rotation = Camera(target + toward, target, *size).rotation
         x, y, z = ((points - target) @ rotation.T).T
         distance = max((np.abs(x) / side - z).max(), (y / bottom - z).max(), (y / top - z).max(), 0.3)
         u, v = x / (z + distance), y / (z + distance)
         off = 0.5 * np.array([u.min() + u.max(), v.min() + v.max() - top - bottom])
         target = target + distance * rotation[:2].T @ off
-    return Camera(target + distance * toward, target, width, height)
+    return Camera(target + distance * toward, target, *size)
 
 
 def best_view(
@@ -99,8 +104,7 @@ def best_view(
     ghosts: Surface,
     trace: Float[ndarray, "n 3"],
     obstacles: Surface,
-    width: int,
-    height: int,
+    size: tuple[int, int],
     free: tuple[float, float],
     azimuth: float | None = None,
 ) -> Camera:
@@ -113,50 +117,40 @@ def best_view(
     near = np.linalg.norm(obstacles.vertices - middle, axis=1) < MAX_FRAMING_DISTANCE
     points = np.concatenate([moving, obstacles.vertices[near]])
     points = points[ConvexHull(points, qhull_options="QJ").vertices]
-    small = (160, max(1, 160 * height // width))
+    small = (160, max(1, 160 * size[1] // size[0]))
     best, best_score = _direction(0.0, ELEVATIONS[0]), -1.0
     around = np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS) if azimuth is None else np.array([azimuth])
     for elevation in ELEVATIONS:
         for angle in around:
-            camera = framed(points, _direction(angle, elevation), *small, free)
+            camera = framed(points, _direction(angle, elevation), small, free)
             score = _score(camera, arm, ghosts, trace, obstacles)
             if score > best_score:
                 best, best_score = _direction(angle, elevation), score
-    return framed(points, best, width, height, free)
+    return framed(points, best, size, free)
 
 
 def view_of_motion(
-    robot: Robot,
-    scene: Scene,
-    surfaces: list[Surface],
-    tool: tuple[int, Float[ndarray, "3"]],
+    arm: DrawnArm,
+    obstacles: Sequence[Drawable],
     q: Float[ndarray, "n dof"],
-    width: int,
-    height: int,
+    size: tuple[int, int],
     free: tuple[float, float],
 ) -> Camera:
-    """The best view of a motion among obstacles; `surfaces` and `tool` as from module `style`."""
-    q = style.dense(q, TRACE_POINTS)
-    poses = style.frames(robot, q)
-    colored = zip(scene.shapes, style.obstacle_colors(scene), strict=True)
-    obstacles = style.join([style.shape_surface(shape, color) for shape, color in colored])
-    ghosts = style.join([style.posed(surfaces, poses[i]) for i in (0, len(q) // 2)])
-    arm, trace = style.posed(surfaces, poses[-1]), style.trace(robot, tool, q)
-    return best_view(arm, ghosts, trace, obstacles, width, height, free)
+    """The best view of a motion among obstacles."""
+    q = dense(q, TRACE_POINTS)
+    ghosts = join([arm.posed(row) for row in (q[0], q[len(q) // 2])])
+    surfaces = join([one.surface for one in obstacles])
+    return best_view(arm.posed(q[-1]), ghosts, arm.tool_points(q), surfaces, size, free)
 
 
 def _score(
     camera: Camera, arm: Surface, ghosts: Surface, trace: Float[ndarray, "n 3"], obstacles: Surface
 ) -> float:
     """Visible fraction of the arm, plus half that of the ghosts, plus the visible length of the trace."""
-    empty = np.zeros((camera.height, camera.width), np.float32)
-    ident = np.empty(empty.shape, np.int32)
-    hidden = empty.copy()
-    draw(hidden, ident, camera.project(obstacles.vertices), obstacles.faces)
+    hidden, _, _ = drawn_by(camera, obstacles)
     score = 0.0
     for part, weight in ((arm, 1.0), (ghosts, 0.5)):
-        drawn = empty.copy()
-        draw(drawn, ident, camera.project(part.vertices), part.faces)
+        drawn, _, _ = drawn_by(camera, part)
         score += weight * float((drawn > hidden).sum() / max(1, (drawn > 0).sum()))
     pixels = camera.project(trace)
     column, row = pixels[:, 0].astype(int), pixels[:, 1].astype(int)

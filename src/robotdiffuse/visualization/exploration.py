@@ -1,16 +1,39 @@
-"""What a picture and a page of an exploration show: its moments, and the voxels known at each."""
+"""What was known and done during an exploration: as a picture, as a page, and as the live page shows it."""
 
+import base64
+from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from PIL import Image
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
+from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
 from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.perception.seen_points_kernel import near_scene
 from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
-from robotdiffuse.planning.exploration.steps import DONE
+from robotdiffuse.planning.exploration.steps import DONE, LOOK
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.visualization.arm import DrawnArm
+from robotdiffuse.visualization.camera import Camera, view_of_motion
+from robotdiffuse.visualization.picture import (
+    MARGINS,
+    ClearSurface,
+    PictureSettings,
+    caption,
+    faded_below,
+    linear,
+    render,
+    save_png,
+    tube,
+)
+from robotdiffuse.visualization.replay_page import page_data, page_shapes, page_text
 
 LIKELY = 0.5
 """Voxels of unknown space that are occupied with a larger probability are shown as predicted."""
@@ -22,6 +45,24 @@ FRUSTUM_DEPTH = 0.25
 """Length of the pyramid that shows where a camera looks [m]."""
 READING_TIME = 1.5
 """Pages rest before each step, for its reason to be read [s]."""
+MAX_MOMENTS = 6
+TILE = PictureSettings(width=720, height=450, ghosts=2)
+GAP = 6
+"""Between moments [pixels]."""
+GAP_COLOR = (0xFF, 0xFF, 0xFF)
+UNKNOWN_ALPHA, PREDICTED_ALPHA = 0.27, 0.55
+SHARE_COLORS = ((0x8A, 0x93, 0xA0), UNKNOWN)
+"""Of the labels of the shares that were seen free, and unknown."""
+CAPTION_SIZE = 1.7
+FADE = (0.7, 0.95)
+"""Where moments fade behind their caption, and how much; see `faded_below`."""
+WHITE = (0xFF, 0xFF, 0xFF)
+LAYERS = (
+    {"name": "Occupied", "color": OBSERVED, "opacity": 1.0, "order": 0},
+    {"name": "Predicted", "color": ASSUMED, "opacity": 0.6, "order": 1},
+    {"name": "Unknown", "color": UNKNOWN, "opacity": 0.28, "order": 20},
+)
+"""Sets of voxels on the page, in the order in which see-through ones are drawn."""
 Voxels = Bool[ndarray, "nx ny nz"]
 
 
@@ -34,21 +75,21 @@ class Moment:
     act: RecordedAct
     known: RecordedView
 
-    @property
-    def shares(self) -> list[tuple[str, str]]:
-        """Labels and values of what was known."""
-        parts = (("seen free", self.known.free), ("unknown", self.known.unknown))
-        return [(name, f"{100 * voxels.mean():.0f} %") for name, voxels in parts]
+
+def shares(known: RecordedView) -> list[tuple[str, str]]:
+    """Labels and values of what was known."""
+    parts = (("seen free", known.free), ("unknown", known.unknown))
+    return [(name, f"{100 * voxels.mean():.0f} %") for name, voxels in parts]
 
 
 def moments(explorer: RecordedExplorer) -> list[Moment]:
     """All acts for which something was known, in order."""
-    found = []
+    known = []
     for number, act in enumerate(explorer.acts):
         before = [view for view in explorer.views if view.act < number]
         if before:
-            found.append(Moment(number + 1, act, before[-1]))
-    return found
+            known.append(Moment(number + 1, act, before[-1]))
+    return known
 
 
 def title(act: RecordedAct) -> str:
@@ -62,11 +103,11 @@ def title(act: RecordedAct) -> str:
 class ShownVoxels:
     """Sets of voxels that are shown, without those in the scene that is known anyway."""
 
-    occupied: Bool[ndarray, "nx ny nz"]
-    predicted: Bool[ndarray, "nx ny nz"]
+    occupied: Voxels
+    predicted: Voxels
     """Unknown, and probably occupied."""
-    unknown: Bool[ndarray, "nx ny nz"]
-    free: Bool[ndarray, "nx ny nz"]
+    unknown: Voxels
+    free: Voxels
 
     @property
     def layers(self) -> tuple[tuple[Voxels, Voxels], ...]:
@@ -79,9 +120,7 @@ class ShownVoxels:
         )
 
 
-def shown_voxels(
-    view: RecordedView, act: RecordedAct | None, in_known_scene: Bool[ndarray, "nx ny nz"]
-) -> ShownVoxels:
+def shown_voxels(view: RecordedView, act: RecordedAct | None, in_known_scene: Voxels) -> ShownVoxels:
     """What is shown after a view, with the prediction of an act."""
     unknown = view.unknown & ~in_known_scene
     probability = None if act is None else act.predicted
@@ -89,7 +128,7 @@ def shown_voxels(
     return ShownVoxels(view.occupied & ~in_known_scene, predicted, unknown, view.free)
 
 
-def in_known_scene(explorer: RecordedExplorer) -> Bool[ndarray, "nx ny nz"]:
+def in_known_scene(explorer: RecordedExplorer) -> Voxels:
     """The voxels at or in the scene that is known without views."""
     if not explorer.scene.shapes:
         return np.zeros(MAP.shape, np.bool_)
@@ -112,3 +151,209 @@ def frustum(explorer: RecordedExplorer, act: RecordedAct) -> list[Float[ndarray,
     T = act.T_base_camera
     rim = in_camera @ T[:3, :3].T + T[:3, 3]
     return [np.stack([T[:3, 3], corner]) for corner in rim] + [np.concatenate([rim, rim[:1]])]
+
+
+def faces_between(inside: Voxels, outside: Voxels) -> tuple[Int[ndarray, "n"], Bool[ndarray, "n"]]:
+    """The faces between a voxel of one set and one of another, in order, and whether the one inside comes
+    first along the axis.
+
+    A face has one number: axis · voxels + the flat index of the voxel before it along that axis.
+    """
+    numbers, first = [], []
+    for axis in range(3):
+        before = [slice(None)] * 3
+        after = [slice(None)] * 3
+        before[axis], after[axis] = slice(None, -1), slice(1, None)
+        forward = np.zeros(inside.shape, np.bool_)
+        backward = forward.copy()
+        forward[tuple(before)] = inside[tuple(before)] & outside[tuple(after)]
+        backward[tuple(before)] = outside[tuple(before)] & inside[tuple(after)]
+        found = np.flatnonzero(forward | backward)
+        numbers.append(found + axis * inside.size)
+        first.append(forward.reshape(-1)[found])
+    return np.concatenate(numbers), np.concatenate(first)
+
+
+def faces_surface(inside: Voxels, outside: Voxels, color: Color) -> Surface:
+    """The faces between two sets of voxels, of a map, as a surface in the base frame; normals
+    point out of the set inside, and corners are counterclockwise as seen from there."""
+    numbers, first = faces_between(inside, outside)
+    axis, flat = np.divmod(numbers, inside.size)
+    at = np.stack(np.unravel_index(flat, inside.shape), axis=1)
+    along, across, up = (np.eye(3)[(axis + k) % 3] for k in range(3))
+    corner = at + along
+    vertices = np.stack([corner, corner + across, corner + across + up, corner + up], axis=1)
+    normals = np.where(first[:, None], along, -along)
+    one = np.array([[0, 1, 2], [0, 2, 3]])
+    wound = np.where(first[:, None, None], one, one[:, ::-1])
+    faces = (4 * np.arange(len(numbers))[:, None, None] + wound).reshape(-1, 3)
+    vertices = vertices.reshape(-1, 3) * MAP.edge + MAP.low
+    return Surface(vertices, normals.repeat(4, axis=0), painted(color, len(vertices)), faces)
+
+
+def write_exploration_picture(
+    explorer: RecordedExplorer, scene: Scene, file: str | FilePath, settings: PictureSettings = TILE
+) -> None:
+    """Write the moments of an exploration as one .png: at most MAX_MOMENTS, the first and the last included.
+
+    Each shows the arm's motion among what was known when it was chosen: voxels seen occupied (blue),
+    predicted ones (violet), the boundary of unknown space (grey, see-through), and at the end of a look what
+    the camera will see (a pyramid). scene: the true one, from which the view is chosen. settings: of each
+    moment. Raises InputError for another ending or a file that cannot be written.
+    """
+    path = check_output(file, (".png",))
+    shown = moments(explorer)
+    chosen = _chosen(len(shown))
+    whole = np.concatenate([moment.act.waypoints for moment in shown])
+    size = settings.width, settings.height
+    camera = view_of_motion(DrawnArm(explorer.robot), drawables(scene), whole, size, MARGINS)
+    known = in_known_scene(explorer)
+    tiles = [_tile(explorer, shown[i], known, camera, settings) for i in chosen]
+    save_png(_joined(tiles), path)
+
+
+def _chosen(count: int) -> list[int]:
+    """The first moment, the last two, and others between them."""
+    if count <= MAX_MOMENTS:
+        return list(range(count))
+    return [*np.linspace(0, count - 3, MAX_MOMENTS - 2).round().astype(int), count - 2, count - 1]
+
+
+def _tile(
+    explorer: RecordedExplorer,
+    moment: Moment,
+    known: Voxels,
+    camera: Camera,
+    settings: PictureSettings,
+) -> Image.Image:
+    robot, act = explorer.robot, moment.act
+    shown = shown_voxels(moment.known, act, known)
+    occupied, predicted, unknown = (
+        faces_surface(*pair, color)
+        for pair, color in zip(shown.layers, (OBSERVED, WHITE, WHITE), strict=True)
+    )
+    clear = [
+        ClearSurface(unknown, linear(UNKNOWN), UNKNOWN_ALPHA),
+        ClearSurface(predicted, linear(ASSUMED), PREDICTED_ALPHA),
+    ]
+    look = [tube(edge, LOOK_COLOR, LOOK_COLOR) for edge in frustum(explorer, act)]
+    motion = act.trajectory or Path(robot.joint_names, act.waypoints)
+    pixels, _ = render(robot, explorer.scene, motion, settings, camera, added=(occupied, *look), clear=clear)
+    image = Image.fromarray(faded_below(pixels, *FADE))
+    drawn = {
+        "occupied": OBSERVED,
+        **({} if act.predicted is None else {"predicted": ASSUMED}),
+        **({"next look": LOOK_COLOR} if look else {}),
+    }
+    facts = [*shares(moment.known), *((name, "") for name in drawn)]
+    colors = (*SHARE_COLORS, *drawn.values())
+    caption(image, f"{moment.number}  {title(moment.act)}", facts, colors, CAPTION_SIZE)
+    return image
+
+
+def _joined(tiles: list[Image.Image]) -> Image.Image:
+    """The pictures in rows of two or three."""
+    columns = min(len(tiles), 3 if len(tiles) > 4 else 2)
+    rows = -(-len(tiles) // columns)
+    width, height = tiles[0].width + GAP, tiles[0].height + GAP
+    sheet = Image.new("RGB", (columns * width - GAP, rows * height - GAP), GAP_COLOR)
+    for i, tile in enumerate(tiles):
+        sheet.paste(tile, (i % columns * width, i // columns * height))
+    return sheet
+
+
+def write_exploration(explorer: RecordedExplorer, scene: Scene, file: str | FilePath) -> None:
+    """Write an exploration as a self-contained .html file, with what was known after each view.
+
+    scene: the true one, which the page can show. Raises InputError for another ending or a file that cannot
+    be written.
+    """
+    target = check_output(file, (".html", ".htm"))
+    robot = explorer.robot
+    data = page_data(robot, scene, _whole_motion(explorer))
+    data["exploration"] = {
+        "shape": MAP.shape,
+        "low": MAP.low,
+        "edge": MAP.edge,
+        "layers": LAYERS,
+        "look_color": LOOK_COLOR,
+        "known": _known(explorer),
+        "acts": [_act(explorer, moment) for moment in moments(explorer)],
+        "true_scene": data["scene"],
+    }
+    data["scene"] = page_shapes(explorer.scene)
+    data["facts"] = _facts(explorer)
+    write_atomically(target, page_text(f"{robot.name} · exploration", data, "exploration.js"))
+
+
+def _page_time(time: float, act: int) -> float:
+    """The time on the page of a time during an act."""
+    return round(time + READING_TIME * (act + 1), 4)
+
+
+def _whole_motion(explorer: RecordedExplorer) -> Trajectory:
+    """All motions with the pauses between them."""
+    times, positions = [], []
+    for number, act in enumerate(explorer.acts):
+        times.append(np.array([_page_time(act.begins, number - 1)]))
+        positions.append(act.configuration[None])
+        if act.trajectory is not None:
+            times.append(_page_time(act.begins, number) + act.trajectory.times)
+            positions.append(act.trajectory.positions)
+    q = np.concatenate(positions)
+    return Trajectory(explorer.robot.joint_names, np.concatenate(times), q, 0 * q, 0 * q)
+
+
+def _known(explorer: RecordedExplorer) -> list[dict[str, Any]]:
+    """Times, and the faces of each layer that come or go, after each view and each prediction."""
+    known_scene = in_known_scene(explorer)
+    before = [np.zeros(0, np.int64) for _ in LAYERS]
+    states = []
+    for number, act in enumerate(explorer.acts):
+        views = [view for view in explorer.views if view.act == number]
+        earlier = [view for view in explorer.views if view.act < number]
+        times = [_page_time(view.time, number) for view in views]
+        for time, view in zip(
+            (_page_time(act.begins, number - 1), *times), (*earlier[-1:], *views), strict=True
+        ):
+            layers = shown_voxels(view, act, known_scene).layers
+            after = [faces_between(*pair)[0] for pair in layers]
+            changed = [np.setxor1d(a, b) for a, b in zip(before, after, strict=True)]
+            states.append({"time": time, "layers": [_packed(faces) for faces in changed]})
+            before = after
+    return states
+
+
+def _packed(numbers: Int[ndarray, "n"]) -> str:
+    """Ascending numbers in base64: the differences from one to the next, in groups of 7 bits, the lowest
+    first, of which all but the last are marked."""
+    steps = np.diff(numbers, prepend=0)
+    groups = np.stack([steps >> shift & 127 for shift in (0, 7, 14, 21)], axis=1)
+    used = np.stack([np.ones(len(steps), bool), *(steps >= 1 << shift for shift in (7, 14, 21))], axis=1)
+    marked = np.concatenate([used[:, 1:], np.zeros((len(steps), 1), bool)], axis=1)
+    return base64.b64encode((groups + 128 * marked)[used].astype(np.uint8).tobytes()).decode("ascii")
+
+
+def _act(explorer: RecordedExplorer, moment: Moment) -> dict[str, Any]:
+    act = moment.act
+    motion = act.step.motion
+    end = motion.path.positions[-1] if act.step.kind == LOOK and motion and motion.path else None
+    return {
+        "time": _page_time(act.begins, moment.number - 2),
+        "title": f"{moment.number}  {title(moment.act)}",
+        "reason": act.step.reason,
+        "known": ", ".join(f"{value} {name}" for name, value in shares(moment.known)),
+        "look": [np.round(edge, 4).tolist() for edge in frustum(explorer, act)],
+        "end": None if end is None else np.round(end, 5).tolist(),
+    }
+
+
+def _facts(explorer: RecordedExplorer) -> list[tuple[str, str]]:
+    last, kinds = explorer.acts[-1].step, Counter(act.step.kind for act in explorer.acts)
+    return [
+        ("status", "solved" if last.kind == DONE else last.kind),
+        ("policy", explorer.settings.policy.replace("_", " ")),
+        ("looks", str(kinds[LOOK])),
+        ("views", str(len(explorer.views))),
+        ("time in motion", f"{explorer.duration:.1f} s"),
+    ]

@@ -8,7 +8,6 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from tempfile import TemporaryDirectory
 
 from PIL import Image
 
@@ -18,7 +17,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization.picture import PictureSettings, render
-from robotdiffuse.visualization.replay_page import write_replay
+from robotdiffuse.visualization.replay_page import page_data, page_text
 
 THUMBNAIL = PictureSettings(480, 300, ghosts=3)
 
@@ -106,7 +105,8 @@ def write_gallery(
     target = check_output(file, (".html", ".htm"))
     replays, buttons = [], []
     for i, entry in enumerate(entries):
-        replays.append(_replay(robot, entry))
+        data = page_data(robot, entry.scene, entry.motion, moving=entry.moving)
+        replays.append(page_text(entry.title, data))
         buttons.append(
             f'<button><img alt="" src="data:image/jpeg;base64,{_thumbnail(robot, entry)}">'
             f"<b>{html.escape(entry.title)}</b><span>{html.escape(entry.caption)}</span></button>"
@@ -124,13 +124,6 @@ def _shared(pages: list[str]) -> dict[str, list]:
     cut = [re.split(r'(?=<script)|(?="scene":)', page) for page in pages]
     places = {part: i for i, part in enumerate(dict.fromkeys(part for parts in cut for part in parts))}
     return {"parts": list(places), "pages": [[places[part] for part in parts] for parts in cut]}
-
-
-def _replay(robot: Robot, entry: GalleryEntry) -> str:
-    with TemporaryDirectory() as folder:
-        file = FilePath(folder) / "replay.html"
-        write_replay(robot, entry.scene, entry.motion, file, title=entry.title, moving=entry.moving)
-        return file.read_text("utf-8")
 
 
 def _thumbnail(robot: Robot, entry: GalleryEntry) -> str:

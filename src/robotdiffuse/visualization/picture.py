@@ -14,13 +14,13 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.drawables import GOAL, START, Color, Surface, drawables, join, painted
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.visualization import style
-from robotdiffuse.visualization.camera import Camera, best_view
+from robotdiffuse.visualization.arm import DrawnArm, dense, facts
+from robotdiffuse.visualization.camera import Camera, best_view, drawn_by
 from robotdiffuse.visualization.rasterizer import blend_ghost, draw, light_lattice, shade
-from robotdiffuse.visualization.style import GOAL, START, Surface, join
 
 SUPERSAMPLING = 2
 """Rendered pixels per pixel along each side."""
@@ -45,13 +45,12 @@ COMPARED = ((0xE3, 0xA8, 0x12), (0xCF, 0x33, 0x3B), (0x2F, 0x6F, 0xD0), (0x8B, 0
 """sRGB colours of the traces of several motions in one picture."""
 MOVED_ALPHA = 0.22
 """Of moving obstacles along their way."""
+TRACE_STEPS = 240
+"""Configurations along a motion of which the trace is drawn."""
+WHITE = (0xFF, 0xFF, 0xFF)
 SHELL_COLOR, SHELL_ALPHA = (0x35, 0xB8, 0x5C), 0.2
 MARGINS = (0.05, 0.11)
 """Fractions of the height left free above the arm, and below it for the caption."""
-
-
-Color = tuple[int, int, int]
-"""sRGB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +106,7 @@ def write_picture(
     path = check_output(file, (".png",))
     settings = settings or PictureSettings()
     pixels, _ = render(robot, scene, motion, settings, moving=moving)
-    image = Image.fromarray(faded_below(pixels))
-    caption(image, title or robot.name, style.facts(motion, result, robot))
-    save_png(image, path)
+    write_captioned(pixels, path, title or robot.name, facts(motion, result, robot))
 
 
 def write_comparison(
@@ -132,9 +129,21 @@ def write_comparison(
         raise InputError(f"{len(motions)} motions; a picture shows 1 to {len(COMPARED)}")
     first, *others = motions.values()
     pixels, _ = render(robot, scene, first, settings or PictureSettings(), others=others, moving=moving)
+    figures = [", ".join(v for k, v in facts(m, None) if v != "untimed") for m in motions.values()]
+    captions = list(zip(motions, figures, strict=True))
+    write_captioned(pixels, path, title or robot.name, captions, COMPARED)
+
+
+def write_captioned(
+    pixels: np.ndarray,
+    path: FilePath,
+    title: str,
+    facts: list[tuple[str, str]],
+    colors: Sequence[Color] = (),
+) -> None:
+    """Write a picture with its caption; see `caption`."""
     image = Image.fromarray(faded_below(pixels))
-    figures = [", ".join(v for k, v in style.facts(m, None) if v != "untimed") for m in motions.values()]
-    caption(image, title or robot.name, list(zip(motions, figures, strict=True)), COMPARED)
+    caption(image, title, facts, colors)
     save_png(image, path)
 
 
@@ -163,71 +172,63 @@ def render(
     added, clear: further surfaces in the base frame, solid and see-through.
     moving: obstacles that are solid where they are at the start, and see-through later.
     """
-    scene = scene.with_shapes([*scene.shapes, *(one.shape for one in moving)])
-    surfaces = style.robot_surfaces(robot)
-    q = style.dense(motion.positions, 240)
-    poses = style.frames(robot, q)
-    trace = style.trace(robot, style.tool_point(robot, surfaces), q)
-    colors = style.obstacle_colors(scene)
-    obstacles = join([style.shape_surface(s, c) for s, c in zip(scene.shapes, colors, strict=True)])
-    goal = style.posed(surfaces, poses[-1])
+    arm, obstacles = DrawnArm(robot), drawables(scene, moving)
+    q = dense(motion.positions, TRACE_STEPS)
+    surroundings = join([one.surface for one in obstacles])
+    goal = arm.posed(q[-1])
     steps = np.linspace(0, len(q) - 1, settings.ghosts + 1).round().astype(int)[:-1] if len(q) > 1 else []
-    ghosts = [(style.posed(surfaces[1:], poses[i][1:]), i / (len(q) - 1)) for i in steps]
-    faint = join([ghost for ghost, _ in ghosts])
+    ghosts = [(arm.posed(q[i], 1), i / (len(q) - 1)) for i in steps]
+    traces = [arm.trace(one.positions, TRACE_STEPS) for one in (motion, *others)]
     if camera is None:
         size = settings.width, settings.height
-        camera = best_view(goal, faint, trace, obstacles, *size, MARGINS, settings.azimuth)
+        faint = join([ghost for ghost, _ in ghosts])
+        camera = best_view(goal, faint, traces[0], surroundings, size, MARGINS, settings.azimuth)
     big = Camera(camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height)
-    tool = style.tool_point(robot, surfaces)
-    traces = [trace, *(style.trace(robot, tool, style.dense(other.positions, 240)) for other in others)]
     colors = [(color, color) for color in COMPARED] if others else [(START, GOAL)]
     tubes = [tube(points, *of) for points, of in zip(traces, colors, strict=False)]
-    ghosts.sort(key=lambda ghost: -float(np.linalg.norm(ghost[0].vertices.mean(0) - big.eye)))
-    over = [
-        ClearSurface(ghost, _mixed(START, GOAL, share), 0.50 if share == 0 else 0.26)
-        for ghost, share in ghosts
-    ]
+    over = []
     if isinstance(motion, Trajectory):
         times = np.linspace(0.0, motion.duration, settings.ghosts + 1)[1:]
-        for one, color in zip(
-            moving, style.obstacle_colors(scene)[len(scene.shapes) - len(moving) :], strict=True
-        ):
-            places = [style.shape_surface(one.at(time), color) for time in times] if one.known else []
-            over = [*(ClearSurface(place, linear(color), MOVED_ALPHA) for place in places), *over]
+        # the first obstacle is drawn over the others
+        for one in reversed([one for one in obstacles if one.moving is not None and one.moving.known]):
+            over += [ClearSurface(one.surface_at(time), linear(one.color), MOVED_ALPHA) for time in times]
+    ghosts.sort(key=lambda ghost: -float(np.linalg.norm(ghost[0].vertices.mean(0) - big.eye)))
+    for ghost, share in ghosts:
+        color = linear(START) * (1 - share) + linear(GOAL) * share
+        over.append(ClearSurface(ghost, color, 0.50 if share == 0 else 0.26))
     if settings.shell:
-        over.append(ClearSurface(_shell(robot, poses[-1], settings.shell), linear(SHELL_COLOR), SHELL_ALPHA))
-    image = _paint(big, join([goal, obstacles, *tubes, *added]), [*clear, *over])
+        over.append(ClearSurface(_shell(arm, q[-1], settings.shell), linear(SHELL_COLOR), SHELL_ALPHA))
+    image = _paint(big, join([goal, surroundings, *tubes, *added]), [*clear, *over])
     s = SUPERSAMPLING
     image = image.reshape(settings.height, s, settings.width, s, 3).mean(axis=(1, 3))
     return _to_srgb(image), camera
 
 
-def _shell(robot: Robot, T_base_frame: Float[ndarray, "frames 4 4"], thickness: float) -> Surface:
+def _shell(arm: DrawnArm, q: Float[ndarray, "dof"], thickness: float) -> Surface:
     """The covering spheres of the arm, enlarged by the thickness of the shell [m]."""
-    import trimesh
-
-    ball, parts = trimesh.creation.icosphere(subdivisions=3), []
-    white = np.ones((len(ball.vertices), 3))
+    robot, T_base_frame = arm.robot, arm.frames(q)
+    balls = []
     for link, spheres in robot.spheres.items():
         T = T_base_frame[robot.link_frame(link)] @ robot.T_frame_link(link)
-        for x, y, z, radius in spheres:
-            vertices = (T @ [x, y, z, 1.0])[:3] + (radius + thickness) * ball.vertices
-            parts.append(Surface(vertices, np.array(ball.vertices), white, np.asarray(ball.faces, np.int64)))
-    return join(parts)
+        balls += [
+            _ball((T @ [x, y, z, 1.0])[:3], radius + thickness, WHITE, 3) for x, y, z, radius in spheres
+        ]
+    return join(balls)
 
 
-def _mixed(first: Color, last: Color, share: float) -> Float[ndarray, "3"]:
-    """The linear colour between two sRGB colours."""
-    return linear(first) * (1 - share) + linear(last) * share
+def _ball(center: Float[ndarray, "3"], radius: float, color: Color, subdivisions: int) -> Surface:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    vertices = np.array(ball.vertices)
+    faces = np.asarray(ball.faces, np.int64)
+    return Surface(center + radius * vertices, vertices, painted(color, len(vertices)), faces)
 
 
 def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Float[ndarray, "h w 3"]:
     """Linear colours of the solid surfaces with the see-through ones over them, in their order."""
-    shape = (camera.height, camera.width)
-    image = np.zeros((*shape, 3), np.float32)
-    near, ident = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
-    screen = camera.project(solid.vertices)
-    draw(near, ident, screen, solid.faces)
+    near, ident, screen = drawn_by(camera, solid)
+    image = np.zeros((*near.shape, 3), np.float32)
     view = (camera.eye, camera.rays())
     height = min(0.0, float(solid.vertices[:, 2].min(initial=0.0)))
     ground = (height - 1e-4, GROUND_RADIUS, linear((0xE9, 0xEB, 0xEE)), linear((0xC3, 0xC9, 0xD1)))
@@ -241,14 +242,9 @@ def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Flo
     lattice = light_lattice(LIGHT_SPACING, *seen, view, ground[0], sky, key)
     shade(image, lattice, LIGHT_SPACING, *seen, colors, view, ground, background, sky, key, light)
     for one in clear:
-        ghost = one.surface
-        own, shown = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
-        screen = camera.project(ghost.vertices)
-        draw(own, shown, screen, ghost.faces)
-        blend_ghost(
-            image, near, own, shown, screen, ghost.faces, ghost.normals, _linear_array(ghost.colors),
-            view, toward, one.tint, one.alpha,
-        )  # fmt: skip
+        own, shown, screen = drawn_by(camera, one.surface)
+        arrays = one.surface.faces, one.surface.normals, _linear_array(one.surface.colors)
+        blend_ghost(image, near, own, shown, screen, *arrays, view, toward, one.tint, one.alpha)
     return image
 
 
@@ -311,18 +307,7 @@ def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tup
 def tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
     """A round tube along a polyline, coloured from the first to the last colour, with spheres at both
     ends."""
-    import trimesh
-
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    balls = [
-        Surface(
-            point + 2.2 * TUBE_RADIUS * ball.vertices,
-            np.array(ball.vertices),
-            np.tile(np.array(color) / 255.0, (len(ball.vertices), 1)),
-            np.asarray(ball.faces, np.int64),
-        )
-        for point, color in ((points[0], first), (points[-1], last))
-    ]
+    balls = [_ball(points[i], 2.2 * TUBE_RADIUS, color, 2) for i, color in ((0, first), (-1, last))]
     n = len(points)
     if n < 2:
         return join(balls)

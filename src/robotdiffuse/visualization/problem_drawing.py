@@ -6,34 +6,29 @@ from pathlib import Path as FilePath
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from PIL import Image
 
 from robotdiffuse.core.errors import shortened
-from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import IDENTITY
 from robotdiffuse.core.types import Path
+from robotdiffuse.drawables import START, Color, Surface, drawables, link_surfaces, painted
 from robotdiffuse.planning.pose_goals import pose_configurations
 from robotdiffuse.problems.goals import AnyGoal, JointGoal, poses_of
 from robotdiffuse.problems.problem import Problem, StateValidity
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.visualization import style
+from robotdiffuse.visualization.arm import DrawnArm
 from robotdiffuse.visualization.camera import view_of_motion
 from robotdiffuse.visualization.picture import (
     MARGINS,
     ClearSurface,
     PictureSettings,
-    caption,
-    faded_below,
     linear,
     render,
-    save_png,
     tube,
+    write_captioned,
 )
-from robotdiffuse.visualization.replay_page import page_data, page_shapes, page_surface, write_page
-from robotdiffuse.visualization.style import START, Surface
+from robotdiffuse.visualization.replay_page import page_data, page_shapes, page_surface, page_text
 
 COLLIDING = (0xD0, 0x1F, 0x2B)
 """sRGB colour of links that collide."""
@@ -64,21 +59,28 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     T_world_poses = _goal_poses(problem)
     near_poses = [Sphere(T[:3, 3], AXIS_LENGTH) for T in T_world_poses]
     framed = scene.with_shapes([*scene.shapes, *near_poses])  # what the camera shows
-    marks = [*_colliding_links(robot, states, list(validities.values())), *_axes(T_world_poses)]
+    arm = DrawnArm(robot)
+    marks = [*_colliding_links(arm, states, list(validities.values())), *_axes(T_world_poses)]
     facts = [(what, state.reason or "free") for what, state in validities.items()]
     if result is not None and all(validities.values()):
         facts = [("reason", shortened(result.reason))]
     status = "" if result is None else f" · {result.status.value.replace('_', ' ')}"
     title = f"{robot.name}{status}"
     if target.suffix.lower() == ".png":
-        image = _picture(robot, scene, framed, states, [surface for surface, _ in marks])
-        caption(image, title, facts)
-        return save_png(image, target)
+        settings = PictureSettings()
+        size = settings.width, settings.height
+        camera = view_of_motion(arm, drawables(framed), states, size, MARGINS)
+        start = ClearSurface(arm.posed(states[0], 1), linear(START), START_ALPHA)
+        ghost = [start] if len(states) > 1 else []
+        end = Path(robot.joint_names, states[-1:])
+        surfaces = [surface for surface, _ in marks]
+        pixels, _ = render(robot, scene, end, settings, camera, added=surfaces, clear=ghost)
+        return write_captioned(pixels, target, title, facts)
     data = page_data(robot, framed, Path(robot.joint_names, states))
     data["scene"] = [*page_shapes(scene), *(page_surface("mark", *mark) for mark in marks)]
     data["times"] = [0.0] * len(states)  # nothing moves
     data["facts"] = facts
-    return write_page(target, title, data)
+    return write_atomically(target, page_text(title, data))
 
 
 def _goal_state(problem: Problem) -> tuple[Float[ndarray, "dof"] | None, StateValidity]:
@@ -97,16 +99,16 @@ def _goal_state(problem: Problem) -> tuple[Float[ndarray, "dof"] | None, StateVa
 
 
 def _colliding_links(
-    robot: Robot, states: Float[ndarray, "n dof"], validities: list[StateValidity]
-) -> list[tuple[Surface, tuple[int, int, int]]]:
+    arm: DrawnArm, states: Float[ndarray, "n dof"], validities: list[StateValidity]
+) -> list[tuple[Surface, Color]]:
     """The surfaces of the links that collide in each state, and their colour."""
-    links = style.link_surfaces(robot)
+    robot, links = arm.robot, link_surfaces(arm.robot)
     marks = []
     for q, validity in zip(states, validities, strict=False):  # there may be no goal state
-        T_base_frame = style.frames(robot, q)
+        T_base_frame = arm.frames(q)
         for link in validity.links:
-            painted = _raised(links[link]).moved(T_base_frame[robot.link_frame(link)])
-            marks.append((painted, COLLIDING))
+            T_base_link = T_base_frame[robot.link_frame(link)] @ robot.T_frame_link(link)
+            marks.append((_raised(links[link]).moved(T_base_link), COLLIDING))
     return marks
 
 
@@ -116,8 +118,8 @@ def _raised(surface: Surface) -> Surface:
     corner = corner.reshape(-1)
     normals = np.stack([np.bincount(corner, column) for column in surface.normals.T], axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    colors = np.tile(np.array(COLLIDING) / 255, (len(surface.colors), 1))
-    return replace(surface, vertices=surface.vertices + OFFSET * normals[corner], colors=colors)
+    vertices = surface.vertices + OFFSET * normals[corner]
+    return replace(surface, vertices=vertices, colors=painted(COLLIDING, len(vertices)))
 
 
 def _goal_poses(problem: Problem) -> list[Float[ndarray, "4 4"]]:
@@ -127,7 +129,7 @@ def _goal_poses(problem: Problem) -> list[Float[ndarray, "4 4"]]:
     return [T_world_base @ pose.T_base_frame for goal in goals for pose in poses_of(goal)]
 
 
-def _axes(poses: list[Float[ndarray, "4 4"]]) -> list[tuple[Surface, tuple[int, int, int]]]:
+def _axes(poses: list[Float[ndarray, "4 4"]]) -> list[tuple[Surface, Color]]:
     """The axes of poses, and their colours."""
     axes = []
     for T in poses:
@@ -135,19 +137,3 @@ def _axes(poses: list[Float[ndarray, "4 4"]]) -> list[tuple[Surface, tuple[int, 
             ends = np.stack([T[:3, 3], T[:3, 3] + AXIS_LENGTH * T[:3, axis]])
             axes.append((tube(ends, color, color), color))
     return axes
-
-
-def _picture(
-    robot: Robot, scene: Scene, framed: Scene, states: Float[ndarray, "n dof"], marks: list[Surface]
-) -> Image.Image:
-    """The picture without its caption."""
-    settings = PictureSettings()
-    surfaces = style.robot_surfaces(robot)
-    tool = style.tool_point(robot, surfaces)
-    size = (settings.width, settings.height)
-    camera = view_of_motion(robot, framed, surfaces, tool, states, *size, MARGINS)
-    start = style.posed(surfaces[1:], style.frames(robot, states[0])[1:])
-    ghost = [ClearSurface(start, linear(START), START_ALPHA)] if len(states) > 1 else []
-    end = Path(robot.joint_names, states[-1:])
-    pixels, _ = render(robot, scene, end, settings, camera, added=marks, clear=ghost)
-    return Image.fromarray(faded_below(pixels))

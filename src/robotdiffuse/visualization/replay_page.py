@@ -17,14 +17,14 @@ from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
 from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, thinned
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud, Shape
-from robotdiffuse.visualization import style
-from robotdiffuse.visualization.camera import TRACE_POINTS, VERTICAL_FIELD, view_of_motion
-from robotdiffuse.visualization.style import GOAL, START, Surface
+from robotdiffuse.scenes.shapes import PointCloud
+from robotdiffuse.visualization.arm import DrawnArm, facts, interpolated, timed
+from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
 
 MAX_ROW_RATE = 60.0
 """Most rows of the motion per second; the page interpolates between them."""
@@ -58,11 +58,12 @@ def write_replay(
     target = check_output(file, (".html", ".htm"))
     count = len(scene.shapes) + len(moving)
     title = title or f"{robot.name} · {count} obstacle{'' if count == 1 else 's'}"
-    write_page(target, title, page_data(robot, scene, motion, result, candidates, moving))
+    data = page_data(robot, scene, motion, result, candidates, moving)
+    write_atomically(target, page_text(title, data))
 
 
-def write_page(target: FilePath, title: str, data: dict[str, Any], script: str = "") -> None:
-    """Write a replay page with this data. script: name of a file that runs after `replay.js`."""
+def page_text(title: str, data: dict[str, Any], script: str = "") -> str:
+    """A page with the data of `page_data`. script: name of a file that runs after `replay.js`."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     page = files("robotdiffuse.visualization") / "page"
     parts = {
@@ -75,7 +76,7 @@ def write_page(target: FilePath, title: str, data: dict[str, Any], script: str =
         "more": (page / script).read_text("utf-8") if script else "",
     }
     template = (page / "replay.html").read_text("utf-8")
-    write_atomically(target, re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template))
+    return re.sub(r"\{\{(\w+)\}\}", lambda part: parts[part[1]], template)
 
 
 def page_data(
@@ -87,12 +88,9 @@ def page_data(
     moving: Sequence[MovingObstacle] = (),
 ) -> dict[str, Any]:
     """What the page reads; see `write_replay`."""
-    static = scene
-    scene = scene.with_shapes([*scene.shapes, *(one.shape for one in moving)])
-    surfaces = style.robot_surfaces(robot)
-    frame, point = tool = style.tool_point(robot, surfaces)
-    times, positions = _thinned(*style.timed(motion))
-    colors = style.obstacle_colors(scene)
+    arm, obstacles = DrawnArm(robot), drawables(scene, moving)
+    times, positions = _thinned(*timed(motion))
+    camera = view_of_motion(arm, obstacles, motion.positions, VIEW_SIZE, VIEW_MARGINS)
     return {
         "robot": {
             "name": robot.name,
@@ -100,24 +98,32 @@ def page_data(
             "offsets": [_rounded(offset[:3].reshape(-1), 9) for offset in robot.frame_offsets],
             "parents": robot.parents.tolist(),
             "prismatic": list(robot.prismatic),
-            "frames": [_packed(surface) if len(surface.faces) else None for surface in surfaces],
+            "frames": [_packed(surface) if len(surface.faces) else None for surface in arm.surfaces],
             "spheres": _spheres(robot),
-            "tool": {"frame": frame, "point": _rounded(point, 5)},
+            "tool": {"frame": arm.tool_frame, "point": _rounded(arm.tool_point, 5)},
         },
-        "scene": page_shapes(scene)[: len(static.shapes)],
+        "scene": [_shape(one) for one in obstacles if one.moving is None],
         "moving": [
-            {"shape": shape, "track": _track(one, motion)}
-            for shape, one in zip(page_shapes(scene)[len(static.shapes) :], moving, strict=True)
+            {"shape": _shape(one), "track": _track(one, motion)}
+            for one in obstacles
+            if one.moving is not None
         ],
-        "ground": _ground(scene, colors),
+        "ground": round(
+            float(min([one.surface.vertices[:, 2].min(initial=0.0) for one in obstacles] + [0.0])), 4
+        ),
         "timed": isinstance(motion, Trajectory),
         "times": _rounded(times, 4),
-        "positions": [_rounded(row, 5) for row in positions],
-        "candidates": [_candidate(robot, tool, path) for path in candidates],
+        "positions": _rounded(positions, 5),
+        "candidates": [_rounded(arm.trace(path.positions), 4) for path in candidates],
         "start_color": START,
         "goal_color": GOAL,
-        "facts": style.facts(motion, result, robot),
-        "camera": _camera(robot, scene, surfaces, tool, motion.positions),
+        "facts": facts(motion, result, robot),
+        "camera": {
+            "eye": _rounded(camera.eye, 4),
+            "target": _rounded(camera.target, 4),
+            "field": round(float(np.degrees(VERTICAL_FIELD)), 3),
+            "aspect": VIEW_SIZE[0] / VIEW_SIZE[1],
+        },
     }
 
 
@@ -129,19 +135,19 @@ def _thinned(
     if len(times) <= most:
         return times, positions
     at = np.linspace(0, times[-1], most)
-    return at, np.stack([np.interp(at, times, positions[:, j]) for j in range(positions.shape[1])], axis=1)
+    return at, interpolated(at, times, positions)
 
 
-def _track(obstacle: MovingObstacle, motion: Path | Trajectory) -> list[list[float]]:
+def _track(obstacle: Drawable, motion: Path | Trajectory) -> list[list[float]]:
     """How the obstacle has moved from its first pose at equal steps of the motion's time: x y z, and the
     quaternion wxyz."""
     if not isinstance(motion, Trajectory):
         return [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]
     count = int(min(MAX_ROWS, np.ceil(TRACK_RATE * motion.duration) + 1))
-    T_shape_base = inverse(obstacle.shape.T_base_shape)
+    T_shape_base = inverse(obstacle.frame())
     rows = []
     for time in np.linspace(0.0, motion.duration, count):
-        T = obstacle.pose(time) @ T_shape_base
+        T = obstacle.frame(time) @ T_shape_base
         rows.append(_rounded(np.concatenate([T[:3, 3], quaternion_from_rotation(T[:3, :3])]), 6))
     return rows
 
@@ -158,59 +164,27 @@ def _spheres(robot: Robot) -> list[list[float | int]]:
     return rows
 
 
-def _candidate(robot: Robot, tool: tuple[int, ndarray], path: Path) -> list[list[float]]:
-    points = style.trace(robot, tool, style.dense(path.positions, TRACE_POINTS))
-    return [_rounded(point, 4) for point in points]
-
-
-def _camera(
-    robot: Robot,
-    scene: Scene,
-    surfaces: list[Surface],
-    tool: tuple[int, ndarray],
-    q: Float[ndarray, "n dof"],
-) -> dict[str, Any]:
-    camera = view_of_motion(robot, scene, surfaces, tool, q, *VIEW_SIZE, VIEW_MARGINS)
-    return {
-        "eye": _rounded(camera.eye, 4),
-        "target": _rounded(camera.target, 4),
-        "field": round(float(np.degrees(VERTICAL_FIELD)), 3),
-        "aspect": VIEW_SIZE[0] / VIEW_SIZE[1],
-    }
-
-
-def _ground(scene: Scene, colors: list[tuple[int, int, int]]) -> float:
-    lows = [
-        style.shape_surface(s, c).vertices[:, 2].min(initial=0.0)
-        for s, c in zip(scene.shapes, colors, strict=True)
-    ]
-    return round(float(min([0.0, *lows])), 4)
-
-
 def page_shapes(scene: Scene) -> list[dict[str, Any]]:
     """The obstacles for the page."""
-    colors = style.obstacle_colors(scene)
-    return [_shape(shape, color) for shape, color in zip(scene.shapes, colors, strict=True)]
+    return [_shape(one) for one in drawables(scene)]
 
 
-def _shape(shape: Shape, color: tuple[int, int, int]) -> dict[str, Any]:
+def _shape(obstacle: Drawable) -> dict[str, Any]:
     """An obstacle for the page: its fields, or packed geometry."""
+    shape, color = obstacle.shape, obstacle.color
+    if isinstance(shape, Triangulated):
+        return page_surface(shape.name, obstacle.surface, color)
     record: dict[str, Any] = {"kind": shape.kind, "name": shape.name, "color": color}
     if isinstance(shape, PointCloud):
-        low, step, points = _quantised(style.thinned(shape.points))
+        low, step, points = _quantised(thinned(shape.points))
         return record | {"radius": shape.point_radius, "low": low, "step": step, "points": points}
-    if isinstance(shape, Triangulated):
-        return page_surface(shape.name, style.shape_surface(shape, color), color)
-    for name in ("center", "size", "wxyz"):
+    for name in ("center", "size", "wxyz", "radius", "height"):
         if hasattr(shape, name):
             record[name] = _rounded(getattr(shape, name), 6)
-    for name in ("radius", "height"):
-        if hasattr(shape, name):
-            record[name] = round(getattr(shape, name), 6)
     return record
 
 
-def page_surface(name: str, surface: Surface, color: tuple[int, int, int]) -> dict[str, Any]:
+def page_surface(name: str, surface: Surface, color: Color) -> dict[str, Any]:
     """A surface in the base frame for the page, in one colour."""
     return {"kind": "mesh", "name": name, "color": color, "surface": _packed(surface, colored=False)}
 
@@ -245,5 +219,5 @@ def _base64(array: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 
-def _rounded(values: np.ndarray, digits: int) -> list[float]:
+def _rounded(values: np.ndarray | float, digits: int) -> Any:
     return np.round(values, digits).tolist()

@@ -405,8 +405,7 @@ def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Problem files that browsers send to the live page."""
     from robotdiffuse.robots import load_robot
-    from robotdiffuse.visualization.live.files import problem_text, uploaded_problem
-    from robotdiffuse.visualization.live.session import Session
+    from robotdiffuse.visualization.live.session import Session, problem_text, uploaded_problem
 
     problem = PROBLEM | ({}, EQUIPPED, CONSTRAINED, MOVING)[rng.integers(4)]
     ending = (".yaml", ".json")[rng.integers(2)]
@@ -421,14 +420,14 @@ def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """Heads of requests to the live page, which accepts them or not and never raises."""
-    from robotdiffuse.visualization.live.access import accepted_head
+    """Requests to the live page, which accepts them or not and never raises."""
+    from robotdiffuse.visualization.live.server import may_connect
 
     token = ("", "abc")[rng.integers(2)]
     host = (b"localhost:8080", b"[::1]:1", b"a.example")[rng.integers(3)]
-    head = b"GET /abc/?x=1 HTTP/1.1\r\nHost: %s\r\nOrigin: http://%s\r\nUpgrade: websocket" % (host, host)
-    head = damaged(rng, head)
-    return lambda: accepted_head(head, token)
+    fields = (b"/abc/?x=1", host, b"http://" + host)
+    path, host, origin = (damaged(rng, field).decode("latin-1") for field in fields)
+    return lambda: may_connect(path, host, origin, token)
 
 
 def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:

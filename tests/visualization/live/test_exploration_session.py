@@ -12,8 +12,11 @@ from helpers.explorations import BEYOND, FLOOR, HOME, WALL
 from helpers.waiting import state_when
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.planning.exploration.steps import DONE, LOOK, ExplorerSettings
-from robotdiffuse.visualization.live import exploration_session
-from robotdiffuse.visualization.live.exploration_session import (
+
+pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
+
+from robotdiffuse.visualization.live import exploration as exploration_session
+from robotdiffuse.visualization.live.exploration import (
     CHOOSING,
     ENDED,
     MOVING,
@@ -23,9 +26,9 @@ from robotdiffuse.visualization.live.exploration_session import (
     WAITING,
     ExplorationSession,
     ExplorationState,
+    exploration_badge,
 )
-
-pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
+from robotdiffuse.visualization.live.session import NO_MOTION, VALID
 
 PATIENCE = 300.0
 """[s]; a new machine compiles first."""
@@ -80,7 +83,6 @@ def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: ExplorationSes
 def test_an_error_is_shown_and_a_restart_helps(
     session: ExplorationSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from robotdiffuse.visualization.live.exploration_page import exploration_badge
 
     def fails(*_: object) -> None:
         raise ValueError("no camera")
@@ -95,8 +97,6 @@ def test_an_error_is_shown_and_a_restart_helps(
 
 
 def test_the_badge_says_what_the_arm_does(session: ExplorationSession) -> None:
-    from robotdiffuse.visualization.live.exploration_page import exploration_badge
-    from robotdiffuse.visualization.live.validity import NO_MOTION, VALID
 
     assert exploration_badge(session.state).headline == "not begun"
     session.set_mode(RUNNING)

@@ -10,7 +10,7 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.visualization.live.files import (
+from robotdiffuse.visualization.live.session import (
     first_problem,
     problem_for,
     problem_text,

@@ -14,9 +14,7 @@ from helpers.browsers import CHROMIUM, FLAGS
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.problems.goals import PoseGoal
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.visualization.live.access import listen
-from robotdiffuse.visualization.live.files import first_problem, problem_text
-from robotdiffuse.visualization.live.session import PageOptions, Session
+from robotdiffuse.visualization.live.session import PageOptions, Session, first_problem, problem_text
 
 if TYPE_CHECKING:
     from robotdiffuse.visualization.live.page import Page
@@ -48,12 +46,13 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def live() -> Iterator["tuple[Page, str]"]:
     from robotdiffuse.visualization.live.page import Page
+    from robotdiffuse.visualization.live.server import PageServer, free_port
 
-    listening = listen("127.0.0.1", 0)
-    page = Page(Session(first_problem(None, None), PageOptions("aorrtc")), listening)
+    server = PageServer("127.0.0.1", free_port("127.0.0.1", 0))
+    page = Page(Session(first_problem(None, None), PageOptions("aorrtc")), server)
     # in whichever test a worker begins, it compiles here: later waits are for the page alone
     until(lambda: page.session.state.motion is not None, patience=COMPILING / 1000)
-    yield page, "http://{}:{}/".format(*listening.getsockname())
+    yield page, server.url
     page.close()
 
 
@@ -194,15 +193,16 @@ def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(
 
 def test_it_comes_back_after_the_server_restarts(browser: Any, live: "tuple[Page, str]") -> None:
     from robotdiffuse.visualization.live.page import Page
+    from robotdiffuse.visualization.live.server import PageServer, free_port
 
     view = browser.new_page(viewport={"width": 500, "height": 400})
     number = 0
     for planner in ("aorrtc", "rrt_connect"):
-        listening = listen("127.0.0.1", number)
-        page = Page(Session(live[0].session.state.problem, PageOptions(planner)), listening)
+        server = PageServer("127.0.0.1", free_port("127.0.0.1", number))
+        page = Page(Session(live[0].session.state.problem, PageOptions(planner)), server)
         if not number:
-            number = listening.getsockname()[1]
-            view.goto(f"http://127.0.0.1:{number}/")
+            number = server.get_port()
+            view.goto(server.url)
         until(lambda: beside(view, "Planner").input_value() == planner)  # noqa: B023
         view.locator(VALID).wait_for()
         page.close()

@@ -29,7 +29,6 @@ def test_viser_is_silent_and_other_threads_print(
 
     monkeypatch.setattr(viser.ViserServer, "__init__", watched_start)
     monkeypatch.setattr(viser.ViserServer, "stop", watched_stop)
-    viser_server, _ = server.new_server()
-    server.stop_server(viser_server)
+    server.PageServer("127.0.0.1", server.free_port("127.0.0.1", 0)).stop()
     assert during == [sys.stdout, sys.stdout]
     assert capsys.readouterr().out == ""

@@ -15,6 +15,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Status
+from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.goals import AnyGoal, JointGoal, PoseGoal
 from robotdiffuse.problems.problem import Problem
@@ -24,10 +25,20 @@ from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, PointCloud, Sphere
 from robotdiffuse.validation.validator import verify_trajectory
-from robotdiffuse.visualization.live.latest_task import LatestTask
-from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, moved_to, new_obstacle, resized
-from robotdiffuse.visualization.live.session import PageOptions, Session, State
-from robotdiffuse.visualization.live.validity import INVALID, NO_MOTION, VALID, validity
+from robotdiffuse.visualization.live.session import (
+    INVALID,
+    NEW_OBSTACLES,
+    NO_MOTION,
+    VALID,
+    PageOptions,
+    Session,
+    State,
+    dimensions,
+    moved_to,
+    resized,
+    validity,
+)
+from robotdiffuse.visualization.live.threads import LatestTask
 
 START = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 END = np.array([1.2, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
@@ -317,7 +328,7 @@ CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
     "shape",
     [
         *(
-            new_obstacle(kind, np.array([0.1, 0.2, 0.3]), 0.08)
+            NEW_OBSTACLES[kind](np.array([0.1, 0.2, 0.3]), 0.08)
             for kind in ("sphere", "box", "cylinder", "capsule")
         ),
         Mesh(CORNERS, [[0, 1, 2], [0, 1, 3]], xyz=(0.1, 0, 0)),
@@ -327,7 +338,7 @@ CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 )
 def test_shapes_go_where_their_handles_are_put(shape) -> None:
     T = transform(np.array([0.5, -0.2, 0.7]), rotation_about(np.array([0.6, 0.0, 0.8]), 1.0))
-    at = handle_pose(moved_to(shape, T))
+    at = own_frame(moved_to(shape, T))
     turned = shape.kind not in ("sphere", "point_cloud")
     np.testing.assert_allclose(at, T if turned else transform(T[:3, 3]), atol=1e-12)
     for name, value in dimensions(shape).items():

@@ -11,16 +11,19 @@ from helpers import waiting
 from helpers.browsers import CHROMIUM, FLAGS
 from helpers.explorations import BEYOND, FLOOR, HOME, WALL
 from robotdiffuse.planning.exploration.steps import ExplorerSettings
-from robotdiffuse.visualization.live.access import listen
-from robotdiffuse.visualization.live.exploration_session import (
+
+pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
+
+from robotdiffuse.visualization.live.exploration import (
     ENDED,
     MOVING,
     PAUSED,
     RUNNING,
+    ExplorationPage,
     ExplorationSession,
 )
+from robotdiffuse.visualization.live.server import PageServer, free_port
 
-pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
 playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
 
 PATIENCE = 300.0
@@ -38,17 +41,14 @@ pytestmark = [
 @pytest.fixture
 def view() -> Iterator[tuple[Any, ExplorationSession, dict[str, Any]]]:
     """A browser at the page, the session, and what is drawn by name."""
-    from robotdiffuse.visualization.live.exploration_page import ExplorationPage
-
     problem = rd.Problem(rd.load_robot("panda"), rd.Scene([FLOOR, WALL]), HOME, BEYOND)
     session = ExplorationSession(problem, ExplorerSettings(time_limit=5.0), False, 0, speed=0.1)
-    listening = listen("127.0.0.1", 0)
-    page = ExplorationPage(session, listening)
+    page = ExplorationPage(session, PageServer("127.0.0.1", free_port("127.0.0.1", 0)))
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
         view = browser.new_page(viewport={"width": 900, "height": 600})
         view.set_default_timeout(1000 * PATIENCE)
-        view.goto("http://{}:{}/".format(*listening.getsockname()))
+        view.goto(page.server.url)
         yield view, session, page.server.scene._handle_from_node_name
         browser.close()
     page.close()

@@ -1,68 +1,97 @@
-"""The page: shows a session in browsers with viser, behind an access proxy."""
+"""The page: shows a session in browsers with viser, and its control panel."""
 
 import contextlib
-import socket
+import html
 import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import viser
 from jaxtyping import Float
 from numpy import ndarray
+from viser import uplot
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.core.transforms import rotation_from_quaternion, transform
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.drawables import GOAL, START, drawables, own_frame
+from robotdiffuse.planning import PLANNERS
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.validation.report import Violation
-from robotdiffuse.visualization import style
-from robotdiffuse.visualization.live.access import AccessProxy
+from robotdiffuse.visualization.arm import DrawnArm, interpolated
 from robotdiffuse.visualization.live.drawing import (
     GHOST_OPACITY,
     POSE_RATE,
     RED,
     Arm,
     Obstacles,
-    Poses,
     draw_candidates,
     draw_trace,
     draw_trees,
-    sampled_poses,
+    place,
+    sampled_frames,
 )
-from robotdiffuse.visualization.live.latest_task import LatestTask
-from robotdiffuse.visualization.live.panel import Panel, PanelCallbacks
-from robotdiffuse.visualization.live.player import Player
-from robotdiffuse.visualization.live.server import add_stage, new_server, set_first_view, stop_server
-from robotdiffuse.visualization.live.session import Session, State
-from robotdiffuse.visualization.live.validity import validity
-from robotdiffuse.visualization.style import GOAL, START, Surface
+from robotdiffuse.visualization.live.server import PageServer
+from robotdiffuse.visualization.live.session import (
+    COLLISIONS,
+    INVALID,
+    MAX_DIMENSION,
+    MIN_DIMENSION,
+    NEW_OBSTACLES,
+    NO_MOTION,
+    PENDING,
+    TREE_SETTINGS,
+    VALID,
+    Session,
+    State,
+    Validity,
+    dimensions,
+    problem_text,
+    replay_page,
+    uploaded_problem,
+    validity,
+)
+from robotdiffuse.visualization.live.threads import Changes, LatestTask, Player
 
 GIZMO_SIZE, SMALL_GIZMO_SIZE = 0.23, 0.16
 """Sizes of gizmos, as fractions of the arm's reach."""
+BADGE_COLORS = {VALID: "#0f8f6f", INVALID: "#c92f2f", NO_MOTION: "#b26a00", PENDING: "#6b7684"}
+JOINT_COLORS = ("#4f7fd9", "#10a37f", "#d97b5c", "#8a63d2", "#c2a23a", "#4fa3b8", "#c96a9a", "#7a8794")
+"""Colours of joints in the plot."""
+NO_OBSTACLE = "(none)"
+"""Option of the dropdown for no selected obstacle."""
+PLOTS = ("position", "velocity", "acceleration")
+NOTIFICATION_TIME = 8.0
+"""Time that notifications stay [s]."""
 
 
 class Page:
-    """Shows a session to all browsers that pass the access proxy on `listening`, until it is closed."""
+    """Shows a session to all browsers that the server lets in, until it is closed."""
 
-    def __init__(self, session: Session, listening: socket.socket, token: str = "") -> None:
+    def __init__(self, session: Session, server: PageServer) -> None:
         self.session = session
-        self._selected, self._drawn = "", dict[str, Any]()
-        self.server, secret = new_server()
-        self._add_static_scene()
-        callbacks = PanelCallbacks(self.select, self._seek, self._set_playing)
-        self._panel = Panel(self.server, session, callbacks)
-        self._obstacles = Obstacles(self.server, self.select)
-        self._moving = Obstacles(self.server, lambda _: None)
+        self.server = server
+        self._selected = ""
+        self._changes = Changes()
+        server.add_stage(reach(session.state.problem.robot))
+        self.goal_gizmo = _Gizmo(server, "/drag/goal", GIZMO_SIZE, session.move_goal)
+        self._start_gizmo = _Gizmo(server, "/drag/start", SMALL_GIZMO_SIZE, session.move_start)
+        self._obstacle_gizmo = _Gizmo(server, "/drag/obstacle", GIZMO_SIZE, self._move_selected)
+        self._gizmos = self.goal_gizmo, self._start_gizmo, self._obstacle_gizmo
+        self._panel = Panel(server, session, PanelCallbacks(self.select, self._seek, self._set_playing))
+        self._obstacles = Obstacles(server, self.select)
+        self._moving = Obstacles(server)
         self._arms: dict[str, Arm] = {}
-        self._poses: Poses | None = None
+        self._frames: Float[ndarray, "n frames 4 4"] | None = None
         self._lock = threading.Lock()
         self.player = Player(self._show_time)
         self._drawing = LatestTask[None](lambda _: self._draw(), "draw")
         session.on_change = self._redraw
-        self._proxy = AccessProxy(listening, self.server.get_port(), secret, token)
         self._redraw()
         session.start()
 
@@ -74,21 +103,11 @@ class Page:
     def close(self) -> None:
         """Stop serving and end all threads."""
         self.session.close()
-        self._proxy.close()
         self.player.close()
         for gizmo in self._gizmos:
             gizmo.close()
         self._drawing.close()
-        stop_server(self.server)
-
-    def _add_static_scene(self) -> None:
-        """Add lights, floor and gizmos."""
-        server = self.server
-        add_stage(server, reach(self.session.state.problem.robot))
-        self.goal_gizmo = _Gizmo(server, "/drag/goal", GIZMO_SIZE, self.session.move_goal)
-        self._start_gizmo = _Gizmo(server, "/drag/start", SMALL_GIZMO_SIZE, self.session.move_start)
-        self._obstacle_gizmo = _Gizmo(server, "/drag/obstacle", GIZMO_SIZE, self._move_selected)
-        self._gizmos = self.goal_gizmo, self._start_gizmo, self._obstacle_gizmo
+        self.server.stop()
 
     def _move_selected(self, T_base_handle: Float[ndarray, "4 4"]) -> None:
         if self._selected:
@@ -99,109 +118,80 @@ class Page:
 
     def _draw(self) -> None:
         """Draw what has changed; only this task and the player draw."""
-        state, selected = self.session.state, self._selected
+        state, selected, new = self.session.state, self._selected, self._changes.new
         problem, robot = state.problem, state.problem.robot
-        Poses.of(robot, problem.start[None])  # compiles here, since nothing is sent within the block
+        if new("robot", robot):
+            self._new_robot(robot)
+        self._drawn.frames(problem.start)  # compiles here, since nothing is sent within the block
         with self.server.atomic():
             self._panel.show(state, validity(state), selected)
-            if self._new("robot", robot):
-                self._new_robot(robot)
-            if self._new("scene", problem.scene) | self._new("selected", selected):
-                self._obstacles.show(problem.scene, selected)
-                names = [shape.name for shape in problem.known_scene.shapes]
-                T = self.session.obstacle_pose(selected) if selected in names else None
-                self._obstacle_gizmo.show(T)
-            if self._new("moving", problem.moving):
-                self._show_moving(problem.moving, 0.0)
+            if new("scene", problem.scene, selected):
+                self._obstacles.show(drawables(problem.scene), selected)
+                shapes = {shape.name: shape for shape in problem.known_scene.shapes}
+                self._obstacle_gizmo.show(own_frame(shapes[selected]) if selected in shapes else None)
+            if new("moving", problem.moving):
+                self._show_moving(0.0)
             self._start_gizmo.show(link_pose(robot, problem.start, robot.tip))
-            if self._new("start", problem.start) | self._new("motion start", state.motion):
-                self._ghost("start", None if _starts_at_start(state) else problem.start)
-            if self._new("goal", state.goal_configuration):
-                self._ghost("goal", state.goal_configuration)
+            if new("start", problem.start, state.motion):
+                self._arms["start"].show(None if _starts_at_start(state) else problem.start)
+            if new("goal", state.goal_configuration):
+                self._arms["goal"].show(state.goal_configuration)
             self.goal_gizmo.show(state.goal_pose)
-            if self._new("motion", state.motion):
+            if new("motion", state.motion):
                 self._new_motion(state)
-            if self._new("validation", state.validation):
-                self._show_violation(state)
-            if self._new("candidates", state.candidates):
-                draw_candidates(self.server, robot, self._tool, state.candidates)
+            if new("validation", state.validation):
+                self._arms["contact"].show(_first_collision(state))
+            if new("candidates", state.candidates):
+                draw_candidates(self.server, self._drawn, state.candidates)
             answer = state.answer
-            trees = answer.trees if state.options.trees and answer is not None else ()
-            if (answer is not None or not state.options.trees) and self._new("trees", trees):
-                draw_trees(self.server, robot, self._tool, trees)
-
-    def _new(self, what: str, value: object) -> bool:
-        """Whether a value has changed since the last drawing."""
-        known = what in self._drawn and self._drawn[what] is value
-        self._drawn[what] = value
-        return not known
+            shown = answer if state.options.trees else None
+            if (answer is not None or not state.options.trees) and new("trees", shown):
+                draw_trees(self.server, self._drawn, () if shown is None else shown.trees)
 
     def _new_robot(self, robot: Robot) -> None:
         for arm in self._arms.values():
-            arm.remove()
-        surfaces = style.robot_surfaces(robot)
-        self._tool = style.tool_point(robot, surfaces)
+            arm.root.remove()
+        self._drawn = DrawnArm(robot)
+        draw = partial(Arm, self.server)
         self._arms = {
-            "arm": Arm(self.server, "arm", surfaces),
-            "start": Arm(self.server, "start", surfaces, START, GHOST_OPACITY),
-            "goal": Arm(self.server, "goal", surfaces, GOAL, GHOST_OPACITY),
-            "contact": Arm(self.server, "contact", surfaces, RED, 2 * GHOST_OPACITY),
+            "arm": draw("arm", self._drawn),
+            "start": draw("start", self._drawn, START, GHOST_OPACITY),
+            "goal": draw("goal", self._drawn, GOAL, GHOST_OPACITY),
+            "contact": draw("contact", self._drawn, RED, 2 * GHOST_OPACITY),
         }
         for gizmo in self._gizmos:
-            gizmo.fit(reach(robot))
-        self._set_first_view(surfaces)
-        draw_trees(self.server, robot, self._tool, ())
-        for what in ("start", "goal", "motion", "validation", "scene", "trees"):
-            self._drawn.pop(what, None)
-
-    def _set_first_view(self, surfaces: list[Surface]) -> None:
-        """Set the view of new browsers so that most of start and goal is visible."""
-        state = self.session.state
-        problem, goal = state.problem, state.goal_configuration
-        q = np.stack([problem.start, problem.start if goal is None else goal])
-        set_first_view(self.server, problem, surfaces, q)
-
-    def _ghost(self, name: str, q: Float[ndarray, "dof"] | None) -> None:
-        robot = self.session.state.problem.robot
-        self._arms[name].show(None if q is None else Poses.of(robot, q[None]))
+            gizmo.handle.scale = gizmo.size * reach(robot)
+        problem, goal = self.session.state.problem, self.session.state.goal_configuration
+        ends = np.stack([problem.start, problem.start if goal is None else goal])
+        self.server.set_first_view(self._drawn, problem, ends)
+        draw_trees(self.server, self._drawn, ())
+        self._changes.forget("start", "goal", "motion", "validation", "scene", "trees")
 
     def _new_motion(self, state: State) -> None:
         motion = None if state.motion is None else state.motion.trajectory
-        if motion is None:
-            with self._lock:
-                self._poses = None
-            self.server.scene.remove_by_name("/trace")
-            self._arms["arm"].show(Poses.of(state.problem.robot, state.problem.start[None]))
-            return
-        poses = sampled_poses(state.problem.robot, motion)
+        frames = None if motion is None else sampled_frames(self._drawn, motion)
         with self._lock:
-            self._poses = poses
-        draw_trace(self.server, state.problem.robot, self._tool, motion)
-        self.player.load(motion.duration)
-
-    def _show_violation(self, state: State) -> None:
-        """Show the arm in red at the first collision of the motion."""
-        violation = None if state.validation is None else state.validation.report.violation
-        motion = None if state.motion is None else state.motion.trajectory
-        if violation is None or motion is None or not _is_collision(violation):
-            self._arms["contact"].show(None)
-            return
-        q = np.array([np.interp(violation.time, motion.times, column) for column in motion.positions.T])
-        self._arms["contact"].show(Poses.of(state.problem.robot, q[None]))
+            self._frames = frames
+        draw_trace(self.server, self._drawn, motion)
+        if motion is None:
+            self._arms["arm"].show(state.problem.start)
+        else:
+            self.player.load(motion.duration)
 
     def _show_time(self, at: float) -> None:
         with self._lock:
-            if self._poses is None or "arm" not in self._arms:
+            if self._frames is None or "arm" not in self._arms:
                 return
-            row = min(round(at * POSE_RATE), len(self._poses.xyz) - 1)
-            self._arms["arm"].show(self._poses, row)
-        self._show_moving(self.session.state.problem.moving, at)
+            row = min(round(at * POSE_RATE), len(self._frames) - 1)
+            self._arms["arm"].show_frames(self._frames[row])
+        self._show_moving(at)
         self._panel.show_time(at, self.player.duration)
 
-    def _show_moving(self, moving: tuple[MovingObstacle, ...], at: float) -> None:
+    def _show_moving(self, at: float) -> None:
         """Show the moving obstacles where they are at a time of the motion [s]."""
+        obstacles = drawables(Scene(), self.session.state.problem.moving)
         with self._lock:
-            self._moving.show(Scene([one.at(at) for one in moving]), "")
+            self._moving.show(obstacles, time=at)
 
     def _seek(self, at: float) -> None:
         self._set_playing(False)
@@ -218,7 +208,9 @@ class _Gizmo:
     def __init__(self, server: viser.ViserServer, name: str, size: float, moved: Any) -> None:
         """size: as a fraction of the arm's reach."""
         self.handle = server.scene.add_transform_controls(name, depth_test=False, visible=False)
-        self._held, self._size, self._moved = False, size, moved
+        self.size = size
+        self._held = False
+        self._moved = moved
         self._moving = LatestTask(self._move, name)
 
         @self.handle.on_update
@@ -236,17 +228,10 @@ class _Gizmo:
         """End its thread."""
         self._moving.close()
 
-    def fit(self, reach: float) -> None:
-        """Scale to an arm of this reach [m]."""
-        self.handle.scale = self._size * reach
-
     def show(self, T: Float[ndarray, "4 4"] | None) -> None:
         """Move to a pose, unless it is being dragged; hide for None."""
         if T is not None and not self._held:
-            wxyz = quaternion_from_rotation(T[:3, :3])
-            handle = self.handle
-            if not (np.allclose(handle.position, T[:3, 3]) and np.allclose(handle.wxyz, wxyz)):
-                handle.position, handle.wxyz = T[:3, 3], wxyz
+            place(self.handle, T)
         if self.handle.visible is not (T is not None):
             self.handle.visible = T is not None
 
@@ -257,5 +242,290 @@ def _starts_at_start(state: State) -> bool:
     return motion is None or np.allclose(motion.positions[0], state.problem.start)
 
 
-def _is_collision(violation: Violation) -> bool:
-    return violation.kind in ("scene_collision", "self_collision")
+def _first_collision(state: State) -> Float[ndarray, "dof"] | None:
+    """The configuration at the first collision of the motion; None if there is none."""
+    violation = None if state.validation is None else state.validation.report.violation
+    motion = None if state.motion is None else state.motion.trajectory
+    if violation is None or motion is None or violation.kind not in COLLISIONS:
+        return None
+    return interpolated(np.array([violation.time]), motion.times, motion.positions)[0]
+
+
+@dataclass(frozen=True)
+class PanelCallbacks:
+    """Functions of the page that the panel calls."""
+
+    select: Callable[[str], None]
+    seek: Callable[[float], None]
+    play: Callable[[bool], None]
+
+
+class Panel:
+    """The widgets of the control panel."""
+
+    def __init__(self, server: viser.ViserServer, session: Session, callbacks: PanelCallbacks) -> None:
+        self._server, self._session, self._callbacks = server, session, callbacks
+        gui = server.gui
+        self._changes = Changes()
+        self._badge = gui.add_html("")
+        self._slider = gui.add_slider("Time", min=0.0, max=1.0, step=0.01, initial_value=0.0)
+        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Plan"):
+            self._plan_tab()
+        with tabs.add_tab("Obstacles"):
+            self._obstacles_tab()
+        with tabs.add_tab("Start"):
+            self._joints_box = gui.add_folder("Joints")
+            self._joints: list[viser.GuiInputHandle[float]] = []
+        with tabs.add_tab("Files"):
+            self._files_tab()
+        self._on(self._slider, lambda event: callbacks.seek(event.target.value))
+        self._play.on_click(lambda _event: callbacks.play(self._play.label == "Play"))
+
+    def _on(self, widget: Any, do: Callable[[Any], object]) -> None:
+        """Call `do` when a visitor changes a widget; show its InputError as a notification."""
+
+        @widget.on_update
+        def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                self.guarded(event, lambda: do(event))
+
+    def guarded(self, event: viser.GuiEvent, do: Callable[[], object]) -> None:
+        """Call `do`; show its InputError as a notification to the visitor."""
+        try:
+            do()
+        except InputError as error:
+            if event.client is not None:
+                event.client.add_notification(
+                    "Not possible", str(error), auto_close_seconds=NOTIFICATION_TIME, color="red"
+                )
+
+    # tabs
+
+    def _plan_tab(self) -> None:
+        gui, session, options = self._server.gui, self._session, self._session.state.options
+        hints = {
+            "follow": "Plan again after each change",
+            "candidates": "Motions proposed by the network: red in collision, green from 5 cm clearance",
+            "trees": "Search trees from the start (blue) and the goal (green); planners: "
+            + ", ".join(TREE_SETTINGS),
+        }
+        labels = {"follow": "Plan automatically", "candidates": "Candidates", "trees": "Search trees"}
+        self._options: dict[str, Any] = {
+            "planner": gui.add_dropdown("Planner", tuple(PLANNERS), initial_value=options.planner)
+        }
+        limit = gui.add_slider(
+            "Time limit [s]", min=0.05, max=10.0, step=0.05, initial_value=min(options.time_limit, 10.0)
+        )
+        for name, hint in hints.items():
+            value = getattr(options, name)
+            self._options[name] = gui.add_checkbox(labels[name], initial_value=value, hint=hint)
+        self._now = gui.add_button("Plan now", icon=viser.Icon.ROUTE)
+        self._stages = gui.add_html("")
+        self._kind = gui.add_dropdown("Plot", PLOTS, initial_value=PLOTS[0])
+        self._plot_box = gui.add_folder("Joint values relative to limits")
+        self._plot: viser.GuiUplotHandle | None = None
+        for name, widget in {**self._options, "time_limit": limit}.items():
+            self._on(widget, lambda event, name=name: session.set_options(**{name: event.target.value}))
+        self._on(self._kind, lambda _event: self._show_plot(session.state))
+        self._now.on_click(lambda event: self.guarded(event, session.plan_now))
+
+    def _obstacles_tab(self) -> None:
+        gui = self._server.gui
+        names: tuple[str, ...] = (NO_OBSTACLE,)
+        self._selected: Any = gui.add_dropdown("Obstacle", names, initial_value=NO_OBSTACLE)
+        self._sizes_box = gui.add_folder("Size [m]", visible=False)
+        self._sizes: dict[str, Any] = {}
+        self._delete = gui.add_button("Delete", icon=viser.Icon.TRASH, visible=False)
+        self._new = gui.add_dropdown("New obstacle", tuple(NEW_OBSTACLES), initial_value="sphere")
+        self._add = gui.add_button("Add", icon=viser.Icon.PLUS)
+        self._on(self._selected, lambda event: self._callbacks.select(_name(event.target.value)))
+        self._delete.on_click(
+            lambda event: self.guarded(event, lambda: self._session.delete_obstacle(self._selected.value))
+        )
+        self._add.on_click(lambda event: self.guarded(event, self._add_obstacle))
+
+    def _add_obstacle(self) -> None:
+        self._callbacks.select(self._session.add_obstacle(self._new.value))
+
+    def _files_tab(self) -> None:
+        gui, session = self._server.gui, self._session
+        load = gui.add_upload_button("Load problem", icon=viser.Icon.UPLOAD, mime_type=".yaml,.yml,.json")
+        save = gui.add_button("Save problem", icon=viser.Icon.DOWNLOAD)
+        share = gui.add_button("Save replay", icon=viser.Icon.SHARE)
+
+        @load.on_upload
+        def _(event: viser.GuiEvent) -> None:
+            file, robot = load.value, session.state.problem.robot
+            self.guarded(event, lambda: session.open(uploaded_problem(file.content, file.name, robot)))
+
+        save.on_click(lambda event: self.guarded(event, lambda: _send(event, *self._problem_file())))
+        share.on_click(lambda event: self.guarded(event, lambda: _send(event, *self._replay_file())))
+
+    def _problem_file(self) -> tuple[str, bytes]:
+        return "problem.yaml", problem_text(self._session.state.problem)
+
+    def _replay_file(self) -> tuple[str, bytes]:
+        state = self._session.state
+        if state.motion is None:
+            raise InputError("there is no motion to save yet")
+        candidates = () if state.candidates is None else state.candidates.positions
+        paths = tuple(Path(state.problem.robot.joint_names, q) for q in candidates)
+        return "replay.html", replay_page(state.problem, state.motion, paths)
+
+    # display
+
+    def show(self, state: State, validity: Validity, selected: str) -> None:
+        """Update the widgets to a state."""
+        if self._changes.new("validity", (validity.kind, validity.headline, validity.lines), state.planning):
+            self._badge.content = badge_html(validity, state.planning)
+        if self._changes.new("seconds", state.seconds):
+            self._stages.content = _stages_html(state.seconds)
+        for name, widget in self._options.items():
+            set_value(widget, getattr(state.options, name))
+        if self._changes.new("motion", state.motion):
+            self._show_plot(state)
+        if self._changes.new("robot", state.problem.robot):
+            self._new_joints(state.problem.robot)
+        if self._changes.new("start", state.problem.start):
+            for widget, value in zip(self._joints, state.problem.start, strict=True):
+                set_value(widget, round(float(value), 3))
+        self._show_obstacle(state, selected)
+
+    def _show_obstacle(self, state: State, selected: str) -> None:
+        shapes = {shape.name: shape for shape in state.problem.known_scene.shapes}
+        options: tuple[str, ...] = (NO_OBSTACLE, *shapes)
+        if self._changes.new("options", options):
+            self._selected.options = options
+        name = selected if selected in shapes else NO_OBSTACLE
+        set_value(self._selected, name)
+        shape = shapes.get(selected)
+        self._delete.visible = shape is not None
+        sizes = {} if shape is None else dimensions(shape)
+        self._sizes_box.visible = bool(sizes)
+        if self._changes.new("sizes of", (name, *sizes)):
+            for widget in self._sizes.values():
+                widget.remove()
+            with self._sizes_box:
+                self._sizes = {of: self._size_slider(name, of, value) for of, value in sizes.items()}
+        for of, value in sizes.items():
+            set_value(self._sizes[of], value)
+
+    def _size_slider(self, name: str, dimension: str, value: float) -> Any:
+        most = max(MAX_DIMENSION, value)
+        slider = self._server.gui.add_slider(
+            dimension, min=min(MIN_DIMENSION, value), max=most, step=0.005, initial_value=value
+        )
+        self._on(slider, lambda event: self._session.resize_obstacle(name, dimension, event.target.value))
+        return slider
+
+    def _new_joints(self, robot: Robot) -> None:
+        for widget in self._joints:
+            widget.remove()
+        self._joints = []
+        limits = zip(robot.joint_names, robot.lower, robot.upper, robot.continuous, strict=True)
+        with self._joints_box:
+            for name, low, high, turns in limits:
+                low, high = (-np.pi, np.pi) if turns else (float(low), float(high))
+                low, high = np.floor(100 * low) / 100, np.ceil(100 * high) / 100  # for short labels
+                widget = self._server.gui.add_slider(name, min=low, max=high, step=0.001, initial_value=low)
+                self._on(widget, partial(self._move_joint, len(self._joints)))
+                self._joints.append(widget)
+
+    def _move_joint(self, index: int, event: Any) -> None:
+        problem = self._session.state.problem
+        q = problem.start.copy()
+        q[index] = np.clip(event.target.value, problem.robot.lower[index], problem.robot.upper[index])
+        self._session.set_start(q)
+
+    def show_time(self, at: float, duration: float) -> None:
+        """Set the time slider [s]."""
+        most = max(np.ceil(100 * duration) / 100, 0.01)
+        if self._slider.max != most:
+            self._slider.max = most
+        self._slider.value = round(at, 2)
+
+    def show_playing(self, playing: bool) -> None:
+        """Set the play button."""
+        self._play.label = "Pause" if playing else "Play"
+        self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
+
+    def _show_plot(self, state: State) -> None:
+        robot, motion = state.problem.robot, state.motion
+        if motion is None or motion.trajectory is None:
+            return
+        data = plotted(robot, motion.trajectory, self._kind.value)
+        names = tuple(robot.joint_names)
+        if self._plot is not None and not self._changes.new("joints of the plot", names):
+            self._plot.data = data
+            return
+        if self._plot is not None:
+            self._plot.remove()
+        self._changes.new("joints of the plot", names)
+        joints = [
+            uplot.Series(label=name, stroke=JOINT_COLORS[i % len(JOINT_COLORS)], width=1.5)
+            for i, name in enumerate(names)
+        ]
+        limit = uplot.Series(label="limit", stroke="#c92f2f", width=1, dash=(6, 4))
+        with self._plot_box:
+            self._plot = self._server.gui.add_uplot(
+                data=data,
+                series=(uplot.Series(label="time [s]"), *joints, limit, limit),
+                scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(-118.0, 118.0))},
+                axes=(uplot.Axis(label="s"), uplot.Axis(label="% of limit")),
+                legend=uplot.Legend(show=False),
+                height=220,
+            )
+
+
+def plotted(robot: Robot, motion: Trajectory, kind: str) -> tuple[np.ndarray, ...]:
+    """Plot data: times, each joint in % of its limits, and the limits 100 and -100.
+
+    Position 0 % is the middle of the range; the limit of a continuous joint is half a turn.
+    """
+    if kind == "velocity":
+        values = motion.velocities / robot.velocity
+    elif kind == "acceleration":
+        values = motion.accelerations / robot.acceleration
+    else:
+        middle = np.where(robot.continuous, 0.0, 0.5 * (robot.lower + robot.upper))
+        half = np.where(robot.continuous, np.pi, 0.5 * (robot.upper - robot.lower))
+        values = (motion.positions - middle) / half
+    limit = np.full(len(motion.times), 100.0)
+    return (motion.times, *(100.0 * values).T, limit, -limit)
+
+
+def set_value(widget: Any, value: object) -> None:
+    """Set a widget, without a message to browsers if it already has the value."""
+    if widget.value != value:
+        widget.value = value
+
+
+def _name(option: str) -> str:
+    return "" if option == NO_OBSTACLE else option
+
+
+def _send(event: viser.GuiEvent, name: str, content: bytes) -> None:
+    if event.client is not None:
+        event.client.send_file_download(name, content, save_immediately=True)
+
+
+def badge_html(validity: Validity, planning: bool = False) -> str:
+    """A coloured box with a headline and lines."""
+    lines = "".join(f"<div>{html.escape(line)}</div>" for line in validity.lines)
+    busy = " · planning" if planning and validity.kind != PENDING else ""
+    return (
+        f'<div data-validity="{validity.kind}" style="margin: 0 0.8em 0.8em; padding: 0.7em 0.9em; '
+        f"border-radius: 8px; color: white; font-size: 0.85em; line-height: 1.4; "
+        f'background: {BADGE_COLORS[validity.kind]}; overflow-wrap: anywhere">'
+        f"<b>{html.escape(validity.headline)}</b>{busy}{lines}</div>"
+    )
+
+
+def _stages_html(seconds: tuple[tuple[str, float], ...]) -> str:
+    rows = "".join(
+        f'<tr><td>{html.escape(stage)}</td><td style="text-align: right">{1e3 * took:.1f} ms</td></tr>'
+        for stage, took in seconds
+    )
+    return f'<table style="margin: 0 0.8em; width: calc(100% - 1.6em); font-size: 0.85em">{rows}</table>'

@@ -1,6 +1,15 @@
-"""The server of a page: viser behind an access proxy, with lights, a floor and a first view."""
+"""The server of a page: viser with access control, lights, a floor and a first view.
 
+viser by itself accepts every connection. Here it checks each browser before any data is sent: the address
+that it connects to must end with the token, or, without a token, name this machine (which stops DNS
+rebinding); a page of another origin is refused. What viser serves without a check is its own program.
+"""
+
+import hmac
+import ipaddress
 import secrets
+import socket
+from urllib.parse import urlsplit
 
 import numpy as np
 import rich
@@ -9,11 +18,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from viser import infra
 
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.drawables import drawables
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.visualization import style
+from robotdiffuse.visualization.arm import DrawnArm
 from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
-from robotdiffuse.visualization.live.access import SECRET
-from robotdiffuse.visualization.style import Surface
 
 FLOOR_SIZE = 4.7
 """Edge length of the floor, as a multiple of the arm's reach."""
@@ -23,80 +32,129 @@ LIGHTS = (2.0, (-2.0, -3.0, 5.0)), (1.1, (3.0, 2.0, 3.0)), (0.7, (-3.0, 3.0, 1.0
 """Intensity and position of each light."""
 PANEL_OFFSET = 0.2
 """Shift of the view to the left of the control panel, as a fraction of the window's height."""
+POLICY_VIOLATION = 1008
+"""Code with which WebSockets are closed that may not connect."""
 
 
-class _Server(viser.ViserServer):
-    """viser's server without its public share URLs."""
+def is_loopback(host: str) -> bool:
+    """Whether an address can be reached only from this machine."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+def free_port(host: str, port: int) -> int:
+    """The port; a free one for 0. Raises InputError if it cannot be listened on."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+    except (OSError, UnicodeError):
+        raise InputError(f"--host is {host!r}; it must be an address of this machine") from None
+    with socket.socket(family, kind, protocol) as listening:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind(address)
+        except OSError as error:
+            why = error.strerror or str(error)
+            raise InputError(
+                f"port {port} of {host} cannot be used: {why}; choose another with --port, or 0 for any"
+            ) from None
+        return listening.getsockname()[1]
+
+
+def may_connect(path: str, host: str, origin: str | None, token: str) -> bool:
+    """Whether a browser may connect, by the path, Host and Origin of its request."""
+    if origin is not None and _part(origin, "netloc") != host:
+        return False
+    if token:
+        return hmac.compare_digest(path.partition("?")[0].strip("/").encode(), token.encode())
+    return is_loopback(_part(f"//{host}", "hostname"))
+
+
+def _part(url: str, name: str) -> str:
+    """A part of a URL; "" if it is not one."""
+    try:
+        return getattr(urlsplit(url), name) or ""
+    except ValueError:
+        return ""
+
+
+class PageServer(viser.ViserServer):
+    """A silent viser server that checks who connects, without viser's public share URLs.
+
+    Raises AttributeError for a version of viser with other internals.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        """On hosts that others can reach, browsers need a random token."""
+        self.token = "" if is_loopback(host) else secrets.token_urlsafe(16)
+        with (
+            rich.get_console().capture()
+        ):  # viser prints its own address; other threads' output is left alone
+            super().__init__(host, port, verbose=False)
+        inner = self._websock_server
+
+        async def check(client: infra.WebsockClientConnection) -> None:
+            connection = inner._live_connections[client.client_id]
+            request = connection.request
+            hosts, origins = (
+                [] if request is None else request.headers.get_all(name) for name in ("Host", "Origin")
+            )
+            known = request is not None and len(hosts) == 1 and len(origins) <= 1
+            if not (known and may_connect(request.path, hosts[0], next(iter(origins), None), self.token)):
+                await connection.close(POLICY_VIOLATION)
+
+        inner.on_client_connect(check)
+        inner.disconnect_all_clients()  # who came before; browsers connect again by themselves
+
+    @property
+    def url(self) -> str:
+        """The address of the page, for browsers."""
+        host = self.get_host()
+        name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        place = f"{name}:{self.get_port()}/"
+        return f"http://{place}" + (f"?websocket=ws://{place}{self.token}" if self.token else "")
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """None: a browser must not open a tunnel from the internet to the page."""
         return None
 
+    def stop(self) -> None:
+        """Stop without the message that viser's thread would print."""
+        loop = self._websock_server._background_event_loop
+        assert loop is not None, "the server runs"
+        loop.call_soon_threadsafe(rich.get_console().begin_capture)
+        super().stop()
 
-def new_server() -> tuple[viser.ViserServer, str]:
-    """A viser server on a local port, and the secret that its access proxy needs."""
-    secret = secrets.token_urlsafe(32)
-    with rich.get_console().capture():  # viser prints its own address; other threads' output is left alone
-        server = _Server("127.0.0.1", 0, verbose=False)
-    _require_secret(secret, server)
-    return server, secret
+    def add_stage(self, reach: float) -> None:
+        """Add the theme, lights and a floor for an arm of this reach [m]."""
+        self.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.gui.set_panel_label("RobotDiffuse")
+        # viser's default lighting, an environment map with shadows, is a hundred times slower without a
+        # graphics card
+        self.scene.configure_environment_map(None)
+        self.scene.configure_default_lights(enabled=False)
+        self.scene.add_light_ambient("/light/sky", intensity=1.1)
+        for i, (intensity, at) in enumerate(LIGHTS):
+            self.scene.add_light_directional(f"/light/{i}", intensity=intensity, position=at)
+        side = FLOOR_SIZE * reach
+        self.scene.add_grid(
+            "/floor",
+            side,
+            side,
+            cell_size=side / 40,
+            cell_color=(236, 238, 241),
+            section_size=side / 8,
+            section_color=(214, 218, 224),
+        )
 
-
-def stop_server(server: viser.ViserServer) -> None:
-    """Stop a server without the message that its thread would print."""
-    loop = server._websock_server._background_event_loop
-    assert loop is not None, "the server runs"
-    loop.call_soon_threadsafe(rich.get_console().begin_capture)
-    server.stop()
-
-
-def add_stage(server: viser.ViserServer, reach: float) -> None:
-    """Add the theme, lights and a floor for an arm of this reach [m]."""
-    server.gui.configure_theme(show_logo=False, show_share_button=False)
-    server.gui.set_panel_label("RobotDiffuse")
-    # viser's default lighting, an environment map with shadows, is a hundred times slower without a
-    # graphics card
-    server.scene.configure_environment_map(None)
-    server.scene.configure_default_lights(enabled=False)
-    server.scene.add_light_ambient("/light/sky", intensity=1.1)
-    for i, (intensity, at) in enumerate(LIGHTS):
-        server.scene.add_light_directional(f"/light/{i}", intensity=intensity, position=at)
-    side = FLOOR_SIZE * reach
-    server.scene.add_grid(
-        "/floor",
-        side,
-        side,
-        cell_size=side / 40,
-        cell_color=(236, 238, 241),
-        section_size=side / 8,
-        section_color=(214, 218, 224),
-    )
-
-
-def set_first_view(
-    server: viser.ViserServer, problem: Problem, surfaces: list[Surface], q: Float[ndarray, "n dof"]
-) -> None:
-    """Set the view of new browsers so that the arm is visible in all configurations, beside the panel."""
-    tool = style.tool_point(problem.robot, surfaces)
-    view = view_of_motion(problem.robot, problem.scene, surfaces, tool, q, *VIEW_SIZE, VIEW_MARGINS)
-    height = 2 * np.tan(VERTICAL_FIELD / 2) * np.linalg.norm(view.target - view.eye)
-    aside = PANEL_OFFSET * height * view.rotation[0]
-    camera = server.initial_camera
-    camera.fov = VERTICAL_FIELD
-    camera.position, camera.look_at = tuple(view.eye + aside), tuple(view.target + aside)
-
-
-def _require_secret(secret: str, server: viser.ViserServer) -> None:
-    """Close connections that bypass the access proxy: viser accepts any page in any browser on this machine
-    that finds its port. Raises AttributeError for a version of viser with other internals."""
-    inner = server._websock_server
-    connections = inner._live_connections
-
-    async def check(client: infra.WebsockClientConnection) -> None:
-        connection = connections[client.client_id]
-        request = connection.request
-        given = "" if request is None else request.headers.get(SECRET, "")
-        if not secrets.compare_digest(given.encode(), secret.encode()):
-            await connection.close(1008)
-
-    inner.on_client_connect(check)
+    def set_first_view(self, arm: DrawnArm, problem: Problem, q: Float[ndarray, "n dof"]) -> None:
+        """Set the view of new browsers so that the arm is visible in all configurations, beside the panel."""
+        view = view_of_motion(arm, drawables(problem.scene), q, VIEW_SIZE, VIEW_MARGINS)
+        height = 2 * np.tan(VERTICAL_FIELD / 2) * np.linalg.norm(view.target - view.eye)
+        aside = PANEL_OFFSET * height * view.rotation[0]
+        camera = self.initial_camera
+        camera.fov = VERTICAL_FIELD
+        camera.position, camera.look_at = tuple(view.eye + aside), tuple(view.target + aside)

@@ -9,30 +9,55 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from importlib.resources import as_file, files
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, shortened, unknown_name
+from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
+from robotdiffuse.core.errors import InputError, distinct, shortened, shown, unknown_name
+from robotdiffuse.core.input_files import parse_json, parse_yaml
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
+from robotdiffuse.core.transforms import inverse, transform
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner, planner_settings
 from robotdiffuse.planning.diffusion.candidates import Candidates, draw_candidates
 from robotdiffuse.planning.planner import Planner
+from robotdiffuse.problems.families import load_family
+from robotdiffuse.problems.files import load_problem, problem_from_record, save_problem
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import known_robots, load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
-from robotdiffuse.scenes.shapes import Shape
+from robotdiffuse.scenes.mesh import Mesh
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from robotdiffuse.validation.report import Report
-from robotdiffuse.validation.validator import verify_trajectory
-from robotdiffuse.visualization.live.latest_task import LatestTask
-from robotdiffuse.visualization.live.obstacles import handle_pose, moved_to, new_obstacle, resized
+from robotdiffuse.validation.validator import verify, verify_trajectory
+from robotdiffuse.visualization.live.threads import LatestTask
+from robotdiffuse.visualization.replay_page import write_replay
 
+NEW_OBSTACLES: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
+    "sphere": lambda center, size: Sphere(center, size),
+    "box": lambda center, size: Box(center, (2 * size, 2 * size, 2 * size)),
+    "cylinder": lambda center, size: Cylinder(center, 0.75 * size, 3 * size),
+    "capsule": lambda center, size: Capsule(center, 0.75 * size, 2.5 * size),
+}
+"""Makers of new obstacles, by kind, from their centre and the radius of a sphere of similar size [m]."""
+MIN_DIMENSION, MAX_DIMENSION = 0.01, 2.0
+"""Bounds of a dimension [m]."""
+AXES = ("x", "y", "z")
+ORIENTED = (Box, Cylinder, Capsule, Mesh)
+"""Shapes that can be rotated. Rotating a sphere has no effect, and point clouds store no pose."""
 NEW_POSITION, NEW_RADIUS = np.array([0.5, 0.0, 0.5]), 0.094
 """Position of new obstacles and radius of a new sphere, as fractions of the arm's reach."""
 TREE_SETTINGS = {
@@ -43,6 +68,20 @@ TREE_SETTINGS = {
 """Planners whose search trees can be shown, with the setting that keeps the trees."""
 QUICK_IK = InverseKinematicsSettings(max_rounds=2, patience=1)
 """Inverse kinematics while dragging: few attempts, because many poses are out of reach."""
+
+
+DEMO_FILE = "shelf.yaml"
+FAMILY = "shelf"
+MAX_UPLOAD_SIZE = 5_000_000
+"""Largest problem file [bytes]."""
+FILE_FIELDS = ("file", "request", "views")
+"""Fields of a problem that name files on the server."""
+MAX_SAMPLES = 1000
+"""Most random configurations that are tried for a free start and goal."""
+NO_FILES = "the page reads no other files; open this problem with `robotdiffuse live PROBLEM`"
+VALID, INVALID, NO_MOTION, PENDING = "valid", "invalid", "none", "pending"
+"""Kinds of badges: green, red, no motion, not validated yet."""
+COLLISIONS = ("scene_collision", "self_collision")
 
 
 @dataclass(frozen=True)
@@ -182,11 +221,12 @@ class Session:
     def add_obstacle(self, kind: str, center: Float[ndarray, "3"] | None = None) -> str:
         """Add an obstacle and return its name. Default centre [m]: in front of the arm, at half its reach."""
         with self._lock:
+            if kind not in NEW_OBSTACLES:
+                raise unknown_name("kind of obstacle", kind, NEW_OBSTACLES)
             length = reach(self._state.problem.robot)
             center = length * NEW_POSITION if center is None else center
-            obstacle = new_obstacle(kind, center, round(NEW_RADIUS * length, 2))
-            shapes = [*self._state.problem.known_scene.shapes, obstacle]
-            self._set_scene(shapes)
+            obstacle = NEW_OBSTACLES[kind](center, round(NEW_RADIUS * length, 2))
+            self._set_scene([*self._state.problem.known_scene.shapes, obstacle])
             return self._state.problem.known_scene.shapes[-1].name
 
     def move_obstacle(self, name: str, T_base_handle: Float[ndarray, "4 4"]) -> None:
@@ -209,10 +249,6 @@ class Session:
         if name not in shapes:
             raise unknown_name("obstacle", name, shapes)
         return shapes[name]
-
-    def obstacle_pose(self, name: str) -> Float[ndarray, "4 4"]:
-        """T_base_handle of an obstacle."""
-        return handle_pose(self.obstacle(name))
 
     def _change_obstacle(self, name: str, change: Callable[[Shape], Shape]) -> None:
         with self._lock:
@@ -382,3 +418,190 @@ def _free(validation: Validation) -> bool:
     """Whether a motion is valid except perhaps for its goal, which moves while the target is dragged."""
     violation = validation.report.violation
     return violation is None or violation.kind == "goal"
+
+
+def moved_to(shape: Shape, T_base_handle: Float[ndarray, "4 4"]) -> Shape:
+    """The shape with its handle at a pose; shapes without an orientation are not rotated."""
+    if not isinstance(shape, ORIENTED):
+        T_base_handle = transform(T_base_handle[:3, 3])
+    return shape.moved(T_base_handle @ inverse(own_frame(shape)))
+
+
+def dimensions(shape: Shape) -> dict[str, float]:
+    """The adjustable dimensions of a shape by name [m]; none for meshes and point clouds."""
+    if isinstance(shape, Box):
+        return {f"size {axis}": float(value) for axis, value in zip(AXES, shape.size, strict=True)}
+    if isinstance(shape, Sphere):
+        return {"radius": shape.radius}
+    if isinstance(shape, Cylinder | Capsule):
+        return {"radius": shape.radius, "height": shape.height}
+    return {}
+
+
+def resized(shape: Shape, dimension: str, value: float) -> Shape:
+    """The shape with one of its `dimensions` changed. Raises InputError for another name and values out of
+    bounds."""
+    known = dimensions(shape)
+    if dimension not in known:
+        raise unknown_name(f"dimension of {shape.name}:", dimension, known)
+    if not MIN_DIMENSION <= value <= MAX_DIMENSION:
+        size, least, most = distinct(value, MIN_DIMENSION, MAX_DIMENSION)
+        raise InputError(f"{dimension} of {shape.name} is {size} m; it must be {least} to {most} m")
+    if isinstance(shape, Box):
+        size = np.array([value if name == dimension else old for name, old in known.items()])
+        return replace(shape, size=size)
+    return replace(shape, **{dimension: value})  # type: ignore[type-var]
+
+
+@dataclass(frozen=True)
+class Validity:
+    """Kind and text of the badge."""
+
+    kind: str
+    headline: str
+    lines: tuple[str, ...] = ()
+
+
+def validity(state: State) -> Validity:
+    """The badge of a state: clearances, or link, obstacle, depth and time of a violation, or why there is no
+    motion."""
+    why_not = _why_not(state)
+    more = (f"no new plan: {why_not}",) if why_not else ()
+    validation = state.validation
+    if state.motion is None:
+        if why_not:
+            return Validity(NO_MOTION, "no plan", (why_not,))
+        if state.planning:
+            return Validity(PENDING, "planning", ("a new machine compiles first, for about a minute",))
+        return Validity(PENDING, "not planned yet")
+    if validation is None:
+        return Validity(PENDING, "validating")
+    report, trajectory = validation.report, state.motion.trajectory
+    assert trajectory is not None
+    violation = report.violation
+    if violation is None:
+        lines = (
+            f"{_to_obstacles(state, report)}, between links {_distance(report.self_clearance)}, "
+            f"over {trajectory.duration:.2f} s",
+            *more,
+        )
+        return Validity(VALID, f"free, clearance at least {_distance(report.min_clearance)}", lines)
+    what = "collides" if violation.kind in COLLISIONS else "not valid"
+    when = f"at {violation.time:.2f} s of {trajectory.duration:.2f} s"
+    return Validity(INVALID, f"{what}: {violation.message}", (when, *more))
+
+
+def _to_obstacles(state: State, report: Report) -> str:
+    problem = state.problem
+    if not (problem.scene.shapes or problem.moving):
+        return "no obstacles"
+    return f"to obstacles {_distance(report.scene_clearance)}"
+
+
+def _why_not(state: State) -> str:
+    """Why the last planning call found no motion; "" if it did."""
+    if state.failure:
+        return state.failure
+    if state.answer is None or state.answer.solved:
+        return ""
+    return f"{state.answer.status.value}: {state.answer.reason}"
+
+
+def _distance(metres: float | None) -> str:
+    metres = metres or 0.0
+    if metres > CLEARANCE_CAP - 1e-4:
+        return f"more than {CLEARANCE_CAP:g} m"
+    return f"{100 * metres:.1f} cm" if metres >= 0.01 else f"{1000 * metres:.1f} mm"
+
+
+def first_problem(file: str | None, robot: str | None) -> Problem:
+    """The first problem of the page: from a file, for a robot, or the demo.
+
+    Raises InputError if both are given, and for a bad file or robot.
+    """
+    if file is not None and robot is not None:
+        raise InputError(f"{file} names its robot; give a problem or --robot {robot}, not both")
+    if file is not None:
+        return load_problem(file)
+    if robot is not None:
+        return problem_for(load_robot(robot))
+    with as_file(files("robotdiffuse") / "examples" / DEMO_FILE) as demo:
+        return load_problem(demo)
+
+
+def problem_for(robot: Robot) -> Problem:
+    """A problem of the family shelf for the arm; if there is none, between two free configurations in an
+    empty scene."""
+    rng = np.random.default_rng(0)
+    try:
+        return load_family(FAMILY).draw(robot, rng).problem(robot)
+    except InputError:
+        pass
+    lower, upper = (np.clip(limit, -np.pi, np.pi) for limit in (robot.lower, robot.upper))
+    free: list[np.ndarray] = []
+    for q in rng.uniform(lower, upper, (MAX_SAMPLES, robot.dof)):
+        alone = Problem(robot, Scene(), q, JointGoal(q))
+        if verify(alone, JointPath(robot.joint_names, q[None])).valid:
+            free.append(q)
+        if len(free) == 2:
+            return Problem(robot, Scene(), free[0], JointGoal(free[1]))
+    raise InputError(f"of {MAX_SAMPLES} random configurations of {robot.name} fewer than 2 are free")
+
+
+def uploaded_problem(content: bytes, name: str, robot: Robot) -> Problem:
+    """The problem in an uploaded file.
+
+    It may name known robots and the one on the page, but no files on the server. Raises InputError, which
+    begins with the name of the file.
+    """
+    if len(content) > MAX_UPLOAD_SIZE:
+        raise InputError(f"{name} has {len(content)} bytes; at most {MAX_UPLOAD_SIZE} are read")
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{name} is not UTF-8 text") from None
+    data = parse_json(text, name) if name.lower().endswith(".json") else parse_yaml(text, name)
+    try:
+        _check_contained(data, robot)
+        return problem_from_record(data)
+    except InputError as error:
+        raise InputError(f"{name}: {str(error).removeprefix('problem: ')}") from None
+
+
+def _check_contained(data: object, robot: Robot) -> None:
+    """Raises InputError if the data of a problem file names files."""
+    if not isinstance(data, dict):
+        return  # the problem reader rejects it
+    given, known = data.get("robot"), known_robots()
+    if isinstance(given, str) and given not in known and given != robot.source:
+        raise unknown_name("robot", given, known)
+    if isinstance(data.get("scene"), str):
+        raise InputError(f"scene is {shown(data['scene'])}; {NO_FILES}")
+    parts: list[object] = [data]
+    while parts:
+        part = parts.pop()
+        if isinstance(part, dict):
+            for field in FILE_FIELDS:
+                if field in part:
+                    raise InputError(f"{field} is {shown(part[field])}; {NO_FILES}")
+            parts += part.values()
+        elif isinstance(part, list):
+            parts += part
+
+
+def problem_text(problem: Problem) -> bytes:
+    """The problem as a YAML file."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "problem.yaml"
+        save_problem(problem, file)
+        return file.read_bytes()
+
+
+def replay_page(problem: Problem, result: PlanResult, candidates: tuple[JointPath, ...] = ()) -> bytes:
+    """The replay of a solved result as a self-contained HTML page."""
+    motion = result.trajectory or result.path
+    assert motion is not None
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "replay.html"
+        write_replay(*problem.standing(), motion, file, result=result, candidates=candidates)
+        return file.read_bytes()

@@ -1,0 +1,240 @@
+"""What is drawn of a robot and of obstacles: surfaces and colours, over time.
+
+Pictures, replays, the live page, recordings for Rerun and Foxglove, and PyBullet's cameras draw these.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.core.transforms import inverse, transform
+from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.visual_meshes import load_visual
+from robotdiffuse.scenes.mesh import Triangulated
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+
+Color = tuple[int, int, int]
+"""sRGB."""
+START, GOAL = (0x4F, 0x7F, 0xD9), (0x10, 0xA3, 0x7F)
+"""Colours of the start and goal of a motion; the trace fades from one to the other."""
+OBSTACLES = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
+FURNITURE = (0xCD, 0xC0, 0xAC)
+OBSERVED, ASSUMED = (0x4F, 0x7C, 0xAC), (0xB9, 0x8A, 0xD9)
+"""Points that cameras observed, and points assumed to be occupied in unknown space."""
+FURNITURE_SIZE = 0.7
+"""Obstacles with a longer side than this count as furniture, with its own colour [m]."""
+CREASE_ANGLE = np.radians(38)
+"""Edges with a larger angle between their faces are drawn sharp [rad]."""
+MAX_SIZE = 60_000
+"""Most points of a cloud, and most faces of a mesh, that are drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles with a normal and an sRGB colour (0 to 1) at each vertex."""
+
+    vertices: Float[ndarray, "v 3"]
+    normals: Float[ndarray, "v 3"]
+    colors: Float[ndarray, "v 3"]
+    faces: Int[ndarray, "f 3"]
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "Surface":
+        """The surface after a rigid transform."""
+        vertices = self.vertices @ T[:3, :3].T + T[:3, 3]
+        return Surface(vertices, self.normals @ T[:3, :3].T, self.colors, self.faces)
+
+    @property
+    def by_color(self) -> list[tuple[Color, "Surface"]]:
+        """The surface split by the colours of its faces."""
+        colors, number = np.unique(np.round(255 * self.colors).astype(int), axis=0, return_inverse=True)
+        of_face = number.reshape(-1)[self.faces[:, 0]]
+        parts = []
+        for i, (r, g, b) in enumerate(colors.tolist()):
+            used, faces = np.unique(self.faces[of_face == i], return_inverse=True)
+            arrays = self.vertices[used], self.normals[used], self.colors[used]
+            parts.append(((r, g, b), Surface(*arrays, faces.reshape(-1, 3))))
+        return parts
+
+
+def join(surfaces: Sequence[Surface]) -> Surface:
+    """One surface from many; an empty one from none."""
+    if not surfaces:
+        return Surface(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    starts = np.cumsum([0] + [len(s.vertices) for s in surfaces[:-1]])
+    return Surface(
+        np.concatenate([s.vertices for s in surfaces]),
+        np.concatenate([s.normals for s in surfaces]),
+        np.concatenate([s.colors for s in surfaces]),
+        np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=True)]),
+    )
+
+
+def painted(color: Color, count: int) -> Float[ndarray, "n 3"]:
+    """A colour for each of `count` vertices or faces."""
+    return np.tile(np.array(color) / 255.0, (count, 1))
+
+
+def creased(
+    vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"], colors: Float[ndarray, "f 3"]
+) -> Surface:
+    """A surface that is shaded smoothly except across sharp edges (CREASE_ANGLE); vertices are split
+    there."""
+    edges = vertices[faces]
+    area = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])
+    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-12)
+    corner = np.argsort(faces.reshape(-1), kind="stable")
+    owner = faces.reshape(-1)[corner]
+    counts = np.bincount(owner, minlength=len(vertices))
+    first = np.cumsum(counts) - counts
+    # all pairs of corners that share a vertex: `mine` gathers from `other`
+    repeats = counts[owner]
+    mine = np.repeat(np.arange(len(owner)), repeats)
+    within = np.arange(len(mine)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    other = first[owner[mine]] + within
+    face = corner // 3
+    alike = np.einsum("ij,ij->i", unit[face[mine]], unit[face[other]]) > np.cos(CREASE_ANGLE)
+    summed = [np.bincount(mine[alike], area[face[other[alike]], i], minlength=len(owner)) for i in range(3)]
+    normals = np.stack(summed, axis=1).astype(np.float64)  # integers if no face has an area
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    keys = np.column_stack([owner, np.round(normals * 100), np.round(colors[face] * 255)]).astype(np.int64)
+    _, keep, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    split = np.empty(3 * len(faces), np.int64)
+    split[corner] = index.reshape(-1)
+    return Surface(vertices[owner[keep]], normals[keep], colors[face[keep]], split.reshape(-1, 3))
+
+
+def link_surfaces(robot: Robot) -> dict[str, Surface]:
+    """The surface of each link, in the link's coordinates."""
+    return {
+        link: join([creased(mesh.vertices, mesh.faces, mesh.colors / 255.0) for mesh in meshes])
+        for link, meshes in load_visual(robot).items()
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Drawable:
+    """An obstacle as it is drawn."""
+
+    shape: Shape
+    """Where it is at time 0, in the base frame."""
+    color: Color
+    moving: MovingObstacle | None = None
+
+    @property
+    def name(self) -> str:
+        return self.shape.name
+
+    @cached_property
+    def surface(self) -> Surface:
+        """Where it is at time 0, in the base frame; a point cloud becomes octahedra."""
+        return _surface(self.shape, self.color)
+
+    def frame(self, time: float = 0.0) -> Float[ndarray, "4 4"]:
+        """The pose of its own frame in the base frame at a time [s]."""
+        return own_frame(self.shape) if self.moving is None else self.moving.pose(time)
+
+    @property
+    def own(self) -> "Drawable":
+        """The obstacle at rest in its own frame."""
+        return Drawable(self.shape.moved(inverse(self.frame())), self.color)
+
+    @property
+    def fixed(self) -> "Drawable":
+        """The obstacle in the frame that it is fixed to: the base, or its own if it moves."""
+        return self if self.moving is None else self.own
+
+    def surface_at(self, time: float) -> Surface:
+        """The surface where it is at a time [s], in the base frame."""
+        return self.surface.moved(self.frame(time) @ inverse(self.frame()))
+
+
+def drawables(scene: Scene, moving: Sequence[MovingObstacle] = ()) -> list[Drawable]:
+    """All obstacles, the moving ones last."""
+    shapes = [(shape, None) for shape in scene.shapes] + [(one.shape, one) for one in moving]
+    return [
+        Drawable(shape, _color(shape, OBSTACLES[i % len(OBSTACLES)]), one)
+        for i, (shape, one) in enumerate(shapes)
+    ]
+
+
+def own_frame(shape: Shape) -> Float[ndarray, "4 4"]:
+    """The pose of a shape's own frame; of shapes without one, the middle of the bounds."""
+    if isinstance(shape, PointCloud):
+        return transform(shape.bounds.mean(axis=0))
+    return shape.T_base_shape
+
+
+def _color(shape: Shape, own: Color) -> Color:
+    if isinstance(shape, SeenPoints | AssumedPoints):
+        return OBSERVED if isinstance(shape, SeenPoints) else ASSUMED
+    size = 0.0
+    if isinstance(shape, Box):
+        size = shape.size.max()
+    elif isinstance(shape, Cylinder | Capsule):
+        size = max(shape.height, 2 * shape.radius)
+    elif isinstance(shape, Triangulated):
+        size = np.ptp(shape.mesh.vertices, axis=0).max()
+    return FURNITURE if size > FURNITURE_SIZE else own
+
+
+def _surface(shape: Shape, color: Color) -> Surface:
+    import trimesh
+
+    T = np.eye(4)
+    if isinstance(shape, PointCloud):
+        return _point_surface(shape, color)
+    if isinstance(shape, Triangulated):
+        vertices, faces = decimated(shape.mesh.world_vertices, shape.mesh.faces)
+    else:
+        T = shape.T_base_shape
+        match shape:
+            case Sphere():
+                solid = trimesh.creation.icosphere(subdivisions=4, radius=shape.radius)
+            case Box():
+                solid = trimesh.creation.box(shape.size)
+            case Cylinder():
+                solid = trimesh.creation.cylinder(shape.radius, shape.height, sections=72)
+            case _:
+                assert isinstance(shape, Capsule)
+                solid = trimesh.creation.capsule(shape.height, shape.radius, count=(48, 32))
+                solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
+        vertices, faces = np.asarray(solid.vertices, np.float64), np.asarray(solid.faces, np.int64)
+    return creased(vertices, faces, painted(color, len(faces))).moved(T)
+
+
+def _point_surface(cloud: PointCloud, color: Color) -> Surface:
+    points = thinned(cloud.points)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    vertices = (points[:, None] + cloud.point_radius * axes).reshape(-1, 3)
+    many = (faces + 6 * np.arange(len(points))[:, None, None]).reshape(-1, 3)
+    return Surface(vertices, np.tile(axes, (len(points), 1)), painted(color, len(vertices)), many)
+
+
+def thinned(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+    """At most MAX_SIZE of the points: every k-th one."""
+    return points[:: -(-len(points) // MAX_SIZE)] if len(points) else points
+
+
+def decimated(
+    vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]
+) -> tuple[Float[ndarray, "w 3"], Int[ndarray, "g 3"]]:
+    """At most MAX_SIZE faces: merge the vertices in each cell of a grid, with growing cells until it
+    suffices."""
+    cell = float(np.ptp(vertices, axis=0).max()) / 400
+    while len(faces) > MAX_SIZE:
+        _, index = np.unique(np.floor(vertices / cell), axis=0, return_inverse=True)
+        index = index.reshape(-1)
+        weight = np.bincount(index)
+        vertices = np.stack([np.bincount(index, vertices[:, i]) / weight for i in range(3)], axis=1)
+        faces = index[faces]
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+        cell *= 1.5
+    return vertices, faces

@@ -1,0 +1,102 @@
+"""An arm as it is drawn, and the motions and figures that are shown of it."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision.exact_meshes import forward_frames
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.drawables import Surface, join, link_surfaces
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.visual_meshes import has_visual
+
+UNTIMED_SPEED = 0.8
+"""Speed in joint space at which a path without times is shown [rad/s]."""
+TRACE_POINTS = 120
+"""Number of configurations along a motion of which the trace is drawn, and by which views are chosen."""
+
+
+class DrawnArm:
+    """The surfaces of a robot on each of its dof + 1 frames, and the point of its tool that leaves a trace.
+
+    The point lies on the z axis of the tip link, as far out as the surfaces on its frame reach: between the
+    fingertips of a gripper.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        by_frame: list[list[Surface]] = [[] for _ in range(robot.dof + 1)]
+        for link, surface in link_surfaces(robot).items():
+            by_frame[robot.link_frame(link)].append(surface.moved(robot.T_frame_link(link)))
+        self.surfaces = [join(surfaces) for surfaces in by_frame]
+        """In the coordinates of each frame."""
+        self.tool_frame = robot.link_frame(robot.tip)
+        T_frame_tip = robot.T_frame_link(robot.tip)
+        along = (self.surfaces[self.tool_frame].vertices - T_frame_tip[:3, 3]) @ T_frame_tip[:3, 2]
+        self.tool_point = T_frame_tip[:3, 3] + max(0.0, along.max(initial=0.0)) * T_frame_tip[:3, 2]
+        """In the coordinates of the tool's frame [m]."""
+
+    def frames(self, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch frames 4 4"]:
+        """T_base_frame of all frames in each configuration."""
+        T = forward_frames(self.robot, q.reshape(-1, self.robot.dof))
+        return T.reshape(*q.shape[:-1], *T.shape[1:])
+
+    def posed(self, q: Float[ndarray, "dof"], begin: int = 0) -> Surface:
+        """The arm in a configuration, from frame `begin` on; 1 leaves out the base."""
+        poses = zip(self.surfaces[begin:], self.frames(q)[begin:], strict=True)
+        return join([surface.moved(T) for surface, T in poses])
+
+    def tool_points(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 3"]:
+        """Positions of the tool [m]."""
+        return self.frames(q)[:, self.tool_frame, :3] @ np.append(self.tool_point, 1.0)
+
+    def trace(self, q: Float[ndarray, "n dof"], count: int = TRACE_POINTS) -> Float[ndarray, "m 3"]:
+        """Positions of the tool at equal steps in joint space along a polyline [m]."""
+        return self.tool_points(dense(q, count))
+
+
+def dense(q: Float[ndarray, "n dof"], count: int) -> Float[ndarray, "m dof"]:
+    """`count` configurations equally spaced along a polyline in joint space; one if it does not move."""
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
+    return q[:1] if s[-1] == 0 else interpolated(np.linspace(0, s[-1], count), s, q)
+
+
+def interpolated(
+    at: Float[ndarray, "m"], times: Float[ndarray, "n"], rows: Float[ndarray, "n dof"]
+) -> Float[ndarray, "m dof"]:
+    """Rows between given ones, linearly."""
+    return np.stack([np.interp(at, times, column) for column in rows.T], axis=1)
+
+
+def timed(motion: Path | Trajectory) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:
+    """Times [s] and positions of a motion; a path without times gets a constant speed in joint space."""
+    if isinstance(motion, Trajectory):
+        return motion.times, motion.positions
+    steps = np.linalg.norm(np.diff(motion.positions, axis=0), axis=1) / UNTIMED_SPEED
+    return np.concatenate([[0.0], np.cumsum(steps)]), motion.positions
+
+
+def facts(
+    motion: Path | Trajectory, result: PlanResult | None, robot: Robot | None = None
+) -> list[tuple[str, str]]:
+    """Labels and values of facts about a motion, for headers and captions; of a robot whose visual meshes are
+    not bundled, how it is drawn."""
+    length = result.path_length if result is not None else None
+    if length is None:
+        length = Path(motion.joint_names, motion.positions).length
+    rows = []
+    if result is not None:
+        rows.append(("status", result.status.value.replace("_", " ")))
+        same = result.stage in ("", result.planner)
+        rows.append(("planner", result.planner if same else f"{result.planner} · {result.stage}"))
+        rows.append(("planning time", f"{1e3 * result.planning_time:.0f} ms"))
+    rows.append(("path length", f"{length:.2f} rad"))
+    if result is not None and result.min_clearance is not None:
+        rows.append(("clearance", f"{result.min_clearance * 1e3:.1f} mm"))
+    if result is not None and result.confidence is not None:
+        rows.append(("free in unknown space", f"{100 * result.confidence:.0f} %"))
+    rows.append(("duration", f"{motion.duration:.2f} s" if isinstance(motion, Trajectory) else "untimed"))
+    if robot is not None and not has_visual(robot):
+        rows.append(("drawn by", "collision geometry"))
+    return rows

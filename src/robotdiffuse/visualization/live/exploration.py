@@ -1,0 +1,462 @@
+"""An exploration that happens while it is watched: its session, and the page that shows it in browsers.
+
+In the session one thread chooses steps and executes them at the motion's speed; visitors only say whether it
+may go on.
+"""
+
+import html
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.drawables import ASSUMED, GOAL, OBSERVED, drawables
+from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
+from robotdiffuse.planning.exploration.simulated import explore, simulated_explorer
+from robotdiffuse.planning.exploration.steps import CHANCE, DONE, LOOK, POLICIES, STRICT, ExplorerSettings
+from robotdiffuse.problems.goals import JointGoal
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.scaling import reach
+from robotdiffuse.visualization.arm import DrawnArm
+from robotdiffuse.visualization.exploration import (
+    LOOK_COLOR,
+    READING_TIME,
+    UNKNOWN,
+    faces_surface,
+    frustum,
+    in_known_scene,
+    shares,
+    shown_voxels,
+    title,
+)
+from robotdiffuse.visualization.live.drawing import (
+    GHOST_OPACITY,
+    TRACE_WIDTH,
+    Arm,
+    Obstacles,
+    add_surface,
+    draw_lines,
+    draw_trace,
+)
+from robotdiffuse.visualization.live.page import badge_html, set_value
+from robotdiffuse.visualization.live.server import PageServer
+from robotdiffuse.visualization.live.session import INVALID, NO_MOTION, PENDING, VALID, Validity
+from robotdiffuse.visualization.live.threads import FRAME_RATE, Changes, LatestTask
+
+WAITING, CHOOSING, MOVING, ENDED = "waiting", "choosing", "moving", "ended"
+"""Phases: at rest until a visitor lets it go on, choosing a step, executing it, and after the last step."""
+PAUSED, STEPPING, RUNNING = "paused", "stepping", "running"
+"""What visitors want: a pause, one step and then a pause, or all steps."""
+CLEAR_OPACITY = 0.6
+"""Of predicted voxels, and of those that a look is to show."""
+UNKNOWN_OPACITY = 0.2
+"""Of the boundary of unknown space, which is drawn where it faces the viewer: it never hides the arm."""
+CAMERA_SIZE, CAMERA_COLOR = 0.12, (40, 48, 58)
+"""Length of the pyramid of the camera on the arm [m], and its colour."""
+SPEEDS = (0.1, 10.0)
+"""Bounds of the slider of the speed."""
+PROMISES = {
+    STRICT: "only through space seen free",
+    CHANCE: "where the stated confidence is high enough",
+}
+"""Policies in plain words."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExplorationState:
+    """Everything that the page shows at one moment."""
+
+    settings: ExplorerSettings
+    noise: bool
+    configuration: Float[ndarray, "dof"]
+    mode: str = PAUSED
+    phase: str = WAITING
+    speed: float = 1.0
+    """Of motions, as a multiple of their own."""
+    explorer: RecordedExplorer | None = None
+    """Of which others read the cameras and the known scene; its thread changes the rest."""
+    acts: tuple[RecordedAct, ...] = ()
+    """Steps so far; while moving the last one is under way."""
+    known: RecordedView | None = None
+    """The latest view, and what is known after it."""
+    violation: str = ""
+    """Why the validator refuses the last motion in the true scene."""
+    failure: str = ""
+    """Why the exploration cannot go on, in one line."""
+
+
+class _OutdatedError(Exception):
+    """The exploration was restarted or closed."""
+
+
+class ExplorationSession:
+    """The state of the exploration and its thread. `on_change` is called after each change, by any thread."""
+
+    def __init__(
+        self, problem: Problem, settings: ExplorerSettings, noise: bool, seed: int, speed: float = 1.0
+    ) -> None:
+        """Begins paused, at the problem's start."""
+        self.problem, self._seed = problem, seed
+        self.on_change: Callable[[], None] = lambda: None
+        self._changed, self._run = threading.Condition(), 0
+        self._state = ExplorationState(settings, noise, problem.start, speed=speed)
+        self._task = LatestTask(self._explore, "explore")
+
+    @property
+    def state(self) -> ExplorationState:
+        """The current state."""
+        return self._state
+
+    def set_mode(self, mode: str) -> None:
+        """Pause, take one step (the one under way, if there is one), or run."""
+        with self._changed:
+            self._state = replace(self._state, mode=mode)
+            if self._run == 0:
+                self._run = 1
+                self._task.submit(self._run)
+            self._changed.notify_all()
+        self.on_change()
+
+    def set_speed(self, speed: float) -> None:
+        """Change the speed of motions."""
+        with self._changed:
+            self._state = replace(self._state, speed=speed)
+        self.on_change()
+
+    def restart(self, policy: str | None = None, noise: bool | None = None) -> None:
+        """Begin anew, with another policy or noise if given. Raises InputError for an unknown policy."""
+        with self._changed:
+            old = self._state
+            settings = old.settings if policy is None else replace(old.settings, policy=policy)
+            noise = old.noise if noise is None else noise
+            start = self.problem.start
+            self._state = ExplorationState(settings, noise, start, old.mode, speed=old.speed)
+            self._run += 1
+            self._task.submit(self._run)
+            self._changed.notify_all()
+        self.on_change()
+
+    def close(self) -> None:
+        """End the thread as soon as the step that it may be choosing is found."""
+        with self._changed:
+            self._run += 1
+            self._changed.notify_all()
+        self._task.close()
+
+    # Work of the thread
+
+    def _explore(self, run: int) -> None:
+        try:
+            self._take_steps(run)
+        except _OutdatedError:
+            pass
+        except Exception as error:  # the page survives any error
+            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            with self._changed:
+                if run == self._run:
+                    failure = kind + shortened(str(error))
+                    self._state = replace(self._state, phase=ENDED, failure=failure)
+            self.on_change()
+
+    def _take_steps(self, run: int) -> None:
+        state = self._update(run, phase=CHOOSING)
+        noise = DepthNoise() if state.noise else None
+        explorer = simulated_explorer(self.problem, state.settings, noise, self._seed)
+        self._update(run, explorer=explorer, known=explorer.views[-1])
+        events = explore(self.problem, explorer, noise, self._seed)
+        ended = False
+        while not ended:
+            if self._state.mode == PAUSED:
+                self._update(run, phase=WAITING)
+            self._wait_while_paused(run)
+            self._update(run, phase=CHOOSING)
+            event = next(events)
+            self._execute(run, explorer)
+            ended = event.step.motion is None or not event.free
+            with self._changed:
+                mode = PAUSED if self._state.mode == STEPPING else self._state.mode
+                self._update(
+                    run,
+                    mode=mode,
+                    phase=ENDED if ended else CHOOSING,
+                    violation=event.violation,
+                    known=explorer.views[-1],
+                )
+
+    def _execute(self, run: int, explorer: RecordedExplorer) -> None:
+        """Execute the last step, in which the views are those that were taken during its motion."""
+        act, number = explorer.acts[-1], len(explorer.acts) - 1
+        before = [view for view in explorer.views if view.act < number]
+        views = [*before[-1:], *(view for view in explorer.views if view.act == number)]
+        self._update(run, phase=MOVING, acts=tuple(explorer.acts), known=views[0])
+        at, last = -READING_TIME, time.perf_counter()
+        while act.trajectory is not None and at < act.duration:
+            if self._wait_while_paused(run):
+                last = time.perf_counter()
+            time.sleep(1 / FRAME_RATE)
+            now = time.perf_counter()
+            speed = self._state.speed if at >= 0 else max(self._state.speed, 1.0)
+            at, last = min(at + speed * (now - last), act.duration), now
+            if at > 0:
+                taken = [view for view in views if view.time <= act.begins + at]
+                q = act.trajectory.at(at).positions
+                self._update(run, configuration=q, known=taken[-1])
+
+    def _update(self, run: int, **changes: Any) -> ExplorationState:
+        with self._changed:
+            if run != self._run:
+                raise _OutdatedError
+            self._state = state = replace(self._state, **changes)
+        self.on_change()
+        return state
+
+    def _wait_while_paused(self, run: int) -> bool:
+        """Whether it was paused."""
+        with self._changed:
+            paused = self._state.mode == PAUSED
+            self._changed.wait_for(lambda: run != self._run or self._state.mode != PAUSED)
+            if run != self._run:
+                raise _OutdatedError
+        return paused
+
+
+class ExplorationPage:
+    """Shows an exploration to all browsers that the server lets in, until it is closed. It runs from when
+    the first one opens the page."""
+
+    def __init__(self, session: ExplorationSession, server: PageServer) -> None:
+        self.session = session
+        self.server = server
+        self._changes = Changes()
+        problem, robot = session.problem, session.problem.robot
+        server.add_stage(reach(robot))
+        self._drawn = DrawnArm(robot)
+        self._arm = Arm(server, "arm", self._drawn)
+        self._look = Arm(server, "look", self._drawn, LOOK_COLOR, GHOST_OPACITY)
+        self._ghost = Arm(server, "goal", self._drawn, GOAL, GHOST_OPACITY)
+        self._goal = problem.goal.positions[0] if isinstance(problem.goal, JointGoal) else None
+        ends = np.stack([problem.start, problem.start if self._goal is None else self._goal])
+        server.set_first_view(self._drawn, problem, ends)
+        self._obstacles = Obstacles(server)
+        self._add_panel()
+        self._lock = threading.Lock()
+        self._closed = False
+        self._drawing = LatestTask[None](lambda _: self._draw_unless_closed(), "draw")
+        session.on_change = self._redraw
+        self._redraw()
+        opened = threading.Event()
+
+        @server.on_client_connect
+        def _(_client: viser.ClientHandle) -> None:
+            if not opened.is_set():
+                opened.set()
+                session.set_mode(RUNNING)
+
+    def close(self) -> None:
+        """Stop serving and end all threads."""
+        self.session.close()
+        self._drawing.close()
+        with self._lock:  # what is being drawn is still sent
+            self._closed = True
+        self.server.stop()
+
+    def _add_panel(self) -> None:
+        gui, session, state = self.server.gui, self.session, self.session.state
+        self._badge = gui.add_html("")
+        self._run = gui.add_button("Run", icon=viser.Icon.PLAYER_PLAY)
+        self._step = gui.add_button("Next step", icon=viser.Icon.PLAYER_SKIP_FORWARD)
+        restart = gui.add_button("Restart", icon=viser.Icon.REFRESH)
+        self._speed = gui.add_slider(
+            "Speed",
+            *SPEEDS,
+            step=0.1,
+            initial_value=float(np.clip(state.speed, *SPEEDS)),
+            hint="1: real time",
+        )
+        policies = (STRICT,) if state.settings.see_goal else POLICIES
+        self._policy = gui.add_dropdown(
+            "Policy", policies, initial_value=state.settings.policy, hint="Restarts the exploration"
+        )
+        self._noise = gui.add_checkbox(
+            "Noise", initial_value=state.noise, hint="Simulate the noise of depth cameras; restarts"
+        )
+        gui.add_html(_legend())
+        self._unknown = gui.add_checkbox("Unknown space", initial_value=True)
+        self._true = gui.add_checkbox("True scene", initial_value=False, hint="What the arm does not know")
+        self._steps = gui.add_html("")
+        self._run.on_click(lambda _: session.set_mode(RUNNING if session.state.mode == PAUSED else PAUSED))
+        self._step.on_click(lambda _: session.set_mode(STEPPING))
+        restart.on_click(lambda _: session.restart())
+        changes: list[tuple[Any, Callable[[Any], None]]] = [
+            (self._speed, session.set_speed),
+            (self._policy, lambda value: session.restart(policy=value)),
+            (self._noise, lambda value: session.restart(noise=value)),
+            (self._unknown, lambda _: self._redraw()),
+            (self._true, lambda _: self._redraw()),
+        ]
+        for widget, do in changes:
+            # changes by the page itself have no client
+            widget.on_update(lambda event, do=do: event.client and do(event.target.value))
+
+    def _redraw(self) -> None:
+        self._drawing.submit(None)
+
+    def _draw_unless_closed(self) -> None:
+        with self._lock:
+            if not self._closed:
+                self._draw()
+
+    def _draw(self) -> None:
+        """Draw what has changed; only this task draws."""
+        state, explorer = self.session.state, self.session.state.explorer
+        act = state.acts[-1] if state.acts else None
+        under_way = act if state.phase == MOVING else None
+        with self.server.atomic():
+            self._show_panel(state)
+            if self._changes.new("configuration", state.configuration):
+                self._arm.show(state.configuration)
+            arrived = act is not None and act.step.kind == DONE
+            if self._goal is not None and self._changes.new("arrived", arrived):
+                self._ghost.show(None if arrived else self._goal)
+            if explorer is None:
+                return
+            if self._changes.new("explorer", explorer):
+                self._known_scene = in_known_scene(explorer)
+                self._show_camera(explorer)
+            if self._changes.new("scene", explorer, self._true.value):
+                scene = self.session.problem.scene if self._true.value else explorer.scene
+                self._obstacles.show(drawables(scene))
+            if self._changes.new("known", state.known, act, under_way, self._unknown.value):
+                self._show_voxels(state.known, act, under_way)
+            if self._changes.new("act", explorer, under_way):
+                self._show_act(explorer, under_way)
+
+    def _show_camera(self, explorer: RecordedExplorer) -> None:
+        """Attach the first camera to the arm."""
+        camera, robot = explorer.cameras[0], explorer.robot
+        T = robot.T_frame_link(camera.link) @ camera.T_link_camera
+        (width, height), fy = camera.size, camera.intrinsics[1]
+        self.server.scene.add_camera_frustum(
+            f"/arm/{robot.link_frame(camera.link)}/camera",
+            fov=2 * np.arctan(height / 2 / fy),
+            aspect=width / height,
+            scale=CAMERA_SIZE,
+            thickness=0.004,
+            color=CAMERA_COLOR,
+            wxyz=quaternion_from_rotation(T[:3, :3]),
+            position=T[:3, 3],
+        )
+
+    def _show_voxels(
+        self, known: RecordedView | None, act: RecordedAct | None, under_way: RecordedAct | None
+    ) -> None:
+        """Show what is known, with the prediction of a step, and what the look under way is to show."""
+        if known is None:
+            return
+        occupied, predicted, unknown = shown_voxels(known, act, self._known_scene).layers
+        wanted = None if under_way is None else under_way.step.wanted
+        wanted = np.zeros_like(known.free) if wanted is None else wanted & known.unknown
+        nothing = np.zeros_like(known.free), known.free
+        for name, (inside, outside), color, opacity in (
+            ("occupied", occupied, OBSERVED, None),
+            ("predicted", predicted, ASSUMED, CLEAR_OPACITY),
+            ("wanted", (wanted, ~wanted), LOOK_COLOR, CLEAR_OPACITY),
+            ("unknown", unknown if self._unknown.value else nothing, UNKNOWN, UNKNOWN_OPACITY),
+        ):
+            surface = faces_surface(inside, outside, color)
+            if not self._changes.new(name, surface.vertices.tobytes()):
+                continue
+            if not len(surface.faces):
+                self.server.scene.remove_by_name(f"/{name}")
+            else:
+                add_surface(self.server, f"/{name}", surface, color, opacity)
+
+    def _show_act(self, explorer: RecordedExplorer, act: RecordedAct | None) -> None:
+        """Show the trace of a step's motion, and of a look also its end and what is seen there."""
+        draw_trace(self.server, self._drawn, None if act is None else act.trajectory)
+        look = act if act is not None and act.step.kind == LOOK else None
+        self._look.show(None if look is None else look.waypoints[-1])
+        edges = [] if look is None else frustum(explorer, look)
+        width = 0.5 * TRACE_WIDTH * reach(explorer.robot)
+        draw_lines(self.server, "/pyramid", edges, [np.array(LOOK_COLOR, float)] * len(edges), width)
+
+    def _show_panel(self, state: ExplorationState) -> None:
+        paused = state.mode == PAUSED
+        if self._changes.new(
+            "options", state.settings, state.noise, state.speed
+        ):  # else a change on its way is undone
+            set_value(self._policy, state.settings.policy)
+            set_value(self._noise, state.noise)
+            set_value(self._speed, float(np.clip(state.speed, *SPEEDS)))
+        if self._changes.new("badge", state.phase, state.mode, state.known, state.acts, state.failure):
+            self._badge.content = badge_html(exploration_badge(state))
+            self._steps.content = _steps_html(state.acts)
+            self._run.label = "Run" if paused else "Pause"
+            self._run.icon = viser.Icon.PLAYER_PLAY if paused else viser.Icon.PLAYER_PAUSE
+            self._run.disabled = self._step.disabled = state.phase == ENDED
+
+
+def exploration_badge(state: ExplorationState) -> Validity:
+    """Kind and text of the badge: the step under way or the end, with its reason and confidence."""
+    if state.failure:
+        return Validity(INVALID, "failed", (state.failure,))
+    if not state.acts or state.phase == CHOOSING:
+        first = "a new machine compiles first, for about a minute"
+        lines = () if state.acts else (first,)
+        what = f"choosing step {len(state.acts) + 1}" if state.phase == CHOOSING else "not begun"
+        return Validity(PENDING, what, (*lines, *_shares(state)))
+    act, number = state.acts[-1], len(state.acts)
+    headline = _title(number, act)
+    if state.phase == ENDED and state.violation:
+        return Validity(INVALID, f"collides in the true scene: {state.violation}", (headline,))
+    kind = PENDING
+    if state.phase == ENDED:
+        kind = VALID if act.step.kind == DONE else NO_MOTION
+    lines = [act.step.reason]
+    if act.step.policy and act.step.motion is not None:
+        lines.append(f"{act.step.policy}: {PROMISES[act.step.policy]}")
+    if act.step.confidence is not None:
+        confidence = np.floor(1000 * act.step.confidence) / 10  # never rounded up to 100 %
+        lines.append(f"stated confidence that it is free: {confidence:g} %")
+    rest = ", paused" if state.mode == PAUSED and state.phase != ENDED else ""
+    return Validity(kind, headline + rest, (*lines, *_shares(state)))
+
+
+def _shares(state: ExplorationState) -> tuple[str, ...]:
+    if state.known is None:
+        return ()
+    return ("of the map " + ", ".join(f"{value} {name}" for name, value in shares(state.known)),)
+
+
+def _title(number: int, act: RecordedAct) -> str:
+    return f"{number}. {title(act)}"
+
+
+def _steps_html(acts: tuple[RecordedAct, ...]) -> str:
+    rows = "".join(f"<div>{html.escape(_title(i, act))}</div>" for i, act in enumerate(acts, 1))
+    return f'<div style="margin: 0.4em 1em; font-size: 0.85em">{rows}</div>'
+
+
+def _legend() -> str:
+    colors = {
+        "seen occupied": OBSERVED,
+        "predicted occupied": ASSUMED,
+        "boundary of unknown space": UNKNOWN,
+        "next look, and what it is to show": LOOK_COLOR,
+        "goal": GOAL,
+    }
+    mark = "display: inline-block; width: 0.8em; height: 0.8em; border-radius: 2px; margin-right: 0.5em"
+    rows = (
+        f'<div><span style="{mark}; background: rgb{color}"></span>{name}</div>'
+        for name, color in colors.items()
+    )
+    return f'<div style="margin: 0.4em 1em; font-size: 0.85em">{"".join(rows)}</div>'
