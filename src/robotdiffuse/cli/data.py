@@ -215,7 +215,7 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 
 def run_view(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.cli.drawing import show
+    from robotdiffuse.cli.view import show
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.datasets.shards import read_manifest
     from robotdiffuse.robots import load_robot
