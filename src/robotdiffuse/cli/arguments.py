@@ -53,6 +53,12 @@ def option(
     parser.add_argument(name, help=help, **more)
 
 
+def options(parser: argparse._ActionsContainer, *rows: tuple[Any, ...]) -> None:
+    """Add options, each a row of the arguments of `option`."""
+    for row in rows:
+        option(parser, *row)
+
+
 def add_import_option(parser: argparse.ArgumentParser) -> None:
     """Add the option --import; `main` imports the modules before it runs the command."""
     option(

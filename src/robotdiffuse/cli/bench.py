@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import add_import_option, command, count, option, positive
+from robotdiffuse.cli.arguments import add_import_option, command, count, option, options, positive
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.ray_cluster import CLUSTERS
@@ -33,35 +33,34 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
         "repeated.",
         run_run,
     )
-    option(
+    options(
         run,
-        "--planners NAME,...",
-        "names from `robotdiffuse planners`, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
-        "or until=first|converged|time_limit, objective=length|time and clearance=M of the calls; "
-        "NAME@FOLDER uses other weights",
+        (
+            "--planners NAME,...",
+            "names from `robotdiffuse planners`, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
+            "or until=first|converged|time_limit, objective=length|time and clearance=M of the calls; "
+            "NAME@FOLDER uses other weights",
+        ),
+        (
+            "--problems SET,...",
+            f"{', '.join(FAMILIES)}, each also with _nontrivial; or files or folders of problems; with "
+            "--preset, sets in addition to its own",
+        ),
+        (
+            "--preset NAME",
+            "a stored comparison with its planners, limits and seeds (benchmarks/README.md): equal_time, "
+            "learning, durations, anytime or restarts",
+        ),
+        ("--out FOLDER !", "folder for problems and results"),
+        ("--time-limit S", "time limit of a call [s] (default: 1)", positive),
+        ("--seeds N", "calls per problem, with different seeds (default: 1)", count),
+        ("--count N", "problems per set (default: 100; all of a folder)", count),
+        (
+            "--equal-time",
+            "also call planners that end early again until the time limit, as extra rows, to compare lengths",
+        ),
+        ("--workers N", "planners that run at once (default: half of the cores)", count),
     )
-    option(
-        run,
-        "--problems SET,...",
-        f"{', '.join(FAMILIES)}, each also with _nontrivial; or files or folders of problems; with "
-        "--preset, sets in addition to its own",
-    )
-    option(
-        run,
-        "--preset NAME",
-        "a stored comparison with its planners, limits and seeds (benchmarks/README.md): equal_time, "
-        "learning, durations, anytime or restarts",
-    )
-    option(run, "--out FOLDER !", "folder for problems and results")
-    option(run, "--time-limit S", "time limit of a call [s] (default: 1)", positive)
-    option(run, "--seeds N", "calls per problem, with different seeds (default: 1)", count)
-    option(run, "--count N", "problems per set (default: 100; all of a folder)", count)
-    option(
-        run,
-        "--equal-time",
-        "also call planners that end early again until the time limit, as extra rows, to compare lengths",
-    )
-    option(run, "--workers N", "planners that run at once (default: half of the cores)", count)
     option(run, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
     add_import_option(run)
     report = command(
@@ -72,13 +71,14 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
         "(motions in 3D), and print the table of each problem set.",
         run_report,
     )
-    option(report, "folder FOLDER", "folder of `robotdiffuse bench run`")
-    option(
-        report, "--limits S,...", "time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)"
+    options(
+        report,
+        ("folder FOLDER", "folder of `robotdiffuse bench run`"),
+        ("--limits S,...", "time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)"),
+        ("--planners NAME,...", "planners to include (default: all)"),
+        ("--out OUT", "folder to write to (default: FOLDER)"),
+        ("--no-replays", "do not write replays.html"),
     )
-    option(report, "--planners NAME,...", "planners to include (default: all)")
-    option(report, "--out OUT", "folder to write to (default: FOLDER)")
-    option(report, "--no-replays", "do not write replays.html")
     add_import_option(report)
     confirm = command(
         actions,
@@ -88,8 +88,11 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
         "validator. The exit status is 1 if it finds a collision.",
         run_confirm,
     )
-    option(confirm, "folder FOLDER", "folder of `bench run`")
-    option(confirm, "--count N", "check only the first N problems of each set (default: all)", count)
+    options(
+        confirm,
+        ("folder FOLDER", "folder of `bench run`"),
+        ("--count N", "check only the first N problems of each set (default: all)", count),
+    )
 
 
 def run_run(arguments: argparse.Namespace) -> int:
@@ -255,17 +258,18 @@ def add_reproduce(commands: argparse._SubParsersAction) -> None:
         "same held-out problems, and write table2.md in the folder.",
         run_table2,
     )
-    option(table2, "--data DATA !", "data set of `data generate`")
-    option(table2, "--out FOLDER !", "folder for networks and page")
-    option(table2, "--samples N", "training samples per row (default: 300000)", count)
-    option(
-        table2, "--encoder-samples N", "point clouds to train the frozen encoder on (default: 300000)", count
+    options(
+        table2,
+        ("--data DATA !", "data set of `data generate`"),
+        ("--out FOLDER !", "folder for networks and page"),
+        ("--samples N", "training samples per row (default: 300000)", count),
+        ("--encoder-samples N", "point clouds to train the frozen encoder on (default: 300000)", count),
+        ("--problems N", "held-out problems (default: 500)", count),
+        ("--family NAME", "family of these problems (default: rop)"),
+        ("--rows NAME,...", "rows to train (default: all ten)"),
+        ("--seeds N", "trainings of each row, with different seeds (default: 1)", count),
+        ("--workers N", "processes (default: all cores)", count, os.cpu_count() or 1),
     )
-    option(table2, "--problems N", "held-out problems (default: 500)", count)
-    option(table2, "--family NAME", "family of these problems (default: rop)")
-    option(table2, "--rows NAME,...", "rows to train (default: all ten)")
-    option(table2, "--seeds N", "trainings of each row, with different seeds (default: 1)", count)
-    option(table2, "--workers N", "processes (default: all cores)", count, os.cpu_count() or 1)
     figures = command(
         actions,
         "figures",
@@ -278,16 +282,18 @@ def add_reproduce(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_planning(parser: argparse.ArgumentParser) -> None:
-    option(parser, "--out FOLDER !", "folder for problems, results, page")
-    option(parser, "--problems N", "problems of each kind of goal (default: 300)", count, 300)
-    option(parser, "--time-limit S", "of a call [s] (default: 10)", positive, 10.0)
-    option(
+    options(
         parser,
-        "--paper-weights FOLDER",
-        "weights of `train planner --config paper`, or points, for a row of the diffusion model without "
-        "clearances, guidance and further samples (default: a note says how to train them)",
+        ("--out FOLDER !", "folder for problems, results, page"),
+        ("--problems N", "problems of each kind of goal (default: 300)", count, 300),
+        ("--time-limit S", "of a call [s] (default: 10)", positive, 10.0),
+        (
+            "--paper-weights FOLDER",
+            "weights of `train planner --config paper`, or points, for a row of the diffusion model without "
+            "clearances, guidance and further samples (default: a note says how to train them)",
+        ),
+        ("--workers N", "planners that run at once (default: half of the cores)", count),
     )
-    option(parser, "--workers N", "planners that run at once (default: half of the cores)", count)
     option(parser, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
 
 

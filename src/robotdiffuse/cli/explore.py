@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, STOPPED, command, option, positive
+from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, STOPPED, command, option, options, positive
 from robotdiffuse.cli.view import ENDINGS, show
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.interop import WRITERS
@@ -37,9 +37,12 @@ def add_live(commands: argparse._SubParsersAction) -> None:
         run_live,
     )
     option(parser, "problem PROBLEM", "problem file (.yaml or .json) to open", nargs="?")
-    option(parser, "--robot NAME", "instead of PROBLEM: name or URDF file of an arm")
-    option(parser, "--planner NAME", "planner; see `robotdiffuse planners` (default: robotdiffuse)")
-    option(parser, "--time-limit S", "time limit of each plan (default: 1 s)", positive, 1.0)
+    options(
+        parser,
+        ("--robot NAME", "instead of PROBLEM: name or URDF file of an arm"),
+        ("--planner NAME", "planner; see `robotdiffuse planners` (default: robotdiffuse)"),
+        ("--time-limit S", "time limit of each plan (default: 1 s)", positive, 1.0),
+    )
     add_address(parser)
 
 
@@ -124,35 +127,37 @@ def add_explore(commands: argparse._SubParsersAction) -> None:
         "strict_then_chance (default: strict)",
         default="strict",
     )
-    option(parser, "--confidence P", "least, of chance (0.98)", float, 0.98)
-    option(
+    options(
         parser,
-        "--see-goal",
-        "go only to goals at which all of the arm's surface was seen to be free (policy strict)",
-    )
-    option(parser, "--time-limit S", "of each search (1)", float, 1.0)
-    option(parser, "--noise", "simulate the noise of depth cameras")
-    option(parser, "--seed N", "random seed", int, 0)
-    option(
-        parser,
-        "--out FILE *",
-        "replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
-        "repeatable",
-    )
-    option(parser, "--view", "write a replay (.html) and open it")
-    option(
-        parser,
-        "--record FILE",
-        "write the depth images with camera parameters, poses and joint states to this .mcap file",
+        ("--confidence P", "least, of chance (0.98)", float, 0.98),
+        (
+            "--see-goal",
+            "go only to goals at which all of the arm's surface was seen to be free (policy strict)",
+        ),
+        ("--time-limit S", "of each search (1)", float, 1.0),
+        ("--noise", "simulate the noise of depth cameras"),
+        ("--seed N", "random seed", int, 0),
+        (
+            "--out FILE *",
+            "replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
+            "repeatable",
+        ),
+        ("--view", "write a replay (.html) and open it"),
+        (
+            "--record FILE",
+            "write the depth images with camera parameters, poses and joint states to this .mcap file",
+        ),
     )
     live = parser.add_argument_group("live page")
-    option(
+    options(
         live,
-        "--live",
-        "serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
-        "page is first opened",
+        (
+            "--live",
+            "serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
+            "page is first opened",
+        ),
+        ("--speed X", "speed of the motions on it (1: real time)", positive, 1.0),
     )
-    option(live, "--speed X", "speed of the motions on it (1: real time)", positive, 1.0)
     add_address(live)
 
 

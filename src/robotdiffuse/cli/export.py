@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import command, option, positive
+from robotdiffuse.cli.arguments import command, option, options, positive
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,9 +21,12 @@ def add_export(commands: argparse._SubParsersAction) -> None:
         ".yaml (a ROS 2 JointTrajectory), .csv and .json.",
         run_export,
     )
-    option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
-    option(parser, "--out FILE * !", "file to write; repeatable")
-    option(parser, "--rate HZ", "resample the motion, and validate it so, for a controller", float)
+    options(
+        parser,
+        ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
+        ("--out FILE * !", "file to write; repeatable"),
+        ("--rate HZ", "resample the motion, and validate it so, for a controller", float),
+    )
 
 
 def run_export(arguments: argparse.Namespace) -> int:
@@ -69,8 +72,11 @@ def add_publish(commands: argparse._SubParsersAction) -> None:
         "Validate the motion of a result file again, and publish it as a ROS JointTrajectory.",
         run_publish,
     )
-    option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
-    option(parser, "--to HOST[:PORT] !", f"rosbridge server (port: {PORT})", address)
+    options(
+        parser,
+        ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
+        ("--to HOST[:PORT] !", f"rosbridge server (port: {PORT})", address),
+    )
     option(
         parser,
         "--topic NAME",

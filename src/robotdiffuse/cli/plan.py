@@ -16,6 +16,7 @@ from robotdiffuse.cli.arguments import (
     natural,
     not_negative,
     option,
+    options,
     positive,
     share,
 )
@@ -41,14 +42,16 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         "solved, 1 no plan, 2 bad input.",
         run_plan,
     )
-    option(parser, "problem PROBLEM", "problem file (.yaml, .json or .jsonl)")
-    option(parser, "--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0)
-    option(parser, "--planner NAME", "see `robotdiffuse planners` (default: robotdiffuse)")
-    option(
+    options(
         parser,
-        "--weights FOLDER",
-        "weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
-        "without clearances as inputs (default: the bundled ones)",
+        ("problem PROBLEM", "problem file (.yaml, .json or .jsonl)"),
+        ("--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0),
+        ("--planner NAME", "see `robotdiffuse planners` (default: robotdiffuse)"),
+        (
+            "--weights FOLDER",
+            "weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
+            "without clearances as inputs (default: the bundled ones)",
+        ),
     )
     option(
         parser,
@@ -64,24 +67,21 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         default=CONVERGED,
         choices=UNTIL,
     )
-    option(
+    options(
         parser,
-        "--clearance M",
-        "distance to obstacles to keep where possible, up to 0.5 m (default: the problem's, or 0.01 m)",
-        not_negative,
-    )
-    option(
-        parser,
-        "--unknown POLICY",
-        "policy for space that the problem's views do not show: optimistic (free), padded, predicted or "
-        "occupied (default: the problem's; else predicted where the network covers the arm's reach, or "
-        "padded)",
-    )
-    option(parser, "--ignore-joints", IGNORE_JOINTS)
-    option(
-        parser,
-        "--next-view",
-        "propose a camera pose that shows most of the unknown space that the motion crosses",
+        (
+            "--clearance M",
+            "distance to obstacles to keep where possible, up to 0.5 m (default: the problem's, or 0.01 m)",
+            not_negative,
+        ),
+        (
+            "--unknown POLICY",
+            "policy for space that the problem's views do not show: optimistic (free), padded, predicted or "
+            "occupied (default: the problem's; else predicted where the network covers the arm's reach, or "
+            "padded)",
+        ),
+        ("--ignore-joints", IGNORE_JOINTS),
+        ("--next-view", "propose a camera pose that shows most of the unknown space that the motion crosses"),
     )
     for what in ("velocity", "acceleration"):
         parser.add_argument(
@@ -104,21 +104,22 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         default=TIME,
         choices=OBJECTIVES,
     )
-    option(
+    options(
         parser,
-        "--blend R",
-        "pass the problem's waypoints without stopping, within this distance: in rad for "
-        "configurations, in m for poses (default: the problem's, or stop)",
-        positive,
+        (
+            "--blend R",
+            "pass the problem's waypoints without stopping, within this distance: in rad for "
+            "configurations, in m for poses (default: the problem's, or stop)",
+            positive,
+        ),
+        ("--seed N", "random seed (default: 0)", natural, 0),
+        (
+            "--out FILE *",
+            "file to write: result (.json), trajectory (.csv), replay (.html), picture (.png), or for other "
+            "programs .mcap (Foxglove, ROS 2), .rosbag2, .rrd (Rerun) or .yaml (JointTrajectory); repeatable",
+        ),
+        ("--view", "write a replay (.html) and open it"),
     )
-    option(parser, "--seed N", "random seed (default: 0)", natural, 0)
-    option(
-        parser,
-        "--out FILE *",
-        "file to write: result (.json), trajectory (.csv), replay (.html), picture (.png), or for other "
-        "programs .mcap (Foxglove, ROS 2), .rosbag2, .rrd (Rerun) or .yaml (JointTrajectory); repeatable",
-    )
-    option(parser, "--view", "write a replay (.html) and open it")
     add_import_option(parser)
 
 
@@ -264,17 +265,18 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
         run_demo,
     )
     seen = parser.add_mutually_exclusive_group()
-    option(
+    options(
         seen,
-        "--camera",
-        "plan with the view of one depth camera instead of the scene; demo_true.png shows the motion in "
-        "the true scene",
-    )
-    option(
-        seen,
-        "--explore",
-        "simulate an arm that sees the shelf by a camera at its tip and looks before it moves; writes "
-        "explore.png and explore.html",
+        (
+            "--camera",
+            "plan with the view of one depth camera instead of the scene; demo_true.png shows the motion in "
+            "the true scene",
+        ),
+        (
+            "--explore",
+            "simulate an arm that sees the shelf by a camera at its tip and looks before it moves; writes "
+            "explore.png and explore.html",
+        ),
     )
     option(
         parser,

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotdiffuse.cli.arguments import command, count, names, natural, option, positive, share
+from robotdiffuse.cli.arguments import command, count, names, natural, option, options, positive, share
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.learning import need_packages
@@ -62,10 +62,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         "cameras do not see, on random scenes.",
         run_completion,
     )
-    option(completion, "--families NAMES", "families of the scenes (default: all)", names)
-    option(completion, "--robot NAME", "bundled name or URDF of the arm in the images")
-    option(completion, "--workers N", "processes that draw samples (default: 1)", natural)
-    option(completion, "--weights FOLDER", "weights to begin with; bundled: those that come with the package")
+    options(
+        completion,
+        ("--families NAMES", "families of the scenes (default: all)", names),
+        ("--robot NAME", "bundled name or URDF of the arm in the images"),
+        ("--workers N", "processes that draw samples (default: 1)", natural),
+        ("--weights FOLDER", "weights to begin with; bundled: those that come with the package"),
+    )
     _add_shared(completion)
     _add_device(completion)
 
@@ -88,38 +91,33 @@ def add(commands: argparse._SubParsersAction) -> None:
         "EDMP), or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
         default="compact",
     )
-    option(
+    options(
         planner,
-        "--encoder FOLDER",
-        "folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
-        "for the denoiser cross_attention (default: that of the config, or the bundled one)",
+        (
+            "--encoder FOLDER",
+            "folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
+            "for the denoiser cross_attention (default: that of the config, or the bundled one)",
+        ),
+        ("--robot NAME", "bundled name or URDF of the robot (default: panda)"),
+        ("--trajectories N", "motions to generate, without --data (default: 60,000)", count),
+        ("--workers N", "processes that generate data without --data (all cores)", count),
     )
-    option(planner, "--robot NAME", "bundled name or URDF of the robot (default: panda)")
-    option(planner, "--trajectories N", "motions to generate, without --data (default: 60,000)", count)
-    option(planner, "--workers N", "processes that generate data without --data (all cores)", count)
     _add_shared(planner, out_required=False)
     _add_device(planner)
     parts = planner.add_argument_group("parts of the model that replace those of the config")
-    option(
+    options(
         parts,
-        "--denoiser NAME",
-        "transformer, encoder_decoder, decoder_only, unet, or cross_attention for the encoder points",
+        (
+            "--denoiser NAME",
+            "transformer, encoder_decoder, decoder_only, unet, or cross_attention for the encoder points",
+        ),
+        ("--sampler NAME", "sampler for planning: ddim or ddpm"),
+        ("--objective NAME", "what the denoiser predicts: clean or noise"),
+        ("--target NAME", "what motions are relative to: residual (the straight line), absolute or limits"),
+        ("--sampling-steps N", "denoising steps for planning", count),
+        ("--condition-drop P", "fraction of samples without condition, for classifier-free guidance", share),
+        ("--waypoints N", "waypoints of a motion", count),
     )
-    option(parts, "--sampler NAME", "sampler for planning: ddim or ddpm")
-    option(parts, "--objective NAME", "what the denoiser predicts: clean or noise")
-    option(
-        parts,
-        "--target NAME",
-        "what motions are relative to: residual (the straight line), absolute or limits",
-    )
-    option(parts, "--sampling-steps N", "denoising steps for planning", count)
-    option(
-        parts,
-        "--condition-drop P",
-        "fraction of samples without condition, for classifier-free guidance",
-        share,
-    )
-    option(parts, "--waypoints N", "waypoints of a motion", count)
 
     baseline = command(
         kinds,
@@ -128,9 +126,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         "Train the network of a learned baseline on planned trajectories.",
         run_baseline,
     )
-    option(baseline, "name NAME", "mpnet, mpinets or trajectory_prior (for MPD and EDMP)")
-    option(baseline, "--data FOLDER !", "data set of `data generate`")
-    option(baseline, "--robot NAME", "bundled name or URDF of the data's robot")
+    options(
+        baseline,
+        ("name NAME", "mpnet, mpinets or trajectory_prior (for MPD and EDMP)"),
+        ("--data FOLDER !", "data set of `data generate`"),
+        ("--robot NAME", "bundled name or URDF of the data's robot"),
+    )
     _add_shared(baseline)
 
     export = command(
@@ -153,13 +154,19 @@ def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> N
         help=f"folder for weights, settings and checkpoints{default}",
     )
     length = parser.add_mutually_exclusive_group()
-    option(length, "--minutes MIN", "length of the training [minutes]", positive)
-    option(length, "--samples N", "length of the training [samples]", count)
-    option(parser, "--seed N", "random seed", natural)
-    option(parser, "--batch N", "samples per step", count)
-    option(parser, "--learning-rate X", "largest learning rate", positive)
-    option(parser, "--threads N", "number of PyTorch threads", count)
-    option(parser, "--checkpoint-seconds S", "time between checkpoints [s] (default: 120)", positive)
+    options(
+        length,
+        ("--minutes MIN", "length of the training [minutes]", positive),
+        ("--samples N", "length of the training [samples]", count),
+    )
+    options(
+        parser,
+        ("--seed N", "random seed", natural),
+        ("--batch N", "samples per step", count),
+        ("--learning-rate X", "largest learning rate", positive),
+        ("--threads N", "number of PyTorch threads", count),
+        ("--checkpoint-seconds S", "time between checkpoints [s] (default: 120)", positive),
+    )
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import IGNORE_JOINTS, command, natural, option
+from robotdiffuse.cli.arguments import IGNORE_JOINTS, command, natural, option, options
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError
 
@@ -29,21 +29,25 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
     )
     option(parser, "motion MOTION", "file (.json, .csv, .yaml, .mcap), or the folder of a ROS 2 bag")
     where = parser.add_mutually_exclusive_group()
-    option(where, "--problem FILE", "problem file (default: the problem in the result or .mcap file)")
-    option(
+    options(
         where,
-        "--scene FILE",
-        "MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs --robot",
+        ("--problem FILE", "problem file (default: the problem in the result or .mcap file)"),
+        (
+            "--scene FILE",
+            "MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs --robot",
+        ),
     )
-    option(parser, "--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0)
-    option(parser, "--robot NAME", "bundled name or URDF, with --scene")
-    option(parser, "--ignore-joints", IGNORE_JOINTS)
-    option(parser, "--topic NAME", "topic of the motion in a bag or MCAP file with several")
-    option(parser, "--all", "print all violations, not only the first")
-    option(
+    options(
         parser,
-        "--certificate FILE.json",
-        "write a proof that the motion is valid, for `robotdiffuse certificate check`",
+        ("--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0),
+        ("--robot NAME", "bundled name or URDF, with --scene"),
+        ("--ignore-joints", IGNORE_JOINTS),
+        ("--topic NAME", "topic of the motion in a bag or MCAP file with several"),
+        ("--all", "print all violations, not only the first"),
+        (
+            "--certificate FILE.json",
+            "write a proof that the motion is valid, for `robotdiffuse certificate check`",
+        ),
     )
 
 
@@ -162,8 +166,11 @@ def add_certificate(commands: argparse._SubParsersAction) -> None:
         "0 if it holds, 1 if not, 2 for bad input.",
         run_check,
     )
-    option(check, "file FILE", "certificate of `robotdiffuse verify --certificate`")
-    option(check, "--problem FILE", "problem file to check it for (default: the problem in the certificate)")
+    options(
+        check,
+        ("file FILE", "certificate of `robotdiffuse verify --certificate`"),
+        ("--problem FILE", "problem file to check it for (default: the problem in the certificate)"),
+    )
 
 
 def run_check(arguments: argparse.Namespace) -> int:

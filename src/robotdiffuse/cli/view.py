@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, command, not_negative, option
+from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, command, not_negative, option, options
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -114,18 +114,19 @@ def add_view(commands: argparse._SubParsersAction) -> None:
         "of one problem",
         nargs="+",
     )
-    option(
+    options(
         parser,
-        "--out FILE *",
-        "replay (.html) or picture (.png); repeatable (default: the name of RESULT with .html)",
-    )
-    option(
-        parser,
-        "--shell M",
-        "with several results: thickness of the safety shell that pictures show about the arm [m] "
-        "(default: 0, none)",
-        not_negative,
-        0.0,
+        (
+            "--out FILE *",
+            "replay (.html) or picture (.png); repeatable (default: the name of RESULT with .html)",
+        ),
+        (
+            "--shell M",
+            "with several results: thickness of the safety shell that pictures show about the arm [m] "
+            "(default: 0, none)",
+            not_negative,
+            0.0,
+        ),
     )
 
 
@@ -210,8 +211,11 @@ def add_simulate(commands: argparse._SubParsersAction) -> None:
         "tracking errors and contacts. Exit status: 0 no contacts, 1 contacts, 2 bad input.",
         run_simulate,
     )
-    option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
-    option(parser, "--out FILE *", "replay (.html) or picture (.png) of the simulated motion; repeatable")
+    options(
+        parser,
+        ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
+        ("--out FILE *", "replay (.html) or picture (.png) of the simulated motion; repeatable"),
+    )
 
 
 def run_simulate(arguments: argparse.Namespace) -> int:
