@@ -34,7 +34,8 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
         ("--problem FILE", "problem file (default: the problem in the result or .mcap file)"),
         (
             "--scene FILE",
-            "MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs --robot",
+            "MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs "
+            "--robot",
         ),
     )
     options(
