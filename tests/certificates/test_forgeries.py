@@ -17,7 +17,7 @@ from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.content_hashes import request_parts, scene_parts
 from robotdiffuse.certificates.requirements import not_checked
 from robotdiffuse.certificates.search import certify
-from robotdiffuse.cli.certificate import described
+from robotdiffuse.cli.verify import described
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.files import problem_from_record

@@ -10,8 +10,9 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.factory_runs import contents, in_this_process
-from robotdiffuse.cli import main, train_robot
-from robotdiffuse.cli.train_robot import data_settings, train_for_robot
+from robotdiffuse.cli import main
+from robotdiffuse.cli import train as train_robot
+from robotdiffuse.cli.train import data_settings, train_for_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.generation import factory
 from robotdiffuse.generation.factory import GenerationSettings

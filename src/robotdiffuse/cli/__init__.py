@@ -11,50 +11,31 @@ from contextlib import suppress
 from typing import NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli import (
-    bench,
-    certificate,
-    completion,
-    data,
-    demo,
-    explore,
-    export,
-    live,
-    plan,
-    planners,
-    publish,
-    reproduce,
-    robot,
-    serve,
-    simulate,
-    train,
-    verify,
-    view,
-)
-from robotdiffuse.cli.exit_status import BAD_INPUT, STOPPED, WRITE_FAILED
+from robotdiffuse.cli import bench, completion, data, explore, export, plan, robot, serve, train, verify, view
+from robotdiffuse.cli.arguments import BAD_INPUT, STOPPED, WRITE_FAILED
 from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.core.registry import import_modules
 
 COMMANDS = (
-    plan.add,
-    demo.add,
-    explore.add,
-    view.add,
-    verify.add,
-    certificate.add,
-    export.add,
-    publish.add,
-    live.add,
-    simulate.add,
-    planners.add,
+    plan.add_plan,
+    plan.add_demo,
+    explore.add_explore,
+    view.add_view,
+    verify.add_verify,
+    verify.add_certificate,
+    export.add_export,
+    export.add_publish,
+    explore.add_live,
+    view.add_simulate,
+    completion.add_planners,
     robot.add,
     data.add,
     train.add,
-    bench.add,
-    reproduce.add,
+    bench.add_bench,
+    bench.add_reproduce,
     serve.add,
     completion.add_schema,
-    completion.add,
+    completion.add_completion,
 )
 """Each function adds one command to the parser and sets its `run` function."""
 

@@ -5,6 +5,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+SOLVED, NO_PLAN, BAD_INPUT, WRITE_FAILED, STOPPED = 0, 1, 2, 3, 130
+"""Exit statuses: done; no valid motion; bad input; the output could not be written; stopped by the user."""
 IGNORE_JOINTS = (
     "note joints of MoveIt files that the robot lacks rather than refuse them; what they move is ignored"
 )
@@ -49,6 +51,12 @@ def option(
     if "!" in words:
         more["required"] = True
     parser.add_argument(name, help=help, **more)
+
+
+def options(parser: argparse._ActionsContainer, *rows: tuple[Any, ...]) -> None:
+    """Add options, each a row of the arguments of `option`."""
+    for row in rows:
+        option(parser, *row)
 
 
 def add_import_option(parser: argparse.ArgumentParser) -> None:

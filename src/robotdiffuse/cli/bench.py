@@ -1,25 +1,26 @@
-"""The commands `robotdiffuse bench run`, `report` and `confirm`."""
+"""The commands `robotdiffuse bench` and `reproduce`, which makes the paper's tables and figures again."""
 
 import argparse
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import add_import_option, command, count, option, positive
+from robotdiffuse.cli.arguments import add_import_option, command, count, option, options, positive
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.problems.families import FAMILIES
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
+    from robotdiffuse.evaluation import report
     from robotdiffuse.evaluation.bench import BenchSettings, Done, Report
     from robotdiffuse.evaluation.comparison import Bench, Section
+    from robotdiffuse.evaluation.paper import Table1Settings
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_bench(commands: argparse._SubParsersAction) -> None:
     parser = command(commands, "bench", "benchmark planners", "Benchmark planners and networks.")
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     run = command(
@@ -32,35 +33,34 @@ def add(commands: argparse._SubParsersAction) -> None:
         "repeated.",
         run_run,
     )
-    option(
+    options(
         run,
-        "--planners NAME,...",
-        "names from `robotdiffuse planners`, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
-        "or until=first|converged|time_limit, objective=length|time and clearance=M of the calls; "
-        "NAME@FOLDER uses other weights",
+        (
+            "--planners NAME,...",
+            "names from `robotdiffuse planners`, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
+            "or until=first|converged|time_limit, objective=length|time and clearance=M of the calls; "
+            "NAME@FOLDER uses other weights",
+        ),
+        (
+            "--problems SET,...",
+            f"{', '.join(FAMILIES)}, each also with _nontrivial; or files or folders of problems; with "
+            "--preset, sets in addition to its own",
+        ),
+        (
+            "--preset NAME",
+            "a stored comparison with its planners, limits and seeds (benchmarks/README.md): equal_time, "
+            "learning, durations, anytime or restarts",
+        ),
+        ("--out FOLDER !", "folder for problems and results"),
+        ("--time-limit S", "time limit of a call [s] (default: 1)", positive),
+        ("--seeds N", "calls per problem, with different seeds (default: 1)", count),
+        ("--count N", "problems per set (default: 100; all of a folder)", count),
+        (
+            "--equal-time",
+            "also call planners that end early again until the time limit, as extra rows, to compare lengths",
+        ),
+        ("--workers N", "planners that run at once (default: half of the cores)", count),
     )
-    option(
-        run,
-        "--problems SET,...",
-        f"{', '.join(FAMILIES)}, each also with _nontrivial; or files or folders of problems; with "
-        "--preset, sets in addition to its own",
-    )
-    option(
-        run,
-        "--preset NAME",
-        "a stored comparison with its planners, limits and seeds (benchmarks/README.md): equal_time, "
-        "learning, durations, anytime or restarts",
-    )
-    option(run, "--out FOLDER !", "folder for problems and results")
-    option(run, "--time-limit S", "time limit of a call [s] (default: 1)", positive)
-    option(run, "--seeds N", "calls per problem, with different seeds (default: 1)", count)
-    option(run, "--count N", "problems per set (default: 100; all of a folder)", count)
-    option(
-        run,
-        "--equal-time",
-        "also call planners that end early again until the time limit, as extra rows, to compare lengths",
-    )
-    option(run, "--workers N", "planners that run at once (default: half of the cores)", count)
     option(run, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
     add_import_option(run)
     report = command(
@@ -71,13 +71,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         "(motions in 3D), and print the table of each problem set.",
         run_report,
     )
-    option(report, "folder FOLDER", "folder of `robotdiffuse bench run`")
-    option(
-        report, "--limits S,...", "time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)"
+    options(
+        report,
+        ("folder FOLDER", "folder of `robotdiffuse bench run`"),
+        ("--limits S,...", "time limits [s] (default: those of the run, and 0.1, 1, 10, 60 below them)"),
+        ("--planners NAME,...", "planners to include (default: all)"),
+        ("--out OUT", "folder to write to (default: FOLDER)"),
+        ("--no-replays", "do not write replays.html"),
     )
-    option(report, "--planners NAME,...", "planners to include (default: all)")
-    option(report, "--out OUT", "folder to write to (default: FOLDER)")
-    option(report, "--no-replays", "do not write replays.html")
     add_import_option(report)
     confirm = command(
         actions,
@@ -87,8 +88,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         "validator. The exit status is 1 if it finds a collision.",
         run_confirm,
     )
-    option(confirm, "folder FOLDER", "folder of `bench run`")
-    option(confirm, "--count N", "check only the first N problems of each set (default: all)", count)
+    options(
+        confirm,
+        ("folder FOLDER", "folder of `bench run`"),
+        ("--count N", "check only the first N problems of each set (default: all)", count),
+    )
 
 
 def run_run(arguments: argparse.Namespace) -> int:
@@ -124,8 +128,6 @@ def calls_shown(settings: "BenchSettings") -> "Iterator[tuple[Report, Done]]":
 
 def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
     """The settings of each pass: of the preset, or one from the options."""
-    from pathlib import Path
-
     from robotdiffuse.evaluation.bench import BenchSettings, preset_settings
 
     if arguments.cluster is not None and arguments.workers is not None:
@@ -156,8 +158,6 @@ def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
 
 
 def run_report(arguments: argparse.Namespace) -> int:
-    from pathlib import Path
-
     from robotdiffuse.core.output_files import write_atomically
     from robotdiffuse.core.tables import show
     from robotdiffuse.evaluation.bench_report import bench_report, main_table, missing_line
@@ -211,8 +211,6 @@ def _limits(text: str) -> list[float]:
 
 
 def run_confirm(arguments: argparse.Namespace) -> int:
-    from pathlib import Path
-
     from robotdiffuse.core.tables import Table, show
     from robotdiffuse.evaluation.checks import confirm
 
@@ -227,3 +225,157 @@ def run_confirm(arguments: argparse.Namespace) -> int:
             f"{contact.other}, {-1000 * contact.distance:.1f} mm deep"
         )
     return 1 if refuted else 0
+
+
+FIGURE_PROBLEMS = 60
+"""Most problems of the plot of success against denoising steps."""
+FIGURE_AZIMUTH = -0.9
+"""Of the camera of figure 1, the same for all noise levels [rad]."""
+
+
+def add_reproduce(commands: argparse._SubParsersAction) -> None:
+    parser = command(
+        commands,
+        "reproduce",
+        "make the paper's tables and figures again, beside the printed ones",
+        "Draw the paper's problems, plan, validate, and write one page. Ctrl-C stops; run the "
+        "same command again to continue.",
+    )
+    actions = parser.add_subparsers(title="parts", metavar="PART", required=True)
+    table1 = command(
+        actions,
+        "table1",
+        "planners on ROP, with poses and with configurations as goals",
+        "Write table1.md in the folder, which is one of `bench run` too.",
+        run_table1,
+    )
+    _add_planning(table1)
+    table2 = command(
+        actions,
+        "table2",
+        "train and compare the rows of the ablation",
+        "Train every row of the paper's Table 2 on the same number of samples, test it on the "
+        "same held-out problems, and write table2.md in the folder.",
+        run_table2,
+    )
+    options(
+        table2,
+        ("--data DATA !", "data set of `data generate`"),
+        ("--out FOLDER !", "folder for networks and page"),
+        ("--samples N", "training samples per row (default: 300000)", count),
+        ("--encoder-samples N", "point clouds to train the frozen encoder on (default: 300000)", count),
+        ("--problems N", "held-out problems (default: 500)", count),
+        ("--family NAME", "family of these problems (default: rop)"),
+        ("--rows NAME,...", "rows to train (default: all ten)"),
+        ("--seeds N", "trainings of each row, with different seeds (default: 1)", count),
+        ("--workers N", "processes (default: all cores)", count, os.cpu_count() or 1),
+    )
+    figures = command(
+        actions,
+        "figures",
+        "denoising, success over time, motions of two planners",
+        "Write figures.md and its pictures in the folder of `reproduce table1`; calls that are "
+        "missing there are made first.",
+        run_figures,
+    )
+    _add_planning(figures)
+
+
+def _add_planning(parser: argparse.ArgumentParser) -> None:
+    options(
+        parser,
+        ("--out FOLDER !", "folder for problems, results, page"),
+        ("--problems N", "problems of each kind of goal (default: 300)", count, 300),
+        ("--time-limit S", "of a call [s] (default: 10)", positive, 10.0),
+        (
+            "--paper-weights FOLDER",
+            "weights of `train planner --config paper`, or points, for a row of the diffusion model without "
+            "clearances, guidance and further samples (default: a note says how to train them)",
+        ),
+        ("--workers N", "planners that run at once (default: half of the cores)", count),
+    )
+    option(parser, "--cluster", "use the Ray cluster at RAY_ADDRESS", choices=CLUSTERS)
+
+
+def run_table1(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.evaluation.paper import table1
+
+    settings, bench = _table1(arguments)
+    return _write(table1(settings, bench), settings.out / "table1.md")
+
+
+def _write(page: "report.Report", file: Path) -> int:
+    page.write(file)
+    print(f"wrote {file}")
+    return 0
+
+
+def _table1(arguments: argparse.Namespace) -> "tuple[Table1Settings, Bench]":
+    """The settings of table 1, and its calls, of which the missing ones are made."""
+    from robotdiffuse.evaluation.paper import Table1Settings, run_table1
+
+    settings = Table1Settings(
+        out=Path(arguments.out),
+        problems=arguments.problems,
+        time_limit=arguments.time_limit,
+        paper_weights=arguments.paper_weights,
+        workers=arguments.workers or max(1, (os.cpu_count() or 1) // 2),
+        cluster=arguments.cluster,
+    )
+    with calls_shown(settings.bench) as (report, done):
+        return settings, run_table1(settings, report, done)
+
+
+def run_table2(arguments: argparse.Namespace) -> int:
+    import sys
+    from dataclasses import fields
+
+    from robotdiffuse.learning import need_packages
+
+    need_packages("the ablation", "torch")
+    from robotdiffuse.evaluation.ablation import ROWS, AblationSettings, run_ablation, table2
+
+    known = {field.name for field in fields(AblationSettings)}
+    given = {name: value for name, value in vars(arguments).items() if name in known and value is not None}
+    settings = AblationSettings(**given)
+    rows = list(ROWS) if arguments.rows is None else arguments.rows.split(",")
+    results = run_ablation(
+        settings, rows, arguments.workers, lambda text: print(text, file=sys.stderr, flush=True)
+    )
+    return _write(table2(settings, results), Path(settings.out) / "table2.md")
+
+
+def run_figures(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.evaluation import paper
+    from robotdiffuse.evaluation.bench_report import about
+    from robotdiffuse.evaluation.problem_sets import hard_cases
+    from robotdiffuse.visualization.picture import PictureSettings, write_comparison, write_picture
+
+    settings, bench = _table1(arguments)
+    out = settings.out
+    count = min(settings.problems, FIGURE_PROBLEMS)
+    command = f"robotdiffuse reproduce figures --out FOLDER --problems {settings.problems} "
+    command += f"--time-limit {settings.time_limit:g}"
+    report = paper.paper_report("Figures", command)
+    report.add("## Figure 1")
+    problem = hard_cases("rop", 1, out / "problems")[0].problem
+    for number, state in enumerate(paper.denoising(problem)):
+        file = f"figure1_{number}.png"
+        size = PictureSettings(width=960, height=600, ghosts=8, azimuth=FIGURE_AZIMUTH)
+        title = f"{state.level:.2f} T"
+        write_picture(problem.robot, problem.scene, state.path, out / file, title=title, settings=size)
+        report.picture(file, f"A motion at noise level {title}")
+    by_steps = paper.plot_success_by_steps(paper.success_by_steps(out, count))
+    report.plot("figure1_steps.svg", f"Success against T, {count} problems, 95 % intervals", by_steps)
+    report.add("## Figure 3")
+    caption = "a: success over time, goals are poses, trivial problems too"
+    report.plot("figure3a.svg", caption, paper.plot_success_over_time(bench))
+    compared = paper.compared_motions(bench)
+    if compared is not None:
+        robot, scene = compared.case.problem.standing()
+        size = PictureSettings(shell=0.05)
+        title = compared.case.name
+        write_comparison(robot, scene, compared.motions, out / "figure3b.png", title=title, settings=size)
+        report.picture("figure3b.png", "b: motions of two planners, with a safety shell of 5 cm")
+    paper.add_notes(report, about(bench))
+    return _write(report, out / "figures.md")

@@ -1,10 +1,38 @@
-"""The commands `robotdiffuse schema` and `robotdiffuse completion`, for editors and shells."""
+"""The commands `robotdiffuse planners`, `schema` and `completion`: what can be named."""
 
 import argparse
 import json
 from collections.abc import Iterator
 
-from robotdiffuse.cli.arguments import command, option
+from robotdiffuse.cli.arguments import add_import_option, command, option
+
+
+def add_planners(commands: argparse._SubParsersAction) -> None:
+    parser = command(
+        commands,
+        "planners",
+        "list the planners, or the settings of one",
+        "List the planners, or the settings of one for `robotdiffuse plan --set`.",
+        run_planners,
+    )
+    option(parser, "planner NAME", "list the settings of this planner", nargs="?")
+    add_import_option(parser)
+
+
+def run_planners(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.core.tables import Column, Table, show
+    from robotdiffuse.planning import PLANNERS, planner_settings
+
+    if arguments.planner is None:
+        rows = [(name, one.kind, one.description) for name, one in PLANNERS.load_installed().items()]
+        show(Table.of("", ("planner", Column("kind", left=True), Column("description", left=True)), rows))
+        return 0
+    settings = planner_settings(arguments.planner, ())
+    rows = [(one.name, one.value, one.rule, one.description) for one in settings.describe()]
+    columns = ("setting", *(Column(name, left=True) for name in ("default", "values", "description")))
+    show(Table.of(f"{arguments.planner}: {PLANNERS[arguments.planner].description}", columns, rows))
+    return 0
+
 
 SHELLS = ("bash", "zsh")
 SCRIPT = """_robotdiffuse() {{
@@ -36,7 +64,7 @@ def add_schema(commands: argparse._SubParsersAction) -> None:
     )
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_completion(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "completion",
         help="print a script that completes commands and options in bash or zsh",
@@ -44,7 +72,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         'eval "$(robotdiffuse completion bash)" in ~/.bashrc, or with zsh in ~/.zshrc.',
     )
     option(parser, "shell", "the shell", choices=SHELLS)
-    parser.set_defaults(run=run, parsers=commands.choices)
+    parser.set_defaults(run=run_completion, parsers=commands.choices)
 
 
 def run_schema(arguments: argparse.Namespace) -> int:
@@ -54,7 +82,7 @@ def run_schema(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_completion(arguments: argparse.Namespace) -> int:
     found = {"": (list(arguments.parsers), ["--help", "--version"])}
     for name, parser in arguments.parsers.items():
         found |= _words(parser, f" {name}")

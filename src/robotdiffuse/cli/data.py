@@ -12,6 +12,7 @@ from robotdiffuse.cli.arguments import (
     natural,
     not_negative,
     option,
+    options,
     positive,
     share,
     shares,
@@ -51,33 +52,37 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
         "unfinished shards; run the same command again to continue.",
         run_generate,
     )
-    option(parser, "--out FOLDER !", "folder for the data")
-    option(parser, "--robot NAME", "bundled name or URDF (default: panda)")
-    option(parser, "--trajectories N", "motions to make (default: 140000)", count)
-    option(parser, "--seed N", "random seed (default: 0)", natural)
-    option(
+    options(
         parser,
-        "--mix NAME=P,...",
-        f"fractions of the problem families {', '.join(FAMILIES)} (default: rop=1)",
-        shares,
+        ("--out FOLDER !", "folder for the data"),
+        ("--robot NAME", "bundled name or URDF (default: panda)"),
+        ("--trajectories N", "motions to make (default: 140000)", count),
+        ("--seed N", "random seed (default: 0)", natural),
+        (
+            "--mix NAME=P,...",
+            f"fractions of the problem families {', '.join(FAMILIES)} (default: rop=1)",
+            shares,
+        ),
+        (
+            "--trivial-share P",
+            "fraction to keep of the problems that a straight line solves (default: 1, as in the paper)",
+            share,
+        ),
+        ("--target KIND", "what targets give: position (default) or pose of the tip"),
+        ("--goals N", "most goal configurations per target (default: 10)", count),
     )
-    option(
-        parser,
-        "--trivial-share P",
-        "fraction to keep of the problems that a straight line solves (default: 1, as in the paper)",
-        share,
-    )
-    option(parser, "--target KIND", "what targets give: position (default) or pose of the tip")
-    option(parser, "--goals N", "most goal configurations per target (default: 10)", count)
     parser.add_argument(
         "--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion (default: 254)"
     )
-    option(parser, "--timing KIND", "waypoints equally spaced in arc length (arc, default) or in time (time)")
-    option(parser, "--safety-distance M", "distance to keep to obstacles [m] (default: 0.05)", not_negative)
-    option(parser, "--planner NAME", "shared_tree_rrt_star (default, as in the paper) or aorrtc")
-    option(parser, "--shard N", "motions per shard (default: 500)", count)
-    option(parser, "--workers N", "processes (default: all cores)", count)
-    option(parser, "--cluster NAME", "ray: use the Ray cluster at RAY_ADDRESS")
+    options(
+        parser,
+        ("--timing KIND", "waypoints equally spaced in arc length (arc, default) or in time (time)"),
+        ("--safety-distance M", "distance to keep to obstacles [m] (default: 0.05)", not_negative),
+        ("--planner NAME", "shared_tree_rrt_star (default, as in the paper) or aorrtc"),
+        ("--shard N", "motions per shard (default: 500)", count),
+        ("--workers N", "processes (default: all cores)", count),
+        ("--cluster NAME", "ray: use the Ray cluster at RAY_ADDRESS"),
+    )
     add_import_option(parser)
 
 
@@ -89,9 +94,12 @@ def add_info(actions: argparse._SubParsersAction) -> None:
         "Print the statistics of a data set and write a page of plots.",
         run_info,
     )
-    option(parser, "folder FOLDER", FOLDER_HELP)
-    option(parser, "--page FILE.html", "page of plots (default: FOLDER/report.html)")
-    option(parser, "--robot NAME", ROBOT_HELP)
+    options(
+        parser,
+        ("folder FOLDER", FOLDER_HELP),
+        ("--page FILE.html", "page of plots (default: FOLDER/report.html)"),
+        ("--robot NAME", ROBOT_HELP),
+    )
 
 
 def add_check(actions: argparse._SubParsersAction) -> None:
@@ -103,12 +111,15 @@ def add_check(actions: argparse._SubParsersAction) -> None:
         "validator and with PyBullet on meshes. Exit status: 0 clean, 1 violations found, 2 bad input.",
         run_check,
     )
-    option(parser, "folder FOLDER", FOLDER_HELP)
-    option(parser, "--count N", "validate N random motions (default: all)", count)
-    option(parser, "--seed N", "random seed (default: 0)", natural, 0)
-    option(parser, "--workers N", "processes (default: all cores)", count, os.cpu_count() or 1)
-    option(parser, "--no-pybullet", "do not validate with PyBullet")
-    option(parser, "--robot NAME", ROBOT_HELP)
+    options(
+        parser,
+        ("folder FOLDER", FOLDER_HELP),
+        ("--count N", "validate N random motions (default: all)", count),
+        ("--seed N", "random seed (default: 0)", natural, 0),
+        ("--workers N", "processes (default: all cores)", count, os.cpu_count() or 1),
+        ("--no-pybullet", "do not validate with PyBullet"),
+        ("--robot NAME", ROBOT_HELP),
+    )
 
 
 def add_view(actions: argparse._SubParsersAction) -> None:
@@ -120,11 +131,14 @@ def add_view(actions: argparse._SubParsersAction) -> None:
         "opens in the browser.",
         run_view,
     )
-    option(parser, "folder FOLDER", FOLDER_HELP)
-    option(parser, "--count N", "motions (default: 6)", count, 6)
-    option(parser, "--seed N", "random seed (default: 0)", natural, 0)
-    option(parser, "--out FILE.html", "page (default: FOLDER/samples.html)")
-    option(parser, "--robot NAME", ROBOT_HELP)
+    options(
+        parser,
+        ("folder FOLDER", FOLDER_HELP),
+        ("--count N", "motions (default: 6)", count, 6),
+        ("--seed N", "random seed (default: 0)", natural, 0),
+        ("--out FILE.html", "page (default: FOLDER/samples.html)"),
+        ("--robot NAME", ROBOT_HELP),
+    )
 
 
 def add_export(actions: argparse._SubParsersAction) -> None:
@@ -136,8 +150,11 @@ def add_export(actions: argparse._SubParsersAction) -> None:
         "x_train n x 254 x 7, y_train n x 23.",
         run_export,
     )
-    option(parser, "folder FOLDER", FOLDER_HELP)
-    option(parser, "file FILE.npz", "file to write")
+    options(
+        parser,
+        ("folder FOLDER", FOLDER_HELP),
+        ("file FILE.npz", "file to write"),
+    )
 
 
 def add_import(actions: argparse._SubParsersAction) -> None:
@@ -149,8 +166,11 @@ def add_import(actions: argparse._SubParsersAction) -> None:
         "train on like any other. The file does not contain the radius of its spheres.",
         run_import,
     )
-    option(parser, "file FILE.npz", "x_train n x 254 x 7, y_train n x 23")
-    option(parser, "--out FOLDER !", "folder for the data")
+    options(
+        parser,
+        ("file FILE.npz", "x_train n x 254 x 7, y_train n x 23"),
+        ("--out FOLDER !", "folder for the data"),
+    )
     option(parser, "--robot NAME", "bundled name or URDF (default: panda)", default="panda")
     option(parser, "--radius M", "radius of the spheres [m] (default: 0.25)", positive, 0.25)
 
@@ -215,7 +235,7 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 
 def run_view(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.cli.drawing import show
+    from robotdiffuse.cli.view import show
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.datasets.shards import read_manifest
     from robotdiffuse.robots import load_robot

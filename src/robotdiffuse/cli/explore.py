@@ -1,13 +1,15 @@
-"""The command `robotdiffuse explore`."""
+"""The commands `robotdiffuse live` and `explore`."""
 
 import argparse
+import os
+import signal
+import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from robotdiffuse.cli.arguments import command, option, positive
-from robotdiffuse.cli.drawing import ENDINGS, show
-from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
-from robotdiffuse.cli.live import LOOPBACK, PORT, add_address, require_viser, serve_until_stopped
+from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, STOPPED, command, option, options, positive
+from robotdiffuse.cli.view import ENDINGS, show
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.interop import WRITERS
 
@@ -17,11 +19,96 @@ if TYPE_CHECKING:
     from robotdiffuse.planning.exploration.simulated import Event
     from robotdiffuse.planning.exploration.steps import ExplorerSettings
     from robotdiffuse.problems.problem import Problem
+    from robotdiffuse.visualization.live.exploration import ExplorationPage
+    from robotdiffuse.visualization.live.page import Page
+
+LOOPBACK = "127.0.0.1"
+PORT = 8080
+
+
+def add_live(commands: argparse._SubParsersAction) -> None:
+    parser = command(
+        commands,
+        "live",
+        "plan interactively in the browser",
+        "Serve an interactive page until Ctrl-C. Drag the target, the start and obstacles: the "
+        "page plans again after each change and shows at once whether the current motion is still valid. "
+        "Without PROBLEM, it shows the demo problem.",
+        run_live,
+    )
+    option(parser, "problem PROBLEM", "problem file (.yaml or .json) to open", nargs="?")
+    options(
+        parser,
+        ("--robot NAME", "instead of PROBLEM: name or URDF file of an arm"),
+        ("--planner NAME", "planner; see `robotdiffuse planners` (default: robotdiffuse)"),
+        ("--time-limit S", "time limit of each plan (default: 1 s)", positive, 1.0),
+    )
+    add_address(parser)
+
+
+def add_address(parser: argparse._ActionsContainer) -> None:
+    """Add the options that say where a page is served."""
+    option(
+        parser,
+        "--host ADDRESS",
+        "address to listen on (default: 127.0.0.1, this machine only); on other addresses the URL of "
+        "the page ends with a secret token that every visitor needs",
+        default=LOOPBACK,
+    )
+    option(parser, "--port N", f"port; 0 for any free one (default: {PORT})", port, PORT)
+
+
+def port(text: str) -> int:
+    """An integer from 0 to 65535."""
+    if not (text.isascii() and text.isdecimal() and int(text) < 2**16):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port, an integer from 0 to 65535")
+    return int(text)
+
+
+def run_live(arguments: argparse.Namespace) -> NoReturn:
+    require_viser("live")
+    from rich.console import Console
+
+    from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
+    from robotdiffuse.visualization.live.page import Page
+    from robotdiffuse.visualization.live.server import PageServer, free_port
+    from robotdiffuse.visualization.live.session import PageOptions, Session, first_problem
+
+    planner = arguments.planner or DEFAULT_PLANNER
+    PLANNERS.entry(planner)
+    options = PageOptions(planner, arguments.time_limit)
+    number = free_port(arguments.host, arguments.port)
+    with Console(stderr=True).status("loading the robot (preparing a new URDF takes a minute)"):
+        problem = first_problem(arguments.problem, arguments.robot)
+    serve_until_stopped(Page(Session(problem, options), PageServer(arguments.host, number)))
+
+
+def require_viser(command: str) -> None:
+    """Raises InputError if viser is not installed."""
+    try:
+        import robotdiffuse.visualization.live.server  # noqa: F401
+    except ModuleNotFoundError as error:
+        if error.name != "viser":
+            raise
+        raise InputError(f"{command} needs viser: pip install 'robotdiffuse[live]'") from None
+
+
+def serve_until_stopped(page: "Page | ExplorationPage") -> NoReturn:
+    """Print the address of a page, serve it until Ctrl-C, and end the process."""
+    ended = threading.Event()
+    for stop_signal in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(stop_signal, lambda *_: ended.set())
+    print(f"the page is at {page.server.url} (stop with Ctrl-C)", flush=True)
+    ended.wait()
+    page.close()
+    print("robotdiffuse: stopped", file=sys.stderr, flush=True)
+    os._exit(STOPPED)  # a normal exit would wait for threads that plan or compile
+
 
 RECORDING = ".mcap"
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_explore(commands: argparse._SubParsersAction) -> None:
     parser = command(
         commands,
         "explore",
@@ -30,7 +117,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "only what depth cameras have seen: one at its tip, and one beside it that takes one image. Shapes "
         "named floor are known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 "
         "not, 2 bad input.",
-        run,
+        run_explore,
     )
     option(parser, "problem PROBLEM", "problem file")
     option(
@@ -40,39 +127,41 @@ def add(commands: argparse._SubParsersAction) -> None:
         "strict_then_chance (default: strict)",
         default="strict",
     )
-    option(parser, "--confidence P", "least, of chance (0.98)", float, 0.98)
-    option(
+    options(
         parser,
-        "--see-goal",
-        "go only to goals at which all of the arm's surface was seen to be free (policy strict)",
-    )
-    option(parser, "--time-limit S", "of each search (1)", float, 1.0)
-    option(parser, "--noise", "simulate the noise of depth cameras")
-    option(parser, "--seed N", "random seed", int, 0)
-    option(
-        parser,
-        "--out FILE *",
-        "replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
-        "repeatable",
-    )
-    option(parser, "--view", "write a replay (.html) and open it")
-    option(
-        parser,
-        "--record FILE",
-        "write the depth images with camera parameters, poses and joint states to this .mcap file",
+        ("--confidence P", "least, of chance (0.98)", float, 0.98),
+        (
+            "--see-goal",
+            "go only to goals at which all of the arm's surface was seen to be free (policy strict)",
+        ),
+        ("--time-limit S", "of each search (1)", float, 1.0),
+        ("--noise", "simulate the noise of depth cameras"),
+        ("--seed N", "random seed", int, 0),
+        (
+            "--out FILE *",
+            "replay with what was known at each time (.html), or a strip of pictures, one a step (.png); "
+            "repeatable",
+        ),
+        ("--view", "write a replay (.html) and open it"),
+        (
+            "--record FILE",
+            "write the depth images with camera parameters, poses and joint states to this .mcap file",
+        ),
     )
     live = parser.add_argument_group("live page")
-    option(
+    options(
         live,
-        "--live",
-        "serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
-        "page is first opened",
+        (
+            "--live",
+            "serve a page that shows the exploration while it happens, until Ctrl-C; it begins when the "
+            "page is first opened",
+        ),
+        ("--speed X", "speed of the motions on it (1: real time)", positive, 1.0),
     )
-    option(live, "--speed X", "speed of the motions on it (1: real time)", positive, 1.0)
     add_address(live)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_explore(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.perception.depth_noise import DepthNoise
     from robotdiffuse.planning.exploration.steps import ExplorerSettings

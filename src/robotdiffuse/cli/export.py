@@ -1,9 +1,9 @@
-"""The command `robotdiffuse export`."""
+"""The commands `robotdiffuse export` and `publish`."""
 
 import argparse
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import command, option
+from robotdiffuse.cli.arguments import command, option, options, positive
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_export(commands: argparse._SubParsersAction) -> None:
     parser = command(
         commands,
         "export",
@@ -19,14 +19,17 @@ def add(commands: argparse._SubParsersAction) -> None:
         "Validate the motion of a result file again, and write it for other programs: .mcap (a "
         "scene that Foxglove opens, with ROS 2 messages), .rosbag2 (a ROS 2 bag, a folder), .rrd (Rerun), "
         ".yaml (a ROS 2 JointTrajectory), .csv and .json.",
-        run,
+        run_export,
     )
-    option(parser, "result RESULT", "result file (.json) of `robotdiffuse plan --out`")
-    option(parser, "--out FILE * !", "file to write; repeatable")
-    option(parser, "--rate HZ", "resample the motion, and validate it so, for a controller", float)
+    options(
+        parser,
+        ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
+        ("--out FILE * !", "file to write; repeatable"),
+        ("--rate HZ", "resample the motion, and validate it so, for a controller", float),
+    )
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_export(arguments: argparse.Namespace) -> int:
     from robotdiffuse.interop import check_export, write_motion
 
     outputs = [check_export(file) for file in arguments.out]
@@ -55,3 +58,49 @@ def validated_motion(file: str, rate: float | None = None) -> "tuple[Problem, Tr
         rows = "" if rate is None else f" with rows at {rate:g} Hz"
         raise InputError(f"{file} is not exported: its motion{rows} is not valid: {violation.message}")
     return problem, trajectory
+
+
+PORT = 9090
+"""Default port of rosbridge."""
+
+
+def add_publish(commands: argparse._SubParsersAction) -> None:
+    parser = command(
+        commands,
+        "publish",
+        "publish a result to ROS through rosbridge",
+        "Validate the motion of a result file again, and publish it as a ROS JointTrajectory.",
+        run_publish,
+    )
+    options(
+        parser,
+        ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
+        ("--to HOST[:PORT] !", f"rosbridge server (port: {PORT})", address),
+    )
+    option(
+        parser,
+        "--topic NAME",
+        "topic to publish on (default: /joint_trajectory)",
+        default="/joint_trajectory",
+    )
+    option(parser, "--timeout S", "timeout of the connection (default: 5 s)", positive, 5.0)
+
+
+def address(text: str) -> tuple[str, int]:
+    """HOST or HOST:PORT."""
+    host, colon, port = text.rpartition(":")
+    if not colon:
+        host, port = text, str(PORT)
+    if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST or HOST:PORT")
+    return host, int(port)
+
+
+def run_publish(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.interop.plain_messages import publish
+
+    host, port = arguments.to
+    _, trajectory = validated_motion(arguments.result)
+    publish(trajectory, host, port, arguments.topic, arguments.timeout)
+    print(f"published {len(trajectory.times)} rows on {arguments.topic} at {host}:{port}")
+    return 0

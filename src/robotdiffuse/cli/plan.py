@@ -1,25 +1,28 @@
-"""The command `robotdiffuse plan`."""
+"""The commands `robotdiffuse plan` and `demo`."""
 
 import argparse
-from dataclasses import replace
+from dataclasses import fields, replace
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotdiffuse.cli.arguments import (
     IGNORE_JOINTS,
+    NO_PLAN,
+    SOLVED,
     add_import_option,
     command,
     jerk_limit,
     natural,
     not_negative,
     option,
+    options,
     positive,
     share,
 )
 from robotdiffuse.cli.console import Spinner, print_next_view, print_result
-from robotdiffuse.cli.drawing import ENDINGS, draw, show
-from robotdiffuse.cli.exit_status import NO_PLAN, SOLVED
-from robotdiffuse.core.types import CONVERGED, OBJECTIVES, TIME, UNTIL
+from robotdiffuse.cli.view import ENDINGS, draw, show
+from robotdiffuse.core.types import CONVERGED, FIRST, OBJECTIVES, TIME, UNTIL
 from robotdiffuse.interop import WRITERS
 
 if TYPE_CHECKING:
@@ -28,38 +31,27 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
 
 RESULT_ENDINGS = (".json", ".csv", *ENDINGS, *WRITERS)
-REQUEST = (
-    *(
-        "time_limit",
-        "seed",
-        "until",
-        "clearance",
-        "velocity_scaling",
-        "acceleration_scaling",
-        "jerk",
-        "objective",
-    ),
-)
-"""Options that are arguments of `Planner.plan`."""
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_plan(commands: argparse._SubParsersAction) -> None:
     parser = command(
         commands,
         "plan",
         "plan a motion for a problem file",
         "Plan a motion for a problem file; every motion found is verified. Exit status: 0 "
         "solved, 1 no plan, 2 bad input.",
-        run,
+        run_plan,
     )
-    option(parser, "problem PROBLEM", "problem file (.yaml, .json or .jsonl)")
-    option(parser, "--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0)
-    option(parser, "--planner NAME", "see `robotdiffuse planners` (default: robotdiffuse)")
-    option(
+    options(
         parser,
-        "--weights FOLDER",
-        "weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
-        "without clearances as inputs (default: the bundled ones)",
+        ("problem PROBLEM", "problem file (.yaml, .json or .jsonl)"),
+        ("--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0),
+        ("--planner NAME", "see `robotdiffuse planners` (default: robotdiffuse)"),
+        (
+            "--weights FOLDER",
+            "weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
+            "without clearances as inputs (default: the bundled ones)",
+        ),
     )
     option(
         parser,
@@ -75,24 +67,21 @@ def add(commands: argparse._SubParsersAction) -> None:
         default=CONVERGED,
         choices=UNTIL,
     )
-    option(
+    options(
         parser,
-        "--clearance M",
-        "distance to obstacles to keep where possible, up to 0.5 m (default: the problem's, or 0.01 m)",
-        not_negative,
-    )
-    option(
-        parser,
-        "--unknown POLICY",
-        "policy for space that the problem's views do not show: optimistic (free), padded, predicted or "
-        "occupied (default: the problem's; else predicted where the network covers the arm's reach, or "
-        "padded)",
-    )
-    option(parser, "--ignore-joints", IGNORE_JOINTS)
-    option(
-        parser,
-        "--next-view",
-        "propose a camera pose that shows most of the unknown space that the motion crosses",
+        (
+            "--clearance M",
+            "distance to obstacles to keep where possible, up to 0.5 m (default: the problem's, or 0.01 m)",
+            not_negative,
+        ),
+        (
+            "--unknown POLICY",
+            "policy for space that the problem's views do not show: optimistic (free), padded, predicted or "
+            "occupied (default: the problem's; else predicted where the network covers the arm's reach, or "
+            "padded)",
+        ),
+        ("--ignore-joints", IGNORE_JOINTS),
+        ("--next-view", "propose a camera pose that shows most of the unknown space that the motion crosses"),
     )
     for what in ("velocity", "acceleration"):
         parser.add_argument(
@@ -115,33 +104,35 @@ def add(commands: argparse._SubParsersAction) -> None:
         default=TIME,
         choices=OBJECTIVES,
     )
-    option(
+    options(
         parser,
-        "--blend R",
-        "pass the problem's waypoints without stopping, within this distance: in rad for "
-        "configurations, in m for poses (default: the problem's, or stop)",
-        positive,
+        (
+            "--blend R",
+            "pass the problem's waypoints without stopping, within this distance: in rad for "
+            "configurations, in m for poses (default: the problem's, or stop)",
+            positive,
+        ),
+        ("--seed N", "random seed (default: 0)", natural, 0),
+        (
+            "--out FILE *",
+            "file to write: result (.json), trajectory (.csv), replay (.html), picture (.png), or for other "
+            "programs .mcap (Foxglove, ROS 2), .rosbag2, .rrd (Rerun) or .yaml (JointTrajectory); repeatable",
+        ),
+        ("--view", "write a replay (.html) and open it"),
     )
-    option(parser, "--seed N", "random seed (default: 0)", natural, 0)
-    option(
-        parser,
-        "--out FILE *",
-        "file to write: result (.json), trajectory (.csv), replay (.html), picture (.png), or for other "
-        "programs .mcap (Foxglove, ROS 2), .rosbag2, .rrd (Rerun) or .yaml (JointTrajectory); repeatable",
-    )
-    option(parser, "--view", "write a replay (.html) and open it")
     add_import_option(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_plan(arguments: argparse.Namespace) -> int:
     from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, planner_settings
+    from robotdiffuse.planning.context import PlanRequest
 
     name = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(name)
     settings = planner_settings(name, arguments.settings) if arguments.settings else None
     outputs = _outputs(arguments)
     problem = _problem(arguments)
-    request = {option: getattr(arguments, option) for option in REQUEST}
+    request = {field.name: getattr(arguments, field.name) for field in fields(PlanRequest)}
     picture = any(file.suffix.lower() == ".png" for file in outputs)
     result = load_and_plan(problem, name, settings, arguments.weights, picture, **request)
     written = [file for file in outputs if _write(problem, result, file)]  # first: `| head` ends what prints
@@ -247,3 +238,144 @@ def load_and_plan(
     spinner = Spinner(f"planning with {planner}")
     with exit_on_interrupt(spinner.stop), spinner, compiling_ahead(picture):
         return load_planner(planner, settings, weights).plan(problem, **request)
+
+
+PROBLEM_FILE, FAMILY = "shelf.yaml", "shelf"
+TIME_LIMIT = 10.0
+"""Time limit for planning [s]."""
+READY = "ready"
+"""Where the arm of `demo --explore` starts, if it has such a pose."""
+EXPLORE_TIME_LIMIT = 2.0
+"""Time limit of each of its searches [s]."""
+MAX_DRAWS, DRAW_TIME_LIMIT = 50, 1.0
+"""Problems that are drawn for another arm, and the time limit of the search that tries each [s]."""
+CAMERA_POSITION, CAMERA_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
+"""Position and target of the camera of `demo --camera` [m]."""
+IMAGE_SIZE, FOCAL_LENGTH = (640, 480), 460.0
+"""Width, height and focal length of its images [pixels]."""
+
+
+def add_demo(commands: argparse._SubParsersAction) -> None:
+    parser = command(
+        commands,
+        "demo",
+        "plan a bundled problem and draw the motion",
+        "Plan a bundled problem with obstacles, and write demo.png and demo.html to the current "
+        "folder; with --explore, see the obstacles by cameras on the way.",
+        run_demo,
+    )
+    seen = parser.add_mutually_exclusive_group()
+    options(
+        seen,
+        (
+            "--camera",
+            "plan with the view of one depth camera instead of the scene; demo_true.png shows the motion in "
+            "the true scene",
+        ),
+        (
+            "--explore",
+            "simulate an arm that sees the shelf by a camera at its tip and looks before it moves; writes "
+            "explore.png and explore.html",
+        ),
+    )
+    option(
+        parser,
+        "--robot NAME",
+        "plan with another arm, between shelves of its size; see `robotdiffuse robot list`",
+    )
+
+
+def run_demo(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.planning import DEFAULT_PLANNER
+    from robotdiffuse.problems.files import load_problem
+
+    names = ("explore.png", "explore.html") if arguments.explore else ("demo.png", "demo.html")
+    outputs = [check_output(file, ENDINGS) for file in names]
+    if arguments.robot is None:
+        with resources.as_file(resources.files("robotdiffuse") / "examples" / PROBLEM_FILE) as file:
+            problem = load_problem(file)
+    else:
+        problem = shelf_problem(arguments.robot)
+    if arguments.explore:
+        return explore_shelf(problem, outputs)
+    true = problem
+    if arguments.camera:
+        outputs.append(check_output("demo_true.png", ENDINGS))
+        problem = seen_by_camera(true)
+    result = load_and_plan(problem, DEFAULT_PLANNER, picture=True, time_limit=TIME_LIMIT)
+    print_result(result, asked_clearance(problem, DEFAULT_PLANNER))
+    if result.trajectory is None or result.path is None:
+        return NO_PLAN
+    if arguments.camera:
+        from robotdiffuse.validation.validator import verify
+
+        violation = verify(true, result.path).violation
+        print("in the true scene:", "free" if violation is None else violation.message)
+    for file in outputs:
+        draw(true if file.name == "demo_true.png" else problem, result, file)
+        print(f"wrote {file.resolve()}")
+    return 0
+
+
+def explore_shelf(problem: "Problem", outputs: list[Path]) -> int:
+    """Take the arm from where it is ready to the problem's goal through space that its cameras see on the
+    way, and draw that."""
+    from robotdiffuse.cli.explore import draw_exploration, simulate
+    from robotdiffuse.planning.exploration.steps import LOOK, ExplorerSettings
+    from robotdiffuse.problems.families.furniture import FLOOR
+    from robotdiffuse.problems.problem import Problem
+    from robotdiffuse.scenes.scene import Scene
+
+    others = [shape for shape in problem.scene.shapes if shape.name != FLOOR.name]
+    start = READY if READY in problem.robot.poses else problem.start
+    problem = Problem(problem.robot, Scene([FLOOR, *others]), start, problem.goal)
+    print("The arm knows the floor, and sees the rest by a camera at its tip and one beside it.")
+    explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
+    looks = sum(act.step.kind == LOOK for act in explorer.acts)
+    end = "is at the goal" if arrived else "is not at the goal"
+    print(f"The arm {end}: {looks} looks, {len(explorer.views)} images, {explorer.duration:.1f} s in motion.")
+    for file in outputs:
+        draw_exploration(explorer, problem, file)
+        print(f"wrote {file.resolve()}")
+    return SOLVED if arrived else NO_PLAN
+
+
+def shelf_problem(robot: str) -> "Problem":
+    """A problem of the family shelf for another arm that the straight line does not solve and a search does.
+
+    Raises InputError if none can be drawn for it.
+    """
+    import numpy as np
+
+    from robotdiffuse.planning import load_planner
+    from robotdiffuse.problems.families.scaled import family_for
+    from robotdiffuse.robots import load_robot
+
+    arm, rng, search = load_robot(robot), np.random.default_rng(0), load_planner("aorrtc")
+    family = family_for(FAMILY, arm)
+    with Spinner(f"drawing a problem for {arm.name}"):
+        for _ in range(MAX_DRAWS):
+            problem = family.draw(arm, rng).problem(arm)
+            found = search.plan(problem, DRAW_TIME_LIMIT, until=FIRST)
+            if found.solved and found.stage != "straight_line":
+                return problem
+    return problem
+
+
+def seen_by_camera(problem: "Problem") -> "Problem":
+    """The problem with one depth view, from behind the arm's shoulder, in place of its scene; the floor stays
+    known."""
+    import numpy as np
+
+    from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+    from robotdiffuse.problems.families.furniture import FLOOR
+    from robotdiffuse.problems.problem import PREDICTED
+    from robotdiffuse.scenes.scene import Scene
+
+    T_base_camera = looking_at(np.array(CAMERA_POSITION), np.array(CAMERA_TARGET))
+    width, height = IMAGE_SIZE
+    intrinsics = (FOCAL_LENGTH, FOCAL_LENGTH, (width - 1) / 2, (height - 1) / 2)
+    true_scene = Scene([FLOOR, *problem.scene.shapes])
+    view = ray_cast(true_scene, T_base_camera, intrinsics, IMAGE_SIZE, problem.robot, problem.start)
+    return replace(problem, scene=Scene([FLOOR]), views=(view,), unknown=PREDICTED)

@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import assignment, command, folder, natural, option
+from robotdiffuse.cli.arguments import assignment, command, folder, natural, option, options
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -51,23 +51,24 @@ def add(commands: argparse._SubParsersAction) -> None:
         "name.",
         run_add,
     )
-    option(make, "urdf URDF", "URDF of an arm, or xacro file, which is compiled: this runs code in it")
-    option(make, "--name NAME", "name that problems use (default: the URDF's)")
-    option(make, "--out FOLDER", "folder to write (default: one in the user's robots)")
-    option(
+    options(
         make,
-        "--group NAME",
-        "group of the SRDF, or arm, to plan for; both or all: several arms as one robot (default: the "
-        "only arm)",
-    )
-    option(make, "--base LINK", "first link of the arm (default: the root)")
-    option(make, "--tip LINK", "last link of the arm (default: the link where a gripper begins)")
-    option(make, "--lock JOINT=VALUE *", "lock a joint at a value [rad or m]; repeatable", assignment)
-    option(
-        make,
-        "--srdf FILE",
-        "SRDF with groups, poses, passive joints and allowed pairs of links (default: the SRDF beside "
-        "the URDF, without its pairs)",
+        ("urdf URDF", "URDF of an arm, or xacro file, which is compiled: this runs code in it"),
+        ("--name NAME", "name that problems use (default: the URDF's)"),
+        ("--out FOLDER", "folder to write (default: one in the user's robots)"),
+        (
+            "--group NAME",
+            "group of the SRDF, or arm, to plan for; both or all: several arms as one robot (default: the "
+            "only arm)",
+        ),
+        ("--base LINK", "first link of the arm (default: the root)"),
+        ("--tip LINK", "last link of the arm (default: the link where a gripper begins)"),
+        ("--lock JOINT=VALUE *", "lock a joint at a value [rad or m]; repeatable", assignment),
+        (
+            "--srdf FILE",
+            "SRDF with groups, poses, passive joints and allowed pairs of links (default: the SRDF beside "
+            "the URDF, without its pairs)",
+        ),
     )
     make.add_argument(
         "--allow",
@@ -77,16 +78,18 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar=("LINK", "LINK"),
         help="two links not to check against each other; repeatable",
     )
-    option(
+    options(
         make,
-        "--package NAME=FOLDER *",
-        "folder of a ROS package (default: search ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders "
-        "above the URDF)",
-        folder,
+        (
+            "--package NAME=FOLDER *",
+            "folder of a ROS package (default: search ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders "
+            "above the URDF)",
+            folder,
+        ),
+        ("--limits FILE", "file of joint limits, as MoveIt's joint_limits.yaml"),
+        ("--licence TEXT", "licence of the URDF's geometry, to keep in the folder"),
+        ("--seed N", "random seed (default: 0)", natural, 0),
     )
-    option(make, "--limits FILE", "file of joint limits, as MoveIt's joint_limits.yaml")
-    option(make, "--licence TEXT", "licence of the URDF's geometry, to keep in the folder")
-    option(make, "--seed N", "random seed (default: 0)", natural, 0)
 
 
 def run_list(arguments: argparse.Namespace) -> int:

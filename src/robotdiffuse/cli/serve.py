@@ -5,7 +5,7 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import command, count, natural, option, positive
+from robotdiffuse.cli.arguments import command, count, natural, option, options, positive
 
 if TYPE_CHECKING:
     from robotdiffuse.robots.robot import Robot
@@ -29,23 +29,24 @@ def add(commands: argparse._SubParsersAction) -> None:
         "another robot that requests may name: one of `robot add`, or a URDF file; repeatable",
     )
     option(parser, "--host HOST", "address to listen on (default: 127.0.0.1)", default="127.0.0.1")
-    option(parser, "--port PORT", "port; 0 for any free one (default: 8000)", natural, 8000)
-    option(parser, "--workers N", "processes that plan (default: one per core)", count)
-    option(
+    options(
         parser,
-        "--queue N",
-        "requests that may wait for a worker; further ones are answered with 429 (default: 16)",
-        natural,
-        16,
-    )
-    option(parser, "--max-time-limit S", "largest time limit of a request (default: 10 s)", positive, 10.0)
-    option(parser, "--max-request-size MB", "largest size of a request (default: 8 MB)", count, 8)
-    option(
-        parser,
-        "--max-worker-memory MB",
-        "a worker that holds more memory than this after an answer is replaced (default: 2048 MB)",
-        count,
-        2048,
+        ("--port PORT", "port; 0 for any free one (default: 8000)", natural, 8000),
+        ("--workers N", "processes that plan (default: one per core)", count),
+        (
+            "--queue N",
+            "requests that may wait for a worker; further ones are answered with 429 (default: 16)",
+            natural,
+            16,
+        ),
+        ("--max-time-limit S", "largest time limit of a request (default: 10 s)", positive, 10.0),
+        ("--max-request-size MB", "largest size of a request (default: 8 MB)", count, 8),
+        (
+            "--max-worker-memory MB",
+            "a worker that holds more memory than this after an answer is replaced (default: 2048 MB)",
+            count,
+            2048,
+        ),
     )
 
 

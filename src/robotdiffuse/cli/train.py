@@ -2,13 +2,23 @@
 
 import argparse
 import os
+import shutil
+import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from robotdiffuse.cli.arguments import command, count, names, natural, option, positive, share
+from robotdiffuse.cli.arguments import command, count, names, natural, option, options, positive, share
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.learning import need_packages
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
+
+if TYPE_CHECKING:
+    from robotdiffuse.generation import GenerationSettings
+    from robotdiffuse.learning.training.config import PlannerTraining
 
 TRAINING_OPTIONS = (
     *("minutes", "samples", "seed", "batch", "learning_rate", "threads"),
@@ -52,10 +62,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         "cameras do not see, on random scenes.",
         run_completion,
     )
-    option(completion, "--families NAMES", "families of the scenes (default: all)", names)
-    option(completion, "--robot NAME", "bundled name or URDF of the arm in the images")
-    option(completion, "--workers N", "processes that draw samples (default: 1)", natural)
-    option(completion, "--weights FOLDER", "weights to begin with; bundled: those that come with the package")
+    options(
+        completion,
+        ("--families NAMES", "families of the scenes (default: all)", names),
+        ("--robot NAME", "bundled name or URDF of the arm in the images"),
+        ("--workers N", "processes that draw samples (default: 1)", natural),
+        ("--weights FOLDER", "weights to begin with; bundled: those that come with the package"),
+    )
     _add_shared(completion)
     _add_device(completion)
 
@@ -78,38 +91,33 @@ def add(commands: argparse._SubParsersAction) -> None:
         "EDMP), or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
         default="compact",
     )
-    option(
+    options(
         planner,
-        "--encoder FOLDER",
-        "folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
-        "for the denoiser cross_attention (default: that of the config, or the bundled one)",
+        (
+            "--encoder FOLDER",
+            "folder of a trained encoder; pointnet or dgcnn, which are trained with the planner; or points, "
+            "for the denoiser cross_attention (default: that of the config, or the bundled one)",
+        ),
+        ("--robot NAME", "bundled name or URDF of the robot (default: panda)"),
+        ("--trajectories N", "motions to generate, without --data (default: 60,000)", count),
+        ("--workers N", "processes that generate data without --data (all cores)", count),
     )
-    option(planner, "--robot NAME", "bundled name or URDF of the robot (default: panda)")
-    option(planner, "--trajectories N", "motions to generate, without --data (default: 60,000)", count)
-    option(planner, "--workers N", "processes that generate data without --data (all cores)", count)
     _add_shared(planner, out_required=False)
     _add_device(planner)
     parts = planner.add_argument_group("parts of the model that replace those of the config")
-    option(
+    options(
         parts,
-        "--denoiser NAME",
-        "transformer, encoder_decoder, decoder_only, unet, or cross_attention for the encoder points",
+        (
+            "--denoiser NAME",
+            "transformer, encoder_decoder, decoder_only, unet, or cross_attention for the encoder points",
+        ),
+        ("--sampler NAME", "sampler for planning: ddim or ddpm"),
+        ("--objective NAME", "what the denoiser predicts: clean or noise"),
+        ("--target NAME", "what motions are relative to: residual (the straight line), absolute or limits"),
+        ("--sampling-steps N", "denoising steps for planning", count),
+        ("--condition-drop P", "fraction of samples without condition, for classifier-free guidance", share),
+        ("--waypoints N", "waypoints of a motion", count),
     )
-    option(parts, "--sampler NAME", "sampler for planning: ddim or ddpm")
-    option(parts, "--objective NAME", "what the denoiser predicts: clean or noise")
-    option(
-        parts,
-        "--target NAME",
-        "what motions are relative to: residual (the straight line), absolute or limits",
-    )
-    option(parts, "--sampling-steps N", "denoising steps for planning", count)
-    option(
-        parts,
-        "--condition-drop P",
-        "fraction of samples without condition, for classifier-free guidance",
-        share,
-    )
-    option(parts, "--waypoints N", "waypoints of a motion", count)
 
     baseline = command(
         kinds,
@@ -118,9 +126,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         "Train the network of a learned baseline on planned trajectories.",
         run_baseline,
     )
-    option(baseline, "name NAME", "mpnet, mpinets or trajectory_prior (for MPD and EDMP)")
-    option(baseline, "--data FOLDER !", "data set of `data generate`")
-    option(baseline, "--robot NAME", "bundled name or URDF of the data's robot")
+    options(
+        baseline,
+        ("name NAME", "mpnet, mpinets or trajectory_prior (for MPD and EDMP)"),
+        ("--data FOLDER !", "data set of `data generate`"),
+        ("--robot NAME", "bundled name or URDF of the data's robot"),
+    )
     _add_shared(baseline)
 
     export = command(
@@ -143,13 +154,19 @@ def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> N
         help=f"folder for weights, settings and checkpoints{default}",
     )
     length = parser.add_mutually_exclusive_group()
-    option(length, "--minutes MIN", "length of the training [minutes]", positive)
-    option(length, "--samples N", "length of the training [samples]", count)
-    option(parser, "--seed N", "random seed", natural)
-    option(parser, "--batch N", "samples per step", count)
-    option(parser, "--learning-rate X", "largest learning rate", positive)
-    option(parser, "--threads N", "number of PyTorch threads", count)
-    option(parser, "--checkpoint-seconds S", "time between checkpoints [s] (default: 120)", positive)
+    options(
+        length,
+        ("--minutes MIN", "length of the training [minutes]", positive),
+        ("--samples N", "length of the training [samples]", count),
+    )
+    options(
+        parser,
+        ("--seed N", "random seed", natural),
+        ("--batch N", "samples per step", count),
+        ("--learning-rate X", "largest learning rate", positive),
+        ("--threads N", "number of PyTorch threads", count),
+        ("--checkpoint-seconds S", "time between checkpoints [s] (default: 120)", positive),
+    )
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
@@ -223,15 +240,12 @@ def run_planner(arguments: argparse.Namespace) -> int:
         given["encoder"] = str(Path(arguments.out) / "encoder")
     settings = planner_training(arguments.config, given)
     if bundled:
-        from robotdiffuse.cli.train_robot import copy_bundled_encoder
-
         copy_bundled_encoder(Path(arguments.out) / "encoder")
     _print_report(train_planner(settings, arguments.out), arguments.out)
     return 0
 
 
 def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
-    from robotdiffuse.cli.train_robot import train_for_robot
     from robotdiffuse.learning.training.configs import planner_training
 
     if arguments.robot is None:
@@ -277,3 +291,117 @@ def _print_report(figures: dict[str, float], out: str) -> None:
     for name, value in figures.items():
         print(f"{name}: {value:.6g}")
     print(f"wrote {out}")
+
+
+MOTIONS = 60_000
+"""Motions to generate: about twenty minutes on two cores. With rotated copies they are 360,000, and the
+training sees each seven times."""
+SAMPLES = 2_400_000
+"""Training samples, as for the bundled Panda weights: one to two hours on one core."""
+MIX = {"rop": 0.2, "rop_dense": 0.3, "shelf": 0.2, "crate": 0.15, "table": 0.15}
+"""Fractions of the problem families: more furniture than for the Panda's weights, where a network helps
+most."""
+WAYPOINTS = 96
+"""Waypoints of a motion, twice as many as the network's."""
+SAFETY_DISTANCE = 0.05
+"""Distance of the motions to obstacles for an arm of the Panda's reach [m]; scaled with the reach."""
+BYTES_PER_MOTION = 8_000
+"""Disk space reserved for each motion, including scene codes and rotated copies; about twice what it
+needs."""
+BYTES_PER_TRAINING = 100_000_000
+"""Disk space for checkpoints and weights."""
+
+
+def data_settings(source: str, robot: Robot, motions: int | None, seed: int | None) -> "GenerationSettings":
+    """Settings of the training data for an arm."""
+    from robotdiffuse.generation import GenerationSettings
+    from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
+    from robotdiffuse.problems.families.scaled import scale_for
+
+    return GenerationSettings(
+        robot=source,
+        trajectories=motions or MOTIONS,
+        seed=seed or 0,
+        mix=MIX,
+        trivial_share=0.1,
+        target="pose",
+        goals=1,
+        waypoints=WAYPOINTS,
+        planner="aorrtc",
+        search=AORRTCSearchSettings(safety_distance=SAFETY_DISTANCE * scale_for(robot)),
+    )
+
+
+def train_for_robot(
+    source: str,
+    given: dict[str, Any],
+    make: Callable[[dict[str, Any]], "PlannerTraining"],
+    out: str | None = None,
+    motions: int | None = None,
+    workers: int | None = None,
+) -> tuple[dict[str, float], Path]:
+    """Generate the data, train, and install the weights; returns the training's figures and the weights'
+    folder.
+
+    source: the robot, as for `load_robot`. given: training settings from the command line, which `make`
+    completes. out: working folder; None: beside the user's robots. motions, workers: for the data.
+
+    Raises InputError for an unknown robot, a folder of other settings, and too little disk space.
+    """
+    from robotdiffuse.cli.console import progress
+    from robotdiffuse.generation import generate
+    from robotdiffuse.learning.training.config import PlannerTraining
+    from robotdiffuse.learning.training.planner import train_planner
+    from robotdiffuse.learning.weights_registry import user_weights
+
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise InputError("torchrun only trains: generate the data first, then give --data")
+    robot = load_robot(source)
+    source = str(Path(source).resolve()) if Path(source).exists() else source
+    kept = user_weights(robot)
+    work = kept.with_name("training") if out is None else Path(out)
+    data = data_settings(source, robot, motions, given.get("seed"))
+    _check_disk(work, data.trajectories)
+    defaults: dict[str, Any] = {"samples": SAMPLES} if given.get("minutes") is None else {}
+    defaults |= {"encoder": str(work / "encoder")}
+    settings: PlannerTraining = make(defaults | given | {"data": str(work / "data"), "robot": source})
+    _say(f"{robot.name}: {data.trajectories:,} motions, then training; all in {work}")
+    with progress("trajectories") as update:
+        generate(data, work / "data", workers or os.cpu_count() or 1, progress=update)
+    if "encoder" not in given:
+        copy_bundled_encoder(work / "encoder")
+    report = train_planner(settings, str(work))
+    network = "trajectory_prior" if settings.encoder is None else "model"
+    # the description last: its presence means that the weights are complete
+    for file in sorted(work.glob(f"{network}.*"), key=lambda file: file.suffix == ".json"):
+        write_atomically(kept / file.name, file.read_bytes(), make_folder=True)
+    return report, kept
+
+
+def _check_disk(work: Path, motions: int) -> None:
+    """Raises InputError if the disk has too little space."""
+    there = next(folder for folder in (work, *work.absolute().parents) if folder.exists())
+    made = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) if work.is_dir() else 0
+    free, needed = shutil.disk_usage(there).free, motions * BYTES_PER_MOTION + BYTES_PER_TRAINING - made
+    if free < needed:
+        raise InputError(
+            f"{motions:,} motions and the training need {needed / 1e6:,.0f} MB more, and {there} has "
+            f"{free / 1e6:,.0f} MB left; free some space, or name another folder with --out"
+        )
+
+
+def copy_bundled_encoder(folder: Path) -> Path:
+    """Save the encoder of the bundled weights in the form that the training reads; returns the folder."""
+    from robotdiffuse.learning.checkpoint import load_model, save_encoder
+    from robotdiffuse.learning.weights_registry import BUNDLED
+
+    if (folder / "encoder.json").is_file():
+        return folder
+    encoder = load_model(BUNDLED / "panda").encoder
+    assert encoder is not None
+    save_encoder(encoder, folder, {"from": "the weights that come with the package for panda"})
+    return folder
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

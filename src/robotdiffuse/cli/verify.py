@@ -1,22 +1,23 @@
-"""The command `robotdiffuse verify`."""
+"""The commands `robotdiffuse verify` and `certificate check`."""
 
 import argparse
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import IGNORE_JOINTS, command, natural, option
+from robotdiffuse.cli.arguments import IGNORE_JOINTS, command, natural, option, options
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
     from robotdiffuse.core import types
     from robotdiffuse.problems.problem import Problem
+    from robotdiffuse.robots.robot import Robot
 
 VALID, NOT_VALID = 0, 1
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def add_verify(commands: argparse._SubParsersAction) -> None:
     parser = command(
         commands,
         "verify",
@@ -24,29 +25,34 @@ def add(commands: argparse._SubParsersAction) -> None:
         "Validate a motion from any planner: a RobotDiffuse result, CSV, JSON, YAML of a ROS "
         "JointTrajectory or MoveIt RobotTrajectory, a ROS 2 bag or MCAP. Exit status: 0 valid, 1 not valid, "
         "2 bad input.",
-        run,
+        run_verify,
     )
     option(parser, "motion MOTION", "file (.json, .csv, .yaml, .mcap), or the folder of a ROS 2 bag")
     where = parser.add_mutually_exclusive_group()
-    option(where, "--problem FILE", "problem file (default: the problem in the result or .mcap file)")
-    option(
+    options(
         where,
-        "--scene FILE",
-        "MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs --robot",
+        ("--problem FILE", "problem file (default: the problem in the result or .mcap file)"),
+        (
+            "--scene FILE",
+            "MoveIt planning scene, instead of a problem; start and goal are those of the motion; needs "
+            "--robot",
+        ),
     )
-    option(parser, "--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0)
-    option(parser, "--robot NAME", "bundled name or URDF, with --scene")
-    option(parser, "--ignore-joints", IGNORE_JOINTS)
-    option(parser, "--topic NAME", "topic of the motion in a bag or MCAP file with several")
-    option(parser, "--all", "print all violations, not only the first")
-    option(
+    options(
         parser,
-        "--certificate FILE.json",
-        "write a proof that the motion is valid, for `robotdiffuse certificate check`",
+        ("--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0),
+        ("--robot NAME", "bundled name or URDF, with --scene"),
+        ("--ignore-joints", IGNORE_JOINTS),
+        ("--topic NAME", "topic of the motion in a bag or MCAP file with several"),
+        ("--all", "print all violations, not only the first"),
+        (
+            "--certificate FILE.json",
+            "write a proof that the motion is valid, for `robotdiffuse certificate check`",
+        ),
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_verify(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
     from robotdiffuse.scenes.scene import contact_notes
 
@@ -141,3 +147,72 @@ def _read(
         raise InputError(f"{arguments.motion}: {error}") from None
     what = "trajectory" if isinstance(fit.motion, Trajectory) else "path"
     return problem, {what: fit.motion}, (*more, *fit.notes)
+
+
+HOLDS, FAILS = 0, 1
+MAX_CHANGES = 4
+"""Differences from the bundled robot in a line at most."""
+
+
+def add_certificate(commands: argparse._SubParsersAction) -> None:
+    parser = command(
+        commands, "certificate", "re-check a certificate of a motion", "Re-check the certificate of a motion."
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    check = command(
+        actions,
+        "check",
+        "re-check a certificate, without search",
+        "Re-check a certificate with code that shares nothing with the validator. Exit status: "
+        "0 if it holds, 1 if not, 2 for bad input.",
+        run_check,
+    )
+    options(
+        check,
+        ("file FILE", "certificate of `robotdiffuse verify --certificate`"),
+        ("--problem FILE", "problem file to check it for (default: the problem in the certificate)"),
+    )
+
+
+def run_check(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.certificates.certificate import load_certificate
+    from robotdiffuse.certificates.requirements import not_checked
+    from robotdiffuse.cli.console import clearances
+    from robotdiffuse.problems.files import load_problem, problem_from_record
+    from robotdiffuse.scenes.scene import contact_notes
+
+    certificate, problem = load_certificate(arguments.file), None
+    if arguments.problem is not None:
+        problem = load_problem(arguments.problem)
+    elif certificate.problem is not None:
+        problem = problem_from_record(certificate.problem)
+    for note in () if problem is None else contact_notes(problem.scene):
+        print(f"note: {note}")
+    found = certificate.check(problem).differences
+    if problem is not None:
+        print(f"robot: {described(problem.robot)}")
+        print(f"problem: {arguments.problem or 'the one in the certificate'}")
+        print(f"not checked: {'; '.join(not_checked(problem, certificate.motion))}")
+    for line in found:
+        print(line)
+    if not found:
+        print(f"holds: {clearances(certificate)}")
+    return FAILS if found else HOLDS
+
+
+def described(robot: "Robot") -> str:
+    """The robot's name, its source, and whether it is the bundled one."""
+    from robotdiffuse.certificates.content_hashes import differences, robot_parts
+    from robotdiffuse.core.errors import joined
+    from robotdiffuse.robots import DATA, ROBOTS, load_robot
+
+    name = robot.name if robot.source is None else f"{robot.name} from {robot.source}"
+    if robot.name not in ROBOTS:
+        return f"{name}, not bundled: the proof holds for the shapes and joints in its files"
+    held = {joint: value for joint, value in robot.locked.items() if joint not in robot.joint_names}
+    bundled = load_robot(DATA / robot.name, held)
+    changes = differences("robot", robot_parts(bundled), robot_parts(robot))
+    if not changes:
+        return f"{name}, the bundled one"
+    listed = joined([line.removeprefix("robot: ") for line in changes], MAX_CHANGES)
+    return f"{name}, not the bundled one: {listed}"

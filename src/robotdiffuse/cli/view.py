@@ -1,20 +1,103 @@
-"""The command `robotdiffuse view`."""
+"""The commands `robotdiffuse view` and `simulate`; results as replays (.html) and pictures (.png)."""
 
 import argparse
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import command, not_negative, option
-from robotdiffuse.cli.drawing import ENDINGS, draw, draw_several, show
+from robotdiffuse.cli.arguments import NO_PLAN, SOLVED, command, not_negative, option, options
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
     from robotdiffuse.core.results import PlanResult
+    from robotdiffuse.core.types import Path as PathOfJoints
+    from robotdiffuse.core.types import Trajectory
     from robotdiffuse.problems.problem import Problem
+    from robotdiffuse.robots.robot import Robot
+    from robotdiffuse.scenes.scene import Scene
+    from robotdiffuse.simulation.replay import Replay
+
+ENDINGS = (".html", ".png")
 
 
-def add(commands: argparse._SubParsersAction) -> None:
+def draw(problem: "Problem", result: "PlanResult | None", file: Path) -> None:
+    """Draw the motion of a result in its scene, as the ending of the file says; without a motion, the start,
+    the goal and the links that collide.
+
+    For a problem with views and the policy `predicted`, the predicted obstacles are drawn too.
+    """
+    if result is None or result.path is None:
+        from robotdiffuse.visualization.problem_drawing import write_problem
+
+        return write_problem(problem, file, result)
+    if file.suffix.lower() == ".html":
+        from robotdiffuse.visualization.replay_page import write_replay as write
+    else:
+        from robotdiffuse.visualization.picture import write_picture as write
+    robot, scene = _shown(problem)
+    write(robot, scene, _motion(result), file, result=result, moving=problem.moving_in_world)
+
+
+def draw_several(problem: "Problem", results: "Mapping[str, PlanResult]", file: Path, shell: float) -> None:
+    """Draw the motions of several solved results, by name, in the scene of one problem: in one picture, or as
+    replays side by side.
+
+    shell: thickness of the safety shell about the arm in pictures [m].
+    """
+    robot, scene = _shown(problem)
+    motions = {name: _motion(result) for name, result in results.items()}
+    if file.suffix.lower() == ".html":
+        from robotdiffuse.visualization.gallery import GalleryEntry, write_gallery
+
+        entries = [
+            GalleryEntry(name, results[name].planner, scene, motion, problem.moving_in_world)
+            for name, motion in motions.items()
+        ]
+        write_gallery(robot, entries, file, robot.name)
+    else:
+        from robotdiffuse.visualization.picture import PictureSettings, write_comparison
+
+        settings = PictureSettings(shell=shell)
+        write_comparison(robot, scene, motions, file, settings=settings, moving=problem.moving_in_world)
+
+
+def _motion(result: "PlanResult") -> "PathOfJoints | Trajectory":
+    motion = result.trajectory or result.path
+    assert motion is not None, "only a solved result has a motion"
+    return motion
+
+
+def _shown(problem: "Problem") -> "tuple[Robot, Scene]":
+    """The robot and the scene of a problem, with predicted obstacles if there are any."""
+    if problem.views and _predicted(problem):
+        from robotdiffuse.planning.pipeline.unknown_space import predicted_obstacles
+        from robotdiffuse.scenes.scene import Scene
+
+        seen = Scene([*problem.scene.shapes, predicted_obstacles(problem)])
+        problem = replace(problem, scene=seen, views=())
+    return problem.standing()
+
+
+def _predicted(problem: "Problem") -> bool:
+    """Whether the policy for unknown space is `predicted`."""
+    from robotdiffuse.planning.pipeline.unknown_space import policy_for
+
+    return policy_for(problem)[0] == "predicted"
+
+
+def show(file: Path) -> None:
+    """Open a file in the browser, if there is a display."""
+    import webbrowser
+
+    if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(file.resolve().as_uri())
+
+
+def add_view(commands: argparse._SubParsersAction) -> None:
     parser = command(
         commands,
         "view",
@@ -22,7 +105,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "Draw the motions of result files, of several in one picture; of a problem, or a "
         "result without a motion, the start, the goal and the links that collide. Without --out, write a "
         "page and open it in the browser.",
-        run,
+        run_view,
     )
     option(
         parser,
@@ -31,18 +114,19 @@ def add(commands: argparse._SubParsersAction) -> None:
         "of one problem",
         nargs="+",
     )
-    option(
+    options(
         parser,
-        "--out FILE *",
-        "replay (.html) or picture (.png); repeatable (default: the name of RESULT with .html)",
-    )
-    option(
-        parser,
-        "--shell M",
-        "with several results: thickness of the safety shell that pictures show about the arm [m] "
-        "(default: 0, none)",
-        not_negative,
-        0.0,
+        (
+            "--out FILE *",
+            "replay (.html) or picture (.png); repeatable (default: the name of RESULT with .html)",
+        ),
+        (
+            "--shell M",
+            "with several results: thickness of the safety shell that pictures show about the arm [m] "
+            "(default: 0, none)",
+            not_negative,
+            0.0,
+        ),
     )
 
 
@@ -84,7 +168,7 @@ def _read(file: str) -> "tuple[PlanResult | None, Problem]":
     return read_result(file)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_view(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
 
     files = arguments.out or [f"{Path(arguments.results[0]).stem}.html"]
@@ -116,3 +200,90 @@ def _read_several(files: list[str]) -> "tuple[Problem, dict[str, PlanResult]]":
         if problem_record(other)["scene"] != problem_record(problem)["scene"] or other.robot != problem.robot:
             raise InputError(f"{name} is of another robot or scene than {names[0]}; results must share both")
     return problem, dict(zip(names, (result, *(one for one, _ in others)), strict=True))
+
+
+def add_simulate(commands: argparse._SubParsersAction) -> None:
+    parser = command(
+        commands,
+        "simulate",
+        "replay a result in the PyBullet simulator",
+        "Replay the motion of a result file in PyBullet with position control, and print "
+        "tracking errors and contacts. Exit status: 0 no contacts, 1 contacts, 2 bad input.",
+        run_simulate,
+    )
+    options(
+        parser,
+        ("result RESULT", "result file (.json) of `robotdiffuse plan --out`"),
+        ("--out FILE *", "replay (.html) or picture (.png) of the simulated motion; repeatable"),
+    )
+
+
+def run_simulate(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.core.types import Trajectory
+
+    try:
+        from robotdiffuse.simulation import replay
+    except ModuleNotFoundError as error:
+        if error.name != "pybullet":
+            raise
+        raise InputError(
+            "simulate needs PyBullet, which has no wheels above Python 3.11: pip install 'robotdiffuse[sim]'"
+        ) from None
+    outputs = [check_output(file, ENDINGS) for file in arguments.out]
+    result, problem = read_solved(arguments.result)
+    if result.trajectory is None:
+        raise InputError(f"{arguments.result} holds a path without times; a replay needs a trajectory")
+    robot, scene = problem.standing()
+    done = replay(robot, scene, result.trajectory, moving=problem.moving_in_world)
+    for name in (one.name for one in problem.moving if not one.known):
+        print(f"note: the motion of {name} is not known; it stands still here")
+    print_replay(problem.robot.name, result.trajectory.duration, done)
+    rates = np.gradient(done.positions, done.times, axis=0)
+    motion = Trajectory(done.joint_names, done.times, done.positions, rates, 0 * rates)
+    for file in outputs:
+        draw(problem, replace(result, trajectory=motion), file)
+        print(f"wrote {file}")
+    return SOLVED if done.free else NO_PLAN
+
+
+def print_replay(robot: str, duration: float, done: "Replay") -> None:
+    """Print tracking errors and contacts."""
+    from robotdiffuse.core.tables import Column, Table, show
+
+    title = f"{robot}: {'free' if done.free else 'contact'}, {duration:.2f} s"
+    rms = float((done.tip_errors**2).mean() ** 0.5)
+    show(
+        Table.of(
+            title,
+            ("", "maximum", "RMS"),
+            [
+                *(
+                    (f"error of {name}", f"{1e3 * most:.3f} mrad", f"{1e3 * rms:.3f} mrad")
+                    for name, most, rms in zip(
+                        done.joint_names, done.max_errors, done.rms_errors, strict=True
+                    )
+                ),
+                ("error of the tip", f"{1e3 * done.tip_errors.max():.3f} mm", f"{1e3 * rms:.3f} mm"),
+            ],
+        )
+    )
+    if not done.free:
+        columns = ("link", Column("touches", left=True), "at", "depth")
+        show(
+            Table.of(
+                "",
+                columns,
+                [
+                    (
+                        contact.link,
+                        contact.other,
+                        f"{contact.time:.2f} s",
+                        f"{1e3 * contact.depth:.1f} mm" if contact.depth > 0 else "none: closer than 2 mm",
+                    )
+                    for contact in done.contacts
+                ],
+            )
+        )

@@ -102,10 +102,10 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     robot, stream = problem.robot, io.BytesIO()
     out = McapWriter(stream)
     obstacles = drawables(problem.scene, problem.moving)
-    clouds = [one for one in obstacles if isinstance(one.shape, PointCloud)]
-    out.protobuf("/scene", _scene(robot, [one for one in obstacles if one not in clouds]), 0)
-    for one in clouds:
-        out.protobuf(f"/points/{one.name}", _cloud(one.shape, robot.base), 0)
+    out.protobuf("/scene", _scene(robot, obstacles), 0)
+    for shape in problem.scene.shapes:
+        if isinstance(shape, PointCloud):
+            out.protobuf(f"/points/{shape.name}", _cloud(shape, robot.base), 0)
     record = joint_trajectory(trajectory.joint_names, trajectory)
     out.ros("/joint_trajectory", JOINT_TRAJECTORY, record, 0)
     out.ros("/display_planned_path", DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record), 0)
@@ -168,6 +168,8 @@ def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
         return update.entities.add(id=name, frame_id=frame, frame_locked=True)
 
     for one in obstacles:
+        if isinstance(one.shape, PointCloud):
+            continue
         drawn = entity(one.name, _frame(one, robot))
         shape = one.fixed.shape
         match shape:

@@ -81,9 +81,7 @@ def _archetype(obstacle: Drawable) -> rr.AsComponents:
     if isinstance(shape, PointCloud):
         return rr.Points3D(shape.points, radii=shape.point_radius, colors=[obstacle.color])
     if not isinstance(shape, Box | Sphere | Cylinder | Capsule):
-        return _mesh(
-            obstacle.surface if obstacle.moving is None else obstacle.surface.moved(inverse(obstacle.frame()))
-        )
+        return _mesh(obstacle.surface)
     T, solid = shape.T_base_shape, rr.components.FillMode.Solid
     placed = {"quaternions": [_quaternion(T)], "colors": [obstacle.color], "fill_mode": solid}
     match shape:

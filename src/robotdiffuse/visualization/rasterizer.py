@@ -58,12 +58,13 @@ def _corner_weights(screen, a, b, c, px, py):
 
 
 @kernel()
-def _lit(maps, directions, scale, center, size, bias, x, y, z, nx, ny, nz, offset, stride):
+def _lit(light, x, y, z, nx, ny, nz, offset, stride):
     """Cosine-weighted fraction of directional lights that reach a point; uses every stride-th light.
 
     Each light has an orthographic map of the surfaces nearest to it. The point is moved along its normal by
     `bias` so that surfaces do not shadow themselves.
     """
+    maps, directions, scale, center, size, bias = light
     x, y, z = x + nx * bias - center[0], y + ny * bias - center[1], z + nz * bias - center[2]
     got, total = 0.0, 0.0
     for k in range(offset, maps.shape[0], stride):
@@ -95,14 +96,31 @@ def _grid(x, y, spacing, width, footprint):
 
 
 @kernel()
+def _ray(rays, row, column):
+    """The ray through the middle of a pixel, with depth 1."""
+    px, py = column + 0.5, row + 0.5
+    rx = rays[0, 0] * px + rays[0, 1] * py + rays[0, 2]
+    ry = rays[1, 0] * px + rays[1, 1] * py + rays[1, 2]
+    rz = rays[2, 0] * px + rays[2, 1] * py + rays[2, 2]
+    return rx, ry, rz
+
+
+@kernel()
+def _normal(normals, i, j, k, u, v, t):
+    """The normal between three corners, and its length."""
+    nx = u * normals[i, 0] + v * normals[j, 0] + t * normals[k, 0]
+    ny = u * normals[i, 1] + v * normals[j, 1] + t * normals[k, 1]
+    nz = u * normals[i, 2] + v * normals[j, 2] + t * normals[k, 2]
+    return nx, ny, nz, np.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
+
+
+@kernel()
 def _surface(row, column, near, ident, screen, faces, normals, camera, height):
     """The surface at a pixel: depth (0 for none), ray, normal towards the eye, corner weights, whether
     solid."""
     eye, rays = camera
     px, py = column + 0.5, row + 0.5
-    rx = rays[0, 0] * px + rays[0, 1] * py + rays[0, 2]
-    ry = rays[1, 0] * px + rays[1, 1] * py + rays[1, 2]
-    rz = rays[2, 0] * px + rays[2, 1] * py + rays[2, 2]
+    rx, ry, rz = _ray(rays, row, column)
     if rz < 0 and eye[2] > height and rz / (height - eye[2]) > near[row, column]:
         return (height - eye[2]) / rz, rx, ry, rz, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, False
     if near[row, column] <= 0:
@@ -110,10 +128,7 @@ def _surface(row, column, near, ident, screen, faces, normals, camera, height):
     f = ident[row, column]
     i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
     u, v, t = _corner_weights(screen, i, j, k, px, py)
-    nx = u * normals[i, 0] + v * normals[j, 0] + t * normals[k, 0]
-    ny = u * normals[i, 1] + v * normals[j, 1] + t * normals[k, 1]
-    nz = u * normals[i, 2] + v * normals[j, 2] + t * normals[k, 2]
-    length = np.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
+    nx, ny, nz, length = _normal(normals, i, j, k, u, v, t)
     if nx * rx + ny * ry + nz * rz > 0:
         length = -length
     return 1 / near[row, column], rx, ry, rz, nx / length, ny / length, nz / length, u, v, t, True
@@ -135,8 +150,8 @@ def light_lattice(spacing, near, ident, screen, faces, normals, camera, height, 
             x, y, z = eye[0] + depth * rx, eye[1] + depth * ry, eye[2] + depth * rz
             at = lattice[row, column]
             at[0], at[1], at[2], at[3], at[6] = depth, nx, ny, nz, 1.0 if solid else 0.0
-            at[4] = _lit(sky[0], sky[1], sky[2], sky[3], sky[4], sky[5], x, y, z, nx, ny, nz, 0, 1)
-            at[5] = _lit(key[0], key[1], key[2], key[3], key[4], key[5], x, y, z, nx, ny, nz, 0, 1)
+            at[4] = _lit(sky, x, y, z, nx, ny, nz, 0, 1)
+            at[5] = _lit(key, x, y, z, nx, ny, nz, 0, 1)
     return lattice
 
 
@@ -212,8 +227,8 @@ def shade(
                 s, q = s / total, q / total
             else:
                 part = (row % 2) * 2 + column % 2
-                s = _lit(sky[0], sky[1], sky[2], sky[3], sky[4], sky[5], x, y, z, nx, ny, nz, part, 4)
-                q = _lit(key[0], key[1], key[2], key[3], key[4], key[5], x, y, z, nx, ny, nz, part, 4)
+                s = _lit(sky, x, y, z, nx, ny, nz, part, 4)
+                q = _lit(key, x, y, z, nx, ny, nz, part, 4)
             stripe, gloss = 0.0, 0.0
             if solid:
                 f = ident[row, column]
@@ -248,13 +263,8 @@ def blend_ghost(image, solid, near, ident, screen, faces, normals, colors, camer
             f = ident[row, column]
             i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
             u, v, t = _corner_weights(screen, i, j, k, px, py)
-            rx = rays[0, 0] * px + rays[0, 1] * py + rays[0, 2]
-            ry = rays[1, 0] * px + rays[1, 1] * py + rays[1, 2]
-            rz = rays[2, 0] * px + rays[2, 1] * py + rays[2, 2]
-            nx = u * normals[i, 0] + v * normals[j, 0] + t * normals[k, 0]
-            ny = u * normals[i, 1] + v * normals[j, 1] + t * normals[k, 1]
-            nz = u * normals[i, 2] + v * normals[j, 2] + t * normals[k, 2]
-            length = np.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
+            rx, ry, rz = _ray(rays, row, column)
+            nx, ny, nz, length = _normal(normals, i, j, k, u, v, t)
             facing = (nx * rx + ny * ry + nz * rz) / (length * np.sqrt(rx * rx + ry * ry + rz * rz))
             bright = 0.62 + 0.38 * max(0.0, (nx * toward[0] + ny * toward[1] + nz * toward[2]) / length)
             cover = min(1.0, alpha * (0.7 + 1.1 * (1 - abs(facing)) ** 2))

@@ -110,7 +110,7 @@ def place(node: Any, T: Float[ndarray, "4 4"]) -> None:
 class Obstacles:
     """The obstacles in the 3D scene. Moved obstacles are moved; changed ones are drawn again."""
 
-    def __init__(self, server: viser.ViserServer, clicked: Callable[[str], object] = lambda _: None) -> None:
+    def __init__(self, server: viser.ViserServer, clicked: Callable[[str], None] = lambda _: None) -> None:
         self._server = server
         self._clicked = clicked
         self._nodes: dict[str, tuple[object, Any]] = {}

@@ -90,20 +90,20 @@ class PageServer(viser.ViserServer):
     def __init__(self, host: str, port: int) -> None:
         """On hosts that others can reach, browsers need a random token."""
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(16)
-        with (
-            rich.get_console().capture()
-        ):  # viser prints its own address; other threads' output is left alone
+        # viser prints its own address; other threads' output is left alone
+        with rich.get_console().capture():
             super().__init__(host, port, verbose=False)
         inner = self._websock_server
 
         async def check(client: infra.WebsockClientConnection) -> None:
             connection = inner._live_connections[client.client_id]
             request = connection.request
-            hosts, origins = (
-                [] if request is None else request.headers.get_all(name) for name in ("Host", "Origin")
-            )
-            known = request is not None and len(hosts) == 1 and len(origins) <= 1
-            if not (known and may_connect(request.path, hosts[0], next(iter(origins), None), self.token)):
+            assert request is not None, "it was answered"
+            headers = request.headers
+            hosts = headers.get_all("Host")
+            origins = headers.get_all("Origin") or [None]
+            alone = len(hosts) == len(origins) == 1
+            if not (alone and may_connect(request.path, hosts[0], origins[0], self.token)):
                 await connection.close(POLICY_VIOLATION)
 
         inner.on_client_connect(check)
