@@ -7,8 +7,7 @@ import pytest
 
 from helpers.commands import run
 from robotdiffuse.learning.denoisers import UNetSettings
-from robotdiffuse.learning.training.config import PlannerTraining
-from robotdiffuse.learning.training.configs import CONFIGS
+from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining
 
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 

@@ -5,7 +5,6 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.costs import path_constraint_cost
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import DISTANCE
@@ -61,7 +60,7 @@ def test_formula_by_hand() -> None:
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_steps_go_down_until_all_waypoints_keep_it(constraint: Constraint) -> None:
     constraints = ready(constraint)
-    guidance = CollisionGuidance(CHECKER, NO_OTHERS, [path_constraint_cost(constraints, 0.95)])
+    guidance = CollisionGuidance(CHECKER, NO_OTHERS, constraints, 0.95)
     q = waves()
     before = formula(constraints, 0.95, q)
     off = before > 0
@@ -73,6 +72,6 @@ def test_steps_go_down_until_all_waypoints_keep_it(constraint: Constraint) -> No
 
 
 def test_steps_are_no_longer_than_pushes() -> None:
-    guidance = CollisionGuidance(CHECKER, NO_OTHERS, [path_constraint_cost(ready(EACH[2]), 0.95)])
+    guidance = CollisionGuidance(CHECKER, NO_OTHERS, ready(EACH[2]), 0.95)
     moved, _ = guidance(waves(), 1)
     assert np.linalg.norm(moved - waves(), axis=2).max() <= NO_OTHERS.push * (1 + 1e-6)

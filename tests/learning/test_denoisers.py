@@ -23,11 +23,10 @@ from robotdiffuse.learning.denoisers import (
 from robotdiffuse.learning.denoisers.networks import MAX_UNFUSED_TOKENS, Denoiser, attend
 from robotdiffuse.learning.encoders import PointsSettings
 from robotdiffuse.learning.exported_model import exported_model
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.motion_model import MotionModel, SamplingSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.weight_files import RobotIdentity
 
 DOF, FEATURES, CODE = 3, 9, 9
 CONDITION = CODE + 2 * DOF
@@ -277,7 +276,7 @@ def test_files(tmp_path, name, null_condition):
     assert loaded.settings == model.settings
     assert type(loaded.denoiser) is DENOISERS.load(name)
     scale = 2.0 if null_condition else 1.0
-    np.testing.assert_array_equal(sample(loaded, scale), sample(model.for_inference(), scale))
+    np.testing.assert_array_equal(sample(loaded, scale), sample(model.requires_grad_(False).eval(), scale))
     exported = exported_model("model", tmp_path, box_arm())
     np.testing.assert_allclose(sample(exported, scale), sample(loaded, scale), atol=1e-4)
 
@@ -339,7 +338,7 @@ def test_dropped_conditions_have_no_effect(name):
 
 
 def test_scale_of_classifier_free_guidance(monkeypatch):
-    model = model_with("transformer", null_condition=True).for_inference()
+    model = model_with("transformer", null_condition=True).requires_grad_(False).eval()
     features, level, condition = inputs(batch=3)
     c = model.denoise(features, level, condition)
     u = model.denoise(features, level, condition, torch.ones(3, dtype=torch.bool))
@@ -361,7 +360,7 @@ def test_scale_of_classifier_free_guidance(monkeypatch):
 
 
 def test_a_model_that_always_had_its_condition_has_no_guidance_scale():
-    model = model_with("unet").for_inference()
+    model = model_with("unet").requires_grad_(False).eval()
     with pytest.raises(InputError, match="guidance_scale is 2"):
         sample(model, 2.0)
     features, level, condition = inputs()

@@ -208,7 +208,7 @@ def run_completion(arguments: argparse.Namespace) -> int:
 def run_planner(arguments: argparse.Namespace) -> int:
     need_packages("training", "torch")
     from robotdiffuse.learning.denoisers import DENOISERS
-    from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+    from robotdiffuse.learning.training.config import CONFIGS, planner_training
     from robotdiffuse.learning.training.planner import train_planner
 
     if arguments.config not in CONFIGS:
@@ -250,7 +250,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
 
 def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
     from robotdiffuse.cli.train_robot import train_for_robot
-    from robotdiffuse.learning.training.configs import planner_training
+    from robotdiffuse.learning.training.config import planner_training
 
     if arguments.robot is None:
         raise InputError("give --robot to generate data for an arm, or --data to use existing data")
@@ -269,7 +269,7 @@ def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
 def run_baseline(arguments: argparse.Namespace) -> int:
     need_packages("training", "torch")
     from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
-    from robotdiffuse.learning.training.configs import planner_training
+    from robotdiffuse.learning.training.config import planner_training
     from robotdiffuse.learning.training.planner import train_planner
 
     given = _given(arguments, ("data", "robot", *TRAINING_OPTIONS))

@@ -82,7 +82,7 @@ def train_for_robot(
     from robotdiffuse.generation import generate
     from robotdiffuse.learning.training.config import PlannerTraining
     from robotdiffuse.learning.training.planner import train_planner
-    from robotdiffuse.learning.weights_registry import user_weights
+    from robotdiffuse.learning.weight_files import user_weights
 
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("torchrun only trains: generate the data first, then give --data")
@@ -122,14 +122,14 @@ def _check_disk(work: Path, motions: int) -> None:
 
 def copy_bundled_encoder(folder: Path) -> Path:
     """Save the encoder of the bundled weights in the form that the training reads; returns the folder."""
-    from robotdiffuse.learning.checkpoint import load_model, save_encoder
-    from robotdiffuse.learning.weights_registry import BUNDLED
+    from robotdiffuse.learning.checkpoint import load_model, save_network
+    from robotdiffuse.learning.weight_files import BUNDLED
 
     if (folder / "encoder.json").is_file():
         return folder
     encoder = load_model(BUNDLED / "panda").encoder
     assert encoder is not None
-    save_encoder(encoder, folder, {"from": "the weights that come with the package for panda"})
+    save_network("encoder", encoder, folder, {"from": "the weights that come with the package for panda"})
     return folder
 
 

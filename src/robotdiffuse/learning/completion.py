@@ -21,8 +21,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, Settings
-from robotdiffuse.learning.weight_files import exported_files, read_description, stamp
-from robotdiffuse.learning.weights_registry import completion_folder
+from robotdiffuse.learning.weight_files import completion_folder, exported_files, read_description, stamp
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
@@ -272,7 +271,7 @@ def exported_completion(folder: str | FilePath | None = None) -> Completion:
 
 @lru_cache(maxsize=4)
 def _exported(place: FilePath, _stamp: tuple[int, int] | None) -> Completion:
-    from robotdiffuse.learning.onnx_session import OnnxNetwork  # imports ONNX Runtime
+    from robotdiffuse.learning.exported_model import OnnxNetwork  # imports ONNX Runtime
 
     parts = exported_files(place, "completion", read_description(place, "completion"))
     if parts.keys() != {".onnx"}:

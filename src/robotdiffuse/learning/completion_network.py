@@ -133,20 +133,12 @@ class CompletionNetwork(SavedModule):
         """`probabilities` of one volume."""
         # two tensors: the exporter takes one tensor for one input
         inputs = {name: torch.zeros(SHAPE, dtype=torch.uint8) for name in ("seen", "behind")}
-        return {".onnx": exported(_Probabilities(self), inputs, {})}
+        return {".onnx": exported(self, self._probabilities_of_one, inputs, {})}
 
-
-class _Probabilities(nn.Module):
-    """`CompletionNetwork.probabilities` of one volume as a module, for export."""
-
-    def __init__(self, network: CompletionNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(
+    def _probabilities_of_one(
         self, seen: UInt8[Tensor, "56 56 32"], behind: UInt8[Tensor, "56 56 32"]
     ) -> Float[Tensor, "112 112 64"]:
-        return self.network.probabilities(seen[None], behind[None])[0]
+        return self.probabilities(seen[None], behind[None])[0]
 
 
 def _blocks(channels: int, count: int) -> nn.Sequential:

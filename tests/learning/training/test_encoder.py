@@ -21,5 +21,5 @@ def test_encoder_learns(tmp_path):
     losses = [float(row["loss"]) for row in read_log(tmp_path)]
     assert losses[-1] < 0.85 * losses[0]
     assert report["distance"] < 0.8 * report["distance_of_constant"]
-    codes = load_encoder(tmp_path)(torch.zeros(1, 0, 3))
+    codes = load_encoder(tmp_path)(torch.zeros(1, 1, 3))
     assert codes.shape == (1, 8)

@@ -4,7 +4,7 @@ Nothing here loads PyTorch, so that planning can read them. The networks are in 
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float32
@@ -12,15 +12,13 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry, Registry
-from robotdiffuse.core.settings import Count, Natural, NotNegative, Settings, Sizes
+from robotdiffuse.core.settings import Count, Sizes
+from robotdiffuse.learning.weight_files import NetworkSettings
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
-
-if TYPE_CHECKING:
-    from robotdiffuse.learning.encoders.networks import Encoder
 
 
 @dataclass(frozen=True)
-class EncoderSettings(Settings, name="encoder"):
+class EncoderSettings(NetworkSettings, name="encoder"):
     """Settings that every encoder has."""
 
     any_size: ClassVar[bool] = True
@@ -100,17 +98,13 @@ def in_order(
 
 @dataclass(frozen=True)
 class PointAutoencoderSettings(EncoderSettings):
+    constants: ClassVar[dict[str, Any]] = {"octaves": 4, "distance_weight": 4.0}
     points: Sizes = (64, 128, 256)
     """Layers of the perceptron on each point."""
-    octaves: Natural = 4
-    """Wavelengths (4 m, 2 m, ...) of the sines and cosines of its coordinates that each point is given."""
     hidden: Count = 384
     """Width of the layer between the pooled features and z, and of the decoder's."""
     decoded: Count = 192
     """Points that the decoder reconstructs."""
-    distance_weight: NotNegative = 4.0
-    """In training: weight of the error of the distance field relative to the Chamfer distance, both in
-    metres."""
 
 
 @dataclass(frozen=True)
@@ -232,11 +226,11 @@ frozen; "jointly" is a part of the planner's network, whose loss trains what wei
 for every batch."""
 
 
-def make_encoder(name: str, settings: EncoderSettings | None = None) -> "Encoder":
+def make_encoder(name: str, settings: EncoderSettings | None = None) -> Any:
     """An untrained encoder of that name; None: with its default settings."""
     return ENCODERS.load(name)(settings or ENCODERS.defaults(name))
 
 
-def encoder_name(encoder: "Encoder") -> str:
+def encoder_name(encoder: object) -> str:
     """The name of an encoder's class in ENCODERS."""
     return next(name for name in ENCODERS if ENCODERS.load(name) is type(encoder))

@@ -19,8 +19,8 @@ from robotdiffuse.datasets.rows import read_rows, turns_about_vertical
 from robotdiffuse.datasets.shards import SPLITS, shard_indices
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint
-from robotdiffuse.learning.clearance_features import PackedClearanceFn
 from robotdiffuse.learning.encoders.networks import Encoder
+from robotdiffuse.learning.motion_model import PackedClearanceFn
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
