@@ -229,7 +229,7 @@ class Study:
             )
             train_encoder(training, str(self.encoder))
         settings, processes = self.training(row), Processes("cpu")
-        train(SceneTask(row, self, settings, processes), settings, str(self.folder(row)), processes)
+        train(SceneTask(row, self, settings, processes), str(self.folder(row)))
 
     def trained(self, row: str) -> tuple[MotionNetwork, int]:
         """The averaged weights of the newest checkpoint, and the samples that it saw."""

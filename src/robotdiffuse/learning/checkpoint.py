@@ -11,7 +11,6 @@ import json
 import struct
 from datetime import UTC, datetime
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -20,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.learning.completion import CompletionSettings
@@ -44,11 +44,8 @@ from robotdiffuse.robots.robot import Robot
 
 def versions() -> dict[str, str]:
     """Versions of this package and of PyTorch, and the date, for the description of a checkpoint."""
-    try:
-        own = version("robotdiffuse")
-    except PackageNotFoundError:
-        own = "from source"
-    return {"robotdiffuse": own, "torch": torch.__version__, "made": datetime.now(UTC).strftime("%Y-%m-%d")}
+    made = datetime.now(UTC).strftime("%Y-%m-%d")
+    return {"robotdiffuse": __version__, "torch": torch.__version__, "made": made}
 
 
 def write_tensors(file: FilePath, tensors: dict[str, Tensor], notes: dict[str, Any]) -> str:

@@ -33,6 +33,7 @@ from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 
+Packed = UInt8[ndarray, "56 56 32"]
 SHOULDER = (0.0, 0.0, 0.33)
 """Of a Panda, in the base frame [m]."""
 REACH = 1.0
@@ -148,11 +149,11 @@ NO_FLOOR_SHARE = 0.1
 class Sample(NamedTuple):
     """An observed volume and the true occupancy, packed."""
 
-    seen: UInt8[ndarray, "56 56 32"]
+    seen: Packed
     """The bits of `BITS`."""
-    behind: UInt8[ndarray, "56 56 32"]
+    behind: Packed
     """Depth behind the nearest surface, in units of DEPTH_STEP."""
-    truth: UInt8[ndarray, "56 56 32"]
+    truth: Packed
     """Whether each of a voxel's eight voxels of 2 cm holds an obstacle: bit 4 x + 2 y + z."""
 
 
@@ -164,7 +165,7 @@ class Samples(NamedTuple):
     truth: UInt8[ndarray, "n 56 56 32"]
 
 
-def pack(volume: ObservedVolume) -> tuple[UInt8[ndarray, "56 56 32"], UInt8[ndarray, "56 56 32"]]:
+def pack(volume: ObservedVolume) -> tuple[Packed, Packed]:
     """`Sample.seen` and `Sample.behind` of an observed volume."""
     seen = np.zeros(SHAPE, np.uint8)
     for bit, of in zip(BITS, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=True):
@@ -177,7 +178,7 @@ def true_voxels(scene: Scene) -> Bool[ndarray, "112 112 64"]:
     return voxels_within(scene, LOW, FINE_VOXEL_SIZE, FINE_SHAPE)
 
 
-def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> UInt8[ndarray, "56 56 32"]:
+def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> Packed:
     """`Sample.truth` of an occupancy."""
     out = np.zeros(SHAPE, np.uint8)
     for bit in range(8):

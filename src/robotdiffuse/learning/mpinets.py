@@ -51,6 +51,9 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
+Configurations = Float32[Tensor, "n dof"]
+Clouds = Float32[Tensor, "n points 3"]
+Joints = Float32[ndarray, "n dof"]
 DIRECTION_OFFSET = 0.1
 """Added to the distance to the goal [half joint ranges] by which the way to it is divided, so that the
 direction fades near the goal."""
@@ -207,12 +210,12 @@ def _rows(values: Float[Tensor, "b n c"], at: Int64[Tensor, "b *m"]) -> Float[Te
 class Steps(NamedTuple):
     """Training samples, each of them one step of a motion."""
 
-    q: Float32[Tensor, "n dof"]
+    q: Configurations
     """The arm's configuration, with noise [rad]."""
-    expert: Float32[Tensor, "n dof"]
+    expert: Configurations
     """The next waypoint of the motion [rad]."""
-    goal: Float32[Tensor, "n dof"]
-    clouds: Float32[Tensor, "n points 3"]
+    goal: Configurations
+    clouds: Clouds
     """Clouds of the scenes [m]."""
     scenes: PackedScenes
 
@@ -273,10 +276,10 @@ class MPiNetsNetwork(BaselineNetwork):
 
     def forward(
         self,
-        clouds: Float32[Tensor, "n points 3"],
-        q: Float32[Tensor, "n dof"],
-        goal: Float32[Tensor, "n dof"],
-    ) -> Float32[Tensor, "n dof"]:
+        clouds: Clouds,
+        q: Configurations,
+        goal: Configurations,
+    ) -> Configurations:
         """The next configurations, within limits [rad]; clouds of the scenes [m], q and goal in [rad]."""
         points = torch.cat([clouds, self._surface(q), self._surface(goal)[:, self._target]], 1).detach()
         with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
@@ -293,8 +296,8 @@ class MPiNetsNetwork(BaselineNetwork):
     def roll_outs(
         self,
         clouds: Float32[ndarray, "n points 3"],
-        start: Float32[ndarray, "n dof"],
-        goal: Float32[ndarray, "n dof"],
+        start: Joints,
+        goal: Joints,
     ) -> "RollOuts":
         """Roll-outs of the policy, in planning."""
         return RollOuts(self, torch.from_numpy(clouds), start, goal)
@@ -325,7 +328,7 @@ class MPiNetsNetwork(BaselineNetwork):
         here, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
         return Steps(here, after, end, clouds, scenes)
 
-    def clouds(self, scenes: PackedScenes, rng: np.random.Generator) -> Float32[Tensor, "n points 3"]:
+    def clouds(self, scenes: PackedScenes, rng: np.random.Generator) -> Clouds:
         """Random clouds of scenes for the network's input [m]; zeros where nothing is in reach."""
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         return surface_clouds(scenes, self.settings.scene_points, generator, region=self.settings.region)
@@ -337,9 +340,9 @@ class RollOuts:
     def __init__(
         self,
         network: MPiNetsNetwork,
-        clouds: Float32[Tensor, "n points 3"],
-        start: Float32[ndarray, "n dof"],
-        goal: Float32[ndarray, "n dof"],
+        clouds: Clouds,
+        start: Joints,
+        goal: Joints,
     ) -> None:
         """clouds of the scenes [m]; start and goal in [rad]."""
         self.network, self._clouds, self._goal = network, clouds, goal
@@ -355,7 +358,7 @@ class RollOuts:
         """Stop these roll-outs."""
         self.running &= ~which
 
-    def advance(self, noise: Float32[ndarray, "n dof"] | None = None) -> None:
+    def advance(self, noise: Joints | None = None) -> None:
         """Advance the running roll-outs by one step; noise [rad] is added to the policy's input
         configuration."""
         rows = np.flatnonzero(self.running)

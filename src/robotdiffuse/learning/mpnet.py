@@ -49,6 +49,8 @@ from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.weight_files import NetworkSettings, RobotIdentity
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
+Clouds = Float[Tensor, "batch points 3"]
+Configurations = Float[Tensor, "batch dof"]
 CURVE_REACH = 16.0
 """The region's reach is scaled to this [m] before points are sorted along the space-filling curve, which
 then fills the region."""
@@ -128,17 +130,17 @@ class MPNetNetwork(BaselineNetwork):
             step = self.normalizer.to_unit(following) - self.normalizer.to_unit(here)
             self.step_scale.fill_(max(float(np.sqrt(np.mean(step**2))), 1e-3))
 
-    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+    def encode(self, cloud: Clouds) -> Float[Tensor, "batch code"]:
         """z of clouds of `settings.points` points in any order [m]; all zeros: no obstacles."""
         return self.encoder(sorted_along_curve(cloud, self.region).flatten(1))
 
     def next_states(
         self,
         z: Float[Tensor, "batch code"],
-        q: Float[Tensor, "batch dof"],
-        goal: Float[Tensor, "batch dof"],
+        q: Configurations,
+        goal: Configurations,
         generator: Generator | None,
-    ) -> Float[Tensor, "batch dof"]:
+    ) -> Configurations:
         """The next waypoints from q to the goal, within the joint limits [rad].
 
         Dropout is drawn from the generator, in training and evaluation mode alike; None: without dropout.
@@ -192,9 +194,7 @@ class MPNetNetwork(BaselineNetwork):
         return (step.float() - wanted).square().mean()
 
     @torch.enable_grad()
-    def autoencoder_loss(
-        self, cloud: Float[Tensor, "batch points 3"], generator: Generator
-    ) -> Float[Tensor, ""]:
+    def autoencoder_loss(self, cloud: Clouds, generator: Generator) -> Float[Tensor, ""]:
         """The mean squared distance of points to their reconstructions plus lambda |dz / d cloud|^2 [m^2]."""
         flat = sorted_along_curve(cloud, self.region).flatten(1)
         flat.requires_grad_()
@@ -257,9 +257,7 @@ class Perceptron(nn.Module):
         return self.linear[-1](x)
 
 
-def sorted_along_curve(
-    cloud: Float[Tensor, "batch points 3"], region: VisibleRegion
-) -> Float[Tensor, "batch points 3"]:
+def sorted_along_curve(cloud: Clouds, region: VisibleRegion) -> Clouds:
     """The points in the order of a space-filling curve (G. Morton 1966), in the region's frame [m].
 
     Positions are relative to the region's centre; an empty cloud, all zeros, stays zero.

@@ -35,11 +35,6 @@ class EncoderSettings(NetworkSettings, name="encoder"):
     """Points outside are ignored, for the arm does not reach them. Within a large reach whole surfaces
     count."""
 
-    @classmethod
-    def paper_size(cls) -> "EncoderSettings":
-        """The sizes given by the authors of this encoder, with z of this paper's size."""
-        return cls(code=60)
-
     def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
         """Points within the region in the form that the exported encoder takes [m]."""
         if self.ordered:
@@ -136,10 +131,6 @@ class PointsSettings(EncoderSettings, name="points"):
         if self.code != 3 * self.cloud:
             raise InputError(f"points.code is {self.code}; it must be three times cloud, {3 * self.cloud}")
 
-    @classmethod
-    def paper_size(cls) -> "PointsSettings":
-        return cls(code=60, cloud=20)
-
 
 @dataclass(frozen=True)
 class PointNetSettings(EncoderSettings):
@@ -158,18 +149,6 @@ class PointNetSettings(EncoderSettings):
     head: tuple[Count, ...] = (192,)
     """Layers between the maximum and z (512, 256)."""
 
-    @classmethod
-    def paper_size(cls) -> "PointNetSettings":
-        return cls(
-            code=60,
-            cloud=1024,
-            first=(64, 64),
-            second=(64, 128, 1024),
-            transform=(64, 128, 1024),
-            transform_head=(512, 256),
-            head=(512, 256),
-        )
-
 
 @dataclass(frozen=True)
 class DGCNNSettings(EncoderSettings):
@@ -186,12 +165,6 @@ class DGCNNSettings(EncoderSettings):
     """Features of a point, computed from all these layers, that are pooled (1024)."""
     head: tuple[Count, ...] = (192,)
     """Layers between the pooled features and z (512, 256)."""
-
-    @classmethod
-    def paper_size(cls) -> "DGCNNSettings":
-        return cls(
-            code=60, cloud=1024, neighbours=20, edges=(64, 64, 128, 256), embedding=1024, head=(512, 256)
-        )
 
 
 _NETWORKS = "robotdiffuse.learning.encoders.networks:"

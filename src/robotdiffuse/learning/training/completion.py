@@ -1,11 +1,10 @@
 """Training of the occupancy completion network on random scenes, and its figures on held-out scenes."""
 
 import copy
-import multiprocessing
 import os
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Annotated, Any
@@ -18,8 +17,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.processes import block_interrupts_in_children, prepare_worker
-from robotdiffuse.core.registry import AddedEntries, added_entries
+from robotdiffuse.core.processes import SingleWorker
 from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
 from robotdiffuse.learning.checkpoint import load_completion, save_network
 from robotdiffuse.learning.completion import (
@@ -40,6 +38,8 @@ from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
+Probabilities = Float32[ndarray, "m"]
+Truth = Bool[ndarray, "m"]
 NICENESS = 5
 """Workers give way to the training itself."""
 BATCHES_AHEAD = 3
@@ -59,17 +59,13 @@ class SamplePrefetcher:
         self._families = tuple(families)
         self._robot = robot
         self._batch = batch
-        self._depth = BATCHES_AHEAD * workers
-        self._pool: ProcessPoolExecutor | None = None
-        if workers:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(workers, context, _start_worker, (added_entries(),))
+        self._workers = deque(SingleWorker(os.nice, (NICENESS,)) for _ in range(workers))
         self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
 
     def next(self, rng: np.random.Generator) -> Samples:
         """The batch of samples with the seeds that `rng` draws."""
         seeds = self._seeds(rng)
-        if self._pool is None:
+        if not self._workers:
             return draw_samples(self._families, self._robot, seeds)
         if not self._pending or self._pending[0][0] != seeds:
             self._pending.clear()
@@ -77,28 +73,22 @@ class SamplePrefetcher:
         following = copy.deepcopy(rng)
         for _ in range(len(self._pending) - 1):
             self._seeds(following)
-        while len(self._pending) <= self._depth:
+        while len(self._pending) <= BATCHES_AHEAD * len(self._workers):
             self._submit(self._seeds(following))
         return self._pending.popleft()[1].result()
 
     def close(self) -> None:
         """Stop the workers."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+        for worker in self._workers:
+            worker.close()
 
     def _seeds(self, rng: np.random.Generator) -> tuple[int, ...]:
         return tuple(rng.integers(SEED_LIMIT, size=self._batch).tolist())
 
     def _submit(self, seeds: tuple[int, ...]) -> None:
-        assert self._pool is not None
-        with block_interrupts_in_children():
-            job = self._pool.submit(draw_samples, self._families, self._robot, seeds)
+        self._workers.rotate()
+        job = self._workers[0].submit(draw_samples, self._families, self._robot, seeds)
         self._pending.append((seeds, job))
-
-
-def _start_worker(entries: AddedEntries) -> None:
-    prepare_worker(entries)
-    os.nice(NICENESS)
 
 
 BUNDLED_WEIGHTS = "bundled"
@@ -260,9 +250,7 @@ class CompletionTask(TrainingTask):
         logits, truth, _ = self._rows(samples, self._counts(samples))
         return binary_cross_entropy_with_logits(logits, truth.float())
 
-    def _predictions(
-        self, samples: Samples
-    ) -> tuple[Float32[ndarray, "m"], Bool[ndarray, "m"], Bool[ndarray, "m"]]:
+    def _predictions(self, samples: Samples) -> tuple[Probabilities, Truth, Truth]:
         """Logits and truth of the predicted voxels, and which of them are unknown and above the ground."""
         found: list[tuple[ndarray, ndarray, ndarray]] = []
         for part in _split(samples):
@@ -279,7 +267,7 @@ def _split(samples: Samples, size: int = 4) -> list[Samples]:
     return [Samples(*(array[i : i + size] for array in samples)) for i in range(0, len(samples.seen), size)]
 
 
-def fitted_temperature(logits: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> float:
+def fitted_temperature(logits: Probabilities, truth: Truth) -> float:
     """The temperature that minimises the cross-entropy of logits divided by it (Guo et al. 2017)."""
     from scipy.optimize import minimize_scalar
 
@@ -292,7 +280,7 @@ def fitted_temperature(logits: Float32[ndarray, "m"], truth: Bool[ndarray, "m"])
     return float(np.exp(found.x))
 
 
-def reliability(p: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> list[list[float]]:
+def reliability(p: Probabilities, truth: Truth) -> list[list[float]]:
     """By bin of the predicted probability: its mean, the share of true voxels, and their number."""
     which = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
     count = np.bincount(which, minlength=CALIBRATION_BINS)
@@ -303,14 +291,14 @@ def reliability(p: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> list[lis
     return [[round(a, 4), round(b, 4), float(n)] for a, b, n in rows]
 
 
-def calibration_error(p: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> float:
+def calibration_error(p: Probabilities, truth: Truth) -> float:
     """Expected calibration error: mean over voxels of |predicted probability - share of true voxels| of their
     bin."""
     rows = np.array(reliability(p, truth))
     return float((np.abs(rows[:, 0] - rows[:, 1]) * rows[:, 2]).sum() / max(1.0, rows[:, 2].sum()))
 
 
-def average_precision(p: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> float:
+def average_precision(p: Probabilities, truth: Truth) -> float:
     """Mean precision over all thresholds, weighted by the gain in recall."""
     order = np.argsort(-p, kind="stable")
     hits = np.cumsum(truth[order])
