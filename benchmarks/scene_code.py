@@ -275,7 +275,7 @@ class SceneTask(PlannerTask):
 
     def validate(self, fraction: float) -> Validation:
         """Adds to the learning curve, and keeps the averaged weights."""
-        samples, folder = round(fraction * (self.own.samples or 0)), self.study.folder(self.row)
+        samples, folder = round(fraction * (self.settings.samples or 0)), self.study.folder(self.row)
         notes = {"samples": samples, "motions": len(self.train_data)}
         write_tensors(folder / "averaged.safetensors", self.model.state_dict(), notes)
         found = tried(self.row, self.model, self.cases, ("own", "hidden"), CURVE_SAMPLES)

@@ -10,7 +10,6 @@ import hashlib
 import json
 import struct
 from datetime import UTC, datetime
-from functools import lru_cache
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -35,8 +34,8 @@ from robotdiffuse.learning.weight_files import (
     checked_bytes,
     completion_folder,
     folder_of,
+    kept_by_stamp,
     read_description,
-    stamp,
     weights_folder,
 )
 from robotdiffuse.robots.robot import Robot
@@ -89,7 +88,7 @@ def save_network(name: str, network: Any, folder: str | FilePath, training: dict
 
     training: the data's fingerprint, the number of samples and so on, for readers.
     """
-    about = {"network": encoder_name(network) if isinstance(network, Encoder) else name}
+    about: dict[str, Any] = {"network": encoder_name(network) if isinstance(network, Encoder) else name}
     if isinstance(network, Network):
         about["robot"] = network.robot.to_json()
     about |= {"settings": network.settings.to_json(), "training": training}
@@ -160,14 +159,12 @@ def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
     made for another robot.
     """
     place = weights_folder(name, folder, robot)
-    network = _loaded(name, place, stamp(place, name))
+    network = _loaded(name, place)
     network.robot.check(robot, str(place / f"{name}.json"))
     return network
 
 
-@lru_cache(maxsize=16)
-def _loaded(name: str, folder: FilePath, _stamp: tuple[int, int] | None) -> Network:
-    return _load(name, folder)
+_loaded = kept_by_stamp(_load)
 
 
 def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionNetwork:

@@ -8,7 +8,6 @@ Nothing here loads PyTorch. The network itself is in `completion_network`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
@@ -21,7 +20,12 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, Settings
-from robotdiffuse.learning.weight_files import completion_folder, exported_files, read_description, stamp
+from robotdiffuse.learning.weight_files import (
+    completion_folder,
+    exported_files,
+    kept_by_stamp,
+    read_description,
+)
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
@@ -266,18 +270,15 @@ def exported_completion(folder: str | FilePath | None = None) -> Completion:
 
     Raises InputError for damaged files, and if there is none, naming the command that trains it.
     """
-    place = completion_folder(folder)
-    return _exported(place, stamp(place, "completion"))
+    return _exported("completion", completion_folder(folder))
 
 
-@lru_cache(maxsize=4)
-def _exported(place: FilePath, _stamp: tuple[int, int] | None) -> Completion:
+@kept_by_stamp
+def _exported(name: str, folder: FilePath) -> Completion:
     from robotdiffuse.learning.exported_model import OnnxNetwork  # imports ONNX Runtime
 
-    parts = exported_files(place, "completion", read_description(place, "completion"))
+    parts = exported_files(folder, name, read_description(folder, name))
     if parts.keys() != {".onnx"}:
-        raise InputError(
-            f"{place / 'completion.json'} names the ONNX files {sorted(parts)}; it must name .onnx"
-        )
-    network = OnnxNetwork(parts[".onnx"], str(place / "completion.onnx"))
+        raise InputError(f"{folder / name}.json names the ONNX files {sorted(parts)}; it must name .onnx")
+    network = OnnxNetwork(parts[".onnx"], f"{folder / name}.onnx")
     return lambda seen, behind: network(seen=seen, behind=behind)

@@ -1,6 +1,5 @@
 """The diffusion model of trained weights, as planning runs it: by ONNX Runtime, without PyTorch."""
 
-from functools import lru_cache
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -23,9 +22,9 @@ from robotdiffuse.learning.motion_model import (
 from robotdiffuse.learning.weight_files import (
     RobotIdentity,
     exported_files,
+    kept_by_stamp,
     read_arrays,
     read_description,
-    stamp,
     weights_folder,
 )
 from robotdiffuse.robots.robot import Robot
@@ -128,16 +127,9 @@ def exported_model(name: str, folder: str | FilePath | None, robot: Robot) -> Mo
     it, and for files that are damaged or made for another robot.
     """
     place = weights_folder(name, folder, robot)
-    return _checked(name, place, stamp(place, name), robot)
-
-
-@lru_cache(maxsize=16)
-def _checked(name: str, folder: FilePath, written: tuple[int, int] | None, robot: Robot) -> MotionModel:
-    model = _loaded(name, folder, written)
-    model.robot.check(robot, str(folder / f"{name}.json"))
+    model = _loaded(name, place)
+    model.robot.check(robot, str(place / f"{name}.json"))
     return model
 
 
-@lru_cache(maxsize=16)
-def _loaded(name: str, folder: FilePath, _stamp: tuple[int, int] | None) -> ExportedModel:
-    return ExportedModel(folder, name)
+_loaded = kept_by_stamp(lambda name, folder: ExportedModel(folder, name))

@@ -7,7 +7,7 @@ training reads, and NAME.onnx and others with that ending, the exported parts th
 import hashlib
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path as FilePath
@@ -164,6 +164,13 @@ def stamp(folder: FilePath, name: str) -> tuple[int, int] | None:
     return status.st_mtime_ns, status.st_ino
 
 
+def kept_by_stamp(load: Callable[[str, FilePath], Any]) -> Callable[[str, FilePath], Any]:
+    """A function that loads a network by name and folder, kept for as long as its description is the
+    same."""
+    cached = lru_cache(maxsize=16)(lambda name, folder, _stamp: load(name, folder))
+    return lambda name, folder: cached(name, folder, stamp(folder, name))
+
+
 def read_description(folder: FilePath, name: str) -> dict[str, Any]:
     """The contents of NAME.json. Raises InputError if it is missing or damaged."""
     file = folder / f"{name}.json"
@@ -234,14 +241,14 @@ def weights_for(name: str, robot: Robot) -> FilePath | None:
     damaged description.
     """
     for place in (user_weights(robot), BUNDLED / robot.name):
-        written = stamp(place, name)
-        if written and not _identity(place / f"{name}.json", written).difference(robot):
+        if stamp(place, name) and not _identity(name, place).difference(robot):
             return place
     return None
 
 
-@lru_cache
-def _identity(file: FilePath, _stamp: tuple[int, int]) -> RobotIdentity:
+@kept_by_stamp
+def _identity(name: str, folder: FilePath) -> RobotIdentity:
+    file = folder / f"{name}.json"
     try:
         about = read_json(file)["robot"]
     except (ValueError, KeyError, TypeError) as error:

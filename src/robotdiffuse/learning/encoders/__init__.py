@@ -167,29 +167,28 @@ class DGCNNSettings(EncoderSettings):
     """Layers between the pooled features and z (512, 256)."""
 
 
-_NETWORKS = "robotdiffuse.learning.encoders.networks:"
-_SETTINGS = "robotdiffuse.learning.encoders:"
+_NETWORKS = "robotdiffuse.learning.encoders.networks"
 ENCODERS = Registry(
     "encoder",
     {
         "compression_autoencoder": Entry(
-            _NETWORKS + "CompressionAutoencoder",
+            f"{_NETWORKS}:CompressionAutoencoder",
             "the paper's: a perceptron on 1,400 points in a fixed order",
-            _SETTINGS + "CompressionAutoencoderSettings",
+            f"{__name__}:CompressionAutoencoderSettings",
             "alone",
         ),
         "point_autoencoder": Entry(
-            _NETWORKS + "PointAutoencoder",
+            f"{_NETWORKS}:PointAutoencoder",
             "a perceptron on each point, pooled: any number of points in any order",
-            _SETTINGS + "PointAutoencoderSettings",
+            f"{__name__}:PointAutoencoderSettings",
             "alone",
         ),
-        "pointnet": Entry(_NETWORKS + "PointNet", "PointNet", _SETTINGS + "PointNetSettings", "jointly"),
-        "dgcnn": Entry(_NETWORKS + "DGCNN", "DGCNN", _SETTINGS + "DGCNNSettings", "jointly"),
+        "pointnet": Entry(f"{_NETWORKS}:PointNet", "PointNet", f"{__name__}:PointNetSettings", "jointly"),
+        "dgcnn": Entry(f"{_NETWORKS}:DGCNN", "DGCNN", f"{__name__}:DGCNNSettings", "jointly"),
         "points": Entry(
-            _NETWORKS + "Points",
+            f"{_NETWORKS}:Points",
             "the points themselves, for the denoiser cross_attention",
-            _SETTINGS + "PointsSettings",
+            f"{__name__}:PointsSettings",
             "jointly",
         ),
     },

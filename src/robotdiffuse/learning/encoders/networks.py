@@ -116,10 +116,10 @@ OCTAVES = 4
 """Wavelengths (4 m, 2 m, ...) of the sines and cosines of a point's coordinates that are inputs too."""
 
 
-def wave_angles(points: Float[Tensor, "*batch 3"]) -> list[Float[Tensor, "*batch 3"]]:
+def wave_angles(points: Float[Tensor, "*batch 3"], octaves: int = OCTAVES) -> list[Float[Tensor, "*batch 3"]]:
     """Coordinates as angles at the wavelengths 4 m, 2 m, ...: with their sines and cosines a small perceptron
     distinguishes positions."""
-    return [points * (torch.pi / 2 * 2**octave) for octave in range(OCTAVES)]
+    return [points * (torch.pi / 2 * 2**octave) for octave in range(octaves)]
 
 
 def pool_max(features: Features, near: Near) -> Pooled:

@@ -59,7 +59,7 @@ class SamplePrefetcher:
         self._families = tuple(families)
         self._robot = robot
         self._batch = batch
-        self._workers = deque(SingleWorker(os.nice, (NICENESS,)) for _ in range(workers))
+        self._workers = deque(SingleWorker(_give_way, ()) for _ in range(workers))
         self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
 
     def next(self, rng: np.random.Generator) -> Samples:
@@ -89,6 +89,10 @@ class SamplePrefetcher:
         self._workers.rotate()
         job = self._workers[0].submit(draw_samples, self._families, self._robot, seeds)
         self._pending.append((seeds, job))
+
+
+def _give_way() -> None:
+    os.nice(NICENESS)
 
 
 BUNDLED_WEIGHTS = "bundled"

@@ -24,6 +24,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_, parameters_to_vector, vector_to_parameters
 from torch.optim.swa_utils import AveragedModel
 
 from robotdiffuse.core.errors import InputError
@@ -33,7 +34,7 @@ from robotdiffuse.learning.checkpoint import read_tensors, versions, write_tenso
 from robotdiffuse.learning.encoders.networks import Encoder
 from robotdiffuse.learning.network import EXPORT_PACKAGES
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16, load_data
-from robotdiffuse.learning.training.config import MotionTraining, TrainingSettings
+from robotdiffuse.learning.training.config import MotionTraining
 from robotdiffuse.robots.robot import Robot
 
 Value = TypeVar("Value")
@@ -92,10 +93,10 @@ class Processes:
             return loss
         # the parameters that have gradients do not depend on the batch: they are the same in all processes
         gradients = [p.grad for p in parameters if p.grad is not None]
-        parts = [g.reshape(-1) for g in gradients]
-        mean = self._mean(torch.cat([*parts, torch.tensor([loss], device=self.device)]))
-        for gradient, part in zip(gradients, mean[:-1].split([len(p) for p in parts]), strict=True):
-            gradient.copy_(part.view_as(gradient))
+        mean = self._mean(
+            torch.cat([parameters_to_vector(gradients), torch.tensor([loss], device=self.device)])
+        )
+        vector_to_parameters(mean[:-1], gradients)
         return float(mean[-1])
 
     def mean(self, *values: float | bool) -> tuple[float, ...]:
@@ -161,7 +162,8 @@ class Validation(NamedTuple):
 class TrainingTask(ABC):
     """A network in training: its loss, its validation, and the files that it leaves."""
 
-    settings: TrainingSettings
+    settings: Any
+    """Of a subclass of `TrainingSettings`."""
     processes: Processes
     title: str
     """Name in progress and messages."""
@@ -293,7 +295,7 @@ class TrainingRun:
         value = self.task.loss(self.fraction, self.rng)
         value.backward()
         mean = self.processes.average(self.parameters.values(), value.item())
-        norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.settings.gradient_norm)
+        norm = clip_grad_norm_(self.parameters.values(), self.settings.gradient_norm)
         self.at.step += 1
         self.at.samples += self._samples_per_step
         if not (math.isfinite(mean) and math.isfinite(norm.item())):
@@ -304,7 +306,7 @@ class TrainingRun:
         self._losses.append(mean)
         self.average.update_parameters(self._trained)
 
-    def _averaged(self, average: Tensor, parameter: Tensor, _count: Tensor) -> Tensor:
+    def _averaged(self, average: Tensor, parameter: Tensor, _count: Tensor | int) -> Tensor:
         decay = min(self.settings.average, self.at.step / (self.at.step + 10))
         return average.lerp(parameter, 1 - decay)
 
@@ -336,7 +338,7 @@ class TrainingRun:
     def averaged(self) -> Iterator[None]:
         """A context in which the module has the moving average of its weights."""
         now = [p.detach().clone() for p in self._trained]
-        self._set(self.average.module)
+        self._set(self.average.parameters())
         try:
             yield
         finally:
@@ -399,7 +401,7 @@ class TrainingRun:
     def _write(self, random_states: Sequence[Mapping[str, Any]]) -> None:
         moments = self.optimizer.state
         tensors: dict[str, Tensor] = {f"module.{name}": t for name, t in self.module.state_dict().items()}
-        averages = zip(self.parameters, self.average.module, strict=True)
+        averages = zip(self.parameters, self.average.parameters(), strict=True)
         tensors |= {f"average.{name}": t for name, t in averages}
         for name, p in self.parameters.items():
             for key, value in moments.get(p, {}).items():
@@ -444,7 +446,7 @@ class TrainingRun:
             state = {k.removeprefix("module."): t for k, t in tensors.items() if k.startswith("module.")}
             self.module.load_state_dict(state)
             device = self.processes.device
-            for name, average in zip(self.parameters, self.average.module, strict=True):
+            for name, average in zip(self.parameters, self.average.parameters(), strict=True):
                 average.data.copy_(tensors[f"average.{name}"])
             self.optimizer.state.clear()
             for name, p in self.parameters.items():

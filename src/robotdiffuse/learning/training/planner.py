@@ -132,7 +132,7 @@ class PlannerTask(MotionTask):
         # codes are computed on the CPU: the frozen encoder stays there
         model.encoder = copy.deepcopy(encoder)
         super().__init__(settings, robot, frozen, processes)
-        self.own, self.title = settings, model.settings.network
+        self.title = model.settings.network
         hard = self.train_data.q[~self.train_data.trivial]
         model.fit_statistics(
             (hard if len(hard) else self.train_data.q)[:MAX_STATISTICS_TRAJECTORIES], settings.smooth_noise
@@ -147,7 +147,7 @@ class PlannerTask(MotionTask):
     def loss_of(
         self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
     ) -> Float[Tensor, ""]:
-        own = self.own
+        own = self.settings
         if own.progressive:
             self.model.coarsen(block_at(fraction))
         batches = Batches(data, self._on_cpu, self.clearances, own.trivial_share, own.weight_limit)
@@ -160,7 +160,7 @@ class PlannerTask(MotionTask):
         if self._on_cpu is not self.model:
             self._on_cpu.load_state_dict(self.model.state_dict())
             self._on_cpu.coarsen(self.model.block)
-        problems = self.own.validation_problems
+        problems = self.settings.validation_problems
         with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
             return planning_success(
                 self._on_cpu, self.robot, self.validation_data, problems, VALIDATION_SAMPLES, rng
