@@ -42,10 +42,10 @@ from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.batches import Batches, load_data, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.encoder import linear_readout, train_encoder
-from robotdiffuse.learning.training.loop import TrainingRun
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.scene_arrays import SPHERE
+from robotdiffuse.scenes.surface_points import PANDA_REGION
 
 SMALL_CAE = CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16))
 SMALL = {
@@ -131,6 +131,8 @@ def test_points_out_of_the_region_do_not_count(name):
     torch.testing.assert_close(encoder(torch.cat([out, points], 1)), encoder(points), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(encoder(out), encoder(torch.zeros(1, 1, 3)))
     assert not torch.allclose(encoder(points), encoder(out))
+    both = torch.cat([points, out], 1)
+    np.testing.assert_array_equal(encoder.near(both)[:, :-1], PANDA_REGION.holds(both.numpy())[:, :-1])
 
 
 @with_weights
@@ -319,12 +321,6 @@ def test_training_alone(name, tmp_path, monkeypatch):
     torch.testing.assert_close(z.std(0), torch.ones(8), atol=0.35, rtol=0)
 
 
-@pytest.mark.parametrize("name", JOINTLY)
-def test_not_alone(name):
-    with pytest.raises(InputError, match=f"name is {name}.*jointly"):
-        EncoderTraining(name=name)
-
-
 def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(encoder_training, "READOUT_SCENES", 32)
     out = str(tmp_path / "out")
@@ -395,25 +391,6 @@ def test_joint_training_changes_the_encoder(name, data, tmp_path):
         np.testing.assert_allclose(z, model.encode(given), atol=1e-5 * np.abs(z).max())
 
 
-@pytest.mark.usefixtures("no_export")
-def test_joint_training_resumes(data, tmp_path, monkeypatch):
-    planned = planner(data, "pointnet", encoder_settings=SMALL["pointnet"])
-    whole = train_planner(planned, str(tmp_path / "whole"))
-    original = TrainingRun.step
-
-    def interrupted(self):
-        original(self)
-        if self.at.step == 3:
-            self.save()
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(TrainingRun, "step", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        train_planner(planned, str(tmp_path / "parts"))
-    monkeypatch.setattr(TrainingRun, "step", original)
-    assert train_planner(planned, str(tmp_path / "parts")) == whole
-
-
 @with_weights
 @pytest.mark.usefixtures("no_export")
 def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
@@ -440,23 +417,19 @@ def test_batches_with_clouds_instead_of_codes(data):
     assert (first.condition[:, :8] == 0).all() and (first.condition[:, 8:] != 0).any()
 
 
-def test_a_frozen_encoder_takes_no_settings(data):
-    with pytest.raises(InputError, match="unknown encoder 'runs/encoder'"):
-        planner(data, "runs/encoder", encoder_settings=SMALL["pointnet"])
-
-
 @pytest.mark.parametrize(
-    "parts",
+    ("kind", "parts", "message"),
     [
-        {"encoder": "points"},
-        {"encoder": "runs/encoder", "denoiser": "cross_attention"},
-        {"encoder": None, "denoiser": "cross_attention"},
+        (PlannerTraining, {"encoder": "points"}, "encoder is points and denoiser is .* need each other"),
+        (PlannerTraining, {"encoder": "e", "denoiser": "cross_attention"}, "encoder is e .* need each other"),
+        (PlannerTraining, {"encoder": None, "denoiser": "cross_attention"}, "is None .* need each other"),
+        (PlannerTraining, {"encoder": "e", "encoder_settings": SMALL["pointnet"]}, "unknown encoder 'e'"),
+        *((EncoderTraining, {"name": name}, f"name is {name}.*jointly") for name in JOINTLY),
     ],
 )
-def test_points_and_cross_attention_need_each_other(parts):
-    wanted = f"encoder is {parts['encoder']} and denoiser is .* need each other"
-    with pytest.raises(InputError, match=wanted):
-        PlannerTraining(data="data", **parts)
+def test_parts_that_do_not_fit_are_refused(kind, parts, message):
+    with pytest.raises(InputError, match=message):
+        kind(**({"data": "data"} if kind is PlannerTraining else {}), **parts)
 
 
 def test_a_model_of_points_needs_both_parts():

@@ -1,8 +1,6 @@
 """Training of baselines: learning, checkpoints, weights of other robots, the command."""
 
-import os
 import shutil
-import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -52,34 +50,11 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return str(tmp_path / "data")
 
 
-def weights(folder: Path) -> dict[str, Tensor]:
-    return load_network("reversal", str(folder), load_robot("panda")).state_dict()
-
-
-def test_training_learns_and_a_stopped_run_ends_the_same(
-    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_learns(data: str, tmp_path: Path) -> None:
     settings = baseline_training("reversal", {"data": data, "samples": 6400, "warmup_steps": 5})
     assert (settings.batch, settings.learning_rate, settings.minutes) == (16, 0.05, None)
     report = train_baseline(settings, str(tmp_path / "whole"))
     assert report["validation"] < 1e-3 and report["samples"] == 6400
-
-    original, steps = Reversal.loss, 0
-
-    def interrupted(self, data, count, fraction, rng):
-        nonlocal steps
-        steps += 1
-        if steps == 150:
-            os.kill(os.getpid(), signal.SIGINT)
-        return original(self, data, count, fraction, rng)
-
-    monkeypatch.setattr(Reversal, "loss", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        train_baseline(settings, str(tmp_path / "parts"))
-    monkeypatch.setattr(Reversal, "loss", original)
-    train_baseline(settings, str(tmp_path / "parts"))
-    whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
-    assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
 def test_weights_of_another_robot_or_none_are_refused(data: str, tmp_path: Path) -> None:
