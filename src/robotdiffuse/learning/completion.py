@@ -100,7 +100,7 @@ BITS = (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW)
 
 
 @dataclass(frozen=True)
-class CameraPlaces:
+class CameraPlaces(Settings, name="cameras"):
     """Distribution of camera poses. Lengths in [m], angles in [rad]."""
 
     distance: Range = (1.2, 2.0)
