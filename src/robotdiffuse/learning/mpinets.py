@@ -41,7 +41,7 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Count, Sizes
+from robotdiffuse.core.settings import Count, NotNegative, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.training.baseline import BaselineNetwork
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
@@ -69,8 +69,6 @@ COLLISION_WEIGHT = 5.0
 """Weight of the loss on the distance to the scene, relative to that on points of the arm (the paper's)."""
 MARGIN = 0.03
 """Distance to the scene below which the collision loss acts [m] (the paper's)."""
-INPUT_NOISE = 0.015
-"""Standard deviation of the noise on the input configuration [rad] (the paper's)."""
 TRIVIAL_SHARE = 0.3
 """Share of the samples from motions between ends whose straight line is free too."""
 
@@ -84,7 +82,6 @@ class MPiNetsNetworkSettings(NetworkSettings, name="mpinets"):
         "point_match": 1.0,
         "collision": 5.0,
         "margin": 0.03,
-        "noise": 0.015,
         "trivial_share": 0.3,
         "near": 0.3,
     }
@@ -108,6 +105,8 @@ class MPiNetsNetworkSettings(NetworkSettings, name="mpinets"):
     """Widths of the layers on all points together (paper: 512, 512, 1,024)."""
     cloud_widths: tuple[Count, Count] = (512, 256)
     """Widths after PointNet++; the last one is the size of the code (paper: 4,096, 2,048, 2,048)."""
+    noise: NotNegative = 0.015
+    """Standard deviation of the noise on the input configuration [rad] (the paper's)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -321,7 +320,7 @@ class MPiNetsNetwork(BaselineNetwork):
         waypoint = rng.integers(0, last + 1, count)
         waypoints = np.stack([waypoint, np.minimum(waypoint + 1, last), np.full(count, last)])
         q, expert, goal = data.q[rows, np.where(way > 0, waypoints, last - waypoints)]
-        q = q + INPUT_NOISE * rng.standard_normal(q.shape, dtype=np.float32)
+        q = q + self.settings.noise * rng.standard_normal(q.shape, dtype=np.float32)
         q = self.normalizer.from_unit(np.clip(self.normalizer.to_unit(q), -1, 1))
         scenes = data.scenes[rows]
         clouds = self.clouds(scenes, rng)

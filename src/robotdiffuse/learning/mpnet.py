@@ -41,7 +41,7 @@ from numpy import ndarray
 from torch import Generator, Tensor, nn
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, Count, Natural, Positive, Sizes
+from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.encoders import curve_keys
 from robotdiffuse.learning.training.baseline import BaselineNetwork
@@ -54,8 +54,6 @@ Configurations = Float[Tensor, "batch dof"]
 CURVE_REACH = 16.0
 """The region's reach is scaled to this [m] before points are sorted along the space-filling curve, which
 then fills the region."""
-CONTRACTION = 1e-3
-"""lambda, the weight of the contractive penalty [m^2]."""
 PRETRAINING = 0.1
 """Share of the training, at its beginning, in which Enet is trained as an auto-encoder."""
 SUB_GOALS = 0.5
@@ -67,7 +65,6 @@ TRIVIAL_SHARE = 0.15
 @dataclass(frozen=True)
 class MPNetSettings(NetworkSettings, name="mpnet"):
     constants: ClassVar[dict[str, Any]] = {
-        "contraction": 1e-3,
         "pretraining": 0.1,
         "sub_goals": 0.5,
         "trivial_share": 0.15,
@@ -81,6 +78,8 @@ class MPNetSettings(NetworkSettings, name="mpnet"):
     Enet)."""
     code: Count = 60
     """Size of z (paper: 28, for a plane)."""
+    contraction: NotNegative = 1e-3
+    """lambda, the weight of the contractive penalty [m^2]."""
     layers: Sizes = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
     """Layers of Pnet (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
     dropout: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
@@ -203,7 +202,7 @@ class MPNetNetwork(BaselineNetwork):
         # with random signs s the mean of |J^T s|^2 is |J|^2 (M. Hutchinson 1990)
         signs = torch.empty_like(z).bernoulli_(0.5, generator=generator) * 2 - 1
         (slope,) = torch.autograd.grad(z, flat, signs, create_graph=True)
-        return error + CONTRACTION * slope.square().sum(1).mean()
+        return error + self.settings.contraction * slope.square().sum(1).mean()
 
     def clouds(
         self, data: TrajectoryData, rows: Int[ndarray, "scenes"], generator: Generator
