@@ -28,7 +28,7 @@ class ToyTask(TrainingTask):
 
     def loss(self, fraction: float, rng: np.random.Generator) -> Tensor:
         self._calls += 1
-        return (self.module.weight * self._factor(self._calls - 1)).square().sum()
+        return (self.module.get_parameter("weight") * self._factor(self._calls - 1)).square().sum()
 
     def validate(self, fraction: float) -> Validation:
         return Validation(0.0)

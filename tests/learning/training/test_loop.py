@@ -42,9 +42,9 @@ def test_the_average_follows_the_weights_with_the_decay_of_the_settings(tmp_path
     expected = None
     for step in range(1, 8):
         run.step()
-        now = run.module.weight.detach().clone()
+        now = run.module.get_parameter("weight").detach().clone()
         decay = min(0.9, step / (step + 10))
         expected = now if expected is None else decay * expected + (1 - decay) * now
     with run.averaged():
-        torch.testing.assert_close(run.module.weight, expected)
-    torch.testing.assert_close(run.module.weight, now)
+        torch.testing.assert_close(run.module.get_parameter("weight"), expected)
+    torch.testing.assert_close(run.module.get_parameter("weight"), now)
