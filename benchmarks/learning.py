@@ -43,7 +43,7 @@ from robotdiffuse.evaluation.methods import (
 )
 from robotdiffuse.evaluation.runs import Clock, Fields, Method, Record, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
-from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
+from robotdiffuse.learning.motion_model import MAX_CLEARANCE, ClearanceFn, MotionModel
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case
@@ -119,7 +119,7 @@ def clearances_without_obstacles(model: MotionModel) -> ClearanceFn:
 
     def clearances(q: ndarray) -> ndarray:
         inputs = np.zeros((*q.shape[:2], links + width), np.float32)
-        inputs[..., :links] = model.settings.clearance_high
+        inputs[..., :links] = MAX_CLEARANCE
         return inputs
 
     return clearances

@@ -48,19 +48,16 @@ from robotdiffuse.learning.denoisers import (
     TransformerSettings,
 )
 from robotdiffuse.learning.denoisers.networks import two_layers
-from robotdiffuse.learning.encoders import EncoderSettings, PointNetSettings, PointsSettings
-from robotdiffuse.learning.encoders.networks import Encoder, fp32, make_encoder, wave_angles
+from robotdiffuse.learning.diffusion import ddim
+from robotdiffuse.learning.encoders import EncoderSettings, PointNetSettings, PointsSettings, make_encoder
+from robotdiffuse.learning.encoders.networks import Encoder, fp32, wave_angles
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.samplers.ddim import ddim
 from robotdiffuse.learning.training.batches import Batch, scene_clouds
-from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
-from robotdiffuse.learning.training.configs import JOINT_POINT_COLLISION
+from robotdiffuse.learning.training.config import JOINT_POINT_COLLISION, EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.encoder import train_encoder
-from robotdiffuse.learning.training.loop import Validation
+from robotdiffuse.learning.training.loop import Processes, Validation, train
 from robotdiffuse.learning.training.planner import PlannerTask, model_settings
-from robotdiffuse.learning.training.processes import Processes
-from robotdiffuse.learning.training.task import train
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.held_out import Case, goal_of
@@ -232,7 +229,7 @@ class Study:
             )
             train_encoder(training, str(self.encoder))
         settings, processes = self.training(row), Processes("cpu")
-        train(SceneTask(row, self, settings, processes), settings, str(self.folder(row)), processes)
+        train(SceneTask(row, self, settings, processes), str(self.folder(row)))
 
     def trained(self, row: str) -> tuple[MotionNetwork, int]:
         """The averaged weights of the newest checkpoint, and the samples that it saw."""
@@ -247,7 +244,7 @@ class Study:
         model = with_parts_of(row, model)
         tensors, notes = read_tensors(self.folder(row) / "averaged.safetensors")
         model.load_state_dict(tensors)
-        return model.for_inference(), notes["samples"]
+        return model.requires_grad_(False).eval(), notes["samples"]
 
 
 def first_length(problem: Problem) -> float | None:
@@ -278,7 +275,7 @@ class SceneTask(PlannerTask):
 
     def validate(self, fraction: float) -> Validation:
         """Adds to the learning curve, and keeps the averaged weights."""
-        samples, folder = round(fraction * (self.own.samples or 0)), self.study.folder(self.row)
+        samples, folder = round(fraction * (self.settings.samples or 0)), self.study.folder(self.row)
         notes = {"samples": samples, "motions": len(self.train_data)}
         write_tensors(folder / "averaged.safetensors", self.model.state_dict(), notes)
         found = tried(self.row, self.model, self.cases, ("own", "hidden"), CURVE_SAMPLES)

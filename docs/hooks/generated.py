@@ -24,10 +24,9 @@ TABLES = {
     "Families of random problems": "problems.families:FAMILIES",
     "Denoisers": "learning.denoisers:DENOISERS",
     "Encoders": "learning.encoders:ENCODERS",
-    "Samplers": "learning.samplers:SAMPLERS",
+    "Samplers": "learning.diffusion:SAMPLERS",
     "Files that motions are written to": "interop:WRITERS",
     "Files that motions are read from": "interop:READERS",
-    "Guidance costs": "learning.costs:COSTS",
 }
 """Tables on the page of parts by name: title, and where the table is."""
 MARK = re.compile(r"^<!-- generated: (.+) -->$", re.MULTILINE)

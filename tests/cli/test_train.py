@@ -7,8 +7,7 @@ import pytest
 
 from helpers.commands import run
 from robotdiffuse.learning.denoisers import UNetSettings
-from robotdiffuse.learning.training.config import PlannerTraining
-from robotdiffuse.learning.training.configs import CONFIGS
+from robotdiffuse.learning.training.config import CONFIGS, PlannerTraining
 
 TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 
@@ -16,6 +15,19 @@ TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 @pytest.fixture(autouse=True)
 def in_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[PlannerTraining]:
+    """The settings of the trainings that are asked for, in place of these."""
+    trained: list[PlannerTraining] = []
+
+    def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
+        trained.append(settings)
+        return {}
+
+    monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
+    return trained
 
 
 def test_unknown_config_lists_them_with_what_they_are(capsys: pytest.CaptureFixture[str]) -> None:
@@ -26,14 +38,7 @@ def test_unknown_config_lists_them_with_what_they_are(capsys: pytest.CaptureFixt
         assert f"  {name}: {config.description}\n" in error
 
 
-def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> None:
-    trained: list[PlannerTraining] = []
-
-    def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
-        trained.append(settings)
-        return {}
-
-    monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
+def test_parts_replace_those_of_the_config(trained: list[PlannerTraining]) -> None:
     parts = ["--objective", "noise", "--sampler", "ddim", "--waypoints", "64", "--condition-drop", "0.2"]
     parts += ["--target", "residual"]
     assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, "--device", "cpu") == 0
@@ -55,14 +60,7 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
     assert row.denoiser == "decoder_only" and row.denoiser_settings is None
 
 
-def test_the_bundled_encoder_is_taken_where_none_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    trained: list[PlannerTraining] = []
-
-    def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
-        trained.append(settings)
-        return {}
-
-    monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
+def test_the_bundled_encoder_is_taken_where_none_is_named(trained: list[PlannerTraining]) -> None:
     assert run("train", "planner", "--data", "d", "--out", "o") == 0
     assert trained[0].encoder == str(Path("o", "encoder")) and Path("o", "encoder", "encoder.json").is_file()
     assert run("train", "planner", "--data", "d", "--out", "o", "--config", "table2_pointnet") == 0
@@ -80,19 +78,9 @@ def test_cross_attention_without_points_is_refused_before_anything_is_made(
 
 @pytest.mark.parametrize(("config", "encoder"), [("points", "points"), ("trajectory_prior", None)])
 def test_the_encoder_of_the_config_is_that_of_an_arm_too(
-    config: str, encoder: str | None, monkeypatch: pytest.MonkeyPatch
+    config: str, encoder: str | None, trained: list[PlannerTraining], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    trained: list[PlannerTraining] = []
-
-    def generate(*_: object, **__: object) -> None:
-        pass
-
-    def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
-        trained.append(settings)
-        return {}
-
-    monkeypatch.setattr("robotdiffuse.generation.generate", generate)
-    monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
+    monkeypatch.setattr("robotdiffuse.generation.generate", lambda *_, **__: None)
     assert run("train", "planner", "--robot", "panda", "--out", "o", "--config", config) == 0
     assert trained[0].encoder == encoder and not Path("o", "encoder").exists()
 

@@ -17,9 +17,9 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.generation import factory
 from robotdiffuse.generation.factory import GenerationSettings
 from robotdiffuse.learning.denoisers import TransformerSettings
-from robotdiffuse.learning.training.configs import planner_training
+from robotdiffuse.learning.training.config import planner_training
 from robotdiffuse.learning.training.loop import TrainingRun
-from robotdiffuse.learning.weights_registry import user_weights, weights_for
+from robotdiffuse.learning.weight_files import user_weights, weights_for
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.robots import load_robot

@@ -10,15 +10,18 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.denoisers import TransformerSettings
-from robotdiffuse.learning.forward_kinematics import ForwardKinematics
-from robotdiffuse.learning.motion_model import MotionModelSettings
+from robotdiffuse.learning.motion_model import (
+    GRADIENT_MARGIN,
+    MAX_CLEARANCE,
+    MotionModelSettings,
+    SamplingSettings,
+    link_clearances,
+)
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.config import PlannerTraining
-from robotdiffuse.learning.training.losses import ArmDistance
+from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
@@ -57,14 +60,14 @@ def test_inputs_are_the_same_in_training_and_planning() -> None:
     scenes.append(Scene(scenes[0].shapes[:1]))
     packed = PackedScenes.pack(scenes, 12, floor=True)
     q, config = configurations(len(packed), 60), model_settings(clearance_gradients=True)
-    given = compile_robot(PANDA), packed, q, config.clearance_high
-    clearances, gradients = packed_clearances_and_gradients(*given, config.gradient_margin)
+    given = compile_robot(PANDA), packed, q, MAX_CLEARANCE
+    clearances, gradients = packed_clearances_and_gradients(*given, GRADIENT_MARGIN)
     np.testing.assert_array_equal(clearances, packed_link_clearances(*given))
     told = np.concatenate([clearances, gradients], axis=-1)
     for i, scene in enumerate(scenes):
         checker = CollisionChecker(PANDA, scene)
         np.testing.assert_allclose(link_clearances(checker, config)(q[i : i + 1])[0], told[i], atol=1e-4)
-        assert (gradients[i].any(axis=1) <= (clearances[i].min(axis=1) < config.gradient_margin)).all()
+        assert (gradients[i].any(axis=1) <= (clearances[i].min(axis=1) < GRADIENT_MARGIN)).all()
     assert 0.3 < gradients.any(axis=-1).mean() < 0.9
 
 

@@ -13,11 +13,11 @@ from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.networks import TrajectoryTransformer
-from robotdiffuse.learning.encoders.networks import make_encoder
+from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+from robotdiffuse.learning.training.config import CONFIGS, planner_training
 from robotdiffuse.learning.training.planner import model_settings
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")

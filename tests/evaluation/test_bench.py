@@ -33,7 +33,7 @@ from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.planner_processes import PlannerProcess, PlannerSpec
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name, validator
 from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records
-from robotdiffuse.learning.weights_registry import BUNDLED
+from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.diffusion.diffusion import Diffusion
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse

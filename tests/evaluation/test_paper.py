@@ -27,8 +27,7 @@ from robotdiffuse.evaluation.statistics import Indicators, comscores
 from robotdiffuse.learning.denoisers import CrossAttentionSettings
 from robotdiffuse.learning.encoders import CompressionAutoencoderSettings, PointsSettings
 from robotdiffuse.learning.motion_model import MotionModelSettings
-from robotdiffuse.learning.weight_files import FORMAT
-from robotdiffuse.learning.weights_registry import BUNDLED
+from robotdiffuse.learning.weight_files import BUNDLED, FORMAT
 from robotdiffuse.problems.goals import PoseGoal
 from robotdiffuse.problems.held_out import CaseFile
 from robotdiffuse.validation.tolerances import goal_error

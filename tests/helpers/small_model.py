@@ -13,7 +13,7 @@ from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.encoders import PointAutoencoderSettings
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.weight_files import RobotIdentity
 
 SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
 

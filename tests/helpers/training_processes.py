@@ -9,17 +9,15 @@ import sys
 import time
 from pathlib import Path
 
-import torch
-
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from helpers.box_arm import box_arm
+from helpers.toy_task import ToyTask
 from robotdiffuse.core.processes import exit_process
 from robotdiffuse.learning.checkpoint import write_tensors
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
-from robotdiffuse.learning.training.loop import TrainingRun, Validation
-from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.loop import Processes, TrainingRun
 
 STEP_SECONDS = 0.3
 STOP_AFTER = 3
@@ -28,9 +26,9 @@ STOP_AFTER = 3
 def slow(settings: PlannerTraining, out: Path) -> None:
     original = TrainingRun.step
 
-    def step(self, loss):
+    def step(self):
         time.sleep(STEP_SECONDS)
-        original(self, loss)
+        original(self)
 
     TrainingRun.step = step
     training.train_planner(settings, str(out))
@@ -40,14 +38,14 @@ def two(settings: PlannerTraining, out: Path) -> None:
     """A run undisturbed, one that is cut in two, and a toy whose second process meets what is not finite."""
     original = TrainingRun.step
 
-    def first_step_kept(self, loss):
-        original(self, loss)
+    def first_step_kept(self):
+        original(self)
         if self.at.step == 1 and self.processes.first:
             gradients = {name: p.grad for name, p in self.parameters.items() if p.grad is not None}
             write_tensors(out / "first_step.safetensors", gradients, {})
 
-    def cut(self, loss):
-        original(self, loss)
+    def cut(self):
+        original(self)
         if self.at.step == STOP_AFTER:
             self.save()
             raise KeyboardInterrupt
@@ -68,22 +66,14 @@ def two(settings: PlannerTraining, out: Path) -> None:
 
 
 def bad_step_in_one(out: str) -> dict[str, float]:
-    torch.manual_seed(0)
-    module, processes = torch.nn.Linear(2, 1), Processes("cpu")
+    settings = EncoderTraining(minutes=None, samples=20, batch=2, average=0.9, bad_steps=3)
+    index = Processes("cpu").index
     run = TrainingRun(
-        module,
-        out,
-        EncoderTraining(minutes=None, samples=20, batch=2, average=0.9, bad_steps=3),
-        identity={},
-        processes=processes,
+        ToyTask(settings, lambda call: float("nan") if call == 2 and index else 1.0 + index), out
     )
-
-    def loss(rng):
-        bad = run.at.step == 2 and not processes.first
-        return (module.weight * (float("nan") if bad else 1.0 + processes.index)).square().sum()
-
-    run.loop(loss, lambda: Validation(0.0), "toy")
-    return {"skipped": run.at.skipped, "samples": run.at.samples, "weight": module.weight.sum().item()}
+    run.loop()
+    weight = run.module.get_parameter("weight").sum().item()
+    return {"skipped": run.at.skipped, "samples": run.at.samples, "weight": weight}
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ from robotdiffuse.learning.checkpoint import (
     fingerprint,
     load_encoder,
     load_model,
-    save_encoder,
     save_network,
 )
 from robotdiffuse.learning.encoders.networks import (
@@ -120,7 +119,7 @@ def test_damaged_weights_give_one_line(tmp_path, case, file):
 
 def test_encoder_files(tmp_path):
     encoder = PointAutoencoder(SMALL_ENCODER)
-    save_encoder(encoder, tmp_path, {})
+    save_network("encoder", encoder, tmp_path, {})
     loaded = load_encoder(tmp_path)
     torch.testing.assert_close(loaded(cloud(9)), encoder(cloud(9)), atol=5e-3, rtol=0)
     with pytest.raises(InputError, match=r"no trained model: encoder\.json"):

@@ -5,9 +5,8 @@ import pytest
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.learning.clearance_features import link_clearances
-from robotdiffuse.learning.motion_model import MotionModelSettings
-from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.motion_model import MAX_CLEARANCE, MotionModelSettings, link_clearances
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -33,7 +32,7 @@ def test_a_held_object_counts_as_a_part_of_what_carries_it(carrier: str, clearan
     bare, carrying = (link_clearances(checker, settings)(q) for checker in checkers)
     assert bare.shape == carrying.shape, "the network was trained for the bare arm"
     links, own = checkers[0].links, checkers[1]
-    rod = own.link_clearances(q.reshape(-1, 7), settings.clearance_high)[:, own.links.index("rod")]
+    rod = own.link_clearances(q.reshape(-1, 7), MAX_CLEARANCE)[:, own.links.index("rod")]
     at = links.index(carrier)
     expected = bare[..., : len(links)].copy()
     expected[..., at] = np.minimum(expected[..., at], rod.reshape(4, 5))

@@ -16,7 +16,7 @@ from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.shards import write_manifest, write_shard
 from robotdiffuse.datasets.surface_clouds import surface_clouds
-from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
+from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_network
 from robotdiffuse.learning.denoisers import CrossAttentionSettings, TransformerSettings
 from robotdiffuse.learning.encoders import (
     ENCODERS,
@@ -25,27 +25,27 @@ from robotdiffuse.learning.encoders import (
     PointAutoencoderSettings,
     PointNetSettings,
     PointsSettings,
+    encoder_name,
+    make_encoder,
 )
 from robotdiffuse.learning.encoders.networks import (
     Autoencoder,
     CompressionAutoencoder,
     EdgeConvolution,
-    encoder_name,
-    make_encoder,
     neighbours,
 )
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training import encoder as encoder_training
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.batches import Batches, load_data, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.encoder import linear_readout, train_encoder
-from robotdiffuse.learning.training.loop import TrainingRun
 from robotdiffuse.learning.training.planner import train_planner
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.scenes.scene_arrays import SPHERE
+from robotdiffuse.scenes.surface_points import PANDA_REGION
 
 SMALL_CAE = CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16))
 SMALL = {
@@ -81,7 +81,7 @@ def test_every_encoder_is_tested():
 
 
 @every_encoder
-@pytest.mark.parametrize("n", [0, 1, 2, 31, 40, 300])
+@pytest.mark.parametrize("n", [1, 2, 31, 40, 300])
 def test_any_number_of_points(name, n):
     encoder = small(name)
     z = encoder(cloud(n, 3))
@@ -103,7 +103,7 @@ def test_any_number_of_obstacles(name):
     assert clouds.shape == (13, encoder.settings.cloud, 3)
     z = encoder(clouds)
     assert z.isfinite().all()
-    torch.testing.assert_close(z[0], encoder(torch.zeros(1, 0, 3))[0], msg="no obstacle is no point")
+    torch.testing.assert_close(z[0], encoder(torch.zeros(1, 1, 3))[0], msg="no obstacle is no point")
     assert len(z.detach().round(decimals=6).unique(dim=0)) == 13
 
 
@@ -129,8 +129,10 @@ def test_points_out_of_the_region_do_not_count(name):
     encoder, points = small(name), cloud(20)
     out = torch.tensor([[[3.0, 0.0, 0.5], [0.3, 0.0, -0.2], [0.0, 0.0, 0.0]]])
     torch.testing.assert_close(encoder(torch.cat([out, points], 1)), encoder(points), atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(encoder(out), encoder(torch.zeros(1, 0, 3)))
+    torch.testing.assert_close(encoder(out), encoder(torch.zeros(1, 1, 3)))
     assert not torch.allclose(encoder(points), encoder(out))
+    both = torch.cat([points, out], 1)
+    np.testing.assert_array_equal(encoder.near(both)[:, :-1], PANDA_REGION.holds(both.numpy())[:, :-1])
 
 
 @with_weights
@@ -139,7 +141,7 @@ def test_gradients_reach_every_parameter(name):
     encoder = small(name)
     clouds = torch.cat([cloud(40, 6), torch.zeros(2, 40, 3)])
     clouds[5, 2:] = 0.0
-    loss = encoder(clouds).square().sum() + encoder(clouds[:, :0]).square().sum()
+    loss = encoder(clouds).square().sum() + encoder(0 * clouds[:, :1]).square().sum()
     if isinstance(encoder, Autoencoder):
         loss = loss + encoder.loss(clouds, np.random.default_rng(0))[0]
     loss.backward()
@@ -154,14 +156,14 @@ def test_files(name, tmp_path):
     if isinstance(encoder, Autoencoder):
         with torch.no_grad():
             encoder.standardize(encoder.encode(cloud(40, 30)))
-    save_encoder(encoder, tmp_path, {})
+    save_network("encoder", encoder, tmp_path, {})
     loaded = load_encoder(tmp_path)
     assert type(loaded) is ENCODERS.load(name)
     assert loaded.settings == encoder.settings
     assert not any(p.requires_grad for p in loaded.parameters())
     points = cloud(40)
     torch.testing.assert_close(loaded(points), encoder(points), atol=0.02, rtol=0)  # stored in fp16
-    save_encoder(loaded, tmp_path / "again", {})
+    save_network("encoder", loaded, tmp_path / "again", {})
     assert fingerprint(load_encoder(tmp_path / "again")) == fingerprint(loaded)
 
 
@@ -178,8 +180,15 @@ def test_settings_are_read_by_name(name):
 
 @pytest.mark.parametrize("name", ["compression_autoencoder", "pointnet", "dgcnn"])
 def test_sizes_of_the_papers(name):
-    encoder = make_encoder(name, ENCODERS.defaults(name).paper_size())
-    assert encoder.settings.code == 60
+    """Built at the sizes that the authors of each encoder give, with z of this paper's size."""
+    wide = {"first": (64, 64), "second": (64, 128, 1024), "transform": (64, 128, 1024)}
+    sizes: dict[str, Any] = {
+        "compression_autoencoder": {},
+        "pointnet": wide | {"cloud": 1024, "transform_head": (512, 256), "head": (512, 256)},
+        "dgcnn": {"cloud": 1024, "neighbours": 20, "edges": (64, 64, 128, 256), "embedding": 1024},
+    }
+    sizes["dgcnn"]["head"] = (512, 256)
+    encoder = make_encoder(name, replace(ENCODERS.defaults(name), code=60, **sizes[name]))
     weights = sum(p.numel() for p in encoder.parameters())
     # PointNet 3.5 million, of which the head to 40 classes is small; DGCNN 1.8 million
     least, most = {"pointnet": (3.0e6, 3.6e6), "dgcnn": (1.2e6, 1.9e6)}.get(name, (7e6, 8e6))
@@ -213,19 +222,20 @@ def test_compression_autoencoder_has_the_papers_layers():
 
 
 def test_arranged_clouds():
-    """Points are sorted like the ordered clouds of `surface_clouds`, and thinned or repeated evenly."""
+    """Points are sorted like the ordered clouds of `surface_clouds`, and thinned or repeated evenly.
+    Both round coordinates to a millionth of the largest."""
     encoder = make_encoder("points", PointsSettings(code=120, cloud=40))
     scenes = random_scenes(20, 12, np.random.default_rng(0))
     clouds = partial(surface_clouds, scenes, region=encoder.settings.region)
     ordered = clouds(40, torch.Generator().manual_seed(0), ordered=True)
     loose = clouds(40, torch.Generator().manual_seed(0))
-    torch.testing.assert_close(encoder.arrange(ordered), ordered, atol=1e-6, rtol=0)
-    torch.testing.assert_close(encoder.arrange(loose), ordered, atol=1e-6, rtol=0)
+    torch.testing.assert_close(encoder.arrange(ordered), ordered, atol=2e-6, rtol=0)
+    torch.testing.assert_close(encoder.arrange(loose), ordered, atol=2e-6, rtol=0)
     every = ordered[:, 1::4]  # of 40 for 10, the middle one of each four
     few = make_encoder("points", PointsSettings(code=30, cloud=10))
-    torch.testing.assert_close(few.arrange(loose)[:, :, 0], ordered[:, 2::4, 0], atol=1e-6, rtol=0)
+    torch.testing.assert_close(few.arrange(loose)[:, :, 0], ordered[:, 2::4, 0], atol=2e-6, rtol=0)
     repeated = encoder.arrange(every)
-    torch.testing.assert_close(repeated, every.repeat_interleave(4, 1), atol=1e-6, rtol=0)
+    torch.testing.assert_close(repeated, every.repeat_interleave(4, 1), atol=2e-6, rtol=0)
 
 
 def test_clouds_along_a_curve():
@@ -311,12 +321,6 @@ def test_training_alone(name, tmp_path, monkeypatch):
     torch.testing.assert_close(z.std(0), torch.ones(8), atol=0.35, rtol=0)
 
 
-@pytest.mark.parametrize("name", JOINTLY)
-def test_not_alone(name):
-    with pytest.raises(InputError, match=f"name is {name}.*jointly"):
-        EncoderTraining(name=name)
-
-
 def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(encoder_training, "READOUT_SCENES", 32)
     out = str(tmp_path / "out")
@@ -387,29 +391,10 @@ def test_joint_training_changes_the_encoder(name, data, tmp_path):
         np.testing.assert_allclose(z, model.encode(given), atol=1e-5 * np.abs(z).max())
 
 
-@pytest.mark.usefixtures("no_export")
-def test_joint_training_resumes(data, tmp_path, monkeypatch):
-    planned = planner(data, "pointnet", encoder_settings=SMALL["pointnet"])
-    whole = train_planner(planned, str(tmp_path / "whole"))
-    original = TrainingRun.step
-
-    def interrupted(self, loss):
-        original(self, loss)
-        if self.at.step == 3:
-            self.save()
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(TrainingRun, "step", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        train_planner(planned, str(tmp_path / "parts"))
-    monkeypatch.setattr(TrainingRun, "step", original)
-    assert train_planner(planned, str(tmp_path / "parts")) == whole
-
-
 @with_weights
 @pytest.mark.usefixtures("no_export")
 def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
-    save_encoder(small(name), tmp_path / "encoder", {})
+    save_network("encoder", small(name), tmp_path / "encoder", {})
     before = fingerprint(load_encoder(tmp_path / "encoder"))
     train_planner(planner(data, str(tmp_path / "encoder")), str(tmp_path / "out"))
     encoder = load_model(tmp_path / "out").encoder
@@ -432,23 +417,19 @@ def test_batches_with_clouds_instead_of_codes(data):
     assert (first.condition[:, :8] == 0).all() and (first.condition[:, 8:] != 0).any()
 
 
-def test_a_frozen_encoder_takes_no_settings(data):
-    with pytest.raises(InputError, match="unknown encoder 'runs/encoder'"):
-        planner(data, "runs/encoder", encoder_settings=SMALL["pointnet"])
-
-
 @pytest.mark.parametrize(
-    "parts",
+    ("kind", "parts", "message"),
     [
-        {"encoder": "points"},
-        {"encoder": "runs/encoder", "denoiser": "cross_attention"},
-        {"encoder": None, "denoiser": "cross_attention"},
+        (PlannerTraining, {"encoder": "points"}, "encoder is points and denoiser is .* need each other"),
+        (PlannerTraining, {"encoder": "e", "denoiser": "cross_attention"}, "encoder is e .* need each other"),
+        (PlannerTraining, {"encoder": None, "denoiser": "cross_attention"}, "is None .* need each other"),
+        (PlannerTraining, {"encoder": "e", "encoder_settings": SMALL["pointnet"]}, "unknown encoder 'e'"),
+        *((EncoderTraining, {"name": name}, f"name is {name}.*jointly") for name in JOINTLY),
     ],
 )
-def test_points_and_cross_attention_need_each_other(parts):
-    wanted = f"encoder is {parts['encoder']} and denoiser is .* need each other"
-    with pytest.raises(InputError, match=wanted):
-        PlannerTraining(data="data", **parts)
+def test_parts_that_do_not_fit_are_refused(kind, parts, message):
+    with pytest.raises(InputError, match=message):
+        kind(**({"data": "data"} if kind is PlannerTraining else {}), **parts)
 
 
 def test_a_model_of_points_needs_both_parts():

@@ -16,7 +16,7 @@ from robotdiffuse.learning.encoders import CompressionAutoencoderSettings
 from robotdiffuse.learning.encoders.networks import CompressionAutoencoder
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.weights_registry import BUNDLED
+from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.perception.observed_volume import SHAPE
 from robotdiffuse.robots import load_robot
 

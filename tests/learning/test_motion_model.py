@@ -9,43 +9,21 @@ import torch
 from helpers.box_arm import box_arm
 from helpers.small_model import SMALL_ENCODER, small_model
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
+from robotdiffuse.learning.diffusion import SAMPLERS, NoiseSchedule, ScheduleSettings, noise_factor
 from robotdiffuse.learning.encoders.networks import (
     PointAutoencoder,
     chamfer,
     nearest,
 )
-from robotdiffuse.learning.motion_model import GuideFn, MotionModelSettings
+from robotdiffuse.learning.motion_model import GuideFn, MotionModelSettings, SamplingSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.robots.normalizer import JointNormalizer
-from robotdiffuse.scenes.surface_points import PANDA_REGION
 
 
 def cloud(n: int, seed: int = 0) -> torch.Tensor:
     points = np.random.default_rng(seed).uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.8], (1, n, 3))
     return torch.from_numpy(points.astype(np.float32))
-
-
-def test_encoder_leaves_out_points_out_of_the_region():
-    encoder = PointAutoencoder(SMALL_ENCODER)
-    points = cloud(20)
-    out = torch.tensor([[[3.0, 0.0, 0.5], [0.3, 0.0, -0.2]]])
-    torch.testing.assert_close(encoder(torch.cat([points, out], 1)), encoder(points))
-    torch.testing.assert_close(encoder(out), encoder(torch.zeros(1, 0, 3)))
-    assert not torch.allclose(encoder(points), encoder(torch.zeros(1, 0, 3)))
-    both = np.concatenate([points.numpy(), out.numpy()], 1)
-    np.testing.assert_array_equal(encoder.near(torch.from_numpy(both)).numpy(), PANDA_REGION.holds(both))
-
-
-def test_encoder_takes_any_number_of_points():
-    model = small_model().for_inference()
-    for n in (0, 1, 5000):
-        z = model.encode(cloud(n)[0].numpy().astype(np.float64))
-        assert z.shape == (8,)
-        assert np.isfinite(z).all()
 
 
 def test_standardized_codes():
@@ -104,32 +82,9 @@ def test_noise_is_zero_at_the_ends_and_has_the_data_s_covariance(smooth):
     np.testing.assert_allclose(covariance[1:-1, 1:-1], wanted, atol=2e-3)
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
-@pytest.mark.parametrize("eta", [0.0, 1.0])
-def test_sampler_recovers_a_gaussian(name, eta):
-    """For Gaussian data the best denoiser has a closed form; samples have their mean and deviation."""
-    mean, std, n = 0.7, 0.3, 40_000
-    schedule = NoiseSchedule(ScheduleSettings())
-    rng = np.random.default_rng(1)
-
-    def predict(x, level):
-        a, s = schedule.signal[level], schedule.noise[level]
-        return mean + a * std**2 / (a**2 * std**2 + s**2) * (x - a * mean)
-
-    def deviations(steps):
-        x = SAMPLERS.load(name)(predict, schedule, lambda: rng.standard_normal(n), steps, eta)
-        return abs(x.mean() - mean), abs(x.std() - std)
-
-    few, many = deviations(10), deviations(200)
-    # the standard error is 0.0015 of the mean; of many steps, the discretisation leaves less than 0.005
-    assert max(few[0], many[0]) < 0.008
-    assert many[1] < 0.01
-    assert many[1] < few[1]
-
-
 @pytest.mark.parametrize("guided", [False, True])
 def test_samples_hold_start_and_goal(guided):
-    model = small_model().for_inference()
+    model = small_model().requires_grad_(False).eval()
     model.residual_scale.fill_(0.3)
     start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
     levels = []

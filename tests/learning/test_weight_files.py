@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.onnx_session import OnnxNetwork
+from robotdiffuse.learning.exported_model import OnnxNetwork
 from robotdiffuse.learning.weight_files import checked_bytes, read_description
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from helpers.example_robots import TIPS, example_robot, planar_arm
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_angle, transform
-from robotdiffuse.learning.forward_kinematics import ForwardKinematics
+from robotdiffuse.learning.training.losses import ForwardKinematics
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
@@ -20,7 +20,8 @@ from robotdiffuse.robots.robot import Robot
 
 def errors(robot: Robot, frame: str, T: np.ndarray, q: np.ndarray) -> tuple[float, float]:
     """Largest position error [m] and orientation error [rad] of solutions, by the PyTorch kinematics."""
-    poses = ForwardKinematics(robot, torch.float64).link(torch.tensor(q), frame).numpy()
+    T_base_frame = ForwardKinematics(robot, torch.float64)(torch.tensor(q)).numpy()
+    poses = T_base_frame[:, robot.link_frame(frame)] @ robot.T_frame_link(frame)
     turns = [rotation_angle(pose[:3, :3] @ T[:3, :3].T) for pose in poses]
     return float(np.linalg.norm(poses[:, :3, 3] - T[:3, 3], axis=1).max()), max(turns)
 

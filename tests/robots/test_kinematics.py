@@ -8,7 +8,7 @@ import torch
 
 from helpers.example_robots import TIPS, example_robot, planar_arm, urdf_file
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.forward_kinematics import ForwardKinematics
+from robotdiffuse.learning.training.losses import ForwardKinematics
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
@@ -55,109 +55,77 @@ class PinocchioArm:
 
 
 def test_planar_arm_by_hand() -> None:
-    fk = ForwardKinematics(planar_arm(2.0, 1.0), torch.float64)
-    T = fk.link(torch.tensor([[np.pi / 2, -np.pi / 2], [0.0, np.pi / 2]], dtype=torch.float64), "tip")
+    robot = planar_arm(2.0, 1.0)
+    T = robot.fk(np.array([[np.pi / 2, -np.pi / 2], [0.0, np.pi / 2]]), "tip")
     np.testing.assert_allclose(T[:, :3, 3], [[1, 2, 0], [2, 1, 0]], atol=1e-12)
-    J = fk.jacobian(torch.tensor([0.0, np.pi / 2], dtype=torch.float64), "tip")
+    J = robot.jacobian(np.array([0.0, np.pi / 2]), "tip")
     np.testing.assert_allclose(J.T, [[-1, 2, 0, 0, 0, 1], [-1, 0, 0, 0, 0, 1]], atol=1e-12)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-5)])
 @pytest.mark.parametrize("name", TIPS)
-def test_links_match_pinocchio(name: str, dtype: torch.dtype, tolerance: float, tmp_path: Path) -> None:
+def test_frames_of_the_networks_match_pinocchio(
+    name: str, dtype: torch.dtype, tolerance: float, tmp_path: Path
+) -> None:
     robot = example_robot(name)
     oracle = PinocchioArm(name, robot, tmp_path)
     q = configurations(robot, 20)
-    T = ForwardKinematics(robot, dtype).links(q)
+    T_base_frame = ForwardKinematics(robot, dtype)(q).numpy()
     for i in range(len(q)):
         oracle.update(q[i])
-        for k, link in enumerate(robot.link_names):
-            np.testing.assert_allclose(T[i, k], oracle.pose(link), rtol=0, atol=tolerance, err_msg=link)
+        for link in robot.link_names:
+            T = T_base_frame[i, robot.link_frame(link)] @ robot.T_frame_link(link)
+            np.testing.assert_allclose(T, oracle.pose(link), rtol=0, atol=tolerance, err_msg=link)
 
 
 @pytest.mark.parametrize("name", TIPS)
-def test_jacobian_matches_pinocchio(name: str, tmp_path: Path) -> None:
+def test_poses_and_jacobians_match_pinocchio(name: str, tmp_path: Path) -> None:
     robot = example_robot(name)
     oracle = PinocchioArm(name, robot, tmp_path)
-    q = configurations(robot, 5)
+    q = configurations(robot, 5).numpy()
     for link in robot.link_names:
-        J = ForwardKinematics(robot, torch.float64).jacobian(q, link)
+        T, J, origins = robot.fk(q, link), robot.jacobian(q, link), link_origins(robot, q, link)
         for i in range(len(q)):
             oracle.update(q[i])
+            np.testing.assert_allclose(T[i], oracle.pose(link), rtol=0, atol=1e-9, err_msg=link)
             np.testing.assert_allclose(J[i], oracle.jacobian(link), rtol=0, atol=1e-9, err_msg=link)
+            np.testing.assert_allclose(origins[i], oracle.pose(link)[:3, 3], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(link_pose(robot, q[i], link), T[i], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(robot.fk(q[0].tolist()), robot.fk(q[0], robot.tip), atol=1e-12)
 
 
 @pytest.mark.parametrize("name", TIPS)
 def test_jacobian_matches_finite_differences(name: str) -> None:
     robot = example_robot(name)
-    fk = ForwardKinematics(robot, torch.float64)
-    q, step = configurations(robot, 3), 1e-6
-    steps = step * torch.eye(robot.dof, dtype=torch.float64)
+    q, step = configurations(robot, 3).numpy(), 1e-6
     for link in robot.link_names:
-        before, after = (fk.link(q[:, None] + sign * steps, link) for sign in (-1, 1))
+        before, after = (
+            np.stack([robot.fk(row + sign * step * np.eye(robot.dof), link) for row in q]) for sign in (-1, 1)
+        )
         linear = (after - before)[..., :3, 3] / (2 * step)
-        turn = (after[..., :3, :3] @ before[..., :3, :3].mT) / (4 * step)
-        skew = turn - turn.mT
-        angular = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
-        numeric = torch.cat([linear, angular], dim=-1).mT
+        turn = (after[..., :3, :3] @ before[..., :3, :3].swapaxes(-1, -2)) / (4 * step)
+        skew = turn - turn.swapaxes(-1, -2)
+        angular = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+        numeric = np.concatenate([linear, angular], axis=-1).swapaxes(-1, -2)
         # The error of central differences with this step: rounding, 1e-16 / 1e-6, and a margin.
-        np.testing.assert_allclose(fk.jacobian(q, link), numeric, rtol=0, atol=1e-8, err_msg=link)
+        np.testing.assert_allclose(robot.jacobian(q, link), numeric, rtol=0, atol=1e-8, err_msg=link)
 
 
-def test_gradients_of_poses_and_jacobians() -> None:
+def test_gradients_of_the_frames_of_the_networks() -> None:
     robot = example_robot("awkward")
     fk = ForwardKinematics(robot, torch.float64)
-    q = configurations(robot, 2).requires_grad_()
-    assert torch.autograd.gradcheck(fk.links, (q,))
-    assert torch.autograd.gradcheck(lambda q: fk.jacobian(q, robot.tip), (q,))
-    assert torch.autograd.gradgradcheck(lambda q: fk.link(q, robot.tip), (q,))
-
-
-@pytest.mark.parametrize("name", TIPS)
-def test_frames_links_and_single_poses_agree(name: str) -> None:
-    robot = example_robot(name)
-    fk = ForwardKinematics(robot, torch.float64)
-    q = configurations(robot, 1)[0]
-    frames, links = fk(q), fk.links(q)
-    for k, link in enumerate(robot.link_names):
-        T = frames[robot.link_frame(link)].numpy() @ robot.T_frame_link(link)
-        for same in (links[k], fk.link(q, link), link_pose(robot, q.numpy(), link)):
-            np.testing.assert_allclose(same, T, rtol=0, atol=1e-12)
-        origins = link_origins(robot, q.numpy()[None], link)
-        np.testing.assert_allclose(origins, T[None, :3, 3], rtol=0, atol=1e-12)
+    assert torch.autograd.gradcheck(fk, (configurations(robot, 2).requires_grad_(),))
 
 
 @pytest.mark.parametrize("batch", [(), (0,), (1,), (2, 3)])
 def test_batch_shapes(batch: tuple[int, ...]) -> None:
     robot = planar_arm(1.0, 1.0, 1.0)
-    fk = ForwardKinematics(robot)
-    q = torch.zeros((*batch, 3))
-    assert fk(q).shape == (*batch, 4, 4, 4)
-    assert fk.link(q, "l1").shape == (*batch, 4, 4)
-    assert fk.links(q).shape == (*batch, 5, 4, 4)
-    assert fk.jacobian(q, "l0").shape == (*batch, 6, 3)
+    assert ForwardKinematics(robot)(torch.zeros((*batch, 3))).shape == (*batch, 4, 4, 4)
 
 
 def test_bad_input() -> None:
-    robot = planar_arm(1.0, 1.0)
-    fk = ForwardKinematics(robot)
-    with pytest.raises(InputError, match=r"shape \(3,\).*2 planned joints"):
-        fk.link(torch.zeros(3), "tip")
     with pytest.raises(InputError, match="unknown link 'hand'"):
-        fk.link(torch.zeros(2), "hand")
-    with pytest.raises(InputError, match="unknown link 'hand'"):
-        link_pose(robot, np.zeros(2), "hand")
-
-
-@pytest.mark.parametrize("name", TIPS)
-def test_a_robot_s_own_kinematics_are_those_of_the_network_s_side(name: str) -> None:
-    robot = example_robot(name)
-    fk, q = ForwardKinematics(robot, torch.float64), configurations(robot, 5)
-    for link in (None, robot.link_names[-1]):
-        where = link or robot.tip
-        np.testing.assert_allclose(robot.fk(q.numpy(), link), fk.link(q, where), atol=1e-12)
-        np.testing.assert_allclose(robot.jacobian(q.numpy(), link), fk.jacobian(q, where), atol=1e-12)
-        np.testing.assert_allclose(robot.fk(q[0].tolist(), link), fk.link(q[0], where), atol=1e-12)
+        link_pose(planar_arm(1.0, 1.0), np.zeros(2), "hand")
         assert robot.jacobian(q[0].tolist(), link).shape == (6, robot.dof)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from helpers.example_robots import TIPS, example_robot, planar_arm
-from robotdiffuse.learning.forward_kinematics import ForwardKinematics
+from robotdiffuse.learning.training.losses import ForwardKinematics
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
 
@@ -61,11 +61,11 @@ def test_bounds_every_displacement(name: str) -> None:
     b = a + (b - a) * rng.random((500, 1)) ** 3
     bounds = np.abs(b - a) @ motion_radii(robot).T
     fk = ForwardKinematics(robot, torch.float64)
-    T_a, T_b = (fk.links(torch.tensor(q)).numpy() for q in (a, b))
+    frames = [fk(torch.tensor(q)).numpy() for q in (a, b)]
     for i, link in enumerate(link for link in robot.link_names if link in robot.spheres):
         centers = np.hstack([robot.spheres[link][:, :3], np.ones((3, 1))])
-        k = robot.link_names.index(link)
-        moved = np.linalg.norm((T_b[:, k] - T_a[:, k]) @ centers.T, axis=1).max(-1)
+        T_a, T_b = (T[:, robot.link_frame(link)] @ robot.T_frame_link(link) for T in frames)
+        moved = np.linalg.norm((T_b - T_a) @ centers.T, axis=1).max(-1)
         assert (moved <= bounds[:, i] + 1e-12).all()
 
 

@@ -94,7 +94,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run_list(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.tables import Column, Table, show
-    from robotdiffuse.learning.weights_registry import weights_for
+    from robotdiffuse.learning.weight_files import weights_for
     from robotdiffuse.robots import known_robots, load_robot
     from robotdiffuse.robots.robot_folder import read_source
 

@@ -207,7 +207,7 @@ def run_completion(arguments: argparse.Namespace) -> int:
 def run_planner(arguments: argparse.Namespace) -> int:
     need_packages("training", "torch")
     from robotdiffuse.learning.denoisers import DENOISERS
-    from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+    from robotdiffuse.learning.training.config import CONFIGS, planner_training
     from robotdiffuse.learning.training.planner import train_planner
 
     if arguments.config not in CONFIGS:
@@ -246,7 +246,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
 
 
 def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
-    from robotdiffuse.learning.training.configs import planner_training
+    from robotdiffuse.learning.training.config import planner_training
 
     if arguments.robot is None:
         raise InputError("give --robot to generate data for an arm, or --data to use existing data")
@@ -265,7 +265,7 @@ def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
 def run_baseline(arguments: argparse.Namespace) -> int:
     need_packages("training", "torch")
     from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
-    from robotdiffuse.learning.training.configs import planner_training
+    from robotdiffuse.learning.training.config import planner_training
     from robotdiffuse.learning.training.planner import train_planner
 
     given = _given(arguments, ("data", "robot", *TRAINING_OPTIONS))
@@ -352,7 +352,7 @@ def train_for_robot(
     from robotdiffuse.generation import generate
     from robotdiffuse.learning.training.config import PlannerTraining
     from robotdiffuse.learning.training.planner import train_planner
-    from robotdiffuse.learning.weights_registry import user_weights
+    from robotdiffuse.learning.weight_files import user_weights
 
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("torchrun only trains: generate the data first, then give --data")
@@ -392,14 +392,14 @@ def _check_disk(work: Path, motions: int) -> None:
 
 def copy_bundled_encoder(folder: Path) -> Path:
     """Save the encoder of the bundled weights in the form that the training reads; returns the folder."""
-    from robotdiffuse.learning.checkpoint import load_model, save_encoder
-    from robotdiffuse.learning.weights_registry import BUNDLED
+    from robotdiffuse.learning.checkpoint import load_model, save_network
+    from robotdiffuse.learning.weight_files import BUNDLED
 
     if (folder / "encoder.json").is_file():
         return folder
     encoder = load_model(BUNDLED / "panda").encoder
     assert encoder is not None
-    save_encoder(encoder, folder, {"from": "the weights that come with the package for panda"})
+    save_network("encoder", encoder, folder, {"from": "the weights that come with the package for panda"})
     return folder
 
 

@@ -35,8 +35,7 @@ from robotdiffuse.evaluation.report import Report, interval
 from robotdiffuse.evaluation.runs import Record, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.checkpoint import load_model
-from robotdiffuse.learning.training.config import EncoderTraining
-from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+from robotdiffuse.learning.training.config import CONFIGS, EncoderTraining, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
@@ -56,7 +55,7 @@ STOP_TIMEOUT = 20.0
 
 class Row(NamedTuple):
     config: str
-    """Name in `learning.training.configs`."""
+    """Name in `learning.training.config`."""
     guided: bool
     """Whether samples are drawn under collision guidance."""
     paper: tuple[float | None, ...]

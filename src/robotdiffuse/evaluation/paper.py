@@ -29,11 +29,9 @@ from robotdiffuse.evaluation.problem_sets import hard_cases, read_cases, validat
 from robotdiffuse.evaluation.report import Report, interval
 from robotdiffuse.evaluation.runs import Record, run_all
 from robotdiffuse.evaluation.statistics import Indicators, bootstrap_interval, comscores, wilson_interval
-from robotdiffuse.learning.clearance_features import link_clearances
-from robotdiffuse.learning.motion_model import MotionModelSettings
-from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.weight_files import read_description
-from robotdiffuse.learning.weights_registry import POINTS, folder_of, weights_for
+from robotdiffuse.learning.diffusion import SAMPLERS
+from robotdiffuse.learning.motion_model import MotionModelSettings, link_clearances
+from robotdiffuse.learning.weight_files import POINTS, folder_of, read_description, weights_for
 from robotdiffuse.planning.diffusion.diffusion import encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.planning.pose_goals import GOAL_COUNT, pose_configurations

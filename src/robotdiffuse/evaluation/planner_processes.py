@@ -32,9 +32,7 @@ from robotdiffuse.evaluation.runs import (
     Run,
     load_average,
 )
-from robotdiffuse.learning.networks import NETWORKS
-from robotdiffuse.learning.weight_files import read_description
-from robotdiffuse.learning.weights_registry import folder_of
+from robotdiffuse.learning.weight_files import NETWORKS, folder_of, read_description
 from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner

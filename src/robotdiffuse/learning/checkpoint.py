@@ -10,8 +10,6 @@ import hashlib
 import json
 import struct
 from datetime import UTC, datetime
-from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -20,29 +18,33 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning.completion import CompletionSettings
 from robotdiffuse.learning.completion_network import CompletionNetwork
-from robotdiffuse.learning.encoders import ENCODERS
-from robotdiffuse.learning.encoders.networks import Encoder, encoder_name, make_encoder
+from robotdiffuse.learning.encoders import ENCODERS, encoder_name
+from robotdiffuse.learning.encoders.networks import Encoder
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.network import Network, SavedModule
-from robotdiffuse.learning.networks import NETWORKS
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.weight_files import FORMAT, checked_bytes, read_description, stamp
-from robotdiffuse.learning.weights_registry import completion_folder, folder_of, weights_folder
+from robotdiffuse.learning.weight_files import (
+    FORMAT,
+    NETWORKS,
+    RobotIdentity,
+    checked_bytes,
+    completion_folder,
+    folder_of,
+    kept_by_stamp,
+    read_description,
+    weights_folder,
+)
 from robotdiffuse.robots.robot import Robot
 
 
 def versions() -> dict[str, str]:
     """Versions of this package and of PyTorch, and the date, for the description of a checkpoint."""
-    try:
-        own = version("robotdiffuse")
-    except PackageNotFoundError:
-        own = "from source"
-    return {"robotdiffuse": own, "torch": torch.__version__, "made": datetime.now(UTC).strftime("%Y-%m-%d")}
+    made = datetime.now(UTC).strftime("%Y-%m-%d")
+    return {"robotdiffuse": __version__, "torch": torch.__version__, "made": made}
 
 
 def write_tensors(file: FilePath, tensors: dict[str, Tensor], notes: dict[str, Any]) -> str:
@@ -81,6 +83,18 @@ def _pack(module: nn.Module) -> dict[str, Tensor]:
     return {name: t.half() if name in half else t for name, t in module.state_dict().items()}
 
 
+def save_network(name: str, network: Any, folder: str | FilePath, training: dict[str, Any]) -> None:
+    """Write NAME.safetensors and NAME.json; `name` as in NETWORKS, or encoder or completion.
+
+    training: the data's fingerprint, the number of samples and so on, for readers.
+    """
+    about: dict[str, Any] = {"network": encoder_name(network) if isinstance(network, Encoder) else name}
+    if isinstance(network, Network):
+        about["robot"] = network.robot.to_json()
+    about |= {"settings": network.settings.to_json(), "training": training}
+    _save(network, FilePath(folder), name, about)
+
+
 def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
     """Write STEM.safetensors, the exported parts, and last STEM.json with the SHA-256 of all."""
     packed = _pack(module)
@@ -95,46 +109,39 @@ def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any
     write_atomically(folder / f"{stem}.json", json.dumps(about, indent=1) + "\n", make_folder=True)
 
 
-def _read(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Weights and description from files of `_save`. Raises InputError if they are missing or damaged."""
-    about, weights = read_description(folder, stem), folder / f"{stem}.safetensors"
-    checked_bytes(weights, about.get("weights_sha256"), f"{stem}.json")
-    return read_tensors(weights)[0], about
-
-
-def _fill(module: nn.Module, tensors: dict[str, Tensor], file: FilePath) -> None:
-    """Load weights into a module. Raises InputError, naming the file, if they do not fit."""
+def _load(name: str, folder: FilePath) -> Any:
+    """The network of a folder, frozen. Raises InputError if a file is missing or damaged."""
+    about = read_description(folder, name)
+    where = f"{folder / name}.json"
+    weights = folder / f"{name}.safetensors"
+    checked_bytes(weights, about.get("weights_sha256"), f"{name}.json")
+    robots: list[RobotIdentity] = []
+    kind: Any = CompletionNetwork
+    settings: Any = CompletionSettings
+    if name != "completion":
+        table, entry = (ENCODERS, about.get("network", "")) if name == "encoder" else (NETWORKS, name)
+        kind, settings = table.load(entry), table.settings(entry)
+        if table is NETWORKS:
+            robots = [RobotIdentity.from_json(about.get("robot"), f"{where}: robot")]
+    made = settings.from_json(about.get("settings"), f"{where}: settings")
     try:
-        module.load_state_dict(tensors)
+        network = kind(*robots, made)
+    except (RuntimeError, TypeError, MemoryError, OverflowError) as error:
+        # PyTorch's errors for impossible sizes
+        raise InputError(
+            f"{where}: no network can be made from these settings: {shortened(str(error))}"
+        ) from None
+    try:
+        network.load_state_dict(read_tensors(weights)[0])
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{file} does not fit its description: {reason}") from None
-
-
-def save_encoder(encoder: Encoder, folder: str | FilePath, training: dict[str, Any]) -> None:
-    """Write encoder.safetensors and encoder.json. training: a record of the training, for readers."""
-    about = {
-        "network": encoder_name(encoder),
-        "settings": encoder.settings.to_json(),
-        "training": training,
-    }
-    _save(encoder, FilePath(folder), "encoder", about)
+        raise InputError(f"{weights} does not fit its description: {reason}") from None
+    return network.requires_grad_(False).eval()
 
 
 def load_encoder(folder: str | FilePath) -> Encoder:
     """The trained encoder of a folder, frozen. Raises InputError if it is missing or damaged."""
-    tensors, about = _read(FilePath(folder), "encoder")
-    where = str(FilePath(folder) / "encoder.json")
-    kind: Any = ENCODERS.settings(about.get("network", ""))
-    encoder = make_encoder(about["network"], kind.from_json(about.get("settings"), f"{where}: settings"))
-    _fill(encoder, tensors, FilePath(folder) / "encoder.safetensors")
-    return encoder.requires_grad_(False).eval()
-
-
-def save_completion(network: CompletionNetwork, folder: str | FilePath, training: dict[str, Any]) -> None:
-    """Write completion.safetensors and completion.json. training: a record of the training, for readers."""
-    about = {"network": "completion", "settings": network.settings.to_json(), "training": training}
-    _save(network, FilePath(folder), "completion", about)
+    return _load("encoder", FilePath(folder))
 
 
 def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
@@ -142,26 +149,7 @@ def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
 
     Raises InputError for damaged files, and if there is none, naming the command that trains it.
     """
-    place = completion_folder(folder)
-    tensors, about = _read(place, "completion")
-    where = str(place / "completion.json")
-    network = CompletionNetwork(CompletionSettings.from_json(about.get("settings"), f"{where}: settings"))
-    _fill(network, tensors, place / "completion.safetensors")
-    return network.requires_grad_(False).eval()
-
-
-def save_network(name: str, network: Network, folder: str | FilePath, training: dict[str, Any]) -> None:
-    """Write NAME.safetensors and NAME.json; `name` as in NETWORKS.
-
-    training: the data's fingerprint, the number of samples and so on, for readers.
-    """
-    about = {
-        "network": name,
-        "robot": network.robot.to_json(),
-        "settings": network.settings.to_json(),
-        "training": training,
-    }
-    _save(network, FilePath(folder), name, about)
+    return _load("completion", completion_folder(folder))
 
 
 def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
@@ -171,35 +159,12 @@ def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
     made for another robot.
     """
     place = weights_folder(name, folder, robot)
-    network = _loaded(name, place, stamp(place, name))
+    network = _loaded(name, place)
     network.robot.check(robot, str(place / f"{name}.json"))
     return network
 
 
-@lru_cache(maxsize=16)
-def _loaded(name: str, folder: FilePath, _stamp: tuple[int, int] | None) -> Network:
-    return _load(name, folder)
-
-
-def _load(name: str, folder: FilePath) -> Network:
-    tensors, about = _read(folder, name)
-    where, settings = str(folder / f"{name}.json"), NETWORKS.settings(name)
-    assert settings is not None and issubclass(settings, Settings)
-    robot = RobotIdentity.from_json(about.get("robot"), f"{where}: robot")
-    made = settings.from_json(about.get("settings"), f"{where}: settings")
-    try:
-        network: Network = NETWORKS.load(name)(robot, made)
-    except (
-        RuntimeError,
-        TypeError,
-        MemoryError,
-        OverflowError,
-    ) as error:  # PyTorch's errors for impossible sizes
-        raise InputError(
-            f"{where}: no network can be made from these settings: {shortened(str(error))}"
-        ) from None
-    _fill(network, tensors, folder / f"{name}.safetensors")
-    return network.for_inference()
+_loaded = kept_by_stamp(_load)
 
 
 def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionNetwork:
@@ -227,10 +192,7 @@ def export_weights(folder: str | FilePath) -> list[str]:
             continue
         about = read_description(place, name)
         about = {key: about[key] for key in about if not key.endswith("_sha256")}
-        if name == "completion":
-            _save(load_completion(place), place, name, about)
-        else:
-            _save(_load(name, place), place, name, about)
+        _save(_load(name, place), place, name, about)
         written.append(name)
     if not written:
         raise InputError(f"{folder} holds no trained network")

@@ -8,7 +8,6 @@ Nothing here loads PyTorch. The network itself is in `completion_network`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
@@ -21,8 +20,12 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, Settings
-from robotdiffuse.learning.weight_files import exported_files, read_description, stamp
-from robotdiffuse.learning.weights_registry import completion_folder
+from robotdiffuse.learning.weight_files import (
+    completion_folder,
+    exported_files,
+    kept_by_stamp,
+    read_description,
+)
 from robotdiffuse.perception.depth_noise import DepthNoise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
@@ -34,6 +37,7 @@ from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 
+Packed = UInt8[ndarray, "56 56 32"]
 SHOULDER = (0.0, 0.0, 0.33)
 """Of a Panda, in the base frame [m]."""
 REACH = 1.0
@@ -96,7 +100,7 @@ BITS = (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW)
 
 
 @dataclass(frozen=True)
-class CameraPlaces:
+class CameraPlaces(Settings, name="cameras"):
     """Distribution of camera poses. Lengths in [m], angles in [rad]."""
 
     distance: Range = (1.2, 2.0)
@@ -149,11 +153,11 @@ NO_FLOOR_SHARE = 0.1
 class Sample(NamedTuple):
     """An observed volume and the true occupancy, packed."""
 
-    seen: UInt8[ndarray, "56 56 32"]
+    seen: Packed
     """The bits of `BITS`."""
-    behind: UInt8[ndarray, "56 56 32"]
+    behind: Packed
     """Depth behind the nearest surface, in units of DEPTH_STEP."""
-    truth: UInt8[ndarray, "56 56 32"]
+    truth: Packed
     """Whether each of a voxel's eight voxels of 2 cm holds an obstacle: bit 4 x + 2 y + z."""
 
 
@@ -165,7 +169,7 @@ class Samples(NamedTuple):
     truth: UInt8[ndarray, "n 56 56 32"]
 
 
-def pack(volume: ObservedVolume) -> tuple[UInt8[ndarray, "56 56 32"], UInt8[ndarray, "56 56 32"]]:
+def pack(volume: ObservedVolume) -> tuple[Packed, Packed]:
     """`Sample.seen` and `Sample.behind` of an observed volume."""
     seen = np.zeros(SHAPE, np.uint8)
     for bit, of in zip(BITS, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=True):
@@ -178,7 +182,7 @@ def true_voxels(scene: Scene) -> Bool[ndarray, "112 112 64"]:
     return voxels_within(scene, LOW, FINE_VOXEL_SIZE, FINE_SHAPE)
 
 
-def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> UInt8[ndarray, "56 56 32"]:
+def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> Packed:
     """`Sample.truth` of an occupancy."""
     out = np.zeros(SHAPE, np.uint8)
     for bit in range(8):
@@ -266,18 +270,15 @@ def exported_completion(folder: str | FilePath | None = None) -> Completion:
 
     Raises InputError for damaged files, and if there is none, naming the command that trains it.
     """
-    place = completion_folder(folder)
-    return _exported(place, stamp(place, "completion"))
+    return _exported("completion", completion_folder(folder))
 
 
-@lru_cache(maxsize=4)
-def _exported(place: FilePath, _stamp: tuple[int, int] | None) -> Completion:
-    from robotdiffuse.learning.onnx_session import OnnxNetwork  # imports ONNX Runtime
+@kept_by_stamp
+def _exported(name: str, folder: FilePath) -> Completion:
+    from robotdiffuse.learning.exported_model import OnnxNetwork  # imports ONNX Runtime
 
-    parts = exported_files(place, "completion", read_description(place, "completion"))
+    parts = exported_files(folder, name, read_description(folder, name))
     if parts.keys() != {".onnx"}:
-        raise InputError(
-            f"{place / 'completion.json'} names the ONNX files {sorted(parts)}; it must name .onnx"
-        )
-    network = OnnxNetwork(parts[".onnx"], str(place / "completion.onnx"))
+        raise InputError(f"{folder / name}.json names the ONNX files {sorted(parts)}; it must name .onnx")
+    network = OnnxNetwork(parts[".onnx"], f"{folder / name}.onnx")
     return lambda seen, behind: network(seen=seen, behind=behind)

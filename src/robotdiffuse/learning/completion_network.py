@@ -23,6 +23,7 @@ from robotdiffuse.learning.completion import (
 from robotdiffuse.learning.network import SavedModule, exported
 from robotdiffuse.perception.observed_volume import SHAPE
 
+Packed = UInt8[Tensor, "n 56 56 32"]
 CHANNELS = 7
 """Occupied, free, shadow of the arm, out of view, depth behind a surface, height, distance from the base's
 axis."""
@@ -93,9 +94,7 @@ class CompletionNetwork(SavedModule):
         self.register_buffer("temperature", torch.ones(()))
         self.register_buffer("beyond", torch.from_numpy(~reachable()), persistent=False)
 
-    def features(
-        self, seen: UInt8[Tensor, "n 56 56 32"], behind: UInt8[Tensor, "n 56 56 32"]
-    ) -> Float[Tensor, "n 56 28 28 16"]:
+    def features(self, seen: Packed, behind: Packed) -> Float[Tensor, "n 56 28 28 16"]:
         """The input channels of volumes packed by `completion.pack`."""
         kind = torch.bfloat16 if torch.is_autocast_enabled(seen.device.type) else torch.float32
         seen, behind = folded(seen), folded(behind)
@@ -107,9 +106,7 @@ class CompletionNetwork(SavedModule):
         out[..., -self.places.shape[-1] :] = self.places
         return out.permute(0, 4, 1, 2, 3)
 
-    def forward(
-        self, seen: UInt8[Tensor, "n 56 56 32"], behind: UInt8[Tensor, "n 56 56 32"]
-    ) -> Float[Tensor, "n 28 28 16 64"]:
+    def forward(self, seen: Packed, behind: Packed) -> Float[Tensor, "n 28 28 16 64"]:
         """Logits of the voxels of 2 cm, grouped by cells of 8 cm and within them by voxels of 4 cm."""
         features = self.features(seen, behind)
         fine = self.before[0](self.first(features))
@@ -119,9 +116,7 @@ class CompletionNetwork(SavedModule):
         fine = self.after[1](fine + _shuffled(self.up[1](torch.relu(middle))) + self.skip(features))
         return self.last(torch.relu(fine)).permute(0, 2, 3, 4, 1)
 
-    def probabilities(
-        self, seen: UInt8[Tensor, "n 56 56 32"], behind: UInt8[Tensor, "n 56 56 32"]
-    ) -> Float[Tensor, "n 112 112 64"]:
+    def probabilities(self, seen: Packed, behind: Packed) -> Float[Tensor, "n 112 112 64"]:
         """Probability of each voxel of 2 cm; 0 in voxels that were seen free, and beyond REACH."""
         logits = unfolded(unfolded(self(seen, behind).float()))[..., 0] / self.temperature
         free = (seen & FREE).bool() | self.beyond
@@ -133,20 +128,12 @@ class CompletionNetwork(SavedModule):
         """`probabilities` of one volume."""
         # two tensors: the exporter takes one tensor for one input
         inputs = {name: torch.zeros(SHAPE, dtype=torch.uint8) for name in ("seen", "behind")}
-        return {".onnx": exported(_Probabilities(self), inputs, {})}
+        return {".onnx": exported(self, self._probabilities_of_one, inputs, {})}
 
-
-class _Probabilities(nn.Module):
-    """`CompletionNetwork.probabilities` of one volume as a module, for export."""
-
-    def __init__(self, network: CompletionNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(
+    def _probabilities_of_one(
         self, seen: UInt8[Tensor, "56 56 32"], behind: UInt8[Tensor, "56 56 32"]
     ) -> Float[Tensor, "112 112 64"]:
-        return self.network.probabilities(seen[None], behind[None])[0]
+        return self.probabilities(seen[None], behind[None])[0]
 
 
 def _blocks(channels: int, count: int) -> nn.Sequential:

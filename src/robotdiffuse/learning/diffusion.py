@@ -1,4 +1,6 @@
-"""The forward process: x_t = signal_t x_0 + noise_t n, with n a Gaussian trajectory.
+"""Noise levels, what the network predicts at them, and the samplers that go down them.
+
+The forward process: x_t = signal_t x_0 + noise_t n, with n a Gaussian trajectory.
 
 Signal and noise of the levels t = 0 .. T are sqrt(alpha_bar_t) and sqrt(1 - alpha_bar_t), so that unit
 variance is kept; alpha_bar follows the cosine schedule.
@@ -10,14 +12,17 @@ covariance every frequency is hidden at the same rate, and clearances along nois
 information.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
+from itertools import pairwise
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Bound, NotNegative, Settings
 
 
@@ -102,3 +107,163 @@ def noise_factor(
 def white_noise_factor(waypoints: int) -> Float[ndarray, "waypoints waypoints"]:
     """L of noise that is white between the first and the last waypoint, and zero at these."""
     return np.diag(np.r_[0.0, np.ones(waypoints - 2), 0.0])
+
+
+Array = TypeVar("Array", bound=Any)
+"""Clean trajectories, noise, noisy trajectories and network outputs, all arrays or all tensors, of the shape
+[..., waypoints, dof]."""
+
+
+class Objective:
+    """What the network is trained to predict: the clean trajectory x_0 itself (paper, Method).
+
+    Each objective is a linear function of the clean trajectory and the noise. So the clean trajectory can be
+    computed from any of them, and samplers work on clean trajectories only. The formulas are plain arithmetic
+    for NumPy arrays and PyTorch tensors alike; `signal` and `noise_level` are the schedule's values at the
+    levels of the trajectories, and broadcast against these.
+    """
+
+    def target(self, clean: Array, noise: Array, signal: Any, noise_level: Any) -> Array:
+        """The output that the network is trained towards for x_t = signal clean + noise_level noise."""
+        return clean
+
+    def clean(self, x_t: Array, output: Array, signal: Any, noise_level: Any) -> Array:
+        """The clean trajectory that an output of the network for x_t stands for."""
+        return output
+
+    def clean_per_output(self, signal: Any, noise_level: Any) -> Any:
+        """d clean / d output: how an error of the output scales into the clean trajectory."""
+        return 0 * signal + 1
+
+    def weight(
+        self, schedule: NoiseSchedule, t: Int[ndarray, "n"], limit: float | None
+    ) -> Float[ndarray, "n"]:
+        """Weight of the squared error of the output at levels t >= 1, at most `limit`; None: 1 everywhere.
+
+        The weight of `NoiseSchedule.weight` on x_0, converted to the output, so that objectives differ in
+        what the network outputs and not in the levels that they emphasise (Salimans and Ho 2022, section 4;
+        Hang et al. 2023, who convert their weights in the same way). For the noise the converted weight is
+        unbounded where little signal is left, so it is limited once more.
+        """
+        if limit is None:
+            return np.ones(len(t))
+        scale = self.clean_per_output(schedule.signal[t], schedule.noise[t])
+        return np.minimum(schedule.weight(t, limit) * scale**2, limit)
+
+
+class NoiseObjective(Objective):
+    """Predicts the noise n (Ho et al. 2020)."""
+
+    def target(self, clean: Array, noise: Array, signal: Any, noise_level: Any) -> Array:
+        return noise
+
+    def clean(self, x_t: Array, output: Array, signal: Any, noise_level: Any) -> Array:
+        return (x_t - noise_level * output) / signal
+
+    def clean_per_output(self, signal: Any, noise_level: Any) -> Any:
+        return -noise_level / signal
+
+
+OBJECTIVES = Registry(
+    "objective",
+    {
+        "clean": Entry(f"{__name__}:Objective", "the clean trajectory, the paper's"),
+        "noise": Entry(f"{__name__}:NoiseObjective", "the noise"),
+    },
+)
+"""By the name in settings. A new one is a class and a line here."""
+
+Samples = Float[ndarray, "count ..."]
+Predict = Callable[[ndarray, int], ndarray]
+"""From (x_t [count, ...], t) to the predicted clean x_0. It converts the network's output by the objective,
+holds the ends and applies guidance."""
+DrawNoise = Callable[[], ndarray]
+"""Returns fresh standard noise of the shape of the samples."""
+MoveMean = Callable[[ndarray, int], ndarray]
+"""From the mean of a step [count, ...] and the number of steps that remain to the mean that is used
+instead."""
+
+
+def ddim(
+    predict: Predict, schedule: NoiseSchedule, draw_noise: DrawNoise, steps: int, eta: float = 0.0
+) -> Samples:
+    """Samples by DDIM (Song et al. 2021): deterministic, or with a share of fresh noise at every step.
+
+    The predictor is called once per step, first at level T with pure noise.
+
+    steps: calls of the predictor, 1 to T.
+    eta: share of the noise that is drawn afresh at every step: 0 is the deterministic probability flow, 1 the
+        full stochastic process (ancestral sampling).
+    Raises InputError for steps or eta out of range.
+    """
+    if not 0 <= eta <= 1:
+        raise InputError(f"eta is {eta}; it must be between 0 and 1")
+    return reverse_process(predict, schedule, draw_noise, schedule.sampling_levels(steps)[:-1], eta=eta)
+
+
+def ddpm(
+    predict: Predict, schedule: NoiseSchedule, draw_noise: DrawNoise, steps: int, eta: float = 1.0
+) -> Samples:
+    """Samples by DDPM, ancestral sampling (Ho et al. 2020): the sampler of the paper, with all T levels, of
+    MPD and of EDMP. All noise is drawn afresh, whatever `eta` is."""
+    return ddim(predict, schedule, draw_noise, steps, eta=1.0)
+
+
+def reverse_process(
+    predict: Predict,
+    schedule: NoiseSchedule,
+    draw_noise: DrawNoise,
+    levels: Int[ndarray, "steps"],
+    move: MoveMean | None = None,
+    noise_scale: float = 1.0,
+    eta: float = 1.0,
+) -> Samples:
+    """Samples at any levels (Ho et al. 2020, algorithm 2); the means of the steps may be moved.
+
+    Each x at a lower level is drawn about its mean given x_level and the predicted x_0 (Song et al. 2021, eq.
+    12): the noise found in x is kept, except for the share that is drawn afresh (eq. 16). With eta 1 that is
+    q(x_lower | x_level, x_0), of variance beta tilde (Ho et al. 2020, eq. 7; between any two levels, Kingma
+    et al. 2021, eq. 25).
+
+    levels: falling. Sampling begins with standard noise at the first and ends with the clean x_0 below the
+        last.
+    move: replaces the mean of a step, for example by one further down the costs of a guide (MPD, algorithm
+        1).
+    noise_scale: factor of the standard deviation of the noise that is added to the means (MPD: 0.5).
+
+    Raises InputError for levels that do not fall, or that the schedule lacks.
+    """
+    if not len(levels) or np.any(np.diff(levels) >= 0) or not 1 <= levels[-1] <= levels[0] <= schedule.steps:
+        raise InputError(f"levels is {levels.tolist()}; they must fall from at most {schedule.steps} to 1")
+    x = draw_noise()
+    remaining = len(levels)
+    for level, lower in pairwise([*levels.tolist(), 0]):
+        remaining -= 1
+        clean = predict(x, level)
+        mean, deviation = _step(x, clean, schedule, level, lower, eta) if lower else (clean, 0.0)
+        x = mean if move is None else move(mean, remaining)
+        if lower and eta > 0:
+            x = x + noise_scale * deviation * draw_noise()
+    return x
+
+
+def _step(
+    x: Samples, clean: Samples, schedule: NoiseSchedule, level: int, lower: int, eta: float
+) -> tuple[Samples, float]:
+    """Mean and standard deviation of x at the level `lower`, from x at `level` and its clean prediction."""
+    signal, signal_low = schedule.signal[[level, lower]].tolist()
+    noise, noise_low = schedule.noise[[level, lower]].tolist()
+    added = max(noise**2 - (signal / signal_low * noise_low) ** 2, 0.0) ** 0.5
+    fresh = eta * noise_low / noise * added
+    found = (x - signal * clean) / noise
+    return signal_low * clean + (noise_low**2 - fresh**2) ** 0.5 * found, fresh
+
+
+SAMPLERS = Registry(
+    "sampler",
+    {
+        "ddim": Entry(f"{__name__}:ddim", "deterministic, or with a share of fresh noise"),
+        "ddpm": Entry(f"{__name__}:ddpm", "ancestral sampling, the paper's"),
+    },
+)
+"""By the name in settings and checkpoints: functions with the arguments of `ddim`."""

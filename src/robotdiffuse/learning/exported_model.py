@@ -1,20 +1,64 @@
 """The diffusion model of trained weights, as planning runs it: by ONNX Runtime, without PyTorch."""
 
-from functools import lru_cache
 from pathlib import Path as FilePath
 
 import numpy as np
-from jaxtyping import Bool, Float32
+import onnxruntime
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
-from robotdiffuse.learning.onnx_session import OnnxNetwork
-from robotdiffuse.learning.representation import Statistics
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.weight_files import exported_files, read_arrays, read_description, stamp
-from robotdiffuse.learning.weights_registry import weights_folder
+from robotdiffuse.learning.motion_model import (
+    Cloud,
+    Code,
+    Conditions,
+    Dropped,
+    Features,
+    Levels,
+    MotionModel,
+    MotionModelSettings,
+    Outputs,
+    Statistics,
+)
+from robotdiffuse.learning.weight_files import (
+    RobotIdentity,
+    exported_files,
+    kept_by_stamp,
+    read_arrays,
+    read_description,
+    weights_folder,
+)
 from robotdiffuse.robots.robot import Robot
+
+EXTERNAL_DATA = b"\x0a\x08location"
+"""How ONNX writes that a tensor is in another file: the key of an entry of `external_data`.
+ONNX Runtime would look for the file in the current folder."""
+
+
+class OnnxNetwork:
+    """An exported network with one output."""
+
+    def __init__(self, data: bytes, name: str) -> None:
+        """data: of an .onnx file. name: of the file. Raises InputError if ONNX Runtime cannot run it."""
+        if EXTERNAL_DATA in data:
+            raise InputError(
+                f"{name} keeps weights in another file, which is not read; export it in one file"
+            )
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3  # errors only
+        try:
+            self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime's own classes of errors have no common base
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(f"{name} is no network that ONNX Runtime can run: {reason}") from None
+        self.inputs = tuple(node.name for node in self._session.get_inputs())
+        """Names of the inputs."""
+
+    def __call__(self, **inputs: ndarray) -> ndarray:
+        """The output for these inputs."""
+        output = self._session.run(None, inputs)[0]
+        assert isinstance(output, np.ndarray)
+        return output
 
 
 class ExportedModel(MotionModel):
@@ -45,7 +89,7 @@ class ExportedModel(MotionModel):
             output = self.denoised(features, np.ones(1, np.float32), condition)
             fits.append(output.shape == (1, self.waypoints, self.dof))
             if self._encoder is not None:
-                fits.append(self.code_of(np.zeros((0, 3), np.float32)).shape == (self.settings.code,))
+                fits.append(self.encode(np.zeros((0, 3))).shape == (self.settings.code,))
         except Exception as error:  # ONNX Runtime's own classes of errors have no common base
             reason = " ".join(str(error).split())[:200]
             raise InputError(f"{where} does not fit its ONNX files: {reason}") from None
@@ -54,26 +98,26 @@ class ExportedModel(MotionModel):
 
     @property
     def statistics(self) -> Statistics:
-        """See `TrajectoryRepresentation`."""
+        """See `MotionModel`."""
         return self._statistics
 
     def denoised(
         self,
-        features: Float32[ndarray, "batch waypoints features"],
-        level: Float32[ndarray, "batch"],
-        condition: Float32[ndarray, "batch condition"],
-        dropped: Bool[ndarray, "batch"] | None = None,
-    ) -> Float32[ndarray, "batch waypoints dof"]:
+        features: Features,
+        level: Levels,
+        condition: Conditions,
+        dropped: Dropped | None = None,
+    ) -> Outputs:
         """See `MotionModel`."""
         inputs = {"features": features, "level": level, "condition": condition}
         if self.settings.null_condition:
             inputs["dropped"] = np.zeros(len(features), np.bool_) if dropped is None else dropped
         return self._denoiser(**inputs)
 
-    def code_of(self, cloud: Float32[ndarray, "points 3"]) -> Float32[ndarray, "code"]:
+    def code_of(self, cloud: Cloud) -> Code:
         """See `MotionModel`."""
-        assert self._encoder is not None and self.settings.encoder_settings is not None
-        return self._encoder(cloud=self.settings.encoder_settings.prepared(cloud)[None])[0]
+        assert self._encoder is not None
+        return self._encoder(cloud=cloud[None])[0]
 
 
 def exported_model(name: str, folder: str | FilePath | None, robot: Robot) -> MotionModel:
@@ -83,16 +127,9 @@ def exported_model(name: str, folder: str | FilePath | None, robot: Robot) -> Mo
     it, and for files that are damaged or made for another robot.
     """
     place = weights_folder(name, folder, robot)
-    return _checked(name, place, stamp(place, name), robot)
-
-
-@lru_cache(maxsize=16)
-def _checked(name: str, folder: FilePath, written: tuple[int, int] | None, robot: Robot) -> MotionModel:
-    model = _loaded(name, folder, written)
-    model.robot.check(robot, str(folder / f"{name}.json"))
+    model = _loaded(name, place)
+    model.robot.check(robot, str(place / f"{name}.json"))
     return model
 
 
-@lru_cache(maxsize=16)
-def _loaded(name: str, folder: FilePath, _stamp: tuple[int, int] | None) -> ExportedModel:
-    return ExportedModel(folder, name)
+_loaded = kept_by_stamp(lambda name, folder: ExportedModel(folder, name))

@@ -8,29 +8,32 @@ h = max(S - D, 0) of a safe distance S and a distance D:
 |----------------|---------------------------------------------------------------------|-------------|
 | collision      | sum of h^2 / 2 over covering spheres; D: from sphere to scene       | margin (S)  |
 | self_collision | sum of h^2 / 2 over pairs of links; D: between the two links        | self_margin |
-| limits         | sum of h^2 / 2 over joints; D: from joint value to the nearer limit | limit_margin|
-| smoothness     | sum of |q_(i-1) - 2 q_i + q_(i+1)|^2 / 2: accelerations             | smoothness  |
 | length         | sum of |q_(i+1) - q_i|^2 / 2: velocities                            | length      |
 
-The first three concern single waypoints. Each waypoint is pushed by the smallest motion that clears a contact
+The first two concern single waypoints. Each waypoint is pushed by the smallest motion that clears a contact
 (a Gauss-Newton step), and a kernel spreads the pushes over the neighbouring waypoints, as the metric of CHOMP
-does (Zucker et al., IJRR 2013). Length is the smoothness of CHOMP, and smoothness that of STOMP (Kalakrishnan
-et al., ICRA 2011); these two move one waypoint after the other towards its optimum between its neighbours.
+does (Zucker et al., IJRR 2013). Length is the smoothness of CHOMP; it moves one waypoint after the other
+towards its optimum between its neighbours.
 
-The steps of these five are compiled, in `guidance_kernel.descend`. Further costs are in `learning.costs`.
+A problem's path constraints are one more cost: the sum of h^2 / 2 over their rows, where h is how far a row's
+value exceeds a share of its tolerance [m]; a radian counts as `projection_kernel.ANGLE_WEIGHT` metres.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.settings import NotNegative, Positive, Settings, Share
-from robotdiffuse.learning.costs import COSTS, CostStep
 from robotdiffuse.learning.guidance_kernel import OFF, Steps, descend
+from robotdiffuse.problems.compiled_constraints import PathConstraints
+from robotdiffuse.problems.constraint_kernel import make_work
+from robotdiffuse.problems.projection_kernel import step
+
+Trajectories = Float[ndarray, "count waypoints dof"]
 
 
 @dataclass(frozen=True)
@@ -40,24 +43,13 @@ class GuidanceSettings(Settings, name="guidance"):
     covers the motion between two waypoints. None: obstacles have no cost."""
     self_margin: NotNegative | None = 0.01
     """Distance between links below which they are pushed apart [m]; None: no cost."""
-    limit_margin: NotNegative | None = None
-    """Distance of joint values to their limits below which they are pushed back [rad]; None: no cost. The
-    limits themselves are always kept."""
     push: Positive = 0.15
     """Longest push of a waypoint in one step [rad]."""
     width: Positive = 4.0
     """Waypoints over which a push spreads: the standard deviation of the kernel."""
-    smoothness: Share = 0.0
-    """After the pushes, waypoints move by this fraction towards the smallest accelerations; 0: no cost."""
     length: Share = 0.2
-    """Then waypoints move by this fraction towards the middle of their neighbours; 0: no cost."""
-    extra_costs: dict[str, float] = field(default_factory=dict)
-    """Strengths of further costs, by name in `learning.costs.COSTS`."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in self.extra_costs:
-            COSTS.entry(name)
+    """After the pushes, waypoints move by this fraction towards the middle of their neighbours; 0: no
+    cost."""
 
 
 class CollisionGuidance:
@@ -67,43 +59,51 @@ class CollisionGuidance:
         self,
         checker: CollisionChecker,
         settings: GuidanceSettings | None = None,
-        problem_costs: Sequence[CostStep] = (),
+        constraints: PathConstraints | None = None,
+        tolerance_share: float = 1.0,
     ) -> None:
-        """problem_costs: costs of this problem alone; their strength is the setting `push`."""
-        self.checker, self.settings = checker, settings or GuidanceSettings()
-        extra = [(COSTS.load(name), strength) for name, strength in self.settings.extra_costs.items()]
-        self._extra_costs: list[tuple[CostStep, float]] = extra + [
-            (step, self.settings.push) for step in problem_costs
-        ]
+        """constraints: of the path, which are to hold within this share of their tolerances; a step down
+        their cost moves a waypoint by at most the setting `push`."""
+        self.checker = checker
+        self.settings = settings or GuidanceSettings()
+        self._constraints = None
+        if constraints is not None:
+            self._constraints = constraints.rows, constraints.limits(tolerance_share)
 
-    def __call__(
-        self, q: Float[ndarray, "count waypoints dof"], steps: int
-    ) -> tuple[Float[ndarray, "count waypoints dof"], Float[ndarray, "count"]]:
+    def __call__(self, q: Trajectories, steps: int) -> tuple[Trajectories, Float[ndarray, "count"]]:
         """The trajectories [rad] after some steps, and the costs of the margins that the last step found.
 
         The first and the last waypoint stay where they are, and have no cost. A cost of zero: no waypoint
         between them is within a margin, or none was before the last step. Such a trajectory is left as it is;
-        smoothness and length act on every trajectory only where no margin is enabled.
+        the cost of length acts on every trajectory only where no margin is enabled.
         """
         settings, checker = self.settings, self.checker
         index = np.arange(q.shape[1])
-        kernel = np.exp(-0.5 * ((index[:, None] - index) / settings.width) ** 2).astype(np.float32)
+        spread = np.exp(-0.5 * ((index[:, None] - index) / settings.width) ** 2).astype(np.float32)
         moved = np.array(q, np.float32)
         lower, upper = (limits.astype(np.float32) for limits in (checker.robot.lower, checker.robot.upper))
         compiled = Steps(
             margin=OFF if settings.margin is None else np.float32(settings.margin) + checker.padding,
             self_margin=OFF if settings.self_margin is None else np.float32(settings.self_margin),
-            limit_margin=OFF if settings.limit_margin is None else np.float32(settings.limit_margin),
             push=np.float32(settings.push),
-            kernel=kernel,
-            smoothness=np.float32(settings.smoothness),
+            kernel=spread,
             length=np.float32(settings.length),
         )
         costs = np.zeros(len(q), np.float32)
-        # one round at a time only if some of the steps are not compiled
-        for rounds in [1] * steps if self._extra_costs else [steps]:
+        # one round at a time only between steps towards the constraints
+        for rounds in [steps] if self._constraints is None else [1] * steps:
             arrays = checker.robot_arrays, checker.scene_arrays
             costs = descend(*arrays, moved, lower, upper, compiled, rounds)
-            for step, strength in self._extra_costs:
-                moved[:, 1:-1] = np.clip(step(checker, moved, strength)[:, 1:-1], lower, upper)
+            if self._constraints is not None:
+                nearer = moved.astype(np.float64)
+                _towards_constraints(*self._constraints, nearer.reshape(-1, q.shape[2]), settings.push)
+                moved[:, 1:-1] = np.clip(nearer.astype(np.float32)[:, 1:-1], lower, upper)
         return moved, costs
+
+
+@kernel(nogil=True)
+def _towards_constraints(rows, limits, q, max_step):
+    """Moves each configuration of q [n, dof] by a Gauss-Newton step down the cost, in place."""
+    work = make_work(rows)
+    for i in range(len(q)):
+        step(rows, limits, q[i], max_step, work)

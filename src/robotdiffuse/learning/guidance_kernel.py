@@ -23,12 +23,10 @@ class Steps(NamedTuple):
     margin: np.float32
     """[m] here and below, or OFF."""
     self_margin: np.float32
-    limit_margin: np.float32
-    """[rad], or OFF."""
     push: np.float32
+    """[rad]"""
     kernel: Float[ndarray, "waypoints waypoints"]
     """Weights by which pushes spread over neighbouring waypoints."""
-    smoothness: np.float32
     length: np.float32
 
 
@@ -38,7 +36,7 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
     stay. Returns the costs of the margins [batch] that the last round found.
 
     Each waypoint within a margin is pushed out of it, the pushes are spread over its neighbours, then the
-    steps of smoothness and length follow. A trajectory without a waypoint within a margin is left as it is,
+    step of length follows. A trajectory without a waypoint within a margin is left as it is,
     unless no margin is enabled.
     """
     batch, n, dof = q.shape
@@ -49,7 +47,7 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
     costs = np.zeros(batch, np.float32)
     work = make_clearance_workspace(robot, 1)
     pairs = np.full((n, len(robot.pairs)), CLEARANCE_CAP)
-    pushed = max(steps.margin, steps.self_margin, steps.limit_margin) > OFF
+    pushed = max(steps.margin, steps.self_margin) > OFF
     for b in range(batch):
         for _ in range(rounds):
             total = _ZERO
@@ -62,17 +60,10 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
                 )
                 total += cost
                 active[i] = _push_away(cost, gradient, steps.push, pushes[i])
-                if steps.limit_margin > OFF:
-                    cost = _push_inside(q[b, i], lower, upper, steps.limit_margin, steps.push, pushes[i])
-                    total += cost
-                    if cost > _ZERO:
-                        active[i] = _ONE
             costs[b] = total
             if pushed and total <= _ZERO:
                 break
             _spread(q[b], first, last, pushes, active, steps.kernel, lower, upper)
-            if steps.smoothness > _ZERO:
-                _smooth(q[b], first, last, steps.smoothness, lower, upper)
             _shorten(q[b], first, last, steps.length)
     return costs
 
@@ -97,22 +88,6 @@ def _push_away(cost, gradient, push, pushed):
     return _ONE
 
 
-@inner_kernel()
-def _push_inside(q, lower, upper, margin, push, pushed):
-    """Adds the Newton step of the limits' cost, at most `push` [rad] per joint, to pushed[dof]. Returns the
-    cost.
-
-    If a joint's range is narrower than two margins, the middle of the range has no cost.
-    """
-    cost = _ZERO
-    for j in range(len(q)):
-        near = min(margin, np.float32(0.5) * (upper[j] - lower[j]))
-        step = max(lower[j] + near - q[j], _ZERO) - max(q[j] - upper[j] + near, _ZERO)
-        cost += np.float32(0.5) * step * step
-        pushed[j] += min(max(step, -push), push)
-    return cost
-
-
 @allocation_free(fastmath=True)
 def _spread(q, first, last, pushes, active, kernel, lower, upper):
     """Moves each waypoint by a weighted mean of its neighbours' pushes, less where no neighbour is pushed."""
@@ -131,26 +106,6 @@ def _spread(q, first, last, pushes, active, kernel, lower, upper):
                     q[i, j] += share * pushes[k, j]
         for j in range(dof):
             q[i, j] = min(max(q[i, j], lower[j]), upper[j])
-
-
-@allocation_free(fastmath=True)
-def _smooth(q, first, last, share, lower, upper):
-    """Moves each waypoint by a share of Newton's step in that waypoint alone, towards the smallest
-    accelerations that it is part of. Every third waypoint at a time: these share no acceleration."""
-    n, dof = q.shape
-    for offset in range(3):
-        for i in range(first + offset, last, 3):
-            for j in range(dof):
-                gradient = np.float32(-2.0) * (q[i - 1, j] - np.float32(2.0) * q[i, j] + q[i + 1, j])
-                curvature = np.float32(4.0)
-                if i >= 2:
-                    gradient += q[i - 2, j] - np.float32(2.0) * q[i - 1, j] + q[i, j]
-                    curvature += _ONE
-                if i + 2 < n:
-                    gradient += q[i, j] - np.float32(2.0) * q[i + 1, j] + q[i + 2, j]
-                    curvature += _ONE
-                # the middle of two neighbours is within the limits, but this may not be
-                q[i, j] = min(max(q[i, j] - share * gradient / curvature, lower[j]), upper[j])
 
 
 @allocation_free(fastmath=True)

@@ -4,28 +4,101 @@ Everything here is NumPy. The encoder and the denoiser are functions that a subc
 networks in planning (`exported_model`), PyTorch modules in training (`motion_network`).
 """
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import ceil
-from typing import Annotated
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
+from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, Count, OneOf, Positive, Settings, SettingsOf
+from robotdiffuse.core.settings import Bound, Count, OneOf, Settings, SettingsOf, Share
 from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
-from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
+from robotdiffuse.learning.diffusion import (
+    OBJECTIVES,
+    SAMPLERS,
+    NoiseSchedule,
+    Objective,
+    Predict,
+    ScheduleSettings,
+    white_noise_factor,
+)
 from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings, PointAutoencoderSettings
-from robotdiffuse.learning.objectives import OBJECTIVES, Objective
-from robotdiffuse.learning.representation import TARGETS, Reference, TrajectoryRepresentation
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.samplers.sampler import Predict, Sampler
-from robotdiffuse.learning.sampling import SamplingSettings
+from robotdiffuse.learning.weight_files import NetworkSettings, RobotIdentity
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
+Joints = Float[ndarray, "*batch dof"]
+Trajectories = Float[ndarray, "*batch waypoints dof"]
+Features = Float32[ndarray, "batch waypoints features"]
+Levels = Float32[ndarray, "batch"]
+Conditions = Float32[ndarray, "batch condition"]
+Outputs = Float32[ndarray, "batch waypoints dof"]
+Dropped = Bool[ndarray, "batch"]
+Cloud = Float32[ndarray, "points 3"]
+Code = Float32[ndarray, "code"]
+TARGETS = ("residual", "absolute", "limits")
+
+
+class Reference(NamedTuple):
+    """The trajectory that x is relative to, and the ends of x that stay fixed."""
+
+    base: Trajectories
+    """Normalised joint values; the trajectory is `base + scale * x`."""
+    start: Float[ndarray, "*batch 1 dof"]
+    """The first waypoint of x."""
+    goal: Float[ndarray, "*batch 1 dof"]
+    """The last waypoint of x."""
+
+
+class Statistics(NamedTuple):
+    """What a representation takes from the training data; float32."""
+
+    residual_scale: Float[ndarray, "dof"]
+    """Standard deviation of the trajectories about their reference, in units of the joint limits."""
+    residual_mean: Float[ndarray, "dof"]
+    """Their mean, for the target `absolute`; else zero."""
+    noise_factor: Float[ndarray, "waypoints waypoints"]
+    """The matrix that makes noise of white noise, see `diffusion.noise_factor`."""
+
+    @staticmethod
+    def without_data(waypoints: int, dof: int) -> "Statistics":
+        """Those of the target `limits`, and of the others before training."""
+        white = white_noise_factor(waypoints).astype(np.float32)
+        return Statistics(np.ones(dof, np.float32), np.zeros(dof, np.float32), white)
+
+
+@dataclass(frozen=True)
+class SamplingSettings(Settings, name="sampling"):
+    samples: Count = 16
+    """Trajectories per batch."""
+    sampling_steps: Count | None = None
+    """Calls of the denoiser per batch; None: as many as the weights name."""
+    sampler: Annotated[str, OneOf(SAMPLERS)] | None = None
+    """Name in `learning.diffusion.SAMPLERS`; None: the one that the weights name."""
+    eta: Share = 0.0
+    """Fresh noise per denoising step: 0 is DDIM, 1 is ancestral sampling."""
+    guided_share: Share = 0.5
+    """Share of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
+    guidance_scale: float = 1.0
+    """Scale of classifier-free guidance: 1 takes the network's prediction as it is, more follows the
+    condition further, 0 hides the condition. Other than 1 needs weights that were trained with a
+    condition_drop above 0."""
+
+
+MIN_CLEARANCE = -0.1
+MAX_CLEARANCE = 0.4
+"""Clearances are clipped to this range before they enter the denoiser [m]."""
+GRADIENT_MARGIN = 0.1
+"""Gradients are those of the links closer than this [m]."""
+GRADIENT_UNIT = 2.0
+"""Gradients of this size and larger ones enter the denoiser as 1 [m/rad]."""
 MAX_POINTS = 2048
 """Larger clouds are thinned at random to this many points before they are encoded, or to the encoder's own
 size if it does not take clouds of any size."""
@@ -44,7 +117,7 @@ MAX_WAYPOINTS = 4096.0
 
 
 @dataclass(frozen=True)
-class ModelParts(Settings):
+class ModelParts(NetworkSettings):
     """The settings that a model and its training have in common."""
 
     waypoints: Annotated[int, Bound(least=3.0, most=MAX_WAYPOINTS)] = 48
@@ -89,9 +162,12 @@ def check_points(where: str, encoder: str | None, denoiser: str) -> None:
 class MotionModelSettings(ModelParts, name="model"):
     """The parts of the model and its defaults for sampling."""
 
-    clearance_low: float = -0.1
-    """Clearances are clipped to this range before they enter the denoiser [m]."""
-    clearance_high: float = 0.4
+    constants: ClassVar[dict[str, Any]] = {
+        "clearance_low": -0.1,
+        "clearance_high": 0.4,
+        "gradient_margin": 0.1,
+        "gradient_unit": 2.0,
+    }
     encoder: Annotated[str, OneOf(ENCODERS)] | None = "point_autoencoder"
     """Of the scene. None for a prior, which has neither scene nor start and goal as its condition; it finds
     start and goal in the noisy trajectory, whose ends they are."""
@@ -103,10 +179,6 @@ class MotionModelSettings(ModelParts, name="model"):
     )
     null_condition: bool = False
     """Whether the model has a learned stand-in for a dropped condition, for classifier-free guidance."""
-    gradient_margin: Positive = 0.1
-    """Gradients are those of the links closer than this [m]."""
-    gradient_unit: Positive = 2.0
-    """Gradients of this size and larger ones enter the denoiser as 1 [m/rad]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,14 +202,73 @@ class MotionModelSettings(ModelParts, name="model"):
         return 0 if self.encoder_settings is None else self.encoder_settings.code
 
 
-class MotionModel(TrajectoryRepresentation):
-    """The diffusion model over trajectories, represented as in `TrajectoryRepresentation`."""
+class MotionModel(ABC):
+    """The diffusion model over trajectories.
+
+    The numbers x that are diffused are the waypoints of a trajectory, normalised, relative to a reference,
+    scaled. With the targets `residual` and `absolute`, x is in units of the training data's standard
+    deviation, and relative to the straight line from start to goal (residual) or to the mean of the data
+    (absolute, the paper's). With the target `limits`, x is the joint values in units of their limits, the
+    noise is white, and nothing is taken from the data, as in MPD and EDMP. The first and the last waypoint
+    are start and goal: they are written over the ends of x at every step (the paper's noise interpolation).
+    """
 
     def __init__(self, robot: RobotIdentity, settings: MotionModelSettings) -> None:
-        super().__init__(robot.normalizer(), settings.target, settings.waypoints)
-        self.robot, self.settings = robot, settings
+        self.robot = robot
+        self.settings = settings
+        self.normalizer = robot.normalizer()
+        self.waypoints = settings.waypoints
+        self.dof = robot.dof
         self.schedule = NoiseSchedule(settings.schedule)
         self.objective: Objective = OBJECTIVES.make(settings.objective)
+        self.is_unit_joints = settings.target == "limits"
+        """Whether x is the normalised joint values themselves."""
+
+    @property
+    @abstractmethod
+    def statistics(self) -> Statistics:
+        """The statistics of the training data."""
+
+    def clipped(self, x: Trajectories) -> Trajectories:
+        """A predicted x within the joint limits where x is in units of them; other targets: x as it is."""
+        return np.clip(x, -1.0, 1.0) if self.is_unit_joints else x
+
+    def reference(self, start: Joints, goal: Joints) -> Reference:
+        """The reference of trajectories from start to goal [rad]."""
+        a, b = (self._unit(q)[..., None, :] for q in (start, goal))
+        if self.settings.target == "residual":
+            base = a + (b - a) * np.linspace(0.0, 1.0, self.waypoints, dtype=np.float32)[:, None]
+            zero = np.zeros((*base.shape[:-2], 1, self.dof), np.float32)
+            return Reference(base, zero, zero)
+        scale, mean = self.statistics[:2]
+        base = np.broadcast_to(mean, (*a.shape[:-2], self.waypoints, self.dof))
+        return Reference(base, (a - mean) / scale, (b - mean) / scale)
+
+    def _unit(self, q: Joints) -> Joints:
+        return self.normalizer.to_unit(np.asarray(q, np.float32))
+
+    def normalize(self, q: Trajectories, reference: Reference) -> Trajectories:
+        """x of trajectories [rad]; its ends are those of the reference."""
+        unit = self._unit(q)
+        return self.hold_ends((unit - reference.base) / self.statistics.residual_scale, reference)
+
+    def joints(self, x: Trajectories, reference: Reference) -> Trajectories:
+        """Joint values of x [rad]."""
+        return self.normalizer.from_unit(self.unit_joints(x, reference))
+
+    def unit_joints(self, x: Trajectories, reference: Reference) -> Trajectories:
+        """Joint values of x in units of their limits."""
+        return reference.base + x * self.statistics.residual_scale
+
+    def hold_ends(self, x: Trajectories, reference: Reference) -> Trajectories:
+        """Write start and goal over the ends of x, in place (noise interpolation). Returns x."""
+        x[..., :1, :], x[..., -1:, :] = reference.start, reference.goal
+        return x
+
+    def draw_noise(self, count: int, rng: np.random.Generator) -> Float[ndarray, "count waypoints dof"]:
+        """Standard noise of the forward process; zero at both ends."""
+        white = rng.standard_normal((count, self.waypoints, self.dof), dtype=np.float32)
+        return self.statistics.noise_factor @ white
 
     @property
     def feature_count(self) -> int:
@@ -155,11 +286,11 @@ class MotionModel(TrajectoryRepresentation):
     @abstractmethod
     def denoised(
         self,
-        features: Float32[ndarray, "batch waypoints features"],
-        level: Float32[ndarray, "batch"],
-        condition: Float32[ndarray, "batch condition"],
-        dropped: Bool[ndarray, "batch"] | None = None,
-    ) -> Float32[ndarray, "batch waypoints dof"]:
+        features: Features,
+        level: Levels,
+        condition: Conditions,
+        dropped: Dropped | None = None,
+    ) -> Outputs:
         """The denoiser's output, which `objective` converts to the clean trajectory.
 
         dropped: samples whose condition is hidden from the denoiser (Ho and Salimans 2022; paper: C is
@@ -168,8 +299,8 @@ class MotionModel(TrajectoryRepresentation):
         """
 
     @abstractmethod
-    def code_of(self, cloud: Float32[ndarray, "points 3"]) -> Float32[ndarray, "code"]:
-        """z of a cloud by the encoder, which there must be; an empty cloud is allowed."""
+    def code_of(self, cloud: Cloud) -> Code:
+        """z of a cloud as by `EncoderSettings.prepared`, by the encoder, which there must be."""
 
     def encode(
         self, points: Float[ndarray, "n 3"], rng: np.random.Generator | None = None
@@ -187,46 +318,46 @@ class MotionModel(TrajectoryRepresentation):
         if len(points) > most:
             rng = np.random.default_rng(0) if rng is None else rng
             points = points[rng.choice(len(points), most, replace=False)]
-        return self.code_of(points)
+        return self.code_of(of_encoder.prepared(points))
 
     def features(
         self, x: Float[ndarray, "batch waypoints dof"], reference: Reference, clearances: ClearanceFn
-    ) -> Float[ndarray, "batch waypoints features"]:
+    ) -> Features:
         """The denoiser's input for a noisy x: x, the normalised joint values where x is something else, and
         the clearances of the links and their gradients if the settings include them."""
         unit = self.unit_joints(x, reference)
         parts = [x] if self.is_unit_joints else [x, unit]
         if not self.settings.clearance_features:
             return np.concatenate(parts, axis=-1)
-        low, high = self.settings.clearance_low, self.settings.clearance_high
+        low, high = MIN_CLEARANCE, MAX_CLEARANCE
         inputs = clearances(self.normalizer.from_unit(unit))
         near = np.clip(inputs[..., : len(self.robot.links)], low, high)
         near = (near - (low + high) / 2) * (2 / (high - low))
         parts.append(near.astype(np.float32, copy=False))
         if self.settings.clearance_gradients:
-            parts.append(np.clip(inputs[..., -self.dof :] / np.float32(self.settings.gradient_unit), -1, 1))
+            parts.append(np.clip(inputs[..., -self.dof :] / np.float32(GRADIENT_UNIT), -1, 1))
         return np.concatenate(parts, axis=-1)
 
     def condition(
         self,
         code: Float[ndarray, "*batch code"],
-        start: Float[ndarray, "*batch dof"],
-        goal: Float[ndarray, "*batch dof"],
+        start: Joints,
+        goal: Joints,
     ) -> Float[ndarray, "*batch condition"]:
         """C = [z, start, goal], normalised; a single zero without an encoder, since denoisers need a
         number."""
         if self.settings.encoder is None:
             return np.zeros((*np.shape(start)[:-1], 1), np.float32)
-        ends = [self.normalizer.to_unit(np.asarray(q, np.float32)) for q in (start, goal)]
+        ends = [self._unit(q) for q in (start, goal)]
         return np.concatenate([code, *ends], axis=-1, dtype=np.float32)
 
     def denoised_guided(
         self,
-        features: Float32[ndarray, "batch waypoints features"],
-        level: Float32[ndarray, "batch"],
-        condition: Float32[ndarray, "batch condition"],
+        features: Features,
+        level: Levels,
+        condition: Conditions,
         scale: float,
-    ) -> Float32[ndarray, "batch waypoints dof"]:
+    ) -> Outputs:
         """Classifier-free guidance: u + scale (c - u), of the predictions c with the condition and u without.
 
         A scale of 1 is c and one of 0 is u, at the cost of one prediction; others take a batch of twice the
@@ -271,7 +402,7 @@ class MotionModel(TrajectoryRepresentation):
                 f"guidance_scale is {scale}; it must be 1, for this model was trained with "
                 "condition_drop 0 and cannot predict without its condition"
             )
-        draw: Sampler = SAMPLERS.load(settings.sampler or self.settings.sampler)
+        draw = SAMPLERS.load(settings.sampler or self.settings.sampler)
         steps = settings.sampling_steps or self.settings.sampling_steps or self.schedule.steps
         reference = self.reference(start[None], goal[None])
         predict_unguided = self.predictor(reference, self.condition(code, start, goal), clearances, scale)
@@ -314,3 +445,66 @@ class MotionModel(TrajectoryRepresentation):
             return self.hold_ends(self.clipped(clean), reference)
 
         return predict
+
+
+PackedClearanceFn = Callable[[PackedScenes, ndarray], ndarray]
+"""From one scene for each trajectory and joint values [n, waypoints, dof] to the output of a
+`ClearanceFn`."""
+
+
+def link_clearances(checker: CollisionChecker, settings: MotionModelSettings) -> ClearanceFn:
+    """The inputs for a model with these settings, in planning: all trajectories in the checker's scene."""
+    arm_links, carriers = _carriers(checker)
+
+    def clearances(q: ndarray) -> ndarray:
+        configurations = q.reshape(-1, q.shape[-1])
+        if settings.clearance_gradients:
+            links, gradients = checker.clearances_and_gradients(
+                configurations, MAX_CLEARANCE, GRADIENT_MARGIN
+            )
+            inputs = np.concatenate([_of_bare_arm(links, arm_links, carriers), gradients], axis=-1)
+        else:
+            inputs = _of_bare_arm(checker.link_clearances(configurations, MAX_CLEARANCE), arm_links, carriers)
+        return inputs.reshape(*q.shape[:2], -1)
+
+    return clearances
+
+
+def _carriers(checker: CollisionChecker) -> tuple[int, list[int]]:
+    """The number of the checker's links that belong to the bare arm; and for each body after them, the index
+    of the arm's link that carries it: the link that it is fixed to, or the last one that moves no later than
+    it."""
+    robot = checker.robot
+    arm = [link for link in checker.links if link in robot.arm.link_names]
+    fixed_to = {body.name: body.link for body in robot.attached}
+
+    def carrier(link: str) -> int:
+        while link in fixed_to:
+            link = fixed_to[link]
+        order = [(link == other, min(robot.link_frame(other) - robot.link_frame(link), 0)) for other in arm]
+        before = [i for i, other in enumerate(arm) if robot.link_frame(other) <= robot.link_frame(link)]
+        return max(before or range(len(arm)), key=lambda i: (*order[i], i))
+
+    return len(arm), [carrier(link) for link in checker.links[len(arm) :]]
+
+
+def _of_bare_arm(links: ndarray, arm_links: int, carriers: list[int]) -> ndarray:
+    """Clearances [n, links] of the bare arm's links, the only ones that a network has inputs for: an attached
+    body counts as a part of the link that carries it."""
+    of_arm = links[:, :arm_links].copy() if carriers else links
+    for body, carrier in enumerate(carriers, start=arm_links):
+        of_arm[:, carrier] = np.minimum(of_arm[:, carrier], links[:, body])
+    return of_arm
+
+
+def packed_clearances(robot: Robot, settings: MotionModelSettings) -> PackedClearanceFn:
+    """The inputs for a model with these settings, in training: each trajectory in a scene of its own."""
+    arrays = compile_robot(robot)
+
+    def clearances(scenes: PackedScenes, q: ndarray) -> ndarray:
+        arguments = arrays, scenes, q, MAX_CLEARANCE
+        if settings.clearance_gradients:
+            return np.concatenate(packed_clearances_and_gradients(*arguments, GRADIENT_MARGIN), axis=-1)
+        return packed_link_clearances(*arguments)
+
+    return clearances

@@ -1,12 +1,8 @@
 """The diffusion model as a PyTorch module, for training."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import NamedTuple
-
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from torch import Tensor, nn
 
@@ -14,40 +10,36 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.networks import Denoiser, TrajectoryTransformer
 from robotdiffuse.learning.diffusion import noise_factor
-from robotdiffuse.learning.encoders.networks import Encoder, fp32, make_encoder
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.encoders import make_encoder
+from robotdiffuse.learning.encoders.networks import fp32
+from robotdiffuse.learning.motion_model import (
+    Cloud,
+    Code,
+    Conditions,
+    Dropped,
+    Features,
+    Levels,
+    MotionModel,
+    MotionModelSettings,
+    Outputs,
+    Statistics,
+)
 from robotdiffuse.learning.network import Network, exported
-from robotdiffuse.learning.representation import Statistics
-from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.weight_files import RobotIdentity
 
 
-class WaypointMeans(NamedTuple):
-    """Means of blocks of waypoints; the first and the last waypoint are alone."""
-
-    of_waypoints: Float[Tensor, "blocks waypoints"]
-    """The matrix of the means."""
-    interpolation: Float[Tensor, "waypoints blocks"]
-    """The matrix of linear interpolation between the middles of the blocks."""
-    centers: Float[ndarray, "blocks"]
-    """Middles of the blocks [waypoints]."""
-
-    @classmethod
-    def of_blocks(cls, waypoints: int, block: int) -> "WaypointMeans":
-        """Raises InputError unless blocks of that size divide the inner waypoints."""
-        if (waypoints - 2) % block:
-            raise InputError(
-                f"waypoints is {waypoints}; blocks of {block} must divide the {waypoints - 2} inner ones"
-            )
-        index = np.r_[0, 1 + np.arange(waypoints - 2) // block, 1 + (waypoints - 2) // block]
-        member = np.eye(index[-1] + 1)[:, index]
-        means = member / member.sum(1, keepdims=True)
-        at = np.arange(waypoints)
-        centers = means @ at
-        interpolation = np.stack([np.interp(at, centers, row) for row in np.eye(len(centers))], 1)
-        return cls(torch.from_numpy(means).float(), torch.from_numpy(interpolation).float(), centers)
-
-    def to(self, device: torch.device) -> "WaypointMeans":
-        return WaypointMeans(self.of_waypoints.to(device), self.interpolation.to(device), self.centers)
+def block_means(
+    waypoints: int, block: int
+) -> tuple[Float[Tensor, "blocks waypoints"], Float[Tensor, "waypoints blocks"], Float[ndarray, "blocks"]]:
+    """The matrix of the means of blocks of waypoints, that of linear interpolation between the middles of the
+    blocks, and these middles [waypoints]. The first and the last waypoint are alone."""
+    index = np.r_[0, 1 + np.arange(waypoints - 2) // block, 1 + (waypoints - 2) // block]
+    member = np.eye(index[-1] + 1)[:, index]
+    means = member / member.sum(1, keepdims=True)
+    at = np.arange(waypoints)
+    centers = means @ at
+    interpolation = np.stack([np.interp(at, centers, row) for row in np.eye(len(centers))], 1)
+    return torch.from_numpy(means).float(), torch.from_numpy(interpolation).float(), centers
 
 
 class MotionNetwork(Network, MotionModel):
@@ -62,9 +54,9 @@ class MotionNetwork(Network, MotionModel):
     def __init__(self, robot: RobotIdentity, settings: MotionModelSettings) -> None:
         Network.__init__(self)
         MotionModel.__init__(self, robot, settings)
-        fitted = self.target != "limits"
+        fitted = settings.target != "limits"
         for name, values in Statistics.without_data(self.waypoints, self.dof)._asdict().items():
-            kept = fitted and (name != "residual_mean" or self.target == "absolute")
+            kept = fitted and (name != "residual_mean" or settings.target == "absolute")
             self.register_buffer(name, torch.from_numpy(values), persistent=kept)
         self.encoder = (
             None if settings.encoder is None else make_encoder(settings.encoder, settings.encoder_settings)
@@ -73,13 +65,12 @@ class MotionNetwork(Network, MotionModel):
         self.denoiser: Denoiser = DENOISERS.load(settings.denoiser)(settings.denoiser_settings, *sizes)
         self.block = 1
         """Waypoints whose mean the denoiser sees as one; see `coarsen`."""
-        self._means = WaypointMeans.of_blocks(self.waypoints, 1)
         null = nn.Parameter(torch.zeros(self.condition_count)) if settings.null_condition else None
         self.register_parameter("null_condition", null)
 
     @property
     def statistics(self) -> Statistics:
-        """See `TrajectoryRepresentation`; of a network on the CPU."""
+        """See `MotionModel`; of a network on the CPU."""
         return Statistics(self.residual_scale.numpy(), self.residual_mean.numpy(), self.noise_factor.numpy())
 
     def fit_statistics(self, q: Float[ndarray, "n waypoints dof"], smooth_noise: bool) -> None:
@@ -87,11 +78,11 @@ class MotionNetwork(Network, MotionModel):
 
         The target `limits` has no such statistics: nothing happens.
         """
-        if self.target == "limits":
+        if self.settings.target == "limits":
             return
         self.residual_scale.fill_(1.0)
         self.residual_mean.fill_(0.0)
-        if self.target == "absolute":
+        if self.settings.target == "absolute":
             x = self.normalize(q, self.reference(q[:, 0], q[:, -1]))
             self.residual_mean.copy_(torch.from_numpy(x[:, 1:-1].mean((0, 1))))
         x = self.normalize(q, self.reference(q[:, 0], q[:, -1]))
@@ -115,10 +106,10 @@ class MotionNetwork(Network, MotionModel):
         if self.block == 1:
             return self.denoiser(features, level, condition)
         with fp32(features):
-            features = self._means.of_waypoints @ features
+            features = self._means @ features
         output = self.denoiser(features, level, condition)
         with fp32(output):
-            return self._means.interpolation @ output
+            return self._interpolation @ output
 
     def coarsen(self, block: int) -> None:
         """Have the denoiser see the means of blocks of `block` waypoints; 1: single waypoints.
@@ -131,27 +122,29 @@ class MotionNetwork(Network, MotionModel):
             return
         assert isinstance(self.denoiser, TrajectoryTransformer)
         self.block = block
-        self._means = WaypointMeans.of_blocks(self.waypoints, block).to(self.residual_scale.device)
-        self.denoiser.set_positions(self._means.centers)
+        means, interpolation, centers = block_means(self.waypoints, block)
+        self._means = means.to(self.residual_scale.device)
+        self._interpolation = interpolation.to(self.residual_scale.device)
+        self.denoiser.set_positions(centers)
 
     def denoised(
         self,
-        features: Float32[ndarray, "batch waypoints features"],
-        level: Float32[ndarray, "batch"],
-        condition: Float32[ndarray, "batch condition"],
-        dropped: Bool[ndarray, "batch"] | None = None,
-    ) -> Float32[ndarray, "batch waypoints dof"]:
+        features: Features,
+        level: Levels,
+        condition: Conditions,
+        dropped: Dropped | None = None,
+    ) -> Outputs:
         """See `MotionModel`."""
         hidden = None if dropped is None else torch.from_numpy(dropped)
-        with torch.inference_mode(), one_thread():
+        with torch.inference_mode():
             inputs = torch.from_numpy(features), torch.from_numpy(level), torch.from_numpy(condition)
             return self.denoise(*inputs, hidden).numpy()
 
-    def code_of(self, cloud: Float32[ndarray, "points 3"]) -> Float32[ndarray, "code"]:
+    def code_of(self, cloud: Cloud) -> Code:
         """See `MotionModel`."""
         assert self.encoder is not None
-        with torch.inference_mode(), one_thread():
-            return self.encoder(torch.from_numpy(cloud)[None])[0].numpy()
+        with torch.inference_mode():
+            return self.encoder.code_of_ordered(torch.from_numpy(cloud)[None])[0].numpy()
 
     def exports(self) -> dict[str, bytes]:
         """The denoiser; and the encoder, if there is one."""
@@ -162,12 +155,12 @@ class MotionNetwork(Network, MotionModel):
         }
         if self.null_condition is not None:
             inputs["dropped"] = torch.zeros(3, dtype=torch.bool)
-        found = {".onnx": exported(_Denoise(self), inputs, {name: {0: "batch"} for name in inputs})}
+        found = {".onnx": exported(self, self.denoise, inputs, {name: {0: "batch"} for name in inputs})}
         if self.encoder is not None:
             settings = self.encoder.settings
             cloud = {"cloud": torch.rand(1, settings.cloud, 3)}
             axes = {"cloud": {1: "points"}} if settings.any_size else {}
-            found[".encoder.onnx"] = exported(_Encode(self.encoder), cloud, axes)
+            found[".encoder.onnx"] = exported(self.encoder, self.encoder.code_of_ordered, cloud, axes)
         return found
 
     def joints_at(
@@ -178,39 +171,3 @@ class MotionNetwork(Network, MotionModel):
     ) -> Float[Tensor, "n {len(at)} dof"]:
         """Joint values [rad] of the waypoints with these indices, differentiable in x."""
         return self.from_unit(base[:, at] + x[:, at] * self.residual_scale)
-
-
-class _Denoise(nn.Module):
-    """`MotionNetwork.denoise` as a module, for export."""
-
-    def __init__(self, network: MotionNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(
-        self, features: Tensor, level: Tensor, condition: Tensor, dropped: Tensor | None = None
-    ) -> Tensor:
-        return self.network.denoise(features, level, condition, dropped)
-
-
-class _Encode(nn.Module):
-    """`Encoder.code_of_ordered` as a module, for export."""
-
-    def __init__(self, encoder: Encoder) -> None:
-        super().__init__()
-        self.encoder = encoder
-
-    def forward(self, cloud: Tensor) -> Tensor:
-        return self.encoder.code_of_ordered(cloud)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Runs PyTorch on one thread. For batches this small, synchronising a second thread costs more than it
-    saves, and where other processes keep the cores busy it takes a hundred times as long."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -5,9 +5,9 @@ The export is ONNX, the form in which planning runs networks.
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,13 +15,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from robotdiffuse.learning import need_packages
-from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots.normalizer import JointNormalizer
 
 if TYPE_CHECKING:
     from onnx import GraphProto
 
-Module = TypeVar("Module", bound=nn.Module)
 EXPORT_PACKAGES = ("onnx", "onnxscript")
 """What PyTorch's exporter needs."""
 LEAST_STORED_IN_HALF = 1024
@@ -44,10 +43,6 @@ class Network(SavedModule):
     settings: Any
     normalizer: JointNormalizer
 
-    def for_inference(self: Module) -> Module:
-        """Freeze. Returns self."""
-        return self.requires_grad_(False).eval()
-
     def to_unit(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """`JointNormalizer.to_unit` of a tensor, differentiable."""
         return (q - q.new_tensor(self.normalizer.middle)) / q.new_tensor(self.normalizer.half_range)
@@ -57,10 +52,26 @@ class Network(SavedModule):
         return x * x.new_tensor(self.normalizer.half_range) + x.new_tensor(self.normalizer.middle)
 
 
+class _Call(nn.Module):
+    """A function of a module, for export."""
+
+    def __init__(self, module: nn.Module, call: Callable[..., Tensor]) -> None:
+        super().__init__()
+        self.module = module
+        self.call = call
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.call(*inputs)
+
+
 def exported(
-    module: nn.Module, inputs: Mapping[str, Tensor], dynamic: Mapping[str, Mapping[int, str]]
+    module: nn.Module,
+    call: Callable[..., Tensor],
+    inputs: Mapping[str, Tensor],
+    dynamic: Mapping[str, Mapping[int, str]],
 ) -> bytes:
-    """A module, called with the inputs by position, as the bytes of an ONNX file. The module is frozen.
+    """A function of a module, called with the inputs by position, as the bytes of an ONNX file. The module is
+    frozen.
 
     inputs: examples by the names that the inputs get in the file.
     dynamic: names of the axes whose sizes may differ from the examples, by input and axis.
@@ -74,11 +85,11 @@ def exported(
     shapes = tuple({axis: dims[name] for axis, name in dynamic.get(key, {}).items()} for key in inputs)
     with _quietly(), torch.no_grad():
         program = torch.onnx.export(
-            module.requires_grad_(False).eval(),
+            _Call(module, call).requires_grad_(False).eval(),
             tuple(inputs.values()),
             input_names=list(inputs),
             output_names=["output"],
-            dynamic_shapes=shapes,
+            dynamic_shapes=(shapes,),
             dynamo=True,
             verbose=False,
         )

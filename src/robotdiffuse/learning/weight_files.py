@@ -7,16 +7,147 @@ training reads, and NAME.onnx and others with that ending, the exported parts th
 import hashlib
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 from numpy import ndarray
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.input_files import read_bytes, read_json
+from robotdiffuse.collision.kernel_arrays import robot_groups
+from robotdiffuse.core.errors import InputError, joined, shortened
+from robotdiffuse.core.input_files import is_file, read_bytes, read_json
+from robotdiffuse.core.registry import Entry, Registry
+from robotdiffuse.core.settings import Settings
+from robotdiffuse.robots.normalizer import JointNormalizer
+from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.robots.user_data_dir import user_robots
+
+Given = TypeVar("Given", bound="NetworkSettings")
+
+
+class NetworkSettings(Settings):
+    """Settings that come with weights."""
+
+    constants: ClassVar[dict[str, Any]] = {}
+    """What earlier versions had as settings, with the values that the package now has for them: descriptions
+    of weights may name them."""
+
+    @classmethod
+    def from_json(cls: type[Given], values: object, where: str) -> Given:
+        """As for `Settings`. Raises InputError too if a former setting is not what the constant is."""
+        if isinstance(values, dict):
+            known = cls.constants
+            values = {k: value for k, value in values.items() if k not in known or known[k] != value}
+        return super().from_json(values, where)
+
+
+DIMENSION_TOLERANCE = 1e-3
+"""Robots are the same if their dimensions [m] and entries of rotations differ by less than this."""
+
+
+@dataclass(frozen=True)
+class RobotIdentity(Settings):
+    """The robot that weights were trained for, as checkpoints describe it."""
+
+    source: str
+    """Bundled name, or path to its URDF."""
+    joint_names: tuple[str, ...]
+    lower: tuple[float, ...]
+    """Limits that joint values are normalised by [rad], [m] for prismatic joints. The weights serve robots
+    with other limits too: validation uses the limits of the robot itself."""
+    upper: tuple[float, ...]
+    frame_offsets: tuple[tuple[tuple[float, ...], ...], ...]
+    """`Robot.frame_offsets`, to distinguish robots with the same joint names but other dimensions."""
+    links: tuple[str, ...]
+    """Moving links with collision spheres, in the order of link clearances."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        dof = len(self.joint_names)
+        for name in ("lower", "upper", "frame_offsets"):
+            if len(getattr(self, name)) != dof:
+                raise InputError(f"robot.{name} has {len(getattr(self, name))} entries for {dof} joints")
+        if any([len(row) for row in T] != [4] * 4 for T in self.frame_offsets):
+            raise InputError("robot.frame_offsets has an entry that is not 4 x 4 numbers")
+
+    @staticmethod
+    @once_per_robot
+    def of(robot: Robot) -> "RobotIdentity":
+        """The identity of a robot: that of its bare arm, since attached bodies change nothing about its
+        joints."""
+        robot = robot.arm
+        return RobotIdentity(
+            source=robot.source or robot.name,
+            joint_names=robot.joint_names,
+            lower=tuple(robot.lower.tolist()),
+            upper=tuple(robot.upper.tolist()),
+            frame_offsets=tuple(tuple(tuple(row) for row in T) for T in robot.frame_offsets.tolist()),
+            links=tuple(link for link in robot_groups(robot) if robot.link_frame(link) > 0),
+        )
+
+    @property
+    def dof(self) -> int:
+        return len(self.joint_names)
+
+    def normalizer(self) -> JointNormalizer:
+        return JointNormalizer(np.array(self.lower), np.array(self.upper))
+
+    def difference(self, robot: Robot) -> str:
+        """How the robot differs from this one; "" if it is the same."""
+        its = RobotIdentity.of(robot)
+        if its.joint_names != self.joint_names:
+            return f"joints {joined(its.joint_names)}"
+        if not np.allclose(its.frame_offsets, self.frame_offsets, atol=DIMENSION_TOLERANCE):
+            return "other dimensions"
+        if its.links != self.links:
+            return f"spheres on the links {joined(its.links)}, not {joined(self.links)}"
+        return ""
+
+    def check(self, robot: Robot, where: str) -> None:
+        """Raises InputError unless the weights are for this robot. where: names the weights in the
+        message."""
+        other = self.difference(robot)
+        if other:
+            raise InputError(
+                f"{where} was trained for {shortened(self.source)} with joints {joined(self.joint_names)}; "
+                f"the robot {robot.name} has {other}"
+            )
+
+
+NETWORKS = Registry(
+    "network",
+    {
+        "model": Entry(
+            "robotdiffuse.learning.motion_network:MotionNetwork",
+            "the diffusion model of motions",
+            "robotdiffuse.learning.motion_model:MotionModelSettings",
+            "planner --robot NAME",
+        ),
+        "mpnet": Entry(
+            "robotdiffuse.learning.mpnet:MPNetNetwork",
+            "MPNet: the next configuration on the way to the goal",
+            "MPNetSettings",
+        ),
+        "mpinets": Entry(
+            "robotdiffuse.learning.mpinets:MPiNetsNetwork",
+            "MPiNets: a policy with points of scene, arm and target as its input",
+            "MPiNetsNetworkSettings",
+        ),
+        "trajectory_prior": Entry(
+            "robotdiffuse.learning.motion_network:MotionNetwork",
+            "the same model without an encoder, for MPD and EDMP",
+            "robotdiffuse.learning.motion_model:MotionModelSettings",
+            "planner --config trajectory_prior --data FOLDER --out FOLDER",
+        ),
+    },
+)
+"""An entry's kind is the command after `robotdiffuse train` that trains it; empty: `baseline NAME`."""
+
 
 FORMAT = 2
 
@@ -31,6 +162,13 @@ def stamp(folder: FilePath, name: str) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_mtime_ns, status.st_ino
+
+
+def kept_by_stamp(load: Callable[[str, FilePath], Any]) -> Callable[[str, FilePath], Any]:
+    """A function that loads a network by name and folder, kept for as long as its description is the
+    same."""
+    cached = lru_cache(maxsize=16)(lambda name, folder, _stamp: load(name, folder))
+    return lambda name, folder: cached(name, folder, stamp(folder, name))
 
 
 def read_description(folder: FilePath, name: str) -> dict[str, Any]:
@@ -82,3 +220,89 @@ def read_arrays(
     except (SafetensorError, ValueError, struct.error) as error:
         raise InputError(f"{file} is no safetensors file: {str(error).splitlines()[0]}") from None
     return {key: held[key] for key in keys if key in held}
+
+
+BUNDLED = FilePath(__file__).parent / "weights"
+"""Folder of the weights that come with the package; those for a robot are in a folder of its name."""
+POINTS = "panda_points"
+"""Weights of config `points` in that folder: without clearances as inputs."""
+
+
+def user_weights(robot: Robot) -> FilePath:
+    """The folder of weights that the user trained for a robot, in the user's data folder."""
+    return user_robots() / robot.name / "weights"
+
+
+def weights_for(name: str, robot: Robot) -> FilePath | None:
+    """The folder with weights of a network (a name in NETWORKS) for exactly this robot; None if there is
+    none.
+
+    The user's weights take precedence over those of the package. Raises InputError, naming the file, for a
+    damaged description.
+    """
+    for place in (user_weights(robot), BUNDLED / robot.name):
+        if stamp(place, name) and not _identity(name, place).difference(robot):
+            return place
+    return None
+
+
+@kept_by_stamp
+def _identity(name: str, folder: FilePath) -> RobotIdentity:
+    file = folder / f"{name}.json"
+    try:
+        about = read_json(file)["robot"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{file} is damaged: {type(error).__name__}: {error}") from None
+    return RobotIdentity.from_json(about, f"{file}: robot")
+
+
+def folder_of(folder: str | FilePath) -> FilePath:
+    """The folder of weights; the name of one that comes with the package stands for it."""
+    place = FilePath(folder)
+    return place if os.path.exists(place) or not os.path.isdir(BUNDLED / folder) else BUNDLED / folder
+
+
+def check_weights(name: str, folder: str | FilePath | None) -> None:
+    """Raises InputError if a folder is given that holds no weights of this network."""
+    NETWORKS.entry(name)
+    if folder is not None and not is_file(folder_of(folder) / f"{name}.json"):
+        what = f"{folder} holds no {name}" if os.path.isdir(folder) else f"there are no weights {folder}"
+        raise no_weights_error(name, what)
+
+
+def weights_folder(name: str, folder: str | FilePath | None, robot: Robot) -> FilePath:
+    """The folder with weights of a network: the given one, or that of `weights_for`.
+
+    Raises InputError if it holds none, naming the command that trains them.
+    """
+    check_weights(name, folder)
+    if folder is not None:
+        return folder_of(folder)
+    found = weights_for(name, robot)
+    if found is None and (BUNDLED / robot.name / f"{name}.json").is_file():
+        return BUNDLED / robot.name  # made for another arm of that name, which the caller finds
+    if found is None:
+        raise no_weights_error(
+            name, f"no weights of the network {name} come with the package for {robot.name}"
+        )
+    return found
+
+
+def completion_folder(folder: str | FilePath | None) -> FilePath:
+    """The folder with weights of the completion network; None: of those that come with the package.
+
+    Raises InputError if it holds none, naming the command that trains them.
+    """
+    place = BUNDLED / "completion" if folder is None else FilePath(folder)
+    if not (place / "completion.json").is_file():
+        raise InputError(
+            f"{place} holds no weights of the completion network; train them: robotdiffuse train completion "
+            "--out FOLDER"
+        )
+    return place
+
+
+def no_weights_error(name: str, what: str) -> InputError:
+    """The error for missing weights: `what` is missing, and the command that trains it."""
+    how = NETWORKS[name].kind or f"baseline {name} --data FOLDER --out FOLDER"
+    return InputError(f"{what}; train them: robotdiffuse train {how}")

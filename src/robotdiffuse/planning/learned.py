@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning import need_packages
-from robotdiffuse.learning.weights_registry import check_weights
+from robotdiffuse.learning.weight_files import check_weights
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.robots.robot import Robot
 

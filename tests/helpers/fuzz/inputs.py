@@ -449,7 +449,7 @@ def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object
 def _weights(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Folders with the weights of a network."""
     from robotdiffuse.learning.checkpoint import load_network
-    from robotdiffuse.learning.weights_registry import BUNDLED
+    from robotdiffuse.learning.weight_files import BUNDLED
     from robotdiffuse.robots import load_robot
 
     about, tensors = (BUNDLED / "panda" / f"mpinets.{ending}" for ending in ("json", "safetensors"))

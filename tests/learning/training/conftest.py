@@ -10,7 +10,7 @@ from helpers.box_arm import box_arm
 from helpers.stores import WAYPOINTS as STORED
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.datasets.shards import write_manifest, write_shard
-from robotdiffuse.learning.checkpoint import save_encoder
+from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.encoders import PointAutoencoderSettings
 from robotdiffuse.learning.encoders.networks import PointAutoencoder
 from robotdiffuse.learning.training import planner as training
@@ -45,7 +45,7 @@ def stored(tmp_path_factory):
         arrays |= {"trajectories": q, "obstacle_kinds": kinds, "obstacle_params": params}
         write_shard(folder, i, arrays, {})
     torch.manual_seed(0)
-    save_encoder(PointAutoencoder(SMALL_ENCODER), home / "encoder", {})
+    save_network("encoder", PointAutoencoder(SMALL_ENCODER), home / "encoder", {})
     return home
 
 

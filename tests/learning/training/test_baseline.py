@@ -1,8 +1,6 @@
 """Training of baselines: learning, checkpoints, weights of other robots, the command."""
 
-import os
 import shutil
-import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -18,17 +16,10 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning.checkpoint import load_network
-from robotdiffuse.learning.networks import NETWORKS
-from robotdiffuse.learning.networks.base import BaselineNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
+from robotdiffuse.learning.training.baseline import BaselineNetwork, baseline_training, train_baseline
 from robotdiffuse.learning.training.batches import TrajectoryData
-from robotdiffuse.learning.training.validation import motions_free
+from robotdiffuse.learning.weight_files import NETWORKS, RobotIdentity
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.shapes import Box, Sphere
 
 
 @dataclass(frozen=True)
@@ -50,9 +41,6 @@ class Reversal(BaselineNetwork):
         middle = self.layer(torch.cat([q[:, 0], q[:, -1]], -1))
         return (middle - q[:, q.shape[1] // 2]).square().mean()
 
-    def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float:
-        return float(motions_free(robot, data.scenes[:4], data.q[:4]).mean())
-
 
 @pytest.fixture
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
@@ -62,34 +50,11 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return str(tmp_path / "data")
 
 
-def weights(folder: Path) -> dict[str, Tensor]:
-    return load_network("reversal", str(folder), load_robot("panda")).state_dict()
-
-
-def test_training_learns_and_a_stopped_run_ends_the_same(
-    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_learns(data: str, tmp_path: Path) -> None:
     settings = baseline_training("reversal", {"data": data, "samples": 6400, "warmup_steps": 5})
     assert (settings.batch, settings.learning_rate, settings.minutes) == (16, 0.05, None)
     report = train_baseline(settings, str(tmp_path / "whole"))
-    assert report["validation"] < 1e-3 and report["samples"] == 6400 and report["success"] == 1.0
-
-    original, steps = Reversal.loss, 0
-
-    def interrupted(self, data, count, fraction, rng):
-        nonlocal steps
-        steps += 1
-        if steps == 150:
-            os.kill(os.getpid(), signal.SIGINT)
-        return original(self, data, count, fraction, rng)
-
-    monkeypatch.setattr(Reversal, "loss", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        train_baseline(settings, str(tmp_path / "parts"))
-    monkeypatch.setattr(Reversal, "loss", original)
-    train_baseline(settings, str(tmp_path / "parts"))
-    whole, parts = weights(tmp_path / "whole"), weights(tmp_path / "parts")
-    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    assert report["validation"] < 1e-3 and report["samples"] == 6400
 
 
 def test_weights_of_another_robot_or_none_are_refused(data: str, tmp_path: Path) -> None:
@@ -133,15 +98,3 @@ def test_every_network_normalizes_by_the_joint_limits(name: str) -> None:
     torch.testing.assert_close(
         network.from_unit(network.to_unit(torch.from_numpy(ends))), torch.from_numpy(ends)
     )
-
-
-def test_motion_through_the_floor_or_an_obstacle_is_not_free() -> None:
-    panda = load_robot("panda")
-    start = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-    beside, down = start.copy(), start.copy()
-    beside[0], down[1] = 1.0, 1.7
-    motions = np.linspace([start, start, start], [beside, beside, down], 5, axis=1)
-    floor = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1))
-    scenes = [Scene([floor, *shapes]) for shapes in ([], [Sphere((0.4, 0.2, 0.6), 0.1)], [])]
-    free = motions_free(panda, PackedScenes.pack(scenes, 1, floor=True), motions)
-    assert free.tolist() == [True, False, False]

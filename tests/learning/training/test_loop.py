@@ -1,52 +1,50 @@
 """The training loop: steps that are not finite."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import pytest
 import torch
 
+from helpers.toy_task import ToyTask
 from helpers.training_log import read_log
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.training.config import EncoderTraining
-from robotdiffuse.learning.training.loop import TrainingRun, Validation
-from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.loop import TrainingRun
 
 
-def test_losses_that_are_not_finite_are_skipped(tmp_path):
-    torch.manual_seed(0)
-    module = torch.nn.Linear(2, 1)
+def run_of(folder: Path, factor: Callable[[int], float]) -> TrainingRun:
+    """A run of 40 steps, the loss of each with a factor by its number."""
     settings = EncoderTraining(
         minutes=None, samples=40, batch=1, warmup_steps=1, checkpoint_seconds=0.0, average=0.9, bad_steps=3
     )
-    run = TrainingRun(
-        module,
-        str(tmp_path),
-        settings,
-        identity={},
-        processes=Processes("cpu"),
-    )
-    calls = []
+    return TrainingRun(ToyTask(settings, factor), str(folder))
 
-    def loss(rng):
-        calls.append(len(calls))
-        bad = calls[-1] in (4, 10, 11, 12)
-        return (module.weight * (float("nan") if bad else 1.0)).square().sum()
 
-    run.loop(loss, lambda: Validation(0.0), "test")
-    assert torch.isfinite(module.weight).all()
+def test_losses_that_are_not_finite_are_skipped(tmp_path: Path) -> None:
+    run = run_of(tmp_path, lambda call: float("nan") if call in (4, 10, 11, 12) else 1.0)
+    run.loop()
+    assert all(torch.isfinite(parameter).all() for parameter in run.module.parameters())
     assert run.at.samples == 40
     assert run.at.rollbacks == 1
     assert run.at.skipped == 4
     assert int(read_log(tmp_path)[-1]["skipped"]) == 4
 
 
-def test_hopeless_training_stops(tmp_path):
-    module = torch.nn.Linear(2, 1)
-    settings = EncoderTraining(minutes=None, samples=40, batch=1, average=0.9, bad_steps=3)
-    run = TrainingRun(
-        module,
-        str(tmp_path),
-        settings,
-        identity={},
-        processes=Processes("cpu"),
-    )
+def test_hopeless_training_stops(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not finite"):
-        run.loop(lambda rng: module.weight.sum() * float("nan"), lambda: Validation(0.0), "test")
+        run_of(tmp_path, lambda call: float("nan")).loop()
+
+
+def test_the_average_follows_the_weights_with_the_decay_of_the_settings(tmp_path: Path) -> None:
+    """The first step copies; later ones keep step / (step + 10), at most `average`."""
+    run = run_of(tmp_path, lambda call: 1.0)
+    expected = None
+    for step in range(1, 8):
+        run.step()
+        now = run.module.get_parameter("weight").detach().clone()
+        decay = min(0.9, step / (step + 10))
+        expected = now if expected is None else decay * expected + (1 - decay) * now
+    with run.averaged():
+        torch.testing.assert_close(run.module.get_parameter("weight"), expected)
+    torch.testing.assert_close(run.module.get_parameter("weight"), now)

@@ -6,8 +6,13 @@ import torch
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.forward_kinematics import ForwardKinematics
-from robotdiffuse.learning.training.losses import ArmDistance, LossSettings, SurfacePoints, hinge
+from robotdiffuse.learning.training.losses import (
+    ArmDistance,
+    ForwardKinematics,
+    LossSettings,
+    SurfacePoints,
+    hinge,
+)
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot

@@ -20,13 +20,11 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors
 from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
-from robotdiffuse.learning.encoders import PointAutoencoderSettings
-from robotdiffuse.learning.encoders.networks import make_encoder
+from robotdiffuse.learning.diffusion import OBJECTIVES
+from robotdiffuse.learning.encoders import PointAutoencoderSettings, make_encoder
 from robotdiffuse.learning.exported_model import exported_model
+from robotdiffuse.learning.motion_model import SamplingSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.objectives import OBJECTIVES
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training import encoder as encoder_training
 from robotdiffuse.learning.training import loop as training_run
 from robotdiffuse.learning.training import planner as training
@@ -38,10 +36,11 @@ from robotdiffuse.learning.training.batches import (
 )
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.encoder import train_encoder
-from robotdiffuse.learning.training.loop import TrainingRun
+from robotdiffuse.learning.training.loop import Processes, TrainingRun
 from robotdiffuse.learning.training.losses import LossSettings
-from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.planner import free_in_scene, train_planner
+from robotdiffuse.learning.weight_files import RobotIdentity
+from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -72,8 +71,8 @@ def stop_at(monkeypatch, step):
     """Interrupt training after this step, as Ctrl-C would. Returns a function that undoes it."""
     original = TrainingRun.step
 
-    def interrupted(self, loss):
-        original(self, loss)
+    def interrupted(self):
+        original(self)
         if self.at.step == step:
             self.save()
             raise KeyboardInterrupt
@@ -145,8 +144,8 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
         joined = {name: None if a is None else of[type(a)]([a, b]) for name, (a, b) in fields}
         return Batch(**joined)  # type: ignore[arg-type]
 
-    def step(self, loss):
-        original(self, loss)
+    def step(self):
+        original(self)
         gradients.update(
             {name: p.grad.clone() for name, p in self.parameters.items()} if not gradients else {}
         )
@@ -363,3 +362,15 @@ def test_trains_without_some_conditions(data, tmp_path):
         for scale in (1.0, 3.0)
     )
     assert not np.array_equal(plain, pushed)
+
+
+def test_motion_through_the_floor_or_an_obstacle_is_not_free() -> None:
+    panda = load_robot("panda")
+    start = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+    beside, down = start.copy(), start.copy()
+    beside[0], down[1] = 1.0, 1.7
+    motions = np.linspace([start, start], [beside, down], 5, axis=1)
+    floor = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1))
+    assert free_in_scene(CollisionChecker(panda, Scene([floor])), motions).tolist() == [True, False]
+    ball = Scene([floor, Sphere((0.4, 0.2, 0.6), 0.1)])
+    assert free_in_scene(CollisionChecker(panda, ball), motions[:1]).tolist() == [False]

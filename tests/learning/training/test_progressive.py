@@ -12,9 +12,9 @@ from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.denoisers.networks import MAX_UNFUSED_TOKENS, attend
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.motion_model import MotionModelSettings
-from robotdiffuse.learning.motion_network import MotionNetwork, WaypointMeans
-from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.motion_network import MotionNetwork, block_means
 from robotdiffuse.learning.training.config import STAGES, PlannerTraining, block_at
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots import load_robot
 
 SMALL = TransformerSettings(32, 2, 2, 64, patch=1)
@@ -46,16 +46,16 @@ def test_gradients_of_attention_in_bf16_are_those_in_fp32():
 
 @pytest.mark.parametrize("block", [1, 4, 9])
 def test_means_of_blocks_keep_the_ends_and_straight_lines(block):
-    means = WaypointMeans.of_blocks(38, block)
+    means, interpolation, _ = block_means(38, block)
     line = torch.linspace(-1.0, 2.0, 38)[:, None]
-    blocks = means.of_waypoints @ line
+    blocks = means @ line
     assert blocks[0] == line[0] and blocks[-1] == line[-1]
-    torch.testing.assert_close(means.interpolation @ blocks, line)
+    torch.testing.assert_close(interpolation @ blocks, line)
 
 
 def test_means_of_white_noise_are_white():
     block = 9
-    means = WaypointMeans.of_blocks(254, block).of_waypoints
+    means = block_means(254, block)[0]
     covariance = (means @ means.T)[1:-1, 1:-1]
     torch.testing.assert_close(covariance, torch.eye(len(covariance)) / block)
 

@@ -26,12 +26,11 @@ from robotdiffuse.learning.checkpoint import load_network, save_network
 from robotdiffuse.learning.denoisers import UNetSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import Batches, TrajectoryData
-from robotdiffuse.learning.training.configs import planner_training
-from robotdiffuse.learning.training.planner import PlannerLoss, model_settings
-from robotdiffuse.learning.training.processes import Processes
-from robotdiffuse.learning.training.validation import planning_success
+from robotdiffuse.learning.training.config import planner_training
+from robotdiffuse.learning.training.loop import Processes
+from robotdiffuse.learning.training.planner import PlannerLoss, model_settings, planning_success
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.planning.baselines.edmp import EDMP, ENSEMBLE, EDMPSettings, GuideSettings, quadratic_levels
 from robotdiffuse.planning.baselines.guided_prior import collision_gradient, sample, shared_out
 from robotdiffuse.planning.baselines.mpd import (

@@ -10,14 +10,14 @@ import torch
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.learning.checkpoint import load_network, save_network
-from robotdiffuse.learning.networks.mpinets import (
+from robotdiffuse.learning.mpinets import (
     MPiNetsNetwork,
     MPiNetsNetworkSettings,
     RollOuts,
     group_points,
 )
-from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.planning.baselines.mpinets import MPiNets, MPiNetsSettings
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -137,14 +137,6 @@ def test_roll_outs_stay_within_limits(network: MPiNetsNetwork) -> None:
     assert np.abs(waypoints[-1, [0, 2]] - start[0]).max() > 0.5
 
 
-@pytest.mark.parametrize(("walls", "share"), [(False, 1.0), (True, 0.0)])
-def test_success_is_that_of_the_motions(walls: bool, share: float) -> None:
-    straight = Straight(RANGES, SMALL)
-    assert straight.success(line_data(walls), PANDA, np.random.default_rng(0)) == share
-    trivial = replace(line_data(walls), trivial=np.ones(8, bool))
-    assert straight.success(trivial, PANDA, np.random.default_rng(0)) is None
-
-
 @pytest.fixture
 def straight_weights(monkeypatch: pytest.MonkeyPatch) -> MPiNetsNetwork:
     straight = Straight(RANGES, SMALL)
@@ -206,11 +198,8 @@ def test_missing_weights_name_the_command(tmp_path: Path) -> None:
         ({"scene_points": 0}, "scene_points is 0"),
         ({"target_points": 13}, "target_points is 13; it must be at most robot_points, 12"),
         ({"centres": (64, 65)}, "centres is"),
-        ({"radii": (0.2, 0.0)}, "radii is"),
         ({"first_widths": ()}, "first_widths is"),
         ({"cloud_widths": (30, 16)}, "cloud_widths is"),
-        ({"margin": -0.1}, "margin is -0.1"),
-        ({"trivial_share": 2.0}, "trivial_share is 2.0"),
     ],
 )
 def test_bad_network_settings(values: dict, message: str) -> None:

@@ -14,13 +14,13 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.datasets.rows import resample
 from robotdiffuse.learning.checkpoint import save_network
-from robotdiffuse.learning.networks.mpnet import (
+from robotdiffuse.learning.mpnet import (
     MPNetNetwork,
     MPNetSettings,
     sorted_along_curve,
 )
-from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_cloud
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import StartGoal
@@ -260,16 +260,6 @@ def test_giving_up_says_what_was_wrong(weights: str) -> None:
     assert result.refused == "scene_collision" and "hybrid" in result.reason
 
 
-def test_success_is_a_share(weights: str) -> None:
-    net, data = network(), motions()
-    share = net.success(data, PANDA, np.random.default_rng(0))
-    assert share is not None and 0 <= share <= 1
-    nothing = replace(data, trivial=np.ones(4, bool))
-    assert net.success(nothing, PANDA, np.random.default_rng(0)) is None
-    free = replace(data, scenes=PackedScenes.pack([Scene([])] * 4, 2))
-    assert net.success(free, PANDA, np.random.default_rng(0)) == 1.0
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -278,8 +268,6 @@ def test_success_is_a_share(weights: str) -> None:
         ("layers", ()),
         ("step", 0.0),
         ("steady_layers", 12),
-        ("sub_goals", 1.5),
-        ("contraction", -1.0),
     ],
 )
 def test_bad_settings_of_the_network_are_refused(name: str, value: object) -> None:

@@ -11,9 +11,9 @@ from helpers.small_model import small_model
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
+from robotdiffuse.learning.diffusion import SAMPLERS
 from robotdiffuse.learning.exported_model import exported_model
-from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.learning.weight_files import weights_for
 from robotdiffuse.planning.diffusion import hybrid
 from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planning.diffusion.hybrid import BATCH_WORK, RobotDiffuse, RobotDiffuseSettings
@@ -86,7 +86,7 @@ def test_weights_that_need_no_scene_encoding_get_none(planner, no_search, monkey
 
 
 def test_weights_that_need_a_scene_encoding_get_it(planner):
-    model = small_model().for_inference()
+    model = small_model().requires_grad_(False).eval()
     assert not model.settings.null_condition
     checker = CollisionChecker(box_arm(), Scene([BALL]))
     code = planner.code(model, checker, np.random.default_rng(0))

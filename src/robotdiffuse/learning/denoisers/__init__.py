@@ -151,32 +151,31 @@ class UNetSettings(DenoiserSettings, name="unet"):
         return cls(width=144, multiples=(1, 2, 4), kernel=5, condition_width=512)
 
 
-_NETWORKS = "robotdiffuse.learning.denoisers.networks:"
-_SETTINGS = "robotdiffuse.learning.denoisers:"
+_NETWORKS = "robotdiffuse.learning.denoisers.networks"
 DENOISERS = Registry(
     "denoiser",
     {
         "transformer": Entry(
-            _NETWORKS + "TrajectoryTransformer",
+            f"{_NETWORKS}:TrajectoryTransformer",
             "encoder-only transformer, the paper's",
-            _SETTINGS + "TransformerSettings",
+            f"{__name__}:TransformerSettings",
         ),
         "encoder_decoder": Entry(
-            _NETWORKS + "TrajectoryTransformer",
+            f"{_NETWORKS}:TrajectoryTransformer",
             "encoder-decoder transformer",
-            _SETTINGS + "EncoderDecoderSettings",
+            f"{__name__}:EncoderDecoderSettings",
         ),
         "decoder_only": Entry(
-            _NETWORKS + "TrajectoryTransformer",
+            f"{_NETWORKS}:TrajectoryTransformer",
             "decoder-only transformer",
-            _SETTINGS + "DecoderOnlySettings",
+            f"{__name__}:DecoderOnlySettings",
         ),
         "cross_attention": Entry(
-            _NETWORKS + "TrajectoryTransformer",
+            f"{_NETWORKS}:TrajectoryTransformer",
             "transformer whose waypoints attend to points of the scene, of the encoder points",
-            _SETTINGS + "CrossAttentionSettings",
+            f"{__name__}:CrossAttentionSettings",
         ),
-        "unet": Entry(_NETWORKS + "UNet", "temporal U-Net", _SETTINGS + "UNetSettings"),
+        "unet": Entry(f"{_NETWORKS}:UNet", "temporal U-Net", f"{__name__}:UNetSettings"),
     },
 )
 """By the name in settings and checkpoints."""

@@ -19,15 +19,20 @@ from robotdiffuse.learning.denoisers import (
     TransformerSettings,
     UNetSettings,
 )
-from robotdiffuse.learning.encoders.networks import wave_angles
+from robotdiffuse.learning.encoders.networks import OCTAVES, wave_angles
 
-OCTAVES = 4
-"""Wavelengths of the sines and cosines of a point's coordinates that are inputs too; see `wave_angles`."""
 MAX_UNFUSED_TOKENS = 96
 """Up to this number of tokens, attention in fp32 on a CPU does without the fused kernel; in bf16 always.
 Measured with torch 2.13 on one thread, forward and backward [ms], unfused in bf16, unfused in fp32, fused in
 fp32. Batch 64, 4 heads of 128 numbers: 31 tokens 13, 30 and 34; 66 tokens 29, 76 and 56; 97 tokens 49, 93 and
 121; 255 tokens 274, 813 and 480. Batch 128, 5 heads of 32 numbers: 13 tokens 4.5, 8.8 and 8.1."""
+
+
+Features = Float[Tensor, "batch waypoints features"]
+Levels = Float[Tensor, "batch"]
+Conditions = Float[Tensor, "batch condition"]
+Trajectories = Float[Tensor, "batch waypoints dof"]
+Tokens = Float[Tensor, "batch tokens width"]
 
 
 def two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -123,10 +128,10 @@ class Denoiser(nn.Module, ABC):
     @abstractmethod
     def forward(
         self,
-        features: Float[Tensor, "batch waypoints features"],
-        level: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-    ) -> Float[Tensor, "batch waypoints dof"]:
+        features: Features,
+        level: Levels,
+        condition: Conditions,
+    ) -> Trajectories:
         """The output for noisy trajectories; level is t / T in [0, 1]."""
 
 
@@ -160,9 +165,9 @@ class Block(nn.Module):
 
     def forward(
         self,
-        x: Float[Tensor, "batch tokens width"],
+        x: Tokens,
         memory: Float[Tensor, "batch others width"] | None = None,
-    ) -> Float[Tensor, "batch tokens width"]:
+    ) -> Tokens:
         """memory: the encoder's tokens."""
         q, k, v = split_heads(self.qkv(self.norm_attention(x)), 3, self.heads)
         x = x + self.merge(attend(q, k, v, self.causal))
@@ -224,10 +229,10 @@ class TrajectoryTransformer(Denoiser):
 
     def forward(
         self,
-        features: Float[Tensor, "batch waypoints features"],
-        level: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-    ) -> Float[Tensor, "batch waypoints dof"]:
+        features: Features,
+        level: Levels,
+        condition: Conditions,
+    ) -> Trajectories:
         """The output for noisy trajectories; level is t / T in [0, 1]."""
         batch = features.shape[0]
         count = len(self.positions)
@@ -247,9 +252,7 @@ class TrajectoryTransformer(Denoiser):
             x = block(x, memory)
         return self.out(self.norm(x[:, -count:])).float().reshape(batch, -1, self.dof)
 
-    def _encoded(
-        self, condition: Float[Tensor, "batch condition"], level: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch 4 width"]:
+    def _encoded(self, condition: Conditions, level: Levels) -> Float[Tensor, "batch 4 width"]:
         parts = zip(self.condition, condition.split(self.sizes, -1), strict=True)
         memory = torch.stack([*(embed(part) for embed, part in parts), self.level(level)], 1).float()
         for block in self.encoder:
@@ -257,7 +260,7 @@ class TrajectoryTransformer(Denoiser):
         return self.norm_encoded(memory)
 
     def _points(self, points: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch points width"]:
-        angles = torch.cat(wave_angles(points, OCTAVES), -1)
+        angles = torch.cat(wave_angles(points), -1)
         return self.norm_points(self.points(torch.cat([points, angles.sin(), angles.cos()], -1)))
 
 
@@ -290,7 +293,7 @@ class ResidualBlock(nn.Module):
         start_small(self.second, blocks)
 
     def forward(
-        self, x: Float[Tensor, "batch waypoints inputs"], condition: Float[Tensor, "batch condition"]
+        self, x: Float[Tensor, "batch waypoints inputs"], condition: Conditions
     ) -> Float[Tensor, "batch waypoints outputs"]:
         scale, shift = self.film(condition)[:, None].float().chunk(2, -1)
         inner = self.norm_second(self.first(functional.silu(self.norm_first(x))).float())
@@ -333,10 +336,10 @@ class UNet(Denoiser):
 
     def forward(
         self,
-        features: Float[Tensor, "batch waypoints features"],
-        level: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-    ) -> Float[Tensor, "batch waypoints dof"]:
+        features: Features,
+        level: Levels,
+        condition: Conditions,
+    ) -> Trajectories:
         """The output for noisy trajectories; level is t / T in [0, 1]."""
         token = functional.silu(self.condition(condition) + self.level(level))
         if self.padding:

@@ -12,12 +12,13 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry, Registry
-from robotdiffuse.core.settings import Count, Natural, NotNegative, Settings, Sizes
+from robotdiffuse.core.settings import Count, Sizes
+from robotdiffuse.learning.weight_files import NetworkSettings
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
 
 @dataclass(frozen=True)
-class EncoderSettings(Settings, name="encoder"):
+class EncoderSettings(NetworkSettings, name="encoder"):
     """Settings that every encoder has."""
 
     any_size: ClassVar[bool] = True
@@ -33,11 +34,6 @@ class EncoderSettings(Settings, name="encoder"):
     region: VisibleRegion = PANDA_REGION
     """Points outside are ignored, for the arm does not reach them. Within a large reach whole surfaces
     count."""
-
-    @classmethod
-    def paper_size(cls) -> "EncoderSettings":
-        """The sizes given by the authors of this encoder, with z of this paper's size."""
-        return cls(code=60)
 
     def prepared(self, points: Float32[ndarray, "n 3"]) -> Float32[ndarray, "m 3"]:
         """Points within the region in the form that the exported encoder takes [m]."""
@@ -97,17 +93,13 @@ def in_order(
 
 @dataclass(frozen=True)
 class PointAutoencoderSettings(EncoderSettings):
+    constants: ClassVar[dict[str, Any]] = {"octaves": 4, "distance_weight": 4.0}
     points: Sizes = (64, 128, 256)
     """Layers of the perceptron on each point."""
-    octaves: Natural = 4
-    """Wavelengths (4 m, 2 m, ...) of the sines and cosines of its coordinates that each point is given."""
     hidden: Count = 384
     """Width of the layer between the pooled features and z, and of the decoder's."""
     decoded: Count = 192
     """Points that the decoder reconstructs."""
-    distance_weight: NotNegative = 4.0
-    """In training: weight of the error of the distance field relative to the Chamfer distance, both in
-    metres."""
 
 
 @dataclass(frozen=True)
@@ -139,10 +131,6 @@ class PointsSettings(EncoderSettings, name="points"):
         if self.code != 3 * self.cloud:
             raise InputError(f"points.code is {self.code}; it must be three times cloud, {3 * self.cloud}")
 
-    @classmethod
-    def paper_size(cls) -> "PointsSettings":
-        return cls(code=60, cloud=20)
-
 
 @dataclass(frozen=True)
 class PointNetSettings(EncoderSettings):
@@ -161,18 +149,6 @@ class PointNetSettings(EncoderSettings):
     head: tuple[Count, ...] = (192,)
     """Layers between the maximum and z (512, 256)."""
 
-    @classmethod
-    def paper_size(cls) -> "PointNetSettings":
-        return cls(
-            code=60,
-            cloud=1024,
-            first=(64, 64),
-            second=(64, 128, 1024),
-            transform=(64, 128, 1024),
-            transform_head=(512, 256),
-            head=(512, 256),
-        )
-
 
 @dataclass(frozen=True)
 class DGCNNSettings(EncoderSettings):
@@ -190,36 +166,29 @@ class DGCNNSettings(EncoderSettings):
     head: tuple[Count, ...] = (192,)
     """Layers between the pooled features and z (512, 256)."""
 
-    @classmethod
-    def paper_size(cls) -> "DGCNNSettings":
-        return cls(
-            code=60, cloud=1024, neighbours=20, edges=(64, 64, 128, 256), embedding=1024, head=(512, 256)
-        )
 
-
-_NETWORKS = "robotdiffuse.learning.encoders.networks:"
-_SETTINGS = "robotdiffuse.learning.encoders:"
+_NETWORKS = "robotdiffuse.learning.encoders.networks"
 ENCODERS = Registry(
     "encoder",
     {
         "compression_autoencoder": Entry(
-            _NETWORKS + "CompressionAutoencoder",
+            f"{_NETWORKS}:CompressionAutoencoder",
             "the paper's: a perceptron on 1,400 points in a fixed order",
-            _SETTINGS + "CompressionAutoencoderSettings",
+            f"{__name__}:CompressionAutoencoderSettings",
             "alone",
         ),
         "point_autoencoder": Entry(
-            _NETWORKS + "PointAutoencoder",
+            f"{_NETWORKS}:PointAutoencoder",
             "a perceptron on each point, pooled: any number of points in any order",
-            _SETTINGS + "PointAutoencoderSettings",
+            f"{__name__}:PointAutoencoderSettings",
             "alone",
         ),
-        "pointnet": Entry(_NETWORKS + "PointNet", "PointNet", _SETTINGS + "PointNetSettings", "jointly"),
-        "dgcnn": Entry(_NETWORKS + "DGCNN", "DGCNN", _SETTINGS + "DGCNNSettings", "jointly"),
+        "pointnet": Entry(f"{_NETWORKS}:PointNet", "PointNet", f"{__name__}:PointNetSettings", "jointly"),
+        "dgcnn": Entry(f"{_NETWORKS}:DGCNN", "DGCNN", f"{__name__}:DGCNNSettings", "jointly"),
         "points": Entry(
-            _NETWORKS + "Points",
+            f"{_NETWORKS}:Points",
             "the points themselves, for the denoiser cross_attention",
-            _SETTINGS + "PointsSettings",
+            f"{__name__}:PointsSettings",
             "jointly",
         ),
     },
@@ -227,3 +196,13 @@ ENCODERS = Registry(
 """By the name in settings and checkpoints. Two kinds: "alone" is trained with a loss of its own and then
 frozen; "jointly" is a part of the planner's network, whose loss trains what weights it has, on fresh clouds
 for every batch."""
+
+
+def make_encoder(name: str, settings: EncoderSettings | None = None) -> Any:
+    """An untrained encoder of that name; None: with its default settings."""
+    return ENCODERS.load(name)(settings or ENCODERS.defaults(name))
+
+
+def encoder_name(encoder: object) -> str:
+    """The name of an encoder's class in ENCODERS."""
+    return next(name for name in ENCODERS if ENCODERS.load(name) is type(encoder))

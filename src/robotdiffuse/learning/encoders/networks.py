@@ -16,7 +16,6 @@ from numpy.random import Generator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from robotdiffuse.datasets.surface_clouds import sort_points
 from robotdiffuse.learning.encoders import (
     ENCODERS,
     CompressionAutoencoderSettings,
@@ -25,9 +24,16 @@ from robotdiffuse.learning.encoders import (
     PointAutoencoderSettings,
     PointNetSettings,
     PointsSettings,
-    curve_keys,
 )
 from robotdiffuse.learning.network import SavedModule
+
+Cloud = Float[Tensor, "batch points 3"]
+Codes = Float[Tensor, "batch code"]
+Near = Bool[Tensor, "batch points"]
+Features = Float[Tensor, "batch points channels"]
+Pooled = Float[Tensor, "batch channels"]
+Ordered = Float[Tensor, "batch cloud 3"]
+Loss = tuple[Float[Tensor, ""], dict[str, float]]
 
 
 class Encoder(SavedModule, ABC):
@@ -43,48 +49,27 @@ class Encoder(SavedModule, ABC):
         self.register_buffer("center", torch.tensor(settings.region.center), persistent=False)
 
     @abstractmethod
-    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+    def forward(self, cloud: Cloud) -> Codes:
         """z of each cloud [m], float32.
 
         Points outside the region are ignored, so that clouds of different size can share a batch.
         """
 
-    def code_of_ordered(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+    def code_of_ordered(self, cloud: Cloud) -> Codes:
         """z of clouds that already have the size and order that the settings ask for; for export."""
         return self(cloud)
 
-    def near(self, cloud: Float[Tensor, "batch points 3"]) -> Bool[Tensor, "batch points"]:
+    def near(self, cloud: Cloud) -> Near:
         """The points that count: those in the region, without the zeros that `surface_clouds` pads with."""
         region = self.settings.region
         inside = (cloud - self.center).square().sum(-1) < region.reach**2
         return inside & (cloud[..., 2] > region.floor) & (cloud != 0).any(-1)
 
-    def arrange(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch cloud 3"]:
-        """`settings.cloud` points, sorted by x, then y, then z, or along a curve.
-
-        More points are thinned evenly in that order, fewer are repeated, and an empty cloud becomes zeros.
-        Without a curve, clouds of that size by `surface_clouds(..., ordered=True)` stay as they are, up to
-        rounding.
-        """
-        batch, points, _ = cloud.shape
-        wanted = self.settings.cloud
-        if points == 0:
-            return cloud.new_zeros(batch, wanted, 3)
-        near = self.near(cloud)
-        counted = cloud * near[..., None]
-        if self.settings.along_curve:
-            order = curve_keys(counted).argsort(stable=True, dim=1)
-            ordered = counted.gather(1, order[..., None].expand(-1, -1, 3))
-        else:
-            coordinates = list(counted.unbind(-1))
-            sort_points(coordinates)
-            ordered = torch.stack(coordinates, -1)
-        # points that do not count are zeros now: move them behind the others, which keep their order
-        filled = (ordered != 0).any(-1)
-        ordered = ordered.gather(1, (~filled).byte().argsort(stable=True, dim=1)[..., None].expand(-1, -1, 3))
-        at = (torch.arange(wanted, device=cloud.device) * 2 + 1) * filled.sum(1, keepdim=True)
-        index = at.div(2 * wanted, rounding_mode="floor")
-        return ordered.gather(1, index[..., None].expand(-1, -1, 3))
+    def arrange(self, cloud: Cloud) -> Ordered:
+        """The points of each cloud that count, as by `EncoderSettings.prepared`."""
+        counted = zip(cloud.cpu().numpy(), self.near(cloud).cpu().numpy(), strict=True)
+        ordered = [self.settings.prepared(points[near]) for points, near in counted]
+        return torch.from_numpy(np.stack(ordered)).to(cloud.device)
 
 
 class Autoencoder(Encoder):
@@ -98,7 +83,7 @@ class Autoencoder(Encoder):
         self.register_buffer("mean", torch.zeros(settings.code))
         self.register_buffer("scale", torch.ones(settings.code))
 
-    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+    def forward(self, cloud: Cloud) -> Codes:
         """z of each cloud, standardised once `standardize` was called. A cloud may be empty.
 
         Points outside the region are ignored, so that clouds of different size can share a batch.
@@ -106,18 +91,16 @@ class Autoencoder(Encoder):
         return (self.encode(cloud) - self.mean) / self.scale
 
     @abstractmethod
-    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+    def encode(self, cloud: Cloud) -> Codes:
         """z before standardisation."""
 
-    def standardize(self, codes: Float[Tensor, "batch code"]) -> None:
+    def standardize(self, codes: Codes) -> None:
         """Scale z so that each number of these codes has mean 0 and variance 1."""
         self.mean.copy_(codes.mean(0))
         self.scale.copy_(codes.std(0).clamp(min=1e-4))
 
     @abstractmethod
-    def loss(
-        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
-    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    def loss(self, cloud: Cloud, rng: Generator) -> Loss:
         """Loss of the reconstruction, and its errors by name [m]."""
 
     @abstractmethod
@@ -130,24 +113,24 @@ def fp32(tensor: Tensor) -> torch.autocast:
     return torch.autocast(tensor.device.type, enabled=False)
 
 
-def wave_angles(points: Float[Tensor, "*batch 3"], octaves: int) -> list[Float[Tensor, "*batch 3"]]:
+OCTAVES = 4
+"""Wavelengths (4 m, 2 m, ...) of the sines and cosines of a point's coordinates that are inputs too."""
+
+
+def wave_angles(points: Float[Tensor, "*batch 3"], octaves: int = OCTAVES) -> list[Float[Tensor, "*batch 3"]]:
     """Coordinates as angles at the wavelengths 4 m, 2 m, ...: with their sines and cosines a small perceptron
     distinguishes positions."""
     return [points * (torch.pi / 2 * 2**octave) for octave in range(octaves)]
 
 
-def pool_max(
-    features: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
-) -> Float[Tensor, "batch channels"]:
+def pool_max(features: Features, near: Near) -> Pooled:
     """Maximum feature over the points that count; zeros for clouds without any."""
     low = torch.finfo(features.dtype).min
     best = features.masked_fill(~near[..., None], low).amax(1)
     return best.masked_fill(~near.any(1, keepdim=True), 0.0)
 
 
-def pool_mean(
-    features: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
-) -> Float[Tensor, "batch channels"]:
+def pool_mean(features: Features, near: Near) -> Pooled:
     """Mean feature over the points that count; zeros for clouds without any."""
     return (features.float() * near[..., None]).sum(1) / near.sum(1, keepdim=True).clamp(min=1)
 
@@ -169,21 +152,19 @@ class CompressionAutoencoder(Autoencoder):
         sizes = (3 * settings.cloud, *settings.hidden, settings.code)
         self.encoder, self.decoder = _perceptron(sizes), _perceptron(sizes[::-1])
 
-    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+    def encode(self, cloud: Cloud) -> Codes:
         with fp32(cloud):
             return self.encoder(self.arrange(cloud.float()).flatten(1))
 
-    def code_of_ordered(self, cloud: Float[Tensor, "batch cloud 3"]) -> Float[Tensor, "batch code"]:
+    def code_of_ordered(self, cloud: Ordered) -> Codes:
         return (self.encoder(cloud.flatten(1)) - self.mean) / self.scale
 
-    def decode(self, code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch cloud 3"]:
+    def decode(self, code: Codes) -> Ordered:
         """Reconstructed points [m], in the order of `arrange`, from z before standardisation."""
         with fp32(code):
             return self.decoder(code.float()).view(len(code), -1, 3)
 
-    def loss(
-        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
-    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    def loss(self, cloud: Cloud, rng: Generator) -> Loss:
         """The first term of l_AE: the mean over points of the squared distance to the reconstruction [m^2].
 
         The equation does not define K: it is taken as the number of points, and i-hat as the text's x-hat.
@@ -210,6 +191,8 @@ def _perceptron(sizes: tuple[int, ...]) -> nn.Sequential:
 
 DISTANCE_QUERIES = 96
 """Positions per cloud at which the distance field is reconstructed."""
+DISTANCE_WEIGHT = 4.0
+"""In training: weight of the error of the distance field relative to the Chamfer distance, both in metres."""
 DISTANCE_CAP = 0.5
 """Reconstructed distances are capped at this [m]."""
 
@@ -226,7 +209,7 @@ class PointAutoencoder(Autoencoder):
 
     def __init__(self, settings: PointAutoencoderSettings) -> None:
         super().__init__(settings)
-        sizes = (3 + 6 * settings.octaves, *settings.points)
+        sizes = (3 + 6 * OCTAVES, *settings.points)
         self.points = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
         self.empty = nn.Parameter(torch.zeros(2 * sizes[-1]))
         hidden, code = settings.hidden, settings.code
@@ -245,11 +228,8 @@ class PointAutoencoder(Autoencoder):
             nn.Linear(192, 1),
         )  # fmt: skip
 
-    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+    def encode(self, cloud: Cloud) -> Codes:
         """z before standardisation."""
-        empty = self.empty.expand(len(cloud), -1)
-        if cloud.shape[1] == 0:
-            return self.head(empty).float()
         near = self.near(cloud)[..., None]
         with fp32(cloud):
             x = functional.relu(self.points[0](self._waves(cloud)))
@@ -258,28 +238,24 @@ class PointAutoencoder(Autoencoder):
         x = x * near  # features are not negative, so zeros never change a maximum
         count = near.sum(1)
         pooled = torch.cat([x.amax(1).float(), x.float().sum(1) / count.clamp(min=1)], -1)
-        return self.head(torch.where(count > 0, pooled, empty)).float()
+        return self.head(torch.where(count > 0, pooled, self.empty)).float()
 
     def _waves(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch waves"]:
         """Coordinates with the sines and cosines of `wave_angles`."""
-        angles = wave_angles(points, self.settings.octaves)
+        angles = wave_angles(points)
         return torch.cat([points, *(part for a in angles for part in (a.sin(), a.cos()))], -1)
 
-    def decode(self, code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch decoded 3"]:
+    def decode(self, code: Codes) -> Float[Tensor, "batch decoded 3"]:
         """Reconstructed points [m], from z before standardisation."""
         return self.decoder(code).float().view(len(code), -1, 3)
 
-    def distance(
-        self, code: Float[Tensor, "batch code"], at: Float[Tensor, "batch queries 3"]
-    ) -> Float[Tensor, "batch queries"]:
+    def distance(self, code: Codes, at: Float[Tensor, "batch queries 3"]) -> Float[Tensor, "batch queries"]:
         """Reconstructed distance [m] of positions to the cloud, from z before standardisation."""
         return (
             self.query(self.query_code(code)[:, None] + self.query_point(self._waves(at))).float().squeeze(-1)
         )
 
-    def loss(
-        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
-    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    def loss(self, cloud: Cloud, rng: Generator) -> Loss:
         """Chamfer distance plus the weighted error of the distance field.
 
         Errors: `chamfer`, both ways added; `distance`, mean error of the distance field;
@@ -299,11 +275,9 @@ class PointAutoencoder(Autoencoder):
             "distance": (guess - truth).abs().mean().item(),
             "distance_of_constant": (truth - truth.median()).abs().mean().item(),
         }
-        return apart + self.settings.distance_weight * field, errors
+        return apart + DISTANCE_WEIGHT * field, errors
 
-    def _query_positions(
-        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
-    ) -> Float[Tensor, "batch queries 3"]:
+    def _query_positions(self, cloud: Cloud, rng: Generator) -> Float[Tensor, "batch queries 3"]:
         """Positions at which the distance is reconstructed: half of them close to the surfaces."""
         batch, points, _ = cloud.shape
         low, high = np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.3])
@@ -383,7 +357,7 @@ class Transform(nn.Module):
             self.out.bias.copy_(torch.eye(size).flatten())
 
     def forward(
-        self, x: Float[Tensor, "batch points size"], near: Bool[Tensor, "batch points"]
+        self, x: Float[Tensor, "batch points size"], near: Near
     ) -> Float[Tensor, "batch points size"]:
         matrix = self.out(self.head(pool_max(self.points(x), near)))
         return x @ matrix.view(-1, self.size, self.size).to(x.dtype)
@@ -407,9 +381,7 @@ class PointNet(Encoder):
         sizes = (settings.second[-1], *settings.head)
         self.head = nn.Sequential(layers(sizes), nn.Linear(sizes[-1], settings.code))
 
-    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
-        if cloud.shape[1] == 0:
-            return self.head(self.empty.expand(len(cloud), -1)).float()
+    def forward(self, cloud: Cloud) -> Codes:
         near = self.near(cloud)
         with fp32(cloud):
             x = self.first(self.turn_input(cloud, near))
@@ -423,9 +395,7 @@ IGNORED_DISTANCE = 1e9
 """Squared distance that is given to points that do not count."""
 
 
-def neighbours(
-    x: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"], count: int
-) -> Int64[Tensor, "batch points neighbours"]:
+def neighbours(x: Features, near: Near, count: int) -> Int64[Tensor, "batch points neighbours"]:
     """Indices of each point's `count` nearest neighbours, itself included; where there are fewer, itself
     again."""
     with torch.no_grad(), fp32(x):
@@ -454,9 +424,7 @@ class EdgeConvolution(nn.Module):
         self.other = nn.Linear(channels, out, bias=False)
         self.norm = nn.LayerNorm(out)
 
-    def forward(
-        self, x: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
-    ) -> Float[Tensor, "batch points out"]:
+    def forward(self, x: Features, near: Near) -> Float[Tensor, "batch points out"]:
         index = neighbours(x, near, self.count)
         other = self.other(x)
         offset = other.shape[1] * torch.arange(len(other), device=x.device)[:, None, None]
@@ -483,9 +451,7 @@ class DGCNN(Encoder):
         self.empty = nn.Parameter(torch.zeros(sizes[0]))
         self.head = nn.Sequential(*layers(sizes, activation), nn.Linear(sizes[-1], settings.code))
 
-    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
-        if cloud.shape[1] == 0:
-            return self.head(self.empty.expand(len(cloud), -1)).float()
+    def forward(self, cloud: Cloud) -> Codes:
         near = self.near(cloud)
         first, *others = self.edges
         with fp32(cloud):
@@ -502,11 +468,11 @@ class Points(Encoder):
 
     settings: PointsSettings
 
-    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+    def forward(self, cloud: Cloud) -> Codes:
         with fp32(cloud):
             return self.code_of_ordered(self.arrange(cloud.float()))
 
-    def code_of_ordered(self, cloud: Float[Tensor, "batch cloud 3"]) -> Float[Tensor, "batch code"]:
+    def code_of_ordered(self, cloud: Ordered) -> Codes:
         return cloud.flatten(1)
 
 

@@ -1,7 +1,7 @@
 """Training of a learned baseline's network on the same planned trajectories as the diffusion model."""
 
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -10,15 +10,33 @@ from torch import Tensor
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import save_network
-from robotdiffuse.learning.networks import NETWORKS
-from robotdiffuse.learning.networks.base import BaselineNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.network import Network
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.config import BaselineTraining
-from robotdiffuse.learning.training.loop import Validation
-from robotdiffuse.learning.training.processes import Processes
-from robotdiffuse.learning.training.task import MotionTask, train
+from robotdiffuse.learning.training.loop import MotionTask, Processes, Validation, train
+from robotdiffuse.learning.weight_files import NETWORKS, RobotIdentity
 from robotdiffuse.robots import load_robot
+
+
+class BaselineNetwork(Network):
+    """A network that `train_baseline` trains; `settings` are of the class that NETWORKS names."""
+
+    training_defaults: ClassVar[dict[str, Any]] = {}
+    """The network's own defaults of fields of `BaselineTraining`, for example batch."""
+
+    def __init__(self, robot: RobotIdentity, settings: Any) -> None:
+        super().__init__()
+        self.robot, self.settings = robot, settings
+        self.dof, self.normalizer = robot.dof, robot.normalizer()
+
+    def fit_statistics(self, data: TrajectoryData) -> None:
+        """Fill buffers with statistics of the training trajectories; called before a run."""
+
+    def loss(
+        self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
+    ) -> Float[Tensor, ""]:
+        """The loss of `count` samples drawn from the data; `fraction` of the training is done, 0 to 1."""
+        raise NotImplementedError
 
 
 def baseline_training(name: str, given: dict[str, Any]) -> BaselineTraining:
@@ -38,11 +56,10 @@ def train_baseline(settings: BaselineTraining, out: str) -> dict[str, float]:
     """Train a network with its default settings; write NAME.safetensors and NAME.json into the folder `out`.
 
     The same call continues a run that was interrupted. Returns `validation`, the loss on held-out
-    trajectories, `success`, the share of their problems that the network solves by itself, and `samples`.
+    trajectories, and `samples`.
     Raises as `task.train`, and InputError if the data do not fit.
     """
-    processes = Processes(settings.device)
-    return train(_BaselineTask(settings, processes), settings, out, processes)
+    return train(_BaselineTask(settings, Processes(settings.device)), out)
 
 
 class _BaselineTask(MotionTask):
@@ -67,9 +84,6 @@ class _BaselineTask(MotionTask):
         validation = super().validate(fraction)
         self.module.train()
         return validation
-
-    def success(self, rng: np.random.Generator) -> float | None:
-        return self.module.success(self.validation_data, self.robot, rng)
 
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
         save_network(self.title, self.module, folder, training)

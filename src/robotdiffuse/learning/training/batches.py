@@ -19,11 +19,13 @@ from robotdiffuse.datasets.rows import read_rows, turns_about_vertical
 from robotdiffuse.datasets.shards import SPLITS, shard_indices
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.checkpoint import fingerprint
-from robotdiffuse.learning.clearance_features import PackedClearanceFn
 from robotdiffuse.learning.encoders.networks import Encoder
+from robotdiffuse.learning.motion_model import PackedClearanceFn
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
+
+Trajectories = Float[ndarray, "n waypoints dof"]
 
 
 def random_scenes(
@@ -57,7 +59,7 @@ def random_scenes(
 class TrajectoryData:
     """Planned trajectories with their scenes, in memory."""
 
-    q: Float[ndarray, "n waypoints dof"]
+    q: Trajectories
     """[rad], float32, evenly spaced along the path."""
     scenes: PackedScenes
     trivial: Bool[ndarray, "n"]
@@ -217,15 +219,15 @@ class Batch:
     """With zeros for z if there are clouds."""
     clouds: Float32[Tensor, "n points 3"] | None
     """Clouds of the scenes [m], for an encoder that is trained jointly."""
-    clean: Float[ndarray, "n waypoints dof"]
-    noisy: Float[ndarray, "n waypoints dof"]
-    target: Float[ndarray, "n waypoints dof"]
+    clean: Trajectories
+    noisy: Trajectories
+    target: Trajectories
     """The output that the network is trained towards, by the model's objective."""
     weight: Float[ndarray, "n"]
     """Weight of the squared error of the output, by level."""
     clean_weight: Float[ndarray, "n"]
     """Weight of the squared error of the clean trajectory that the output stands for."""
-    base: Float[ndarray, "n waypoints dof"]
+    base: Trajectories
     """`Reference.base` of the trajectories."""
     signal: Float[ndarray, "n 1 1"]
     noise_level: Float[ndarray, "n 1 1"]

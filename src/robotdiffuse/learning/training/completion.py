@@ -1,5 +1,10 @@
 """Training of the occupancy completion network on random scenes, and its figures on held-out scenes."""
 
+import copy
+import os
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Annotated, Any
@@ -12,8 +17,9 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.processes import SingleWorker
 from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
-from robotdiffuse.learning.checkpoint import load_completion, save_completion
+from robotdiffuse.learning.checkpoint import load_completion, save_network
 from robotdiffuse.learning.completion import (
     FREE,
     OCCUPIED,
@@ -26,13 +32,68 @@ from robotdiffuse.learning.completion import (
 )
 from robotdiffuse.learning.completion_network import CompletionNetwork, folded
 from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSettings
-from robotdiffuse.learning.training.loop import Validation
-from robotdiffuse.learning.training.prefetch import SEED_LIMIT, SamplePrefetcher
-from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.task import TrainingTask, train
+from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, on_cpu, train
 from robotdiffuse.perception.observed_volume import VOXEL
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
+
+Probabilities = Float32[ndarray, "m"]
+Truth = Bool[ndarray, "m"]
+NICENESS = 5
+"""Workers give way to the training itself."""
+BATCHES_AHEAD = 3
+"""Batches drawn in advance, for each worker."""
+SEED_LIMIT = 2**62
+"""Seeds of samples are below this."""
+
+
+class SamplePrefetcher:
+    """Batches of samples for a training that draws nothing else from its random number generator.
+
+    A copy of the generator tells the seeds of the next batches, so a resumed run has the same batches.
+    """
+
+    def __init__(self, families: Sequence[str], robot: Robot, batch: int, workers: int) -> None:
+        """workers: number of worker processes; 0: `next` draws the samples itself."""
+        self._families = tuple(families)
+        self._robot = robot
+        self._batch = batch
+        self._workers = deque(SingleWorker(_give_way, ()) for _ in range(workers))
+        self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
+
+    def next(self, rng: np.random.Generator) -> Samples:
+        """The batch of samples with the seeds that `rng` draws."""
+        seeds = self._seeds(rng)
+        if not self._workers:
+            return draw_samples(self._families, self._robot, seeds)
+        if not self._pending or self._pending[0][0] != seeds:
+            self._pending.clear()
+            self._submit(seeds)
+        following = copy.deepcopy(rng)
+        for _ in range(len(self._pending) - 1):
+            self._seeds(following)
+        while len(self._pending) <= BATCHES_AHEAD * len(self._workers):
+            self._submit(self._seeds(following))
+        return self._pending.popleft()[1].result()
+
+    def close(self) -> None:
+        """Stop the workers."""
+        for worker in self._workers:
+            worker.close()
+
+    def _seeds(self, rng: np.random.Generator) -> tuple[int, ...]:
+        return tuple(rng.integers(SEED_LIMIT, size=self._batch).tolist())
+
+    def _submit(self, seeds: tuple[int, ...]) -> None:
+        self._workers.rotate()
+        job = self._workers[0].submit(draw_samples, self._families, self._robot, seeds)
+        self._pending.append((seeds, job))
+
+
+def _give_way() -> None:
+    os.nice(NICENESS)
+
 
 BUNDLED_WEIGHTS = "bundled"
 """Name of the weights that come with the package."""
@@ -83,7 +144,7 @@ def train_completion(settings: CompletionTraining, out: str) -> dict[str, float]
     processes = Processes(settings.device)
     task = CompletionTask(settings, processes)
     try:
-        return train(task, settings, out, processes)
+        return train(task, out)
     finally:
         task.prefetcher.close()
 
@@ -162,7 +223,7 @@ class CompletionTask(TrainingTask):
         return self._figures
 
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
-        save_completion(self._trained, folder, training)
+        save_network("completion", self._trained, folder, training)
 
     def _held_out(self, families: tuple[str, ...], first: int, count: int) -> Samples:
         """`count` held-out samples of each family, from the sample number `first` on."""
@@ -193,9 +254,7 @@ class CompletionTask(TrainingTask):
         logits, truth, _ = self._rows(samples, self._counts(samples))
         return binary_cross_entropy_with_logits(logits, truth.float())
 
-    def _predictions(
-        self, samples: Samples
-    ) -> tuple[Float32[ndarray, "m"], Bool[ndarray, "m"], Bool[ndarray, "m"]]:
+    def _predictions(self, samples: Samples) -> tuple[Probabilities, Truth, Truth]:
         """Logits and truth of the predicted voxels, and which of them are unknown and above the ground."""
         found: list[tuple[ndarray, ndarray, ndarray]] = []
         for part in _split(samples):
@@ -212,7 +271,7 @@ def _split(samples: Samples, size: int = 4) -> list[Samples]:
     return [Samples(*(array[i : i + size] for array in samples)) for i in range(0, len(samples.seen), size)]
 
 
-def fitted_temperature(logits: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> float:
+def fitted_temperature(logits: Probabilities, truth: Truth) -> float:
     """The temperature that minimises the cross-entropy of logits divided by it (Guo et al. 2017)."""
     from scipy.optimize import minimize_scalar
 
@@ -225,7 +284,7 @@ def fitted_temperature(logits: Float32[ndarray, "m"], truth: Bool[ndarray, "m"])
     return float(np.exp(found.x))
 
 
-def reliability(p: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> list[list[float]]:
+def reliability(p: Probabilities, truth: Truth) -> list[list[float]]:
     """By bin of the predicted probability: its mean, the share of true voxels, and their number."""
     which = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
     count = np.bincount(which, minlength=CALIBRATION_BINS)
@@ -236,14 +295,14 @@ def reliability(p: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> list[lis
     return [[round(a, 4), round(b, 4), float(n)] for a, b, n in rows]
 
 
-def calibration_error(p: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> float:
+def calibration_error(p: Probabilities, truth: Truth) -> float:
     """Expected calibration error: mean over voxels of |predicted probability - share of true voxels| of their
     bin."""
     rows = np.array(reliability(p, truth))
     return float((np.abs(rows[:, 0] - rows[:, 1]) * rows[:, 2]).sum() / max(1.0, rows[:, 2].sum()))
 
 
-def average_precision(p: Float32[ndarray, "m"], truth: Bool[ndarray, "m"]) -> float:
+def average_precision(p: Probabilities, truth: Truth) -> float:
     """Mean precision over all thresholds, weighted by the gain in recall."""
     order = np.argsort(-p, kind="stable")
     hits = np.cumsum(truth[order])

@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from robotdiffuse.learning.checkpoint import save_encoder
-from robotdiffuse.learning.encoders.networks import Autoencoder, Encoder, make_encoder
+from robotdiffuse.learning.checkpoint import save_network
+from robotdiffuse.learning.encoders import make_encoder
+from robotdiffuse.learning.encoders.networks import Autoencoder, Encoder
 from robotdiffuse.learning.training.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining
-from robotdiffuse.learning.training.loop import Validation
-from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.task import TrainingTask, train
+from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, on_cpu, train
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 READOUT_SCENES, TEST_SCENES = 2048, 512
@@ -26,6 +25,8 @@ READOUT_POSITIONS = np.stack(
 """Positions around the arm [m] whose distance to the obstacles is read out."""
 MAX_READOUT_DISTANCE = 0.3
 """Distances are clipped to plus and minus this [m]."""
+REGULARIZATION = 1e-7
+"""The paper's lambda: weight of the sum of squared weights, in the unit of the reconstruction's loss."""
 RELATIVE_RIDGE = 1e-3
 """Regularisation of the fit, relative to the mean variance of a code's numbers."""
 
@@ -36,8 +37,7 @@ def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
     The same call continues a run that was interrupted. Returns errors on fresh clouds [m], those of the
     reconstruction (see the encoder's `loss`) and of `linear_readout`, and `samples`. Raises as `task.train`.
     """
-    processes = Processes(settings.device)
-    return train(_EncoderTask(settings, processes), settings, out, processes)
+    return train(_EncoderTask(settings, Processes(settings.device)), out)
 
 
 class _EncoderTask(TrainingTask):
@@ -57,7 +57,7 @@ class _EncoderTask(TrainingTask):
         points = int(rng.integers(max(1, most // 8), most + 1)) if module.settings.any_size else most
         error, _ = self._reconstruction(settings.batch, points, rng)
         theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()
-        return error + settings.regularization * theta
+        return error + REGULARIZATION * theta
 
     def validate(self, fraction: float) -> Validation:
         return Validation(self._validation(128, 123)[0].item())
@@ -74,7 +74,7 @@ class _EncoderTask(TrainingTask):
         return report | linear_readout(trained, self._scenes(READOUT_SCENES + TEST_SCENES, rng), rng)
 
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
-        save_encoder(self._trained, folder, training)
+        save_network("encoder", self._trained, folder, training)
 
     def _scenes(self, count: int, rng: np.random.Generator) -> PackedScenes:
         settings = self.settings

@@ -1,18 +1,22 @@
 """The loop of all training runs: optimiser, learning rate, checkpoints, log, bad steps, interruption."""
 
+import atexit
+import copy
 import csv
 import io
 import json
 import math
 import shutil
 import signal
+import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,12 +24,120 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_, parameters_to_vector, vector_to_parameters
+from torch.optim.swa_utils import AveragedModel
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import lock_folder, write_atomically
-from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
-from robotdiffuse.learning.training.config import TrainingSettings
-from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning import need_packages
+from robotdiffuse.learning.checkpoint import read_tensors, versions, write_tensors
+from robotdiffuse.learning.encoders.networks import Encoder
+from robotdiffuse.learning.network import EXPORT_PACKAGES
+from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16, load_data
+from robotdiffuse.learning.training.config import MotionTraining
+from robotdiffuse.robots.robot import Robot
+
+Value = TypeVar("Value")
+Module = TypeVar("Module", bound=nn.Module)
+
+
+class Processes:
+    """The processes of a training, as seen by one of them. All call the same methods in the same order."""
+
+    def __init__(self, device: str | None) -> None:
+        """device: cpu, or cuda with a device for every process; None: cuda if there is one.
+
+        Matrices are multiplied in bf16 on devices that do so fast. Raises InputError if Accelerate is not
+        installed, the device is missing, or this process has trained on another device.
+        """
+        cuda = torch.cuda.is_available()
+        if device == "cuda" and not cuda:
+            raise InputError("device is cuda, but PyTorch finds no CUDA device here; use cpu")
+        try:
+            from accelerate import Accelerator, PartialState
+        except ImportError:
+            raise InputError('training needs accelerate: pip install "robotdiffuse[train]"') from None
+        cpu = device == "cpu" or not cuda
+        bf16 = fast_bf16() if cpu else torch.cuda.is_bf16_supported(including_emulation=False)
+        wanted = "cpu" if cpu else "cuda"
+        # Accelerate keeps one state per interpreter, that of its first use
+        begun = PartialState().device if PartialState._shared_state else None
+        if begun is not None and begun.type != wanted:
+            raise InputError(
+                f"device is {wanted}, but this process has trained on {begun.type}; start a new process"
+            )
+        self._accelerator = Accelerator(cpu=cpu, mixed_precision="bf16" if bf16 else "no")
+        self.device: torch.device = self._accelerator.device
+        self.count: int = self._accelerator.num_processes
+        self.index: int = self._accelerator.process_index
+        if self.count > 1:
+            # otherwise threads of the process group may outlive the interpreter, which then aborts
+            atexit.register(_leave_group)
+
+    @property
+    def first(self) -> bool:
+        """Whether this process is the one that validates, logs, prints and writes files."""
+        return self.index == 0
+
+    def autocast(self) -> AbstractContextManager[None]:
+        """A context in which matrices are multiplied in bf16, on devices that do so fast."""
+        return self._accelerator.autocast()
+
+    def average(self, parameters: Iterable[nn.Parameter], loss: float) -> float:
+        """Replace the gradients by their means over the processes; returns the mean of the losses.
+
+        A single process leaves them unchanged. Values that are not finite in one process are so in all
+        afterwards.
+        """
+        if self.count == 1:
+            return loss
+        # the parameters that have gradients do not depend on the batch: they are the same in all processes
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        mean = self._mean(
+            torch.cat([parameters_to_vector(gradients), torch.tensor([loss], device=self.device)])
+        )
+        vector_to_parameters(mean[:-1], gradients)
+        return float(mean[-1])
+
+    def mean(self, *values: float | bool) -> tuple[float, ...]:
+        """Means of the values over the processes."""
+        return tuple(self._mean(torch.tensor(values, dtype=torch.float32, device=self.device)).tolist())
+
+    def _mean(self, values: Tensor) -> Tensor:
+        # Accelerate's types allow more than tensors
+        found: Any = self._accelerator.reduce(values, "mean")
+        return found
+
+    def gather(self, value: Value) -> list[Value]:
+        """The values of all processes, in their order."""
+        from accelerate.utils import gather_object
+
+        return gather_object([value])
+
+    def share(self, value: Value | None) -> Value:
+        """The first process's value; the values of the others are ignored."""
+        from accelerate.utils import broadcast_object_list
+
+        values: list[Any] = [value]
+        return broadcast_object_list(values)[0]
+
+    def first_goes_first(self) -> AbstractContextManager[None]:
+        """A context that the first process of each machine passes before the others, which read what it
+        writes."""
+        return self._accelerator.local_main_process_first()
+
+
+def _leave_group() -> None:
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
+
+
+def on_cpu(module: Module) -> Module:
+    """The module itself if it is on the CPU, else a copy on the CPU."""
+    if all(tensor.device.type == "cpu" for tensor in module.state_dict().values()):
+        return module
+    return copy.deepcopy(module).cpu()
+
 
 FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder", "device")
 """Settings that may differ between the parts of one run."""
@@ -47,8 +159,39 @@ class Validation(NamedTuple):
     """Share of held-out problems that the network solves by itself; None: not measured."""
 
 
-LossFn = Callable[[np.random.Generator], Float[Tensor, ""]]
-"""Draws a batch and returns its loss."""
+class TrainingTask(ABC):
+    """A network in training: its loss, its validation, and the files that it leaves."""
+
+    settings: Any
+    """Of a subclass of `TrainingSettings`."""
+    processes: Processes
+    title: str
+    """Name in progress and messages."""
+    module: nn.Module
+    """The network, on the device of the processes."""
+    identity: dict[str, str]
+    """What must be the same when a run is resumed besides the settings, for example the robot."""
+
+    @abstractmethod
+    def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
+        """The loss of a random batch; `fraction` of the training is done, 0 to 1."""
+
+    @abstractmethod
+    def validate(self, fraction: float) -> Validation:
+        """Figures on held-out data, which are the same data at every call."""
+
+    def finish(self) -> dict[str, float]:
+        """The figures of the trained network."""
+        loss, success = self.validate(1.0)
+        return {"validation": loss} | ({} if success is None else {"success": success})
+
+    def about(self) -> dict[str, Any]:
+        """What the checkpoint says about the training, besides settings and figures."""
+        return {}
+
+    @abstractmethod
+    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
+        """Write the weights and their description."""
 
 
 @dataclass
@@ -73,22 +216,18 @@ class TrainingRun:
     read the folder too. They stop, skip and roll back together.
     """
 
-    def __init__(
-        self,
-        module: nn.Module,
-        out: str,
-        settings: TrainingSettings,
-        identity: dict[str, str],
-        processes: Processes,
-    ) -> None:
-        """module: on the device of `processes`. identity: what must be the same when the run is resumed
-        besides the settings, for example the robot.
-        """
-        self.module, self.settings, self.out, self.processes = module, settings, FilePath(out), processes
+    def __init__(self, task: TrainingTask, out: str) -> None:
+        self.task = task
+        self.module = task.module
+        self.settings = settings = task.settings
+        self.processes = processes = task.processes
+        self.out = FilePath(out)
         self.parameters: dict[str, nn.Parameter] = {
-            n: p for n, p in module.named_parameters() if p.requires_grad
+            n: p for n, p in task.module.named_parameters() if p.requires_grad
         }
-        self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
+        self._trained = nn.ParameterList(self.parameters.values())
+        self.average = AveragedModel(self._trained, avg_fn=self._averaged)
+        """The moving average of the parameters."""
         self.optimizer = torch.optim.AdamW(
             self.parameters.values(),
             lr=0.0,
@@ -100,13 +239,12 @@ class TrainingRun:
         seed = [settings.seed, processes.index] if processes.index else settings.seed
         self.rng = np.random.default_rng(seed)
         self.at = Position()
-        self.identity = identity | ({} if processes.count == 1 else {"processes": str(processes.count)})
+        self.identity = task.identity | ({} if processes.count == 1 else {"processes": str(processes.count)})
         self.rows: list[dict[str, float | int | str]] = []
         self._losses: list[float] = []
         self._bad = 0
         self._file = self.out / "training.safetensors"
-        self.resumed = self._file.is_file()
-        if self.resumed:
+        if self._file.is_file():
             self._restore(check=True)
 
     @property
@@ -116,12 +254,7 @@ class TrainingRun:
             return min(1.0, self.at.samples / self.settings.samples)
         return min(1.0, self.at.seconds / (60 * (self.settings.minutes or 1.0)))
 
-    def loop(
-        self,
-        loss: Callable[[np.random.Generator], Float[Tensor, ""]],
-        validate: Callable[[], Validation],
-        title: str,
-    ) -> None:
+    def loop(self) -> None:
         """Train to the end. Ctrl-C stores a checkpoint first, then raises KeyboardInterrupt.
 
         Raises InputError if another training uses the folder, or if the loss diverges.
@@ -129,42 +262,40 @@ class TrainingRun:
         threads = torch.get_num_threads()
         torch.set_num_threads(self.settings.threads)
         try:
-            with self._alone(), _stop_requested() as stop, _progress(self.processes.first) as progress:
-                task = progress.add_task(title, total=1.0, rate="", loss="")
+            alone = lock_folder(self.out) if self.processes.first else nullcontext()
+            with alone, _stop_requested() as stop, _progress(self.processes.first) as progress:
+                bar = progress.add_task(self.task.title, total=1.0, rate="", loss="")
                 last = saved = time.monotonic()
-                stopped: float | bool = False
+                stopped = 0.0
                 while self.fraction < 1.0 and not stopped:
-                    self.step(loss)
+                    self.step()
                     now = time.monotonic()
                     due = now - saved > self.settings.checkpoint_seconds
                     elapsed, stopped, due = self.processes.mean(now - last, stop.is_set(), due)
                     self.at.seconds += elapsed
                     rate, last = self._samples_per_step / max(elapsed, 1e-9), now
                     if self.at.step % LOG_EVERY == 0:
-                        self._log(self.settings.learning_rate * self._lr(), None)
+                        self._log(None)
                         text = f"{self.rows[-1]['loss']:.4f}" if self.rows else ""
-                        progress.update(task, completed=self.fraction, rate=f"{rate:,.0f}/s", loss=text)
+                        progress.update(bar, completed=self.fraction, rate=f"{rate:,.0f}/s", loss=text)
                     if due:
-                        self._checkpoint(validate, progress.console, title)
+                        self._checkpoint(progress.console)
                         saved = time.monotonic()
-                progress.update(task, completed=self.fraction)
-                self._checkpoint(validate, progress.console, title)
+                progress.update(bar, completed=self.fraction)
+                self._checkpoint(progress.console)
                 if stopped:
                     raise KeyboardInterrupt
         finally:
             torch.set_num_threads(threads)
 
-    def _alone(self) -> AbstractContextManager[None]:
-        return lock_folder(self.out) if self.processes.first else nullcontext()
-
-    def step(self, loss: LossFn) -> None:
+    def step(self) -> None:
         """One step of the optimiser, which is skipped if the loss or the gradient is not finite."""
         self.optimizer.param_groups[0]["lr"] = self.settings.learning_rate * self._lr()
         self.optimizer.zero_grad(set_to_none=True)
-        value = loss(self.rng)
+        value = self.task.loss(self.fraction, self.rng)
         value.backward()
         mean = self.processes.average(self.parameters.values(), value.item())
-        norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.settings.gradient_norm)
+        norm = clip_grad_norm_(self.parameters.values(), self.settings.gradient_norm)
         self.at.step += 1
         self.at.samples += self._samples_per_step
         if not (math.isfinite(mean) and math.isfinite(norm.item())):
@@ -173,10 +304,11 @@ class TrainingRun:
         self._bad = 0
         self.optimizer.step()
         self._losses.append(mean)
-        with torch.no_grad():
-            decay = min(self.settings.average, self.at.step / (self.at.step + 10))
-            for name, p in self.parameters.items():
-                self.average[name].lerp_(p, 1 - decay)
+        self.average.update_parameters(self._trained)
+
+    def _averaged(self, average: Tensor, parameter: Tensor, _count: Tensor | int) -> Tensor:
+        decay = min(self.settings.average, self.at.step / (self.at.step + 10))
+        return average.lerp(parameter, 1 - decay)
 
     @property
     def _samples_per_step(self) -> int:
@@ -205,18 +337,19 @@ class TrainingRun:
     @contextmanager
     def averaged(self) -> Iterator[None]:
         """A context in which the module has the moving average of its weights."""
-        kept = {name: p.detach().clone() for name, p in self.parameters.items()}
-        with torch.no_grad():
-            for name, p in self.parameters.items():
-                p.copy_(self.average[name])
+        now = [p.detach().clone() for p in self._trained]
+        self._set(self.average.parameters())
         try:
             yield
         finally:
-            with torch.no_grad():
-                for name, p in self.parameters.items():
-                    p.copy_(kept[name])
+            self._set(now)
 
-    def _log(self, rate: float, validation: Validation | None) -> None:
+    @torch.no_grad()
+    def _set(self, values: Iterable[Tensor]) -> None:
+        for p, value in zip(self._trained, values, strict=True):
+            p.copy_(value)
+
+    def _log(self, validation: Validation | None) -> None:
         loss = (
             float(np.mean(self._losses)) if self._losses else self.rows[-1]["loss"] if self.rows else math.nan
         )
@@ -226,7 +359,7 @@ class TrainingRun:
             self.at.step,
             self.at.samples,
             round(self.at.seconds / 60, 3),
-            f"{rate:.3g}",
+            f"{self.settings.learning_rate * self._lr():.3g}",
             float(f"{loss:.5g}"),
             "" if held_out is None else f"{held_out:.5g}",
             "" if success is None else f"{success:.4g}",
@@ -234,12 +367,12 @@ class TrainingRun:
         )
         self.rows.append(dict(zip(LOG_COLUMNS, row, strict=True)))
 
-    def _checkpoint(self, validate: Callable[[], Validation], console: Console, title: str) -> None:
+    def _checkpoint(self, console: Console) -> None:
         validation = None
         if self.processes.first:
             with self.averaged():
-                validation = validate()
-        self._log(self.settings.learning_rate * self._lr(), validation)
+                validation = self.task.validate(self.fraction)
+        self._log(validation)
         self.save()
         if validation is None:
             return
@@ -247,8 +380,9 @@ class TrainingRun:
         success = validation.success
         planned = "" if success is None or math.isnan(success) else f"{success:.1%} of samples free, "
         console.print(
-            f"{title}: {self.fraction:.1%}, {self.at.samples:,} samples in {self.at.seconds / 60:.1f} min, "
-            f"loss {self.rows[-1]['loss']:.4f}, validation {validation.loss:.4f}, {planned}"
+            f"{self.task.title}: {self.fraction:.1%}, {self.at.samples:,} samples in "
+            f"{self.at.seconds / 60:.1f} min, loss {self.rows[-1]['loss']:.4f}, "
+            f"validation {validation.loss:.4f}, {planned}"
             f"{self.at.skipped} steps skipped",
             highlight=False,
             soft_wrap=True,
@@ -267,7 +401,8 @@ class TrainingRun:
     def _write(self, random_states: Sequence[Mapping[str, Any]]) -> None:
         moments = self.optimizer.state
         tensors: dict[str, Tensor] = {f"module.{name}": t for name, t in self.module.state_dict().items()}
-        tensors |= {f"average.{name}": t for name, t in self.average.items()}
+        averages = zip(self.parameters, self.average.parameters(), strict=True)
+        tensors |= {f"average.{name}": t for name, t in averages}
         for name, p in self.parameters.items():
             for key, value in moments.get(p, {}).items():
                 tensors[f"optimizer.{key}.{name}"] = value
@@ -311,7 +446,8 @@ class TrainingRun:
             state = {k.removeprefix("module."): t for k, t in tensors.items() if k.startswith("module.")}
             self.module.load_state_dict(state)
             device = self.processes.device
-            self.average = {name: tensors[f"average.{name}"].to(device) for name in self.parameters}
+            for name, average in zip(self.parameters, self.average.parameters(), strict=True):
+                average.data.copy_(tensors[f"average.{name}"])
             self.optimizer.state.clear()
             for name, p in self.parameters.items():
                 found = {
@@ -322,6 +458,7 @@ class TrainingRun:
                 if found:
                     self.optimizer.state[p] = found
             self.at = Position(**notes["at"])
+            self.average.n_averaged.fill_(self.at.step)
             states = [notes["random"], *notes.get("random_elsewhere", [])]
             self.rng.bit_generator.state = states[self.processes.index]
             self._losses, self.rows = list(notes["losses"]), list(notes["rows"])
@@ -366,3 +503,81 @@ def _progress(shown: bool) -> Iterator[Progress]:
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not shown) as progress:
         yield progress
+
+
+def train(task: TrainingTask, out: str) -> dict[str, float]:
+    """Train to the end and write the files into the folder `out`; returns the figures.
+
+    The same call continues a run that was interrupted. If torchrun started several processes, all call this
+    and get the same result, see `TrainingRun`. Raises InputError if the folder holds a different run, and
+    KeyboardInterrupt, after a checkpoint, on Ctrl-C.
+    """
+    need_packages("training", *EXPORT_PACKAGES)  # now, and not after hours of training
+    run = TrainingRun(task, out)
+    run.loop()
+    if not task.processes.first:
+        return task.processes.share(None)
+    with run.averaged():
+        report = task.finish() | {"samples": float(run.at.samples)}
+        minutes = round(run.at.seconds / 60, 2)
+        about = task.about() | {"minutes": minutes} | report | versions()
+        task.save(FilePath(out), {"settings": task.settings.to_json(), **about})
+    return task.processes.share(report)
+
+
+MAX_VALIDATION_TRAJECTORIES = 2000
+"""Largest number of trajectories of the validation split that are used."""
+VALIDATION_BATCHES = 8
+"""Batches of these in a validation."""
+
+
+class MotionTask(TrainingTask):
+    """The training of a network on planned trajectories."""
+
+    def __init__(
+        self, settings: MotionTraining, robot: Robot, encoder: Encoder | None, processes: Processes
+    ) -> None:
+        """encoder: the frozen encoder that computes the codes of the scenes, if there is one.
+
+        Raises InputError if the data do not fit the robot, or there are none for training.
+        """
+        self.settings, self.robot, self.processes = settings, robot, processes
+        # the first process caches the codes of the scenes for the others
+        with processes.first_goes_first():
+            self.data = load_data(
+                settings.data, robot, encoder, settings.waypoints, self._report, settings.turned_copies
+            )
+        self.train_data, self.validation_data = self.data.split(MAX_VALIDATION_TRAJECTORIES)
+        if not len(self.train_data):
+            raise InputError(f"data folder {settings.data} holds no trajectory for training")
+
+    def _report(self, text: str) -> None:
+        if self.processes.first:
+            print(text, file=sys.stderr)
+
+    @abstractmethod
+    def loss_of(
+        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
+    ) -> Float[Tensor, ""]:
+        """The loss of a random batch of these data."""
+
+    def success(self, rng: np.random.Generator) -> float | None:
+        """Share of some held-out problems that the network solves by itself; None: not measured."""
+        return None
+
+    def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
+        return self.loss_of(self.train_data, fraction, rng, validating=False)
+
+    def validate(self, fraction: float) -> Validation:
+        if not len(self.validation_data):
+            return Validation(float("nan"))
+        rng = np.random.default_rng(7)
+        with torch.no_grad():
+            losses = [
+                self.loss_of(self.validation_data, fraction, rng, validating=True).item()
+                for _ in range(VALIDATION_BATCHES)
+            ]
+            return Validation(float(np.mean(losses)), self.success(rng))
+
+    def about(self) -> dict[str, Any]:
+        return {"data": self.data.digest, "trajectories": len(self.data)}

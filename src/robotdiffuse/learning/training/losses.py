@@ -16,13 +16,68 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Count, NotNegative, Settings, Share
 from robotdiffuse.core.transforms import rotation_from_quaternion
-from robotdiffuse.learning.forward_kinematics import ForwardKinematics
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+
+
+class ForwardKinematics:
+    """Poses of a robot's frames at batches of configurations; differentiable any number of times.
+
+    Configurations `q` [rad], or [m] for prismatic joints, have any batch shape. They are converted to the
+    dtype and device given here, which the results have too.
+
+    Each step is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C, so it takes
+    one small matrix product and two multiply-adds over the batch.
+    """
+
+    def __init__(
+        self, robot: Robot, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu"
+    ) -> None:
+        self.robot = robot
+        self.dtype = dtype
+        self.device = torch.device(device)
+        turns = np.zeros((3, 4, 4))
+        turns[0, 2, 2] = turns[0, 3, 3] = 1
+        turns[1, 0, 0] = turns[1, 1, 1] = 1
+        turns[2, 1, 0], turns[2, 0, 1] = 1, -1
+        slides = np.stack([np.eye(4), np.outer([0, 0, 1, 0], [0, 0, 0, 1])])
+        self._steps = []
+        """By joint, [12, 4]: C, A and B transposed, stacked; [8, 4]: C and the slide of a prismatic joint."""
+        for offset, prismatic in zip(robot.frame_offsets, robot.prismatic, strict=True):
+            self._steps.append(self._tensor(np.hstack(list(offset @ (slides if prismatic else turns))).T))
+        self._last_row = self._tensor(np.array([[0.0], [0.0], [0.0], [1.0]]))
+
+    def __call__(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch frames 4 4"]:
+        """T_base_frame of all dof + 1 frames, the base (identity) first."""
+        batch = q.shape[:-1]
+        q = q.to(self.device, self.dtype).reshape(-1, self.robot.dof).t()
+        cosines, sines = q.cos(), q.sin()
+        # the batch is the last axis here, so that every operation runs along contiguous numbers
+        T = torch.eye(4, dtype=self.dtype, device=self.device)[:3, :, None].expand(3, 4, q.shape[1])
+        frames = [T]
+        for j in range(self.robot.dof):
+            T = frames[self.robot.parents[j]]
+            parts = self._steps[j] @ T
+            if self.robot.prismatic[j]:
+                T = torch.addcmul(parts[:, :4], q[j], parts[:, 4:])
+            else:
+                T = torch.addcmul(parts[:, :4], cosines[j], parts[:, 4:8])
+                T = torch.addcmul(T, sines[j], parts[:, 8:])
+            frames.append(T)
+        top = torch.stack(frames)
+        bottom = self._last_row.expand(len(frames), 1, 4, q.shape[1])
+        return torch.cat([top, bottom], dim=1).permute(3, 0, 1, 2).reshape(*batch, len(frames), 4, 4)
+
+    def _tensor(self, array: ndarray) -> Tensor:
+        return torch.as_tensor(array, dtype=self.dtype, device=self.device)
+
 
 POINT_UNIT = 0.1
 """Distances in L_point and L_collision are divided by this [m], so that they are of the size of L_joint."""
 MAX_DISTANCE = 1.0
 """Largest distance that is computed [m]; also the distance to an empty scene."""
+SAFE_DISTANCE = 0.05
+"""S of the hinge h in L_collision [m]: distances below it are penalised."""
 EPSILON = 1e-12
 """Added to squared lengths [m^2], so that their root has a gradient everywhere."""
 
@@ -35,8 +90,6 @@ class LossSettings(Settings, name="losses"):
     """lambda_point"""
     collision: NotNegative = 0.0
     """lambda_collision"""
-    safe_distance: NotNegative = 0.05
-    """S of the hinge h [m]: distances below it are penalised."""
     begin: Share = 0.0
     """Share of the training after which L_collision begins; it rises over a tenth of the training. Earlier
     predictions are too far off for a meaningful gradient."""

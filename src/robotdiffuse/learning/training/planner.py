@@ -8,24 +8,98 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from numpy import ndarray
 from torch import Tensor
 
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_network
-from robotdiffuse.learning.clearance_features import packed_clearances
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.encoders.networks import Encoder, encoder_name, make_encoder
-from robotdiffuse.learning.forward_kinematics import ForwardKinematics
-from robotdiffuse.learning.motion_model import ModelParts, MotionModelSettings
+from robotdiffuse.learning.encoders import encoder_name, make_encoder
+from robotdiffuse.learning.encoders.networks import Encoder
+from robotdiffuse.learning.guidance import CollisionGuidance
+from robotdiffuse.learning.motion_model import (
+    ModelParts,
+    MotionModelSettings,
+    SamplingSettings,
+    link_clearances,
+    packed_clearances,
+)
 from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData, fast_bf16
+from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData, encode_scenes, fast_bf16
 from robotdiffuse.learning.training.config import PlannerTraining, block_at
-from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
-from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.task import MotionTask, train
-from robotdiffuse.learning.training.validation import planning_success
+from robotdiffuse.learning.training.loop import MotionTask, Processes, on_cpu, train
+from robotdiffuse.learning.training.losses import (
+    POINT_UNIT,
+    SAFE_DISTANCE,
+    ArmDistance,
+    ForwardKinematics,
+    SurfacePoints,
+    hinge,
+)
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
+
+SAMPLING_STEPS = 6
+"""Sampling steps of every network, so that validation takes less time than the training."""
+PRIOR_GUIDANCE_STEPS = 4
+"""Guidance of a prior, whose inputs do not include the scene: gradient steps in each guided sampling step."""
+CHECKS_PER_SEGMENT = 6
+"""Configurations that are checked in each segment from waypoint to waypoint."""
+
+
+def planning_success(
+    model: MotionNetwork,
+    robot: Robot,
+    data: TrajectoryData,
+    problems: int,
+    candidates: int,
+    rng: np.random.Generator,
+) -> float:
+    """Share of free trajectories among `candidates` samples for each of the first non-trivial problems.
+
+    nan if the data hold no such problem.
+    """
+    rows = np.flatnonzero(~data.trivial)[:problems].tolist()
+    free = [_sampled_free(model, robot, data, row, candidates, rng).mean() for row in rows]
+    return float(np.mean(free)) if free else float("nan")
+
+
+def _sampled_free(
+    model: MotionNetwork,
+    robot: Robot,
+    data: TrajectoryData,
+    row: int,
+    candidates: int,
+    rng: np.random.Generator,
+) -> Bool[ndarray, "candidates"]:
+    q, checker = data.q[row], CollisionChecker(robot, data.scenes.scene(row))
+    code = np.zeros(0)
+    if data.codes is not None:
+        code = data.codes[row]
+    elif model.encoder is not None:
+        code = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
+    guidance = CollisionGuidance(checker)
+
+    def guide(q: ndarray, _level: float) -> ndarray:
+        return guidance(q, PRIOR_GUIDANCE_STEPS)[0]
+
+    start, goal = q[0].astype(np.float64), q[-1].astype(np.float64)
+    clearances = link_clearances(checker, model.settings)
+    settings = SamplingSettings(samples=candidates, sampling_steps=min(SAMPLING_STEPS, model.schedule.steps))
+    guided = guide if model.encoder is None else None
+    q = model.sample(start, goal, code.astype(np.float32), clearances, rng, settings, guided)
+    return free_in_scene(checker, q)
+
+
+def free_in_scene(checker: CollisionChecker, q: Float[ndarray, "n waypoints dof"]) -> Bool[ndarray, "n"]:
+    """Which motions are free in the checker's scene, at their waypoints and between them."""
+    share = np.linspace(0, 1, CHECKS_PER_SEGMENT, endpoint=False)[:, None]
+    dense = q[:, :-1, None] + share * np.diff(q, axis=1)[:, :, None]
+    every = np.concatenate([dense.reshape(len(q), -1, q.shape[-1]), q[:, -1:]], 1)
+    free = checker.free(every.reshape(-1, q.shape[-1])).reshape(len(q), -1)
+    return np.all(free, axis=1, keepdims=True)[:, 0]
+
 
 VALIDATION_SAMPLES = 4
 """Trajectories sampled for each problem of a validation."""
@@ -41,8 +115,7 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     trajectories, `success`, the share of free motions among those sampled for their problems, and `samples`.
     Raises as `task.train`, and InputError if the data or the encoder do not fit.
     """
-    processes = Processes(settings.device)
-    return train(PlannerTask(settings, processes), settings, out, processes)
+    return train(PlannerTask(settings, Processes(settings.device)), out)
 
 
 class PlannerTask(MotionTask):
@@ -59,7 +132,7 @@ class PlannerTask(MotionTask):
         # codes are computed on the CPU: the frozen encoder stays there
         model.encoder = copy.deepcopy(encoder)
         super().__init__(settings, robot, frozen, processes)
-        self.own, self.title = settings, model.settings.network
+        self.title = model.settings.network
         hard = self.train_data.q[~self.train_data.trivial]
         model.fit_statistics(
             (hard if len(hard) else self.train_data.q)[:MAX_STATISTICS_TRAJECTORIES], settings.smooth_noise
@@ -74,7 +147,7 @@ class PlannerTask(MotionTask):
     def loss_of(
         self, data: TrajectoryData, fraction: float, rng: np.random.Generator, validating: bool
     ) -> Float[Tensor, ""]:
-        own = self.own
+        own = self.settings
         if own.progressive:
             self.model.coarsen(block_at(fraction))
         batches = Batches(data, self._on_cpu, self.clearances, own.trivial_share, own.weight_limit)
@@ -87,7 +160,7 @@ class PlannerTask(MotionTask):
         if self._on_cpu is not self.model:
             self._on_cpu.load_state_dict(self.model.state_dict())
             self._on_cpu.coarsen(self.model.block)
-        problems = self.own.validation_problems
+        problems = self.settings.validation_problems
         with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
             return planning_success(
                 self._on_cpu, self.robot, self.validation_data, problems, VALIDATION_SAMPLES, rng
@@ -179,6 +252,6 @@ class PlannerLoss:
             moved = self.points(q) - self.points(model.joints_at(clean, base, waypoints))
             error = error + losses.point * (moved / POINT_UNIT).square().sum(-1).mean((1, 2))
         if self.arm is not None and collision_weight > 0:
-            near = hinge(self.arm(q, batch.scenes), losses.safe_distance) / POINT_UNIT
+            near = hinge(self.arm(q, batch.scenes), SAFE_DISTANCE) / POINT_UNIT
             error = error + collision_weight * near.sum(-1).mean(1)
         return error

@@ -37,8 +37,8 @@ from robotdiffuse.collision.kernels.motions import Space, motions_free, path_len
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive
+from robotdiffuse.learning.diffusion import reverse_process
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.learning.samplers.ddpm import ancestral
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.planning.start_goal import StartGoal
@@ -155,7 +155,7 @@ def sample(
 ) -> Float[ndarray, "count waypoints dof"] | None:
     """A trajectory from each start to its goal, float32, within the limits but for the ends themselves.
 
-    levels, noise_scale: see `ancestral`.
+    levels, noise_scale: see `reverse_process`.
     quiet_steps: additional steps at the last level, without noise (MPD: 5).
     stop: called before every step; None is returned if it returns True.
     """
@@ -173,7 +173,7 @@ def sample(
         return prior.normalize(guide(mean, left), reference)
 
     try:
-        x = ancestral(
+        x = reverse_process(
             predict, prior.schedule, lambda: prior.draw_noise(len(starts), rng), levels, move, noise_scale
         )
         for _ in range(quiet_steps):

@@ -1,6 +1,6 @@
 """MPiNets: roll-outs of a policy, step by step (A. Fishman et al., "Motion Policy Networks", CoRL 2022).
 
-The network inputs of the policy (`learning.networks.mpinets`) are points of the scene, of the arm and of the
+The network inputs of the policy (`learning.mpinets`) are points of the scene, of the arm and of the
 goal. It is rolled out from the start for at most 150 steps, the paper's number. The first roll-out is the
 paper's planner: one cloud, no noise, no repetition. While there is time, others follow with new clouds and
 noise.
@@ -34,7 +34,7 @@ from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.scenes.surface_points import sample_surface
 
 if TYPE_CHECKING:
-    from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork
+    from robotdiffuse.learning.mpinets import MPiNetsNetwork
 
 STANDSTILL = 1e-4
 """A roll-out ends when no joint moves further than this in a step [rad]: the policy would stand still

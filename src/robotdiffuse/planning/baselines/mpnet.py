@@ -2,7 +2,7 @@
 them; then it proposes new states for those that collide.
 
 A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
-Learning-based and Classical Motion Planners", T-RO 2020. The networks are in `learning.networks.mpnet`. The
+Learning-based and Classical Motion Planners", T-RO 2020. The networks are in `learning.mpnet`. The
 parts, by the paper's names:
 
 - *Bidirectional neural planning* (`NeuralPlanning.between`): both ends step towards each other, unchecked
@@ -41,7 +41,7 @@ from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.trajectories.simplification import shortcut
 
 if TYPE_CHECKING:
-    from robotdiffuse.learning.networks.mpnet import MPNetNetwork
+    from robotdiffuse.learning.mpnet import MPNetNetwork
 
 SEARCH_ITERATIONS = 500
 """Iterations of RRT-Connect between two readings of the clock, in hybrid replanning."""

@@ -15,7 +15,6 @@ The weights name the sampler and the number of steps, unless the settings do. Wi
 network runs without guidance.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, TypeVar
@@ -28,10 +27,9 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative
 from robotdiffuse.core.types import Path
-from robotdiffuse.learning.costs import CostStep, path_constraint_cost
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
-from robotdiffuse.learning.sampling import SamplingSettings
-from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.learning.motion_model import SamplingSettings
+from robotdiffuse.learning.weight_files import weights_for
 from robotdiffuse.planning import PATH_CONSTRAINTS
 from robotdiffuse.planning.context import TOLERANCE_FRACTION, PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
@@ -101,18 +99,18 @@ class ModelSampler(LearnedPlanner[SamplerSettings]):
         goals: Float[ndarray, "k dof"],
         rng: np.random.Generator,
         clearances: "ClearanceFn | None" = None,
-        problem_costs: Sequence[CostStep] = (),
+        constraints: PathConstraints | None = None,
     ) -> Float[ndarray, "count waypoints dof"]:
         """A batch of samples under guidance, divided among the nearest goals.
 
         code: the scene, as by `encode`; None: the condition is hidden, for weights that allow it.
         clearances: the model's clearance inputs; None: the true ones of the checker's scene.
-        problem_costs: as for `CollisionGuidance`.
+        constraints: of the path, one more cost of the guidance.
         """
-        from robotdiffuse.learning.clearance_features import link_clearances
+        from robotdiffuse.learning.motion_model import link_clearances
 
         settings = self.settings
-        guidance = CollisionGuidance(checker, settings.guidance, problem_costs)
+        guidance = CollisionGuidance(checker, settings.guidance, constraints, TOLERANCE_FRACTION)
         goals = nearest_goals(start, goals, settings.samples)
         counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(goals))]
         clearances = clearances or link_clearances(checker, model.settings)
@@ -168,10 +166,9 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         start, goals = start_goal.rows()
         code = encode(model, start_goal.checker, self.settings.points, rng)
         names, constraints = context.problem.robot.joint_names, context.validator.constraints
-        costs = [] if constraints is None else [path_constraint_cost(constraints, TOLERANCE_FRACTION)]
         every, valid, until = list[Path](), list[Path](), context.request.time_limit
         while not every or (context.elapsed < until and (valid or self.settings.repeat)):
-            batch = self.draw(model, start_goal.checker, code, start, goals, rng, problem_costs=costs)
+            batch = self.draw(model, start_goal.checker, code, start, goals, rng, constraints=constraints)
             if constraints is not None:
                 batch = [_projected(constraints, q) for q in batch]
             paths = [Path(names, start_goal.complete(q)) for q in batch]

@@ -41,32 +41,50 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings, Share, Sizes
+from robotdiffuse.core.settings import Count, NotNegative, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
-from robotdiffuse.learning.forward_kinematics import ForwardKinematics
-from robotdiffuse.learning.networks.base import BaselineNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.baseline import BaselineNetwork
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
-from robotdiffuse.learning.training.losses import ArmDistance, SurfacePoints, hinge
-from robotdiffuse.learning.training.validation import motions_free
+from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics, SurfacePoints, hinge
+from robotdiffuse.learning.weight_files import NetworkSettings, RobotIdentity
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
+Configurations = Float32[Tensor, "n dof"]
+Clouds = Float32[Tensor, "n points 3"]
+Joints = Float32[ndarray, "n dof"]
 DIRECTION_OFFSET = 0.1
 """Added to the distance to the goal [half joint ranges] by which the way to it is divided, so that the
 direction fades near the goal."""
 LOSS_UNIT = 0.01
 """Losses are divided by this [m], so that they are near 1."""
-SUCCESS_PROBLEMS = 40
-"""Held-out problems that `success` rolls the policy out on."""
-MAX_ROLL_OUT_STEPS = 80
-"""Largest number of steps of a roll-out; the experts take 47."""
+RADII = (0.2, 0.6)
+"""Radii of the balls around centres [m] (paper: 0.05, 0.3)."""
+JOINT_WIDTHS = (32, 64, 128, 128, 64)
+"""Widths of the configuration encoder (the paper's)."""
+DECODER_WIDTHS = (512, 256, 128)
+"""Widths of the decoder (the paper's)."""
+COLLISION_WEIGHT = 5.0
+"""Weight of the loss on the distance to the scene, relative to that on points of the arm (the paper's)."""
+MARGIN = 0.03
+"""Distance to the scene below which the collision loss acts [m] (the paper's)."""
+TRIVIAL_SHARE = 0.3
+"""Share of the samples from motions between ends whose straight line is free too."""
 
 
 @dataclass(frozen=True)
-class MPiNetsNetworkSettings(Settings, name="mpinets"):
+class MPiNetsNetworkSettings(NetworkSettings, name="mpinets"):
+    constants: ClassVar[dict[str, Any]] = {
+        "radii": [0.2, 0.6],
+        "joint_widths": [32, 64, 128, 128, 64],
+        "decoder_widths": [512, 256, 128],
+        "point_match": 1.0,
+        "collision": 5.0,
+        "margin": 0.03,
+        "trivial_share": 0.3,
+        "near": 0.3,
+    }
     scene_points: Count = 256
     """Points of the scene (paper: 4,096)."""
     robot_points: Count = 12
@@ -79,8 +97,6 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
     """Centres of the two set abstractions (paper: 512, 128)."""
     neighbours: tuple[Count, Count] = (16, 16)
     """Points around each centre (paper: 128, 128)."""
-    radii: tuple[Positive, Positive] = (0.2, 0.6)
-    """Radii of the balls around centres [m] (paper: 0.05, 0.3)."""
     first_widths: Sizes = (32, 32, 64)
     """Widths of the layers of the first set abstraction (paper: 64, 64, 64)."""
     second_widths: Sizes = (96, 128, 192)
@@ -89,23 +105,8 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
     """Widths of the layers on all points together (paper: 512, 512, 1,024)."""
     cloud_widths: tuple[Count, Count] = (512, 256)
     """Widths after PointNet++; the last one is the size of the code (paper: 4,096, 2,048, 2,048)."""
-    joint_widths: Sizes = (32, 64, 128, 128, 64)
-    """Widths of the configuration encoder (the paper's)."""
-    decoder_widths: Sizes = (512, 256, 128)
-    """Widths of the decoder (the paper's)."""
-    point_match: NotNegative = 1.0
-    """Weight of the loss on points of the arm (the paper's)."""
-    collision: NotNegative = 5.0
-    """Weight of the loss on the distance to the scene (the paper's)."""
-    margin: NotNegative = 0.03
-    """Distance to the scene below which the collision loss acts [m] (the paper's)."""
     noise: NotNegative = 0.015
     """Standard deviation of the noise on the input configuration [rad] (the paper's)."""
-    trivial_share: Share = 0.3
-    """Share of the samples from motions between ends whose straight line is free too."""
-    near: NotNegative = 0.3
-    """In `success`: within this distance of every joint, the goal is connected by a straight segment
-    [rad]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,7 +115,7 @@ class MPiNetsNetworkSettings(Settings, name="mpinets"):
                 f"mpinets.target_points is {self.target_points}; it must be at most robot_points, "
                 f"{self.robot_points}"
             )
-        for name in ("centres", "neighbours", "radii"):
+        for name in ("centres", "neighbours"):
             if len(getattr(self, name)) != 2:
                 raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be two numbers")
         if self.centres[0] > self.scene_points or self.centres[1] > self.centres[0]:
@@ -208,12 +209,12 @@ def _rows(values: Float[Tensor, "b n c"], at: Int64[Tensor, "b *m"]) -> Float[Te
 class Steps(NamedTuple):
     """Training samples, each of them one step of a motion."""
 
-    q: Float32[Tensor, "n dof"]
+    q: Configurations
     """The arm's configuration, with noise [rad]."""
-    expert: Float32[Tensor, "n dof"]
+    expert: Configurations
     """The next waypoint of the motion [rad]."""
-    goal: Float32[Tensor, "n dof"]
-    clouds: Float32[Tensor, "n points 3"]
+    goal: Configurations
+    clouds: Clouds
     """Clouds of the scenes [m]."""
     scenes: PackedScenes
 
@@ -240,9 +241,9 @@ class MPiNetsNetwork(BaselineNetwork):
         label = torch.cat([part.reshape(-1) for part in labels])
         self._labels = nn.functional.one_hot(label, 1 + 2 * links).float()
         """One-hot labels: scene, each link of the robot, each link of the target."""
-        self.first = SetAbstraction(1 + 2 * links, s.first_widths, s.centres[0], s.neighbours[0], s.radii[0])
+        self.first = SetAbstraction(1 + 2 * links, s.first_widths, s.centres[0], s.neighbours[0], RADII[0])
         self.second = SetAbstraction(
-            s.first_widths[-1], s.second_widths, s.centres[1], s.neighbours[1], s.radii[1]
+            s.first_widths[-1], s.second_widths, s.centres[1], s.neighbours[1], RADII[1]
         )
         # all points together; named as in the weights
         self.together = nn.ModuleDict({"layers": PooledLayers(3 + s.second_widths[-1], s.all_widths)})
@@ -253,11 +254,9 @@ class MPiNetsNetwork(BaselineNetwork):
             nn.LeakyReLU(),
             nn.Linear(wide, code),
         )
-        self.joint_code = _leaky(2 * self.dof, s.joint_widths)
-        last = nn.Linear(s.decoder_widths[-1], self.dof)
-        self.decoder = nn.Sequential(
-            _leaky(code + s.joint_widths[-1], s.decoder_widths), nn.LeakyReLU(), last
-        )
+        self.joint_code = _leaky(2 * self.dof, JOINT_WIDTHS)
+        last = nn.Linear(DECODER_WIDTHS[-1], self.dof)
+        self.decoder = nn.Sequential(_leaky(code + JOINT_WIDTHS[-1], DECODER_WIDTHS), nn.LeakyReLU(), last)
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
                 nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
@@ -276,10 +275,10 @@ class MPiNetsNetwork(BaselineNetwork):
 
     def forward(
         self,
-        clouds: Float32[Tensor, "n points 3"],
-        q: Float32[Tensor, "n dof"],
-        goal: Float32[Tensor, "n dof"],
-    ) -> Float32[Tensor, "n dof"]:
+        clouds: Clouds,
+        q: Configurations,
+        goal: Configurations,
+    ) -> Configurations:
         """The next configurations, within limits [rad]; clouds of the scenes [m], q and goal in [rad]."""
         points = torch.cat([clouds, self._surface(q), self._surface(goal)[:, self._target]], 1).detach()
         with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
@@ -296,8 +295,8 @@ class MPiNetsNetwork(BaselineNetwork):
     def roll_outs(
         self,
         clouds: Float32[ndarray, "n points 3"],
-        start: Float32[ndarray, "n dof"],
-        goal: Float32[ndarray, "n dof"],
+        start: Joints,
+        goal: Joints,
     ) -> "RollOuts":
         """Roll-outs of the policy, in planning."""
         return RollOuts(self, torch.from_numpy(clouds), start, goal)
@@ -306,16 +305,16 @@ class MPiNetsNetwork(BaselineNetwork):
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
     ) -> Float[Tensor, ""]:
         """Point match and collision of one step each of `count` motions, in units of `LOSS_UNIT`."""
-        s, steps = self.settings, self.draw(data, count, rng)
+        steps = self.draw(data, count, rng)
         q = self(steps.clouds, steps.q, steps.goal)
         error = self._surface(q) - self._surface(steps.expert)
         match = error.square().mean() + error.abs().mean()
-        close = hinge(self._distance(q[:, None], steps.scenes), s.margin).mean()
-        return (s.point_match * match + s.collision * close) / LOSS_UNIT
+        close = hinge(self._distance(q[:, None], steps.scenes), MARGIN).mean()
+        return (match + COLLISION_WEIGHT * close) / LOSS_UNIT
 
     def draw(self, data: TrajectoryData, count: int, rng: np.random.Generator) -> Steps:
         """Random waypoints of random motions, forwards or backwards, and the waypoints that follow them."""
-        rows = data.draw(count, self.settings.trivial_share, rng)
+        rows = data.draw(count, TRIVIAL_SHARE, rng)
         last = data.q.shape[1] - 1
         way = np.where(rng.random(count) < 0.5, 1, -1)
         waypoint = rng.integers(0, last + 1, count)
@@ -328,27 +327,10 @@ class MPiNetsNetwork(BaselineNetwork):
         here, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
         return Steps(here, after, end, clouds, scenes)
 
-    def clouds(self, scenes: PackedScenes, rng: np.random.Generator) -> Float32[Tensor, "n points 3"]:
+    def clouds(self, scenes: PackedScenes, rng: np.random.Generator) -> Clouds:
         """Random clouds of scenes for the network's input [m]; zeros where nothing is in reach."""
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         return surface_clouds(scenes, self.settings.scene_points, generator, region=self.settings.region)
-
-    def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
-        """Share of some non-trivial problems that a single roll-out solves: it comes near the goal, and the
-        motion with a straight segment to the goal is free of collision."""
-        rows = np.flatnonzero(~data.trivial)[:SUCCESS_PROBLEMS]
-        if not len(rows):
-            return None
-        scenes, q = data.scenes[rows], data.q[rows].astype(np.float32)
-        roll_outs = RollOuts(self, self.clouds(scenes, rng), q[:, 0], q[:, -1])
-        for _ in range(MAX_ROLL_OUT_STEPS):
-            roll_outs.stop(roll_outs.distances() < self.settings.near)
-            if not roll_outs.running.any():
-                break
-            roll_outs.advance()
-        arrived = roll_outs.distances() < self.settings.near
-        motions = np.concatenate([np.stack(roll_outs.waypoints, 1), q[:, -1:]], 1)
-        return float((arrived & motions_free(robot, scenes, motions)).mean())
 
 
 class RollOuts:
@@ -357,9 +339,9 @@ class RollOuts:
     def __init__(
         self,
         network: MPiNetsNetwork,
-        clouds: Float32[Tensor, "n points 3"],
-        start: Float32[ndarray, "n dof"],
-        goal: Float32[ndarray, "n dof"],
+        clouds: Clouds,
+        start: Joints,
+        goal: Joints,
     ) -> None:
         """clouds of the scenes [m]; start and goal in [rad]."""
         self.network, self._clouds, self._goal = network, clouds, goal
@@ -375,7 +357,7 @@ class RollOuts:
         """Stop these roll-outs."""
         self.running &= ~which
 
-    def advance(self, noise: Float32[ndarray, "n dof"] | None = None) -> None:
+    def advance(self, noise: Joints | None = None) -> None:
         """Advance the running roll-outs by one step; noise [rad] is added to the policy's input
         configuration."""
         rows = np.flatnonzero(self.running)

@@ -41,27 +41,34 @@ from numpy import ndarray
 from torch import Generator, Tensor, nn
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Share, Sizes
+from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Sizes
 from robotdiffuse.datasets.surface_clouds import surface_clouds
 from robotdiffuse.learning.encoders import curve_keys
-from robotdiffuse.learning.networks.base import BaselineNetwork
-from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.baseline import BaselineNetwork
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
-from robotdiffuse.learning.training.validation import motions_free
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.learning.weight_files import NetworkSettings, RobotIdentity
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
+Clouds = Float[Tensor, "batch points 3"]
+Configurations = Float[Tensor, "batch dof"]
 CURVE_REACH = 16.0
 """The region's reach is scaled to this [m] before points are sorted along the space-filling curve, which
 then fills the region."""
-SUCCESS_PROBLEMS = 64
-"""Held-out problems that `success` tries."""
-SUCCESS_STEPS = 24
-"""Calls of Pnet for each of these."""
+PRETRAINING = 0.1
+"""Share of the training, at its beginning, in which Enet is trained as an auto-encoder."""
+SUB_GOALS = 0.5
+"""Share of the samples whose goal is a later waypoint of the trajectory than its last one."""
+TRIVIAL_SHARE = 0.15
+"""Share of the training trajectories between ends whose straight line is free too."""
 
 
 @dataclass(frozen=True)
-class MPNetSettings(Settings, name="mpnet"):
+class MPNetSettings(NetworkSettings, name="mpnet"):
+    constants: ClassVar[dict[str, Any]] = {
+        "pretraining": 0.1,
+        "sub_goals": 0.5,
+        "trivial_share": 0.15,
+    }
     points: Count = 320
     """Points of Enet's input cloud (paper: 1,400, of a plane)."""
     encoder_layers: Sizes = (384, 256, 128)
@@ -73,8 +80,6 @@ class MPNetSettings(Settings, name="mpnet"):
     """Size of z (paper: 28, for a plane)."""
     contraction: NotNegative = 1e-3
     """lambda, the weight of the contractive penalty [m^2]."""
-    pretraining: Annotated[float, Bound(least=0.0, below=1.0)] = 0.1
-    """Share of the training, at its beginning, in which Enet is trained as an auto-encoder."""
     layers: Sizes = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
     """Layers of Pnet (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
     dropout: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
@@ -86,10 +91,6 @@ class MPNetSettings(Settings, name="mpnet"):
     """Distance along the path from one waypoint to the next [rad, joint-space L2]."""
     waypoints: Count = 8
     """Samples drawn of each trajectory; they share z."""
-    sub_goals: Share = 0.5
-    """Share of the samples whose goal is a later waypoint of the trajectory than its last one."""
-    trivial_share: Share = 0.15
-    """Share of the training trajectories between ends whose straight line is free too."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -123,22 +124,22 @@ class MPNetNetwork(BaselineNetwork):
         """Set the unit of Pnet's output: the root mean square of the steps between waypoints."""
         if len(data):
             rng = np.random.default_rng(0)
-            rows = data.draw(5_000, self.settings.trivial_share, rng)
+            rows = data.draw(5_000, TRIVIAL_SHARE, rng)
             here, following, _ = self.training_samples(data.q[rows], rng)
             step = self.normalizer.to_unit(following) - self.normalizer.to_unit(here)
             self.step_scale.fill_(max(float(np.sqrt(np.mean(step**2))), 1e-3))
 
-    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+    def encode(self, cloud: Clouds) -> Float[Tensor, "batch code"]:
         """z of clouds of `settings.points` points in any order [m]; all zeros: no obstacles."""
         return self.encoder(sorted_along_curve(cloud, self.region).flatten(1))
 
     def next_states(
         self,
         z: Float[Tensor, "batch code"],
-        q: Float[Tensor, "batch dof"],
-        goal: Float[Tensor, "batch dof"],
+        q: Configurations,
+        goal: Configurations,
         generator: Generator | None,
-    ) -> Float[Tensor, "batch dof"]:
+    ) -> Configurations:
         """The next waypoints from q to the goal, within the joint limits [rad].
 
         Dropout is drawn from the generator, in training and evaluation mode alike; None: without dropout.
@@ -179,10 +180,10 @@ class MPNetNetwork(BaselineNetwork):
         """
         of = self.settings
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-        rows = data.draw(max(1, count // of.waypoints), of.trivial_share, rng)
+        rows = data.draw(max(1, count // of.waypoints), TRIVIAL_SHARE, rng)
         cloud = self.clouds(data, rows, generator)
         with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
-            if fraction < of.pretraining:
+            if fraction < PRETRAINING:
                 return self.autoencoder_loss(cloud, generator)
             z = self.encode(cloud).repeat_interleave(of.waypoints, 0)
             q, following, goal = (torch.from_numpy(a) for a in self.training_samples(data.q[rows], rng))
@@ -192,9 +193,7 @@ class MPNetNetwork(BaselineNetwork):
         return (step.float() - wanted).square().mean()
 
     @torch.enable_grad()
-    def autoencoder_loss(
-        self, cloud: Float[Tensor, "batch points 3"], generator: Generator
-    ) -> Float[Tensor, ""]:
+    def autoencoder_loss(self, cloud: Clouds, generator: Generator) -> Float[Tensor, ""]:
         """The mean squared distance of points to their reconstructions plus lambda |dz / d cloud|^2 [m^2]."""
         flat = sorted_along_curve(cloud, self.region).flatten(1)
         flat.requires_grad_()
@@ -211,29 +210,6 @@ class MPNetNetwork(BaselineNetwork):
         """A random cloud [m] of the obstacles of each of these trajectories."""
         return surface_clouds(data.scenes[rows], self.settings.points, generator, region=self.region)
 
-    def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
-        """Share of held-out problems solved by one run of bidirectional planning, without replanning."""
-        rows = np.flatnonzero(~data.trivial)[:SUCCESS_PROBLEMS]
-        if not len(rows):
-            return None
-        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-        scenes, q = data.scenes[rows], data.q[rows]
-        with torch.inference_mode():
-            z = self.encode(self.clouds(data, rows, generator))
-            forth, back = ([torch.from_numpy(np.ascontiguousarray(q[:, at]))] for at in (0, -1))
-            found, ended = np.zeros((2, len(rows)), np.bool_)
-            for _ in range(SUCCESS_STEPS):
-                forth.append(self.next_states(z, forth[-1], back[-1], generator))
-                path = torch.stack([*forth, *back[::-1]], 1).numpy()
-                gap = refined(path[:, len(forth) - 1 : len(forth) + 1], 8)
-                joined = np.flatnonzero(~ended)
-                joined = joined[motions_free(robot, scenes[joined], gap[joined])]
-                fine = refined(path[joined], 3)
-                found[joined] = motions_free(robot, scenes[joined], fine)
-                ended[joined] = True
-                forth, back = back, forth
-        return float(found.mean())
-
     def training_samples(
         self, q: Float[ndarray, "scenes waypoints dof"], rng: np.random.Generator
     ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
@@ -245,21 +221,13 @@ class MPNetNetwork(BaselineNetwork):
         rows = np.repeat(np.arange(len(q)), of.waypoints)
         n = len(rows)
         goal = np.full(n, last)
-        near = rng.random(n) < of.sub_goals
+        near = rng.random(n) < SUB_GOALS
         goal[near] = 1 + (rng.random(int(near.sum())) * last).astype(np.int64)
         at = (rng.random(n) * goal).astype(np.int64)
         places = at, np.minimum(at + stride[rows], goal), goal
         back = rng.random(n) < 0.5
         here, following, end = (q[rows, np.where(back, last - place, place)] for place in places)
         return here, following, end
-
-
-def refined(path: Float[ndarray, "n waypoints dof"], parts: int) -> Float[ndarray, "n _ dof"]:
-    """The path with each segment divided into so many equal parts."""
-    n, waypoints, dof = path.shape
-    share = (np.arange(parts, dtype=path.dtype) / parts)[:, None]
-    dense = path[:, :-1, None] + share * np.diff(path, axis=1)[:, :, None]
-    return np.concatenate([dense.reshape(n, (waypoints - 1) * parts, dof), path[:, -1:]], 1)
 
 
 class Perceptron(nn.Module):
@@ -288,9 +256,7 @@ class Perceptron(nn.Module):
         return self.linear[-1](x)
 
 
-def sorted_along_curve(
-    cloud: Float[Tensor, "batch points 3"], region: VisibleRegion
-) -> Float[Tensor, "batch points 3"]:
+def sorted_along_curve(cloud: Clouds, region: VisibleRegion) -> Clouds:
     """The points in the order of a space-filling curve (G. Morton 1966), in the region's frame [m].
 
     Positions are relative to the region's centre; an empty cloud, all zeros, stays zero.
