@@ -1,7 +1,32 @@
-"""The moments of an exploration, and what is shown of each."""
+"""Explorations: moments, faces of voxels, the strip of pictures, and the page, also in a browser."""
 
-from helpers.explorations import recorded
-from robotdiffuse.visualization.exploration import frustum, in_known_scene, moments, shown_voxels, title
+import base64
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from helpers.explorations import FLOOR, recorded
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.perception.occupancy_map import MAP
+from robotdiffuse.visualization.exploration import (
+    GAP,
+    READING_TIME,
+    faces_between,
+    faces_surface,
+    frustum,
+    in_known_scene,
+    moments,
+    shown_voxels,
+    title,
+    write_exploration,
+    write_exploration_picture,
+)
+from robotdiffuse.visualization.picture import PictureSettings
 
 
 def test_moments_show_what_was_known_before_them() -> None:
@@ -17,3 +42,127 @@ def test_moments_show_what_was_known_before_them() -> None:
             {"done": "at the goal"}.get(moment.act.step.kind, moment.act.step.kind)
         )
         assert len(frustum(explorer, moment.act)) == (5 if moment.act.T_base_camera is not None else 0)
+
+
+def test_a_cube_has_six_faces_around_it() -> None:
+    inside = np.zeros((4, 5, 6), np.bool_)
+    inside[1, 2, 3] = True
+    numbers, first = faces_between(inside, ~inside)
+    size, at = inside.size, (1 * 5 + 2) * 6 + 3
+    assert numbers.tolist() == [at - 30, at, size + at - 6, size + at, 2 * size + at - 1, 2 * size + at]
+    assert first.tolist() == [False, True] * 3
+    surface = faces_surface(inside, ~inside, (255, 0, 0))
+    center = (np.array([1.5, 2.5, 3.5])) * MAP.edge + MAP.low
+    away = surface.vertices - center
+    np.testing.assert_allclose(np.abs(away), MAP.edge / 2)
+    np.testing.assert_allclose((away * surface.normals).sum(axis=1), MAP.edge / 2)
+    assert len(surface.faces) == 12 and (surface.colors == [1, 0, 0]).all()
+
+
+def test_faces_lie_between_the_two_sets_alone() -> None:
+    unknown, free = np.zeros((2, 3, 3, 3), np.bool_)
+    unknown[0], free[1, 0, 0] = True, True
+    numbers, first = faces_between(unknown, free)
+    assert numbers.tolist() == [0] and first.tolist() == [True]
+
+
+SMALL = PictureSettings(width=240, height=150, ghosts=1)
+
+
+def test_each_moment_has_a_picture(tmp_path: Path) -> None:
+    problem, explorer = recorded()
+    write_exploration_picture(explorer, problem.scene, tmp_path / "explore.png", SMALL)
+    count = len(moments(explorer))
+    columns = min(count, 3 if count > 4 else 2)
+    with Image.open(tmp_path / "explore.png") as image:
+        width, height = columns * (240 + GAP) - GAP, -(-count // columns) * (150 + GAP) - GAP
+        assert image.size == (width, height)
+        first = np.asarray(image)[:100, :240].astype(int)
+    blue = (first[..., 2] > first[..., 0] + 25).sum()
+    assert blue > 50, "the wall was seen"
+    with pytest.raises(InputError):
+        write_exploration_picture(explorer, problem.scene, tmp_path / "explore.html", SMALL)
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = ["--no-sandbox", "--disable-background-networking", "--use-angle=swiftshader"]
+FLAGS += ["--enable-unsafe-swiftshader"]
+PATIENCE = 300_000
+"""WebGL without a graphics card is slow [ms]."""
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    problem, explorer = recorded()
+    file = tmp_path_factory.mktemp("page") / "explore.html"
+    write_exploration(explorer, problem.scene, file)
+    return file
+
+
+def numbers(text: str) -> list[int]:
+    """What the page decodes: differences in groups of 7 bits, the lowest first."""
+    out, last, value, shift = [], 0, 0, 0
+    for byte in base64.b64decode(text):
+        value, shift = value + ((byte & 127) << shift), shift + 7
+        if byte < 128:
+            last += value
+            out.append(last)
+            value = shift = 0
+    return out
+
+
+def test_the_page_holds_what_was_known_at_each_time(page: Path) -> None:
+    _, explorer = recorded()
+    found = re.search(r'id="data">(.*?)</script>', page.read_text("utf-8"), re.S)
+    assert found is not None
+    data = json.loads(found[1])
+    told = data["exploration"]
+    assert [shape["name"] for shape in data["scene"]] == [FLOOR.name]
+    assert [shape["name"] for shape in told["true_scene"]] == ["floor", "wall"]
+    assert len(told["acts"]) == len(explorer.acts)
+    for number, (act, one) in enumerate(zip(explorer.acts, told["acts"], strict=True)):
+        assert one["time"] == pytest.approx(act.begins + number * READING_TIME, abs=1e-3)
+        assert one["title"].startswith(f"{number + 1}  ") and one["reason"] == act.step.reason
+        assert bool(one["look"]) == (act.T_base_camera is not None) == (one["end"] is not None)
+    assert data["times"][-1] == pytest.approx(
+        explorer.duration + READING_TIME * (len(explorer.acts) - 1), abs=1e-3
+    )
+    times = [known["time"] for known in told["known"]]
+    assert times == sorted(times) and times[0] == 0.0
+    unknown: set[int] = set()
+    for known in told["known"]:
+        unknown ^= set(numbers(known["layers"][2]))
+    last = explorer.views[-1]
+    assert unknown <= set(faces_between(last.unknown, last.free)[0].tolist())
+    assert len(unknown) > 1000, "the boundary of unknown space, without that at the known floor"
+
+
+def test_another_ending_is_refused(tmp_path: Path) -> None:
+    problem, explorer = recorded()
+    with pytest.raises(InputError):
+        write_exploration(explorer, problem.scene, tmp_path / "explore.png")
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_a_browser_shows_the_steps(page: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
+    _, explorer = recorded()
+    errors: list[str] = []
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
+        shown = browser.new_page(viewport={"width": 480, "height": 300})
+        shown.set_default_timeout(PATIENCE)
+        shown.on("pageerror", lambda error: errors.append(str(error)))
+        shown.goto(f"{page.as_uri()}#at=1")
+        rows = shown.evaluate("[...document.querySelectorAll('#steps li')].map((row) => row.ariaCurrent)")
+        toggles = shown.evaluate(
+            "[...document.querySelectorAll('#toggles button')].map((b) => b.textContent)"
+        )
+        pixels = shown.evaluate("layers.map((layer) => layer.meshes[0].geometry.index.count)")
+        browser.close()
+    assert not errors
+    assert rows == ["false"] * (len(explorer.acts) - 1) + ["true"]
+    assert toggles[:5] == ["Occupied", "Predicted", "Unknown", "Next look", "True scene"]
+    assert np.array(pixels)[[0, 2]].min() > 6000

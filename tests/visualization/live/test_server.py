@@ -1,5 +1,6 @@
-"""The server of a page is silent, and what others print is theirs."""
+"""The server of a page: which browsers may connect, errors for ports and hosts, and silence."""
 
+import socket
 import sys
 from typing import Any
 
@@ -9,7 +10,9 @@ pytest.importorskip("viser", reason="live needs viser: pip install 'robotdiffuse
 
 import viser
 
-from robotdiffuse.visualization.live import server
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.visualization.live import server as module
+from robotdiffuse.visualization.live.server import free_port, is_loopback, may_connect
 
 
 def test_viser_is_silent_and_other_threads_print(
@@ -29,6 +32,52 @@ def test_viser_is_silent_and_other_threads_print(
 
     monkeypatch.setattr(viser.ViserServer, "__init__", watched_start)
     monkeypatch.setattr(viser.ViserServer, "stop", watched_stop)
-    server.PageServer("127.0.0.1", server.free_port("127.0.0.1", 0)).stop()
+    module.PageServer("127.0.0.1", module.free_port("127.0.0.1", 0)).stop()
     assert during == [sys.stdout, sys.stdout]
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1:8080", "[::1]:9000", "localhost"])
+def test_names_of_this_machine_are_let_in(host: str) -> None:
+    assert may_connect("/", host, None, "") and may_connect("/", host, f"http://{host}", "")
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("evil.example:8080", None),  # a name that was pointed here
+        ("localhost:8080", "http://evil.example"),
+        ("localhost:8080", "http://localhost:9000"),
+        ("localhost:8080", "null"),
+        ("", None),
+        # urlsplit raises ValueError for brackets in hosts; found by fuzzing
+        *((wrong, None) for wrong in ("[::1", "[::fg]:1", "]", "//[", "127.0.0.1][")),
+        ("localhost", "http://[::1"),
+    ],
+)
+def test_others_are_not(host: str, origin: str | None) -> None:
+    assert not may_connect("/", host, origin, "")
+
+
+def test_elsewhere_the_path_is_the_token() -> None:
+    host = "192.0.2.7:8080"
+    for path in ("/token", "/token/", "/token?darkMode"):
+        assert may_connect(path, host, f"http://{host}", "token")
+        assert not may_connect(path, host, "http://evil.example", "token")
+    for path in ("/", "/tokens", "/toke", "/?token", "/other/token", "/tok\xebn"):
+        assert not may_connect(path, host, None, "token")
+
+
+def test_a_port_that_is_taken_and_a_host_that_is_none() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        number = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"port {number} of 127.0.0.1 cannot be used: .*--port"):
+            free_port("127.0.0.1", number)
+    with pytest.raises(InputError, match="--host is 'no such host'"):
+        free_port("no such host", 0)
+
+
+def test_loopback() -> None:
+    for host, only_here in {"127.0.0.1": True, "::1": True, "localhost": True, "0.0.0.0": False}.items():
+        assert is_loopback(host) is only_here
+    assert not is_loopback("") and not is_loopback("localhost.example")
