@@ -180,7 +180,10 @@ def add_robot(
     allowed = {pair: BY_SRDF for pair in known} if srdf is not None or found is None else {}
     allowed |= {frozenset(pair): NAMED for pair in allow}
     surfaces = {link: tree.surfaces(link) for link in robot.meshes}
-    made = prepare(robot, surfaces, settings or PreparationSettings(), seed, progress, allowed)
+    settings = settings or PreparationSettings()
+    if semantics is not None and semantics is tree.semantics:
+        settings = replace(settings, sampling=replace(settings.sampling, assumptions=False))
+    made = prepare(robot, surfaces, settings, seed, progress, allowed)
     if never_free(made.false_collisions):
         raise never_free_error(urdf, made.false_collisions)
     differences = tuple(

@@ -76,6 +76,7 @@ def robot_bodies(model: "MjModel") -> list[int]:
     for body in range(1, model.nbody):
         trees.setdefault(int(model.body_rootid[body]), []).append(body)
     joints = {root: _joints_of(model, bodies) for root, bodies in trees.items()}
+    kinds = {root: {kind_of("Joint", model.jnt_type[joint]) for joint in own} for root, own in joints.items()}
     driven = {
         int(model.actuator_trnid[k, 0])
         for k in range(model.nu)
@@ -83,15 +84,11 @@ def robot_bodies(model: "MjModel") -> list[int]:
     }
     chosen = [root for root, own in joints.items() if driven & set(own)]
     if not chosen:
-        chosen = [
-            root
-            for root, own in joints.items()
-            if own and all(kind_of("Joint", model.jnt_type[joint]) in MOVABLE for joint in own)
-        ]
+        chosen = [root for root, own in kinds.items() if own.intersection(MOVABLE) and "free" not in own]
     return [body for root in chosen for body in trees[root]]
 
 
-def kind_of(enumeration: str, value: int) -> str:
+def kind_of(enumeration: str, value: Any) -> str:
     """The name of a value of one of MuJoCo's enumerations (Joint, Geom, Trn, Eq), such as "hinge"."""
     import mujoco
 
@@ -287,10 +284,7 @@ class _Conversion:
         elif kind in ("capsule", "cylinder"):
             ET.SubElement(parent, kind, radius=_text(size[:1]), length=_text(2 * size[1:2]))
         elif kind == "ellipsoid":
-            ball = trimesh.creation.icosphere(subdivisions=2)
-            inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
-            ball.apply_scale(size / inner)  # around the ellipsoid
-            ET.SubElement(parent, "mesh", filename=self._written(ball, f"geom{geom}"))
+            ET.SubElement(parent, "mesh", filename=self._written(ellipsoid(size), f"geom{geom}"))
         elif kind == "mesh":
             mesh = int(self.model.geom_dataid[geom])
             if mesh not in self.meshes:
@@ -323,18 +317,22 @@ class _Conversion:
             self._link(link)
 
     def _excluded(self) -> dict[frozenset[str], str]:
-        """Pairs of links that the model excludes, or of which no two geoms may collide by their masks."""
+        """Pairs of links that MuJoCo does not let collide: those that are excluded, that move as one, or of
+        which one carries the other; and those of which no two geoms may collide by their masks."""
         model = self.model
-        pairs = {frozenset(divmod(int(signature), 2**16)) for signature in model.exclude_signature}
+        excluded = {frozenset(divmod(int(signature), 2**16)) for signature in model.exclude_signature}
+        unfiltered = bool(model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_FILTERPARENT))
         solid = [body for body in self.bodies if _colliding(model, body)]
-        pairs |= {frozenset(pair) for pair in combinations(solid, 2) if not _masks_meet(model, *pair)}
-        if len(solid) > 1 and pairs.issuperset(map(frozenset, combinations(solid, 2))):
+        pairs = [
+            (first, second)
+            for first, second in combinations(solid, 2)
+            if frozenset((first, second)) in excluded
+            or _related(model, first, second, unfiltered)
+            or not _masks_meet(model, first, second)
+        ]
+        if len(solid) > 1 and len(pairs) == len(solid) * (len(solid) - 1) // 2:
             self.notes.append("by the masks and exclusions of the model, no two of its links may collide")
-        return {
-            frozenset(map(self.body_name, pair)): EXCLUDED
-            for pair in pairs
-            if len(pair) == 2 and pair.issubset(self.bodies)
-        }
+        return {frozenset(map(self.body_name, pair)): EXCLUDED for pair in pairs}
 
     def _poses(self) -> dict[str, dict[str, float]]:
         model = self.model
@@ -358,6 +356,14 @@ def mesh_of(model: "MjModel", mesh: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)
 
 
+def ellipsoid(radii: Float[ndarray, "3"]) -> trimesh.Trimesh:
+    """A polyhedron around an ellipsoid."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
+    ball.apply_scale(radii / inner)
+    return ball
+
+
 def _model_name(model: "MjModel") -> str:
     return bytes(model.names).partition(b"\0")[0].decode()
 
@@ -370,6 +376,14 @@ def _colliding(model: "MjModel", body: int) -> list[int]:
     """The geoms of a body that collide with anything."""
     masks = model.geom_contype | model.geom_conaffinity
     return [geom for geom in _geoms_of(model, body) if masks[geom]]
+
+
+def _related(model: "MjModel", first: int, second: int, unfiltered: bool) -> bool:
+    """Whether two bodies are joined rigidly, or by the joints of one of them, and not to the world."""
+    own = [int(model.body_weldid[body]) for body in (first, second)]
+    above = [int(model.body_weldid[model.body_parentid[body]]) for body in own]
+    carried = own[0] == above[1] or own[1] == above[0]
+    return own[0] == own[1] or (carried and WORLD not in own and not unfiltered)
 
 
 def _masks_meet(model: "MjModel", first: int, second: int) -> bool:
