@@ -10,7 +10,6 @@ from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
 from robotdiffuse.robots.parsing.mjcf import ellipsoid, kind_of, mesh_of, robot_bodies
 from robotdiffuse.scenes.mesh import Mesh
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
 
 if TYPE_CHECKING:
@@ -22,8 +21,8 @@ PLANE_DEPTH = 0.1
 """Thickness of the boxes that stand for planes [m]."""
 
 
-def scene_from_mujoco(model: "MjModel", data: "MjData | None" = None, base: str = "world") -> Scene:
-    """See `Scene.from_mujoco`."""
+def shapes_in(model: "MjModel", data: "MjData | None", base: str) -> list[Shape]:
+    """The obstacles of a model; see `Scene.from_mujoco`."""
     import mujoco
 
     placed = mujoco.MjData(model)
@@ -38,11 +37,11 @@ def scene_from_mujoco(model: "MjModel", data: "MjData | None" = None, base: str 
     T_base_world = inverse(transform(placed.xpos[body], placed.xmat[body].reshape(3, 3)))
     robot = set(robot_bodies(model))
     rotations = placed.geom_xmat.reshape(-1, 3, 3)
-    return Scene(
+    return [
         _shape(model, geom, T_base_world @ transform(placed.geom_xpos[geom], rotations[geom]))
         for geom in range(model.ngeom)
         if model.geom_bodyid[geom] not in robot and model.geom_contype[geom] | model.geom_conaffinity[geom]
-    )
+    ]
 
 
 def _shape(model: "MjModel", geom: int, T: Float[ndarray, "4 4"]) -> Shape:

@@ -91,9 +91,9 @@ class Scene(Value):
         Raises:
             InputError: For an unknown body, and for height fields and signed distance fields.
         """
-        from robotdiffuse.scenes.mujoco_scene import scene_from_mujoco
+        from robotdiffuse.scenes.mujoco_scene import shapes_in
 
-        return scene_from_mujoco(model, data, base)
+        return cls(shapes_in(model, data, base))
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Scene":
         """The scene after the rigid motion T."""
