@@ -55,6 +55,7 @@ EXTRAS = {
     "foxglove_schemas_protobuf": {"interop"},
     "mcap": {"interop"},
     "mcap_protobuf": {"interop"},
+    "mujoco": {"robots", "scenes"},
     "rerun": {"interop"},
     "rosbags": {"interop"},
     "roslibpy": {"interop"},

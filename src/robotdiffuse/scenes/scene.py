@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
 from functools import cached_property
-from typing import no_type_check
+from typing import TYPE_CHECKING, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +16,9 @@ from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Shape
+
+if TYPE_CHECKING:
+    from mujoco import MjData, MjModel
 
 SHOWN_NAMES = 5
 """Names of shapes in the text of a scene."""
@@ -71,6 +74,26 @@ class Scene(Value):
         count = f"{len(self.shapes)} shape" + ("" if len(self.shapes) == 1 else "s")
         names = joined((shape.name for shape in self.shapes), SHOWN_NAMES)
         return f"Scene({count}: {names})" if names else f"Scene({count})"
+
+    @classmethod
+    def from_mujoco(cls, model: "MjModel", data: "MjData | None" = None, base: str = "world") -> "Scene":
+        """The obstacles of a MuJoCo model: all geoms that collide and are no part of the robot.
+
+        Args:
+            model: A compiled model, as of `mujoco.MjModel.from_xml_path`.
+            data: State of the model, which says where free bodies are; None: as the model places them.
+            base: The body that is the base of the robot; scenes are in its frame. A robot that
+                `load_robot` reads from a model has the base "world".
+
+        Returns:
+            Scene: Planes are boxes of 10 m, or of their size; meshes are convex, as for MuJoCo.
+
+        Raises:
+            InputError: For an unknown body, and for height fields and signed distance fields.
+        """
+        from robotdiffuse.scenes.mujoco_scene import shapes_in
+
+        return cls(shapes_in(model, data, base))
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Scene":
         """The scene after the rigid motion T."""

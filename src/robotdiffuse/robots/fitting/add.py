@@ -139,7 +139,7 @@ def add_robot(
     """Read a URDF, prepare the robot (see `prepare`) and write the robot folder.
 
     Args:
-        urdf: URDF or xacro file. Compiling xacro runs the code in its expressions.
+        urdf: URDF or xacro file, or MuJoCo model. Compiling xacro runs the code in its expressions.
         name: Name of the robot; by default the URDF's.
         base: See `UrdfTree.robot`, also for `tip`, `locked` and `group`.
         limits: Joint limits, a file in the form of MoveIt's joint_limits.yaml.
@@ -159,8 +159,8 @@ def add_robot(
     """
     begin = time.process_time()
     tree = UrdfTree(Path(urdf), packages or {}, compile_xacro=True)
-    found = srdf_beside(urdf, tree.name) if srdf is None else Path(srdf)
-    semantics = None if found is None else read_srdf(found)
+    found = Path(srdf) if srdf is not None else None if tree.semantics else srdf_beside(urdf, tree.name)
+    semantics = tree.semantics if found is None else read_srdf(found)
     robot = tree.robot(base, tip, locked, group, semantics)
     for link in {link for pair in allow for link in pair} - {*robot.link_names}:
         raise unknown_name("link in allow", link, robot.link_names)
@@ -177,10 +177,13 @@ def add_robot(
             f"<collision> elements to its links"
         )
     known = {} if semantics is None else semantics.allowed
-    allowed = {pair: BY_SRDF for pair in known} if srdf is not None else {}
+    allowed = {pair: BY_SRDF for pair in known} if srdf is not None or found is None else {}
     allowed |= {frozenset(pair): NAMED for pair in allow}
     surfaces = {link: tree.surfaces(link) for link in robot.meshes}
-    made = prepare(robot, surfaces, settings or PreparationSettings(), seed, progress, allowed)
+    settings = settings or PreparationSettings()
+    if semantics is not None and semantics is tree.semantics:
+        settings = replace(settings, sampling=replace(settings.sampling, assumptions=False))
+    made = prepare(robot, surfaces, settings, seed, progress, allowed)
     if never_free(made.false_collisions):
         raise never_free_error(urdf, made.false_collisions)
     differences = tuple(

@@ -37,6 +37,9 @@ class SamplingSettings:
     MoveIt's Setup Assistant)."""
     descents: int = 20
     """For a pair without collisions: number of closest samples from which a descent searches for one."""
+    assumptions: bool = True
+    """Whether links that are adjacent, or that collide at rest, in a named pose or up to a stop of a joint,
+    are assumed safe; False for MuJoCo models, which say themselves what may touch."""
 
     def __post_init__(self) -> None:
         if self.samples < 100:
@@ -85,13 +88,15 @@ def find_allowed_collisions(
     poses = links.poses(q)
     default_poses, held_poses = links.poses(default), links.poses(links.named({})[None])
     named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
-    adjacent = _adjacent(robot)
+    adjacent = _adjacent(robot) if settings.assumptions else frozenset[frozenset[str]]()
 
     def reason(a: str, b: str, near: ndarray, colliding: ndarray) -> str:
         if frozenset((a, b)) in adjacent:
             return ADJACENT
         if colliding.mean() >= settings.always:
             return ALWAYS
+        if not settings.assumptions:
+            return by_search(a, b, near, colliding)
         by_default = _own_between(robot, a, b, MAX_HELD_JOINTS)
         zero = by_default is not None and all(joint.lower <= 0 <= joint.upper for joint in by_default)
         if zero and links.collide(default_poses, a, b, 0) and links.collide(held_poses, a, b, 0):
@@ -103,6 +108,9 @@ def find_allowed_collisions(
             links.stop_explains(joint, q, colliding) for joint in between
         ):
             return LIMITS
+        return by_search(a, b, near, colliding)
+
+    def by_search(a: str, b: str, near: ndarray, colliding: ndarray) -> str:
         descents = settings.descents if near.min() < NEAR_DISTANCE else settings.descents // 5
         if not colliding.any() and not _descend(links, a, b, q[np.argsort(near)[:descents]], rng):
             return NEVER

@@ -1,4 +1,4 @@
-"""Reads robots from URDF and xacro files."""
+"""Reads robots from URDF, xacro and MuJoCo files."""
 
 import hashlib
 import xml.etree.ElementTree as ET
@@ -46,7 +46,7 @@ JERK_PER_ACCELERATION = 10.0
 
 @dataclass
 class UrdfTree:
-    """The links and joints of one URDF file, checked as they are read."""
+    """The links and joints of one URDF file or MuJoCo model, checked as they are read."""
 
     path: Path
     folders: dict[str, str | Path]
@@ -54,6 +54,8 @@ class UrdfTree:
     compile_xacro: bool = False
     """Whether a xacro file is compiled, which runs code in it; otherwise it raises InputError."""
     notes: list[str] = field(default_factory=list)
+    semantics: Srdf | None = None
+    """Named poses and allowed pairs of a MuJoCo model."""
     _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -71,10 +73,20 @@ class UrdfTree:
                 f"{self.path.name} was compiled by xacro, which runs the code in its expressions"
             )
             root = parse_xml(self.text, str(self.path))
+        if root.tag == "mujoco":
+            from robotdiffuse.robots.parsing.mjcf import converted
+
+            model = converted(self.path)
+            self.text = model.urdf
+            self.semantics = model.semantics
+            self.notes += model.notes
+            self._mesh_folder = model.folder  # removed with this object
+            self.packages = Packages(Path(model.folder.name, self.path.name), {})
+            root = parse_xml(self.text, str(self.path))
         if root.tag != "robot":
             raise InputError(
-                f"{self.path} is not a URDF: its root element is <{root.tag}>, not <robot>; "
-                f"convert other formats to URDF first"
+                f"{self.path} is neither a URDF nor a MuJoCo model: its root element is <{root.tag}>, not "
+                f"<robot> or <mujoco>; convert other formats first"
             )
         self.name = root.get("name") or self.path.stem
         self.links = self._named(root, "link")

@@ -1,0 +1,409 @@
+"""Reads robots from MuJoCo models (MJCF): the model, as MuJoCo compiles it, becomes a URDF with mesh files.
+
+Links are the bodies of the model, at MuJoCo's frames; sites are links too. Values of joints are MuJoCo's
+`qpos`.
+"""
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.transforms import (
+    inverse,
+    quaternion_from_rotation,
+    rotation_about,
+    rotation_from_quaternion,
+    transform,
+)
+from robotdiffuse.robots.parsing.srdf import Srdf
+
+if TYPE_CHECKING:
+    from mujoco import MjModel
+
+MOVABLE = ("hinge", "slide")
+WORLD = 0
+"""Body that does not move."""
+EXCLUDED = "excluded by the model"
+"""Why a pair of links is not checked."""
+MIN_SHIFT = 1e-9
+"""Joints closer to the origin of their body are at it [m]."""
+
+
+@dataclass(frozen=True)
+class ConvertedModel:
+    """A MuJoCo model as a URDF."""
+
+    urdf: bytes
+    folder: TemporaryDirectory
+    """Holds the mesh files that the URDF names."""
+    semantics: Srdf
+    """Keyframes as named poses, and pairs of links that the model does not let collide."""
+    notes: tuple[str, ...]
+
+
+def compiled_model(path: Path) -> "MjModel":
+    """The model of an MJCF file, as MuJoCo compiles it.
+
+    Raises InputError for a damaged file, and if MuJoCo is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError:
+        raise InputError(
+            f'{path} is a MuJoCo model; reading it needs mujoco: pip install "robotdiffuse[mujoco]"'
+        ) from None
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compiler.fusestatic = False  # bodies without joints are links, too
+        return spec.compile()
+    except Exception as error:  # MuJoCo raises several kinds of errors for a damaged model
+        raise InputError(f"{path} is no valid MuJoCo model: {shortened(str(error))}") from None
+
+
+def robot_bodies(model: "MjModel") -> list[int]:
+    """The bodies of the robot, parents before children: of the trees below the world that actuators move, or
+    else of all trees with hinges or slides and without a free joint."""
+    trees: dict[int, list[int]] = {}
+    for body in range(1, model.nbody):
+        trees.setdefault(int(model.body_rootid[body]), []).append(body)
+    joints = {root: _joints_of(model, bodies) for root, bodies in trees.items()}
+    kinds = {root: {kind_of("Joint", model.jnt_type[joint]) for joint in own} for root, own in joints.items()}
+    driven = {
+        int(model.actuator_trnid[k, 0])
+        for k in range(model.nu)
+        if kind_of("Trn", model.actuator_trntype[k]) in ("joint", "jointinparent")
+    }
+    chosen = [root for root, own in joints.items() if driven & set(own)]
+    if not chosen:
+        chosen = [root for root, own in kinds.items() if own.intersection(MOVABLE) and "free" not in own]
+    return [body for root in chosen for body in trees[root]]
+
+
+def kind_of(enumeration: str, value: Any) -> str:
+    """The name of a value of one of MuJoCo's enumerations (Joint, Geom, Trn, Eq), such as "hinge"."""
+    import mujoco
+
+    return getattr(mujoco, f"mjt{enumeration}")(int(value)).name.rpartition("_")[2].lower()
+
+
+def _joints_of(model: "MjModel", bodies: list[int]) -> list[int]:
+    return [
+        joint
+        for body in bodies
+        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+    ]
+
+
+def converted(path: Path) -> ConvertedModel:
+    """The robot of an MJCF file as a URDF whose root link is the world.
+
+    Raises InputError for a model without a joint, for ball joints, and for geoms that cannot be planned with.
+    """
+    conversion = _Conversion(path, compiled_model(path))
+    return conversion.result()
+
+
+class _Conversion:
+    """The conversion of one model."""
+
+    def __init__(self, path: Path, model: "MjModel") -> None:
+        import mujoco
+
+        self.path = path
+        self.model = model
+        self.mujoco = mujoco
+        self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
+        self.root = ET.Element("robot", name=_model_name(model) or path.stem)
+        self.bodies = robot_bodies(model)
+        self.notes: list[str] = []
+        self.links: set[str] = set()
+        self.meshes: dict[int, str] = {}
+
+    def result(self) -> ConvertedModel:
+        if not self.bodies:
+            raise InputError(f"{self.path} has no robot: no body is moved by a hinge or a slide joint")
+        self._link("world")
+        mimics = self._mimics()
+        for body in self.bodies:
+            self._body(body, mimics)
+        self._sites()
+        ET.indent(self.root)
+        semantics = Srdf(self.path, allowed=self._excluded(), poses=self._poses())
+        return ConvertedModel(ET.tostring(self.root), self.folder, semantics, tuple(self.notes))
+
+    def name(self, kind: Any, index: int) -> str:
+        """The name of an element, or its kind and number."""
+        given = self.mujoco.mj_id2name(self.model, kind, index)
+        return given or f"{kind.name.removeprefix('mjOBJ_').lower()}{index}"
+
+    def body_name(self, body: int) -> str:
+        return self.name(self.mujoco.mjtObj.mjOBJ_BODY, body)
+
+    def joint_name(self, joint: int) -> str:
+        return self.name(self.mujoco.mjtObj.mjOBJ_JOINT, joint)
+
+    def _link(self, name: str) -> ET.Element:
+        self.links.add(name)
+        return ET.SubElement(self.root, "link", name=name)
+
+    def _body(self, body: int, mimics: dict[int, dict[str, str]]) -> None:
+        """The link of a body, and its joints: each at its anchor, which the frame of the body may leave."""
+        model = self.model
+        name = self.body_name(body)
+        parent = int(model.body_parentid[body])
+        above = "world" if parent == WORLD else self.body_name(parent)
+        T = transform(model.body_pos[body], rotation_from_quaternion(model.body_quat[body]))
+        joints = _joints_of(model, [body])
+        for joint in joints:
+            label = self.joint_name(joint)
+            kind = kind_of("Joint", model.jnt_type[joint])
+            if kind == "free":
+                self.notes.append(f"the free joint of {name} is held where the model places it")
+                continue
+            if kind == "ball":
+                raise InputError(f"{self.path}: joint {label} is a ball joint; use three hinges in its place")
+            anchor = np.eye(4)
+            anchor[:3, 3] = model.jnt_pos[joint]
+            reference = self._moved(joint, -float(model.qpos0[model.jnt_qposadr[joint]]))
+            last = joint == joints[-1] and np.linalg.norm(model.jnt_pos[joint]) < MIN_SHIFT
+            child = name if last else f"{label}_anchor"
+            self._link(child) if not last else None
+            self._joint(joint, above, child, T @ anchor @ reference, mimics.get(joint))
+            above = child
+            T = inverse(anchor)
+        if above != name:
+            fixed = ET.SubElement(self.root, "joint", name=f"{name}_fixed", type="fixed")
+            _ends(fixed, above, name)
+            _origin(fixed, T)
+        self._geometry(self._link(name), body)
+
+    def _moved(self, joint: int, value: float) -> Float[ndarray, "4 4"]:
+        """The motion of a joint by a value."""
+        axis = self.model.jnt_axis[joint]
+        if kind_of("Joint", self.model.jnt_type[joint]) == "slide":
+            return transform(value * axis, np.eye(3))
+        return transform(np.zeros(3), rotation_about(axis, value))
+
+    def _joint(self, joint: int, parent: str, child: str, T: ndarray, mimic: dict[str, str] | None) -> None:
+        model = self.model
+        label = self.joint_name(joint)
+        slides = kind_of("Joint", model.jnt_type[joint]) == "slide"
+        limited = bool(model.jnt_limited[joint])
+        if slides and not limited:
+            raise InputError(f"{self.path}: slide joint {label} has no range; give it one")
+        kind = "prismatic" if slides else "revolute" if limited else "continuous"
+        element = ET.SubElement(self.root, "joint", name=label, type=kind)
+        _ends(element, parent, child)
+        _origin(element, T)
+        ET.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
+        limits = {}
+        if limited:
+            limits = dict(zip(("lower", "upper"), map(repr, model.jnt_range[joint].tolist()), strict=True))
+        effort = self._effort(joint)
+        if effort > 0:
+            limits["effort"] = repr(effort)
+        ET.SubElement(element, "limit", limits)
+        if mimic is not None:
+            ET.SubElement(element, "mimic", mimic)
+
+    def _effort(self, joint: int) -> float:
+        """The largest force or torque that the model lets actuators apply; 0 if it has no limit."""
+        model = self.model
+        if model.jnt_actfrclimited[joint]:
+            return float(np.abs(model.jnt_actfrcrange[joint]).max())
+        return max(
+            (
+                float(np.abs(model.actuator_forcerange[k]).max() * abs(model.actuator_gear[k, 0]))
+                for k in range(model.nu)
+                if model.actuator_trnid[k, 0] == joint
+                and kind_of("Trn", model.actuator_trntype[k]) == "joint"
+                and model.actuator_forcelimited[k]
+            ),
+            default=0.0,
+        )
+
+    def _mimics(self) -> dict[int, dict[str, str]]:
+        """Attributes of <mimic> by joint, of equality constraints that are linear."""
+        model = self.model
+        mimics: dict[int, dict[str, str]] = {}
+        for k in range(model.neq):
+            if kind_of("Eq", model.eq_type[k]) != "joint" or not model.eq_active0[k]:
+                continue
+            follower = int(model.eq_obj1id[k])
+            leader = int(model.eq_obj2id[k])
+            offset, slope, *higher = model.eq_data[k, :5].tolist()
+            if leader < 0:
+                continue
+            if any(higher):
+                self.notes.append(
+                    f"joint {self.joint_name(follower)} follows {self.joint_name(leader)} by a polynomial; "
+                    f"it is treated as independent"
+                )
+                continue
+            start = model.qpos0[model.jnt_qposadr[[follower, leader]]]
+            mimics[follower] = {
+                "joint": self.joint_name(leader),
+                "multiplier": repr(slope),
+                "offset": repr(float(start[0] + offset - slope * start[1])),
+            }
+        return mimics
+
+    def _geometry(self, link: ET.Element, body: int) -> None:
+        """The inertia and the geoms of a body; those that collide with nothing are visual."""
+        model = self.model
+        if model.body_mass[body] > 0:
+            inertial = ET.SubElement(link, "inertial")
+            T = transform(model.body_ipos[body], rotation_from_quaternion(model.body_iquat[body]))
+            _origin(inertial, T)
+            ET.SubElement(inertial, "mass", value=repr(float(model.body_mass[body])))
+            xx, yy, zz = map(repr, model.body_inertia[body].tolist())
+            ET.SubElement(inertial, "inertia", ixx=xx, iyy=yy, izz=zz, ixy="0", ixz="0", iyz="0")
+        for geom in _geoms_of(model, body):
+            collides = bool(model.geom_contype[geom] | model.geom_conaffinity[geom])
+            element = ET.SubElement(link, "collision" if collides else "visual")
+            T = transform(model.geom_pos[geom], rotation_from_quaternion(model.geom_quat[geom]))
+            _origin(element, T)
+            self._shape(ET.SubElement(element, "geometry"), geom)
+
+    def _shape(self, parent: ET.Element, geom: int) -> None:
+        kind = kind_of("Geom", self.model.geom_type[geom])
+        size = self.model.geom_size[geom]
+        if kind == "sphere":
+            ET.SubElement(parent, "sphere", radius=_text(size[:1]))
+        elif kind == "box":
+            ET.SubElement(parent, "box", size=_text(2 * size))
+        elif kind in ("capsule", "cylinder"):
+            ET.SubElement(parent, kind, radius=_text(size[:1]), length=_text(2 * size[1:2]))
+        elif kind == "ellipsoid":
+            ET.SubElement(parent, "mesh", filename=self._written(ellipsoid(size), f"geom{geom}"))
+        elif kind == "mesh":
+            mesh = int(self.model.geom_dataid[geom])
+            if mesh not in self.meshes:
+                self.meshes[mesh] = self._written(mesh_of(self.model, mesh), f"mesh{mesh}")
+            ET.SubElement(parent, "mesh", filename=self.meshes[mesh])
+        else:
+            name = self.name(self.mujoco.mjtObj.mjOBJ_GEOM, geom)
+
+            raise InputError(
+                f"{self.path}: {name} of body {self.body_name(int(self.model.geom_bodyid[geom]))} is of type "
+                f"{kind}; a robot may have spheres, capsules, ellipsoids, cylinders, boxes and meshes"
+            )
+
+    def _written(self, mesh: trimesh.Trimesh, name: str) -> str:
+        mesh.export(Path(self.folder.name, f"{name}.stl"))
+        return f"{name}.stl"
+
+    def _sites(self) -> None:
+        bodies = set(self.bodies)
+        for site in range(self.model.nsite):
+            body = int(self.model.site_bodyid[site])
+            name = self.name(self.mujoco.mjtObj.mjOBJ_SITE, site)
+            if body not in bodies:
+                continue
+            link = name if name not in self.links else f"{name}_site"
+            fixed = ET.SubElement(self.root, "joint", name=f"{link}_fixed", type="fixed")
+            _ends(fixed, self.body_name(body), link)
+            rotation = rotation_from_quaternion(self.model.site_quat[site])
+            _origin(fixed, transform(self.model.site_pos[site], rotation))
+            self._link(link)
+
+    def _excluded(self) -> dict[frozenset[str], str]:
+        """Pairs of links that MuJoCo does not let collide: those that are excluded, that move as one, or of
+        which one carries the other; and those of which no two geoms may collide by their masks."""
+        model = self.model
+        excluded = {frozenset(divmod(int(signature), 2**16)) for signature in model.exclude_signature}
+        unfiltered = bool(model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_FILTERPARENT))
+        solid = [body for body in self.bodies if _colliding(model, body)]
+        pairs = [
+            (first, second)
+            for first, second in combinations(solid, 2)
+            if frozenset((first, second)) in excluded
+            or _related(model, first, second, unfiltered)
+            or not _masks_meet(model, first, second)
+        ]
+        if len(solid) > 1 and len(pairs) == len(solid) * (len(solid) - 1) // 2:
+            self.notes.append("by the masks and exclusions of the model, no two of its links may collide")
+        return {frozenset(map(self.body_name, pair)): EXCLUDED for pair in pairs}
+
+    def _poses(self) -> dict[str, dict[str, float]]:
+        model = self.model
+        places = {
+            self.joint_name(joint): model.jnt_qposadr[joint]
+            for joint in _joints_of(model, self.bodies)
+            if kind_of("Joint", model.jnt_type[joint]) in MOVABLE
+        }
+        return {
+            self.name(self.mujoco.mjtObj.mjOBJ_KEY, key): {
+                name: float(model.key_qpos[key, place]) for name, place in places.items()
+            }
+            for key in range(model.nkey)
+        }
+
+
+def mesh_of(model: "MjModel", mesh: int) -> trimesh.Trimesh:
+    """A mesh of a model in the frame of its geoms [m]."""
+    vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
+    faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+    return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)
+
+
+def ellipsoid(radii: Float[ndarray, "3"]) -> trimesh.Trimesh:
+    """A polyhedron around an ellipsoid."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
+    ball.apply_scale(radii / inner)
+    return ball
+
+
+def _model_name(model: "MjModel") -> str:
+    return bytes(model.names).partition(b"\0")[0].decode()
+
+
+def _geoms_of(model: "MjModel", body: int) -> range:
+    return range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+
+
+def _colliding(model: "MjModel", body: int) -> list[int]:
+    """The geoms of a body that collide with anything."""
+    masks = model.geom_contype | model.geom_conaffinity
+    return [geom for geom in _geoms_of(model, body) if masks[geom]]
+
+
+def _related(model: "MjModel", first: int, second: int, unfiltered: bool) -> bool:
+    """Whether two bodies are joined rigidly, or by the joints of one of them, and not to the world."""
+    own = [int(model.body_weldid[body]) for body in (first, second)]
+    above = [int(model.body_weldid[model.body_parentid[body]]) for body in own]
+    carried = own[0] == above[1] or own[1] == above[0]
+    return own[0] == own[1] or (carried and WORLD not in own and not unfiltered)
+
+
+def _masks_meet(model: "MjModel", first: int, second: int) -> bool:
+    """Whether any geom of one body may collide with one of the other."""
+    return any(
+        model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]
+        for a in _colliding(model, first)
+        for b in _colliding(model, second)
+    )
+
+
+def _ends(joint: ET.Element, parent: str, child: str) -> None:
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+
+
+def _origin(element: ET.Element, T: Float[ndarray, "4 4"]) -> None:
+    w, x, y, z = quaternion_from_rotation(T[:3, :3])
+    ET.SubElement(element, "origin", xyz=_text(T[:3, 3]), quat_xyzw=_text(np.array([x, y, z, w])))
+
+
+def _text(numbers: Float[ndarray, "n"]) -> str:
+    return " ".join(map(repr, numbers.tolist()))

@@ -1,0 +1,180 @@
+"""MuJoCo models: frames, limits and collisions against MuJoCo itself; scenes; what cannot be planned with."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.fitting.add import add_robot
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.parsing.urdf import UrdfTree
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+
+mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
+
+ARM = """
+<mujoco model="arm">
+  <compiler angle="radian"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1" pos="0 0 -0.5"/>
+    <body name="crate" pos="0.6 0.1 0">
+      <freejoint/>
+      <geom name="crate_wall" type="box" size="0.05 0.2 0.1"/>
+      <geom name="mark" type="sphere" size="0.02" contype="0" conaffinity="0"/>
+    </body>
+    <body name="base" pos="0.1 -0.2 0.05" euler="0 0 0.4">
+      <geom type="cylinder" size="0.06 0.05" mass="1"/>
+      <body name="shoulder" pos="0 0 0.1" quat="0.9 0.1 0.3 0.2">
+        <joint name="j1" axis="0 0 1" range="-2.5 2.5" pos="0.02 0.01 0.05"/>
+        <joint name="lift" type="slide" axis="0 1 1" range="-0.1 0.2" ref="0.05"/>
+        <geom type="capsule" size="0.04 0.1" pos="0 0 0.1" mass="1"/>
+        <body name="elbow" pos="0 0.05 0.25">
+          <joint name="j2" axis="0 1 0.2" range="-2 2" ref="0.3" actuatorfrcrange="-20 20"/>
+          <geom type="ellipsoid" size="0.05 0.03 0.08" mass="1"/>
+          <body name="wrist" pos="0 0 0.15">
+            <joint name="j3" axis="1 0 0" range="-2 2" pos="0 0 0.02"/>
+            <geom type="box" size="0.02 0.03 0.04" mass="0.5"/>
+            <site name="tool" pos="0 0 0.1" quat="0.7 0 0.7 0"/>
+            <body name="left_finger" pos="0 0.02 0.06">
+              <joint name="f1" type="slide" axis="0 1 0" range="0 0.03"/>
+              <geom type="box" size="0.005 0.005 0.02" mass="0.1"/>
+            </body>
+            <body name="right_finger" pos="0 -0.02 0.06">
+              <joint name="f2" type="slide" axis="0 -1 0" range="0 0.03" ref="0.01"/>
+              <geom type="box" size="0.005 0.005 0.02" mass="0.1"/>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <contact><exclude body1="base" body2="elbow"/></contact>
+  <equality><joint joint1="f2" joint2="f1" polycoef="0.001 1 0 0 0"/></equality>
+  <actuator><position joint="j1" kp="50"/><position joint="f1" kp="50"/></actuator>
+  <keyframe><key name="home" qpos="0.6 0.1 0 1 0 0 0  0.5 0.1 0.4 -0.3 0.01 0.02"/></keyframe>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("mjcf") / "arm.xml"
+    file.write_text(ARM)
+    return file
+
+
+@pytest.fixture(scope="module")
+def arm(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    return add_robot(file, out=tmp_path_factory.mktemp("robots") / "arm").robot
+
+
+def state_of(model: object, robot: Robot, q: np.ndarray) -> object:
+    """MuJoCo's data at a configuration; other joints are where the robot holds them."""
+    data = mujoco.MjData(model)
+    values = dict(zip(robot.joint_names, q, strict=True)) | robot.locked
+    for name, value in values.items():
+        data.qpos[model.joint(name).qposadr] = value  # type: ignore[attr-defined]
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def test_frames_are_those_of_mujoco(file: Path) -> None:
+    robot = UrdfTree(file, {}).robot(tip="wrist")
+    model = mujoco.MjModel.from_xml_path(str(file))
+    assert robot.joint_names == ("j1", "lift", "j2", "j3")
+    rng = np.random.default_rng(0)
+    for q in rng.uniform(robot.lower, robot.upper, (50, robot.dof)):
+        data = state_of(model, robot, q)
+        bodies = ("base", "shoulder", "elbow", "wrist", "left_finger", "right_finger")
+        found = [(data.body(name).xpos, data.body(name).xmat, name) for name in bodies]
+        found.append((data.site("tool").xpos, data.site("tool").xmat, "tool"))
+        for position, rotation, name in found:
+            T = link_pose(robot, q, name)
+            np.testing.assert_allclose(T[:3, 3], position, atol=1e-9)
+            np.testing.assert_allclose(T[:3, :3], rotation.reshape(3, 3), atol=1e-9)
+
+
+def test_limits_poses_and_mimics_are_those_of_the_model(file: Path) -> None:
+    tree = UrdfTree(file, {})
+    robot = tree.robot(tip="wrist", srdf=tree.semantics)
+    np.testing.assert_allclose([robot.lower[1], robot.upper[1]], [-0.1, 0.2])
+    j2 = next(joint for joint in robot.joints if joint.name == "j2")
+    assert j2.effort == 20
+    assert robot.locked["f2"] == pytest.approx(0.01 + 0.001 + robot.locked["f1"])
+    assert robot.poses["home"] == {"j1": 0.5, "lift": 0.1, "j2": 0.4, "j3": -0.3, "f1": 0.01, "f2": 0.02}
+    assert any("no velocity limit" in note for note in robot.notes)
+
+
+def test_self_collisions_are_those_of_mujoco(file: Path, arm: Robot) -> None:
+    """Deeper than 1 mm MuJoCo and the validator's meshes agree; what the model excludes is not checked."""
+    model = mujoco.MjModel.from_xml_path(str(file))
+    checker = CollisionChecker(arm, Scene())
+    rng = np.random.default_rng(1)
+    collisions = 0
+    for q in rng.uniform(arm.lower, arm.upper, (200, arm.dof)):
+        data = state_of(model, arm, q)
+        bodies = [
+            {model.body(model.geom_bodyid[geom]).name for geom in contact.geom}
+            for contact in data.contact
+            if contact.dist < -1e-3
+        ]
+        deep = [pair for pair in bodies if pair <= set(arm.link_names)]
+        assert not deep or not checker.free(q[None])[0], (q, deep)
+        collisions += bool(deep)
+    assert frozenset(("base", "elbow")) in arm.allowed_collisions
+    assert collisions > 3
+
+
+def test_a_scene_is_all_that_is_not_the_robot(file: Path) -> None:
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    data.qpos[2] = 0.3  # lifts the crate; no one has called mj_forward
+    scene = rd.Scene.from_mujoco(model, data)
+    floor, crate = scene.shapes
+    assert [shape.name for shape in scene.shapes] == ["floor", "crate_wall"]
+    assert floor.bounds[1, 2] == pytest.approx(-0.5)
+    np.testing.assert_allclose(crate.bounds, [[0.55, -0.1, 0.2], [0.65, 0.3, 0.4]])
+    raised = rd.Scene.from_mujoco(model, data, base="base")
+    np.testing.assert_allclose(raised.shapes[0].bounds[1, 2], -0.55)
+    with pytest.raises(InputError, match="body"):
+        rd.Scene.from_mujoco(model, base="bse")
+
+
+HILL = """
+<mujoco>
+  <asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>
+  <worldbody><geom name="hill" type="hfield" hfield="h"/></worldbody>
+</mujoco>
+"""
+
+
+def test_geoms_without_a_solid_are_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(HILL)
+    with pytest.raises(InputError, match="geom hill is of type hfield; obstacles may be planes"):
+        rd.Scene.from_mujoco(model)
+
+
+BODY = "<mujoco><worldbody><body>{}<geom size='1'/></body></worldbody></mujoco>"
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        (BODY.format(""), "has no robot: no body is moved by a hinge"),
+        (BODY.format("<joint type='slide'/>"), "slide joint joint0 has no range"),
+        (BODY.format("<joint/><joint name='b' type='ball'/>"), "joint b is a ball joint; use three hinges"),
+        (BODY.format("<joint/><geom type='sdf' mesh='m'/>"), "is no valid MuJoCo model"),
+        ("<mujoco><worldbody><body><joint", "is not well-formed XML"),
+        ("<mujoco><worldbody><box/></worldbody></mujoco>", "is no valid MuJoCo model"),
+        ("<mujoco><asset><mesh name='m' file='none.stl'/></asset></mujoco>", "is no valid MuJoCo model"),
+    ],
+)
+def test_bad_models_are_one_line(text: str, wanted: str, tmp_path: Path) -> None:
+    (tmp_path / "m.xml").write_text(text)
+    with pytest.raises(InputError, match=wanted) as error:
+        UrdfTree(tmp_path / "m.xml", {}).robot()
+    assert "\n" not in str(error.value)
