@@ -11,7 +11,7 @@ from robotdiffuse.visualization import picture
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-SLOW = {"01_own_robot", "05_depth_camera", "09_two_arms", "12_train_on_own_data"}
+SLOW = {"01_own_robot", "05_depth_camera", "09_two_arms", "12_train_on_own_data", "13_mujoco"}
 """They prepare a robot, load networks, compile the code for several arms, or train."""
 
 
@@ -45,9 +45,9 @@ def test_an_example_runs(
         assert (tmp_path / f"{example.stem}.png").stat().st_size > 1000
 
 
-def test_the_gallery_has_twelve_short_examples_with_pictures() -> None:
+def test_the_gallery_has_thirteen_short_examples_with_pictures() -> None:
     numbered = [file for file in EXAMPLES if file.stem[0].isdigit()]
-    assert len(numbered) == 12
+    assert len(numbered) == 13
     for file in numbered:
         assert len(file.read_text(encoding="utf-8").splitlines()) < 40, file.name
         assert (ROOT / "docs" / "images" / "gallery" / f"{file.stem}.png").is_file(), file.name
