@@ -117,7 +117,7 @@ def test_prm_with_many_goals_ends():
 @pytest.mark.parametrize("planner", [planners.OmplRRTConnect, planners.OmplAORRTC])
 def test_a_pose_is_reached(planner):
     to_pose = Problem(PANDA, WALL, LEFT, PoseGoal("panda_hand", link_pose(PANDA, RIGHT, "panda_hand")))
-    result = plan(planner, to_pose)
+    result = planner().plan(to_pose, time_limit=3.0)
     assert result.path is not None, result.reason
     assert verify(to_pose, result.path).valid
 
