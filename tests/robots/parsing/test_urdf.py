@@ -119,7 +119,7 @@ MESH = '<mesh filename="package://a/b.stl"/>'
 FORE, LOOP = '<parent link="upper"/><child link="fore"/>', '<parent link="base"/><child link="upper"/>'
 BAD = {
     "not XML": ("<robot", "well-formed"),
-    "not a robot": ("<mujoco/>", "<mujoco>"),
+    "not a robot": ("<model/>", "<model>"),
     "two roots": (ARM.replace("</robot>", '<link name="loose"/></robot>'), "one root"),
     "two parents": (ARM.replace(FORE, LOOP), "two parent"),
     "unknown link": (ARM.replace('<child link="fore"/>', '<child link="hand"/>'), "'hand'"),
