@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-import mujoco
+import mujoco  # pyright: reportAttributeAccessIssue=false
 import numpy as np
 
 import robotdiffuse as rd

@@ -126,7 +126,6 @@ def test_batch_shapes(batch: tuple[int, ...]) -> None:
 def test_bad_input() -> None:
     with pytest.raises(InputError, match="unknown link 'hand'"):
         link_pose(planar_arm(1.0, 1.0), np.zeros(2), "hand")
-        assert robot.jacobian(q[0].tolist(), link).shape == (6, robot.dof)
 
 
 def test_inverse_kinematics_of_a_robot_nearest_first() -> None:

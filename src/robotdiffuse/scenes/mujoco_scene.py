@@ -1,6 +1,6 @@
 """Reads obstacles from MuJoCo models: the geoms that collide and are no part of the robot."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -8,12 +8,9 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
-from robotdiffuse.robots.parsing.mjcf import ellipsoid, kind_of, mesh_of, robot_bodies
+from robotdiffuse.robots.parsing.mjcf import ellipsoid, imported_mujoco, kind_of, mesh_of, robot_bodies
 from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
-
-if TYPE_CHECKING:
-    from mujoco import MjData, MjModel
 
 PLANE_SIZE = 10.0
 """Edge of the box that stands for an infinite plane [m]."""
@@ -21,10 +18,9 @@ PLANE_DEPTH = 0.1
 """Thickness of the boxes that stand for planes [m]."""
 
 
-def shapes_in(model: "MjModel", data: "MjData | None", base: str) -> list[Shape]:
+def shapes_in(model: Any, data: Any, base: str) -> list[Shape]:
     """The obstacles of a model; see `Scene.from_mujoco`."""
-    import mujoco
-
+    mujoco = imported_mujoco()
     placed = mujoco.MjData(model)
     if data is not None:
         placed.qpos[:] = data.qpos
@@ -44,7 +40,7 @@ def shapes_in(model: "MjModel", data: "MjData | None", base: str) -> list[Shape]
     ]
 
 
-def _shape(model: "MjModel", geom: int, T: Float[ndarray, "4 4"]) -> Shape:
+def _shape(model: Any, geom: int, T: Float[ndarray, "4 4"]) -> Shape:
     """The obstacle of a geom at a pose."""
     body = int(model.geom_bodyid[geom])
     name = model.geom(geom).name or model.body(body).name

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
 from functools import cached_property
-from typing import TYPE_CHECKING, no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +16,6 @@ from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Shape
-
-if TYPE_CHECKING:
-    from mujoco import MjData, MjModel
 
 SHOWN_NAMES = 5
 """Names of shapes in the text of a scene."""
@@ -76,7 +73,7 @@ class Scene(Value):
         return f"Scene({count}: {names})" if names else f"Scene({count})"
 
     @classmethod
-    def from_mujoco(cls, model: "MjModel", data: "MjData | None" = None, base: str = "world") -> "Scene":
+    def from_mujoco(cls, model: Any, data: Any = None, base: str = "world") -> "Scene":
         """The obstacles of a MuJoCo model: all geoms that collide and are no part of the robot.
 
         Args:

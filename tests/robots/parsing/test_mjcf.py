@@ -1,6 +1,7 @@
 """MuJoCo models: frames, limits and collisions against MuJoCo itself; scenes; what cannot be planned with."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,12 +73,12 @@ def arm(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Robot:
     return add_robot(file, out=tmp_path_factory.mktemp("robots") / "arm").robot
 
 
-def state_of(model: object, robot: Robot, q: np.ndarray) -> object:
+def state_of(model: Any, robot: Robot, q: np.ndarray) -> Any:
     """MuJoCo's data at a configuration; other joints are where the robot holds them."""
     data = mujoco.MjData(model)
     values = dict(zip(robot.joint_names, q, strict=True)) | robot.locked
     for name, value in values.items():
-        data.qpos[model.joint(name).qposadr] = value  # type: ignore[attr-defined]
+        data.qpos[model.joint(name).qposadr] = value
     mujoco.mj_forward(model, data)
     return data
 

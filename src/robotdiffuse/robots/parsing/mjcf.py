@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -25,9 +25,6 @@ from robotdiffuse.core.transforms import (
     transform,
 )
 from robotdiffuse.robots.parsing.srdf import Srdf
-
-if TYPE_CHECKING:
-    from mujoco import MjModel
 
 MOVABLE = ("hinge", "slide")
 WORLD = 0
@@ -50,13 +47,20 @@ class ConvertedModel:
     notes: tuple[str, ...]
 
 
-def compiled_model(path: Path) -> "MjModel":
+def imported_mujoco() -> Any:
+    """The module mujoco, which has no types for type checkers."""
+    import mujoco
+
+    return mujoco
+
+
+def compiled_model(path: Path) -> Any:
     """The model of an MJCF file, as MuJoCo compiles it.
 
     Raises InputError for a damaged file, and if MuJoCo is not installed.
     """
     try:
-        import mujoco
+        mujoco = imported_mujoco()
     except ImportError:
         raise InputError(
             f'{path} is a MuJoCo model; reading it needs mujoco: pip install "robotdiffuse[mujoco]"'
@@ -69,7 +73,7 @@ def compiled_model(path: Path) -> "MjModel":
         raise InputError(f"{path} is no valid MuJoCo model: {shortened(str(error))}") from None
 
 
-def robot_bodies(model: "MjModel") -> list[int]:
+def robot_bodies(model: Any) -> list[int]:
     """The bodies of the robot, parents before children: of the trees below the world that actuators move, or
     else of all trees with hinges or slides and without a free joint."""
     trees: dict[int, list[int]] = {}
@@ -90,12 +94,10 @@ def robot_bodies(model: "MjModel") -> list[int]:
 
 def kind_of(enumeration: str, value: Any) -> str:
     """The name of a value of one of MuJoCo's enumerations (Joint, Geom, Trn, Eq), such as "hinge"."""
-    import mujoco
-
-    return getattr(mujoco, f"mjt{enumeration}")(int(value)).name.rpartition("_")[2].lower()
+    return getattr(imported_mujoco(), f"mjt{enumeration}")(int(value)).name.rpartition("_")[2].lower()
 
 
-def _joints_of(model: "MjModel", bodies: list[int]) -> list[int]:
+def _joints_of(model: Any, bodies: list[int]) -> list[int]:
     return [
         joint
         for body in bodies
@@ -115,12 +117,10 @@ def converted(path: Path) -> ConvertedModel:
 class _Conversion:
     """The conversion of one model."""
 
-    def __init__(self, path: Path, model: "MjModel") -> None:
-        import mujoco
-
+    def __init__(self, path: Path, model: Any) -> None:
         self.path = path
         self.model = model
-        self.mujoco = mujoco
+        self.mujoco = imported_mujoco()
         self.folder = TemporaryDirectory(prefix="robotdiffuse-mjcf-")
         self.root = ET.Element("robot", name=_model_name(model) or path.stem)
         self.bodies = robot_bodies(model)
@@ -205,9 +205,10 @@ class _Conversion:
         _ends(element, parent, child)
         _origin(element, T)
         ET.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
-        limits = {}
+        limits: dict[str, str] = {}
         if limited:
-            limits = dict(zip(("lower", "upper"), map(repr, model.jnt_range[joint].tolist()), strict=True))
+            lower, upper = map(repr, model.jnt_range[joint].tolist())
+            limits |= {"lower": lower, "upper": upper}
         effort = self._effort(joint)
         if effort > 0:
             limits["effort"] = repr(effort)
@@ -349,7 +350,7 @@ class _Conversion:
         }
 
 
-def mesh_of(model: "MjModel", mesh: int) -> trimesh.Trimesh:
+def mesh_of(model: Any, mesh: int) -> trimesh.Trimesh:
     """A mesh of a model in the frame of its geoms [m]."""
     vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
     faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
@@ -364,21 +365,21 @@ def ellipsoid(radii: Float[ndarray, "3"]) -> trimesh.Trimesh:
     return ball
 
 
-def _model_name(model: "MjModel") -> str:
+def _model_name(model: Any) -> str:
     return bytes(model.names).partition(b"\0")[0].decode()
 
 
-def _geoms_of(model: "MjModel", body: int) -> range:
+def _geoms_of(model: Any, body: int) -> range:
     return range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
 
 
-def _colliding(model: "MjModel", body: int) -> list[int]:
+def _colliding(model: Any, body: int) -> list[int]:
     """The geoms of a body that collide with anything."""
     masks = model.geom_contype | model.geom_conaffinity
     return [geom for geom in _geoms_of(model, body) if masks[geom]]
 
 
-def _related(model: "MjModel", first: int, second: int, unfiltered: bool) -> bool:
+def _related(model: Any, first: int, second: int, unfiltered: bool) -> bool:
     """Whether two bodies are joined rigidly, or by the joints of one of them, and not to the world."""
     own = [int(model.body_weldid[body]) for body in (first, second)]
     above = [int(model.body_weldid[model.body_parentid[body]]) for body in own]
@@ -386,7 +387,7 @@ def _related(model: "MjModel", first: int, second: int, unfiltered: bool) -> boo
     return own[0] == own[1] or (carried and WORLD not in own and not unfiltered)
 
 
-def _masks_meet(model: "MjModel", first: int, second: int) -> bool:
+def _masks_meet(model: Any, first: int, second: int) -> bool:
     """Whether any geom of one body may collide with one of the other."""
     return any(
         model.geom_contype[a] & model.geom_conaffinity[b] or model.geom_contype[b] & model.geom_conaffinity[a]
