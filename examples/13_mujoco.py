@@ -1,8 +1,11 @@
 """A robot and its scene from a MuJoCo model; MuJoCo executes the motion by the model's actuators."""
 
+# MuJoCo has no types for type checkers:
+# pyright: reportAttributeAccessIssue=false
+
 from pathlib import Path
 
-import mujoco  # pyright: reportAttributeAccessIssue=false
+import mujoco
 import numpy as np
 
 import robotdiffuse as rd
