@@ -51,8 +51,7 @@ from robotdiffuse.learning.completion import (
     predict,
     true_voxels,
 )
-from robotdiffuse.perception.depth_noise import DepthNoise
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.planning import load_planner

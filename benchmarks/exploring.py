@@ -41,23 +41,22 @@ from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.types import FIRST
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.statistics import wilson_interval
-from robotdiffuse.learning.completion import FINE_VOXEL_SIZE, true_voxels
-from robotdiffuse.perception.depth_noise import DepthNoise
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import LOW
+from robotdiffuse.learning.completion import true_voxels
+from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.occupancy_map import Corners
+from robotdiffuse.perception.voxel_grid import FINE_VOXEL_SIZE, LOW
 from robotdiffuse.planning.context import PlanRequest
-from robotdiffuse.planning.exploration.explorer import (
+from robotdiffuse.planning.exploration.explorer import Explorer
+from robotdiffuse.planning.exploration.simulated import explore, measured, taken, wrist_camera
+from robotdiffuse.planning.exploration.steps import (
     CHANCE,
     DONE,
     LOOK,
     STRICT,
     STRICT_THEN_CHANCE,
-    Explorer,
     ExplorerSettings,
     Step,
 )
-from robotdiffuse.planning.exploration.simulated import explore, measured, taken, wrist_camera
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import OPTIMISTIC, PREDICTED, JointGoal, Problem

@@ -19,9 +19,9 @@ from robotdiffuse.interop.depth_recording import (
 )
 from robotdiffuse.interop.mcap_file import McapWriter
 from robotdiffuse.perception.occupancy_map import OccupancyMap
-from robotdiffuse.planning.exploration.explorer import ExplorerSettings
 from robotdiffuse.planning.exploration.recorded import RecordedExplorer
 from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+from robotdiffuse.planning.exploration.steps import ExplorerSettings
 
 PANDA = rd.load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])

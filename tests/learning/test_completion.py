@@ -34,8 +34,9 @@ from robotdiffuse.learning.training.completion import (
     fitted_temperature,
     train_completion,
 )
-from robotdiffuse.perception.observed_volume import SHAPE, observe
+from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.perception.voxel_grid import SHAPE
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene

@@ -17,7 +17,7 @@ from robotdiffuse.learning.encoders.networks import CompressionAutoencoder
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weight_files import BUNDLED
-from robotdiffuse.perception.observed_volume import SHAPE
+from robotdiffuse.perception.voxel_grid import SHAPE
 from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")

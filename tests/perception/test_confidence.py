@@ -4,9 +4,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from robotdiffuse.perception.assumptions import FINE_SHAPE
-from robotdiffuse.perception.confidence import MAX_CONFIDENCE, RATES, confidence, explored_confidence
-from robotdiffuse.perception.unknown_space import CrossedSpace
+from robotdiffuse.perception.unknown_space import (
+    MAX_CONFIDENCE,
+    RATES,
+    CrossedSpace,
+    confidence,
+    explored_confidence,
+)
+from robotdiffuse.perception.voxel_grid import FINE_SHAPE
 
 VOXELS = np.zeros(FINE_SHAPE, np.bool_)
 VOXELS[40:60, 50:52, 20:22] = True

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.perception.depth_filter import depth_spread, filtered, grown_for_noise
-from robotdiffuse.perception.depth_noise import DepthNoise
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.seen_points import seen_points

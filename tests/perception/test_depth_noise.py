@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.depth_noise import DepthNoise
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 
 
 def test_noise_is_as_its_settings_say() -> None:

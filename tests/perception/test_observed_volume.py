@@ -5,7 +5,8 @@ import pytest
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
+from robotdiffuse.perception.observed_volume import ObservedVolume, observe
+from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.depth_noise import DepthNoise
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.free_space_kernel import FREE, OUT
-from robotdiffuse.perception.observed_volume import carve_view
-from robotdiffuse.perception.occupancy_map import MAP, MapSettings, OccupancyMap
+from robotdiffuse.perception.depth_view import DepthNoise, DepthView
+from robotdiffuse.perception.observed_volume import FREE, OUT, carve_view
+from robotdiffuse.perception.occupancy_map import MapSettings, OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
@@ -29,7 +28,7 @@ def view_from(bearing: float, distance: float = 1.5, scene: Scene = SCENE) -> De
 
 
 def true(margin: float) -> np.ndarray:
-    return voxels_within(SCENE, MAP.low, MAP.edge, MAP.shape, margin)
+    return voxels_within(SCENE, MAP, margin)
 
 
 @pytest.mark.parametrize("noisy", (False, True))
@@ -65,9 +64,7 @@ def test_a_voxel_is_the_same_wherever_its_block_begins() -> None:
     states = []
     for shift in (0.0, MAP.edge):
         x, y, z = (side + shift for side in MAP.low)
-        state, behind, counts = (np.empty(MAP.shape, kind) for kind in (np.uint8, np.float32, np.int32))
-        carve_view(view_from(0.3), PANDA, HOME, 0.015, (x, y, z), MAP.edge, state, behind, counts)
-        states.append(state)
+        states.append(carve_view(view_from(0.3), PANDA, HOME, 0.015, replace(MAP, low=(x, y, z)))[0])
     assert {FREE, OUT} < set(np.unique(states[0]))
     assert (states[0][1:, 1:, 1:] != states[1][:-1, :-1, :-1]).mean() < 1e-4
 

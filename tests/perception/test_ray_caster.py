@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.ray_caster import MAX_RANGE, looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.voxel_grid import VoxelGrid
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.scenes.scene import Scene
@@ -118,7 +119,7 @@ def test_pybullets_camera_sees_the_same() -> None:
 def test_voxels_that_hold_obstacles(seed: int) -> None:
     scene = random_scene(np.random.default_rng(seed))
     low, voxel, shape = (-0.5, -0.6, -0.4), 0.04, (20, 25, 22)
-    found = voxels_within(scene, low, voxel, shape, 0.01)
+    found = voxels_within(scene, VoxelGrid(low, shape, voxel), 0.01)
     centers = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1) * voxel + voxel / 2 + low
     nearest = np.min([distance(one, centers) for one in scene.shapes], axis=0)
     sure = np.abs(nearest - 0.01) > 1e-5

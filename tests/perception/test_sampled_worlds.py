@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from robotdiffuse.perception.assumptions import FINE_SHAPE
-from robotdiffuse.perception.sampled_worlds import WORLDS, free_share
+from robotdiffuse.perception.unknown_space import WORLDS, free_share
+from robotdiffuse.perception.voxel_grid import FINE_SHAPE
 
 RNG = np.random.default_rng(0)
 VOXELS = np.zeros(FINE_SHAPE, np.bool_)

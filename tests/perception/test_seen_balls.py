@@ -8,8 +8,13 @@ from scipy.spatial import KDTree
 
 import robotdiffuse as rd
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.perception.seen_balls_kernel import MAX_LOST_FRACTION, see_through, within_voxels
-from robotdiffuse.perception.surface_balls import BALL_RADIUS, surface_balls
+from robotdiffuse.perception.visibility import (
+    BALL_RADIUS,
+    MAX_LOST_FRACTION,
+    see_through,
+    surface_balls,
+    within_voxels,
+)
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 

@@ -13,9 +13,9 @@ from robotdiffuse.core.transforms import transform
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.perception.seen_points import (
     ARM_DISTANCE,
+    CELL,
     MIN_POINT_RADIUS,
     POINT_RADIUS,
-    VOXEL,
     seen_points,
 )
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
@@ -61,7 +61,7 @@ def test_points_lie_on_what_was_seen_and_cover_it() -> None:
     points = seen_points([seen], PANDA, START)
     assert np.abs(np.linalg.norm(points - BALL.center, axis=1) - BALL.radius).max() < 0.004
     gaps = np.linalg.norm(seen.points()[:, None] - points[None], axis=2).min(axis=1)
-    assert len(points) < len(seen.points()) and gaps.max() < VOXEL * np.sqrt(3)
+    assert len(points) < len(seen.points()) and gaps.max() < CELL * np.sqrt(3)
 
 
 def test_the_arm_is_filtered_as_it_stood_then() -> None:
@@ -69,7 +69,7 @@ def test_the_arm_is_filtered_as_it_stood_then() -> None:
         arm = placed_spheres(PANDA, q)
         points = seen_points([view(np.concatenate([arm, BALL_ROW]), told)], PANDA, START)
         to_arm = np.linalg.norm(points[:, None] - arm[None, :, :3], axis=2) - arm[:, 3]
-        assert len(points) and to_arm.min() > ARM_DISTANCE - VOXEL
+        assert len(points) and to_arm.min() > ARM_DISTANCE - CELL
         assert np.abs(np.linalg.norm(points - BALL.center, axis=1) - BALL.radius).max() < 0.004
     assert len(seen_points([view(placed_spheres(PANDA, GOAL), START)], PANDA, START)) > 100
 

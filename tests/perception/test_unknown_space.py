@@ -3,10 +3,9 @@
 import numpy as np
 
 from robotdiffuse.core.types import Path
-from robotdiffuse.perception.assumptions import FINE_SHAPE, voxels_in
 from robotdiffuse.perception.unknown_space import UnknownSpace
+from robotdiffuse.perception.voxel_grid import FINE, FINE_SHAPE
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import placed_spheres
 
 PANDA = load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
@@ -17,7 +16,7 @@ PREDICTED = np.full(FINE_SHAPE, 0.01, np.float32)
 def test_only_what_the_arm_fills_at_the_ends_is_left_out_without_a_margin() -> None:
     """A hand that grazes an unseen cupboard beside its goal stated a confidence of 0.98."""
     ends, path = START[None], Path(PANDA.joint_names, np.stack([START, START + 0.015, START]))
-    filled = voxels_in(placed_spheres(PANDA, START).astype(np.float32))
+    filled = FINE.filled(PANDA, [START])
     bare = UnknownSpace(PANDA, ends, EVERYWHERE, PREDICTED, margin=0.0).crossed(path)
     usual = UnknownSpace(PANDA, ends, EVERYWHERE, PREDICTED).crossed(path)
     assert bare.voxels.any() and not (bare.voxels & filled).any()

@@ -10,15 +10,12 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.assumptions import CARVING_MARGIN, FINE_SHAPE, voxels_in
-from robotdiffuse.perception.depth_noise import DepthNoise
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, OccupancyMap
+from robotdiffuse.perception.depth_view import DepthNoise, DepthView
+from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
-from robotdiffuse.perception.surface_balls import surface_balls
-from robotdiffuse.perception.swept_voxels_kernel import sweep
-from robotdiffuse.perception.view_memory import ViewMemory
-from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+from robotdiffuse.perception.unknown_space import CARVING_MARGIN
+from robotdiffuse.perception.visibility import surface_balls
+from robotdiffuse.perception.voxel_grid import FINE_SHAPE, LAYERS_BELOW, MAP, sweep
 from robotdiffuse.planning.exploration.goal_seen import GoalSeen
 from robotdiffuse.planning.exploration.looks import best_looks
 from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
@@ -30,7 +27,7 @@ from robotdiffuse.planning.exploration.simulated import (
     simulated_explorer,
     wrist_camera,
 )
-from robotdiffuse.planning.exploration.steps import DONE
+from robotdiffuse.planning.exploration.steps import DONE, ExplorerSettings
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.validation.validator import verify
 
@@ -104,7 +101,7 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
     unseen = swept & ~one.map.free
     ends = [placed_spheres(PANDA, q).astype(np.float32) for q in step.motion.path.positions[[0, -1]]]
     # covering spheres are larger than the links that the validator checks
-    assert (unseen & ~voxels_in(np.concatenate(ends), 2 * CARVING_MARGIN, MAP)).sum() <= 20
+    assert (unseen & ~MAP.within(np.concatenate(ends), 2 * CARVING_MARGIN)).sum() <= 20
 
 
 def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
@@ -117,7 +114,7 @@ def test_obstacles_cover_what_is_not_seen_free_but_at_the_ends() -> None:
     )
     at = np.floor((cloud.points - MAP.low) / MAP.edge).astype(int)
     assert not one.map.free[tuple(at.T)].any()
-    true = voxels_within(rd.Scene([WALL]), MAP.low, MAP.edge, MAP.shape, -0.0)
+    true = voxels_within(rd.Scene([WALL]), MAP, -0.0)
     assert not (one.map.free & true).sum() > 0.01 * true.sum()
     spheres = placed_spheres(PANDA, HOME)
     distances = np.linalg.norm(cloud.points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]

@@ -10,7 +10,7 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.perception.visibility_kernel import CELL, seen_weights
+from robotdiffuse.perception.visibility import ARM_CELL, seen_weights
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.next_view import next_view, poses_around
 from robotdiffuse.problems.problem import Problem
@@ -75,7 +75,10 @@ def test_the_arm_hides_what_is_behind_it() -> None:
     image, q = (np.array(camera, np.float32), (480, 640)), START.astype(np.float32)[None]
     pose, seen, expected = BEYOND[None].astype(np.float32), [], []
     for i in np.flatnonzero((abs(rows - 240) < 239) & (abs(columns - 320) < 319)):
-        around = np.s_[max(rows[i] - CELL, 0) : rows[i] + CELL, max(columns[i] - CELL, 0) : columns[i] + CELL]
+        around = np.s_[
+            max(rows[i] - ARM_CELL, 0) : rows[i] + ARM_CELL,
+            max(columns[i] - ARM_CELL, 0) : columns[i] + ARM_CELL,
+        ]
         behind = arm[around] < z[i] - 0.2
         if behind.all() or np.isinf(arm[around]).all():
             one = voxels[i : i + 1], np.ones(1, np.float32), filled, low, edge

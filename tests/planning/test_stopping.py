@@ -8,7 +8,7 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.planning.exploration.explorer import ExplorerSettings
+from robotdiffuse.planning.exploration.steps import ExplorerSettings
 from robotdiffuse.planning.exploration.stopping import braked
 from robotdiffuse.trajectories.speed_limits import jerk_limits
 from robotdiffuse.validation.validator import verify

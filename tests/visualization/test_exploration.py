@@ -12,7 +12,7 @@ from PIL import Image
 
 from helpers.explorations import FLOOR, recorded
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.occupancy_map import MAP
+from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.visualization.exploration import (
     GAP,
     READING_TIME,

@@ -14,7 +14,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.interop import WRITERS
 
 if TYPE_CHECKING:
-    from robotdiffuse.perception.depth_noise import DepthNoise
+    from robotdiffuse.perception.depth_view import DepthNoise
     from robotdiffuse.planning.exploration.recorded import RecordedExplorer
     from robotdiffuse.planning.exploration.simulated import Event
     from robotdiffuse.planning.exploration.steps import ExplorerSettings
@@ -163,7 +163,7 @@ def add_explore(commands: argparse._SubParsersAction) -> None:
 
 def run_explore(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
-    from robotdiffuse.perception.depth_noise import DepthNoise
+    from robotdiffuse.perception.depth_view import DepthNoise
     from robotdiffuse.planning.exploration.steps import ExplorerSettings
     from robotdiffuse.problems.files import load_problem
 

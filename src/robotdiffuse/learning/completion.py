@@ -26,11 +26,11 @@ from robotdiffuse.learning.weight_files import (
     kept_by_stamp,
     read_description,
 )
-from robotdiffuse.perception.depth_noise import DepthNoise
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
+from robotdiffuse.perception.depth_view import DepthNoise, DepthView
+from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
-from robotdiffuse.perception.seen_points_kernel import near_scene
+from robotdiffuse.perception.seen_points import near_scene
+from robotdiffuse.perception.voxel_grid import FINE, LOW, SHAPE, VOXEL
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import Range, base_spheres
 from robotdiffuse.robots.kinematics import link_poses
@@ -89,9 +89,6 @@ def covers(robot: Robot) -> bool:
     return True
 
 
-FINE_VOXEL_SIZE = VOXEL / 2
-"""Edge of the voxels that are predicted [m]."""
-FINE_SHAPE = (2 * SHAPE[0], 2 * SHAPE[1], 2 * SHAPE[2])
 DEPTH_STEP = 0.01
 """Depths behind surfaces are stored in whole steps of this [m]."""
 OCCUPIED, FREE, SHADOW, OUT_OF_VIEW = 1, 2, 4, 8
@@ -179,7 +176,7 @@ def pack(volume: ObservedVolume) -> tuple[Packed, Packed]:
 
 def true_voxels(scene: Scene) -> Bool[ndarray, "112 112 64"]:
     """The voxels of 2 cm that hold obstacles."""
-    return voxels_within(scene, LOW, FINE_VOXEL_SIZE, FINE_SHAPE)
+    return voxels_within(scene, FINE)
 
 
 def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> Packed:

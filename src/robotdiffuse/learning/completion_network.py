@@ -21,7 +21,7 @@ from robotdiffuse.learning.completion import (
     voxel_centers,
 )
 from robotdiffuse.learning.network import SavedModule, exported
-from robotdiffuse.perception.observed_volume import SHAPE
+from robotdiffuse.perception.voxel_grid import SHAPE
 
 Packed = UInt8[Tensor, "n 56 56 32"]
 CHANNELS = 7

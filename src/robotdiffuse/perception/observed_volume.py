@@ -1,5 +1,8 @@
 """ObservedVolume: voxels within an arm's reach that depth views observed occupied or free; the rest is
-unknown."""
+unknown.
+
+Each voxel is projected into the image; rays are not followed through the voxels.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,19 +13,336 @@ from jaxtyping import Bool, Float, Float32, Int32, UInt8
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.free_space_kernel import BEHIND, FREE, OUT, SHADOW, carve
+from robotdiffuse.perception.ray_caster import rectangle
+from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
-VOXEL = 0.04
-"""Edge length of a voxel [m]."""
-LOW = (-1.12, -1.12, -0.1)
-"""Lower corner of the volume, in the frame of the base [m]. A floor at z = 0 is in the middle of a layer of
-voxels, not between two layers."""
-SHAPE = (56, 56, 32)
-"""Number of voxels along x, y and z: the space around an arm with a reach of 1.1 m on a table."""
+HIDDEN, FREE, BEHIND, SHADOW, OUT = 0, 1, 2, 3, 4
+"""States of a voxel in a view: not observed, entirely free, behind a surface, behind the arm, outside the
+image."""
+NO_RETURN = np.float32(-1.0)
+"""Depth of a pixel without a return."""
+MAX_DEPTH = np.float32(1e6)
+"""Depth of a pixel without an obstacle in range, and of unknown pixels [m]."""
+POOLED_FOCAL_LENGTH = 250.0
+"""Images are downsampled by min-pooling while their focal length stays above this [pixels]: a voxel of 4 cm
+at a distance of 2 m is then 5 pixels wide."""
+MIN_RETURN_FRACTION = np.float32(0.5)
+"""Minimum fraction of a voxel's pixels with a return for it to be observed free."""
+MIN_POINT_FRACTION = np.float32(0.03)
+"""Minimum fraction of a voxel's pixels with points in it for it to be observed occupied: excludes
+outliers."""
+FLYING_PIXEL_STEP = np.float32(0.03)
+"""A flying pixel is nearer than one neighbour and farther than the opposite one by at least this [m]..."""
+FLYING_PIXEL_WIDTHS = np.float32(4.0)
+"""... or, if that is more, by this many widths of a pixel at its distance."""
+BLOCK = 4
+"""Edge of the blocks of voxels of which all are tried at once, in voxels."""
+PIXEL_SLACK, DEPTH_SLACK = np.float32(0.01), np.float32(1e-4)
+"""More than the rounding errors of a place in the image [pixels] and of a depth [m]."""
+FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
+"""All fastmath flags except those that assume finite numbers."""
+_HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+
+
+@kernel(fastmath=FASTMATH)
+def usable_depth(depth, focal):
+    """The depths, with MAX_DEPTH for rays without an obstacle and NO_RETURN for missing returns and flying
+    pixels."""
+    h, w = depth.shape
+    out = np.empty((h, w), np.float32)
+    for v in range(h):
+        for u in range(w):
+            d = depth[v, u]
+            out[v, u] = min(d, MAX_DEPTH) if d > _ZERO else NO_RETURN
+    flying = np.zeros((h, w), np.bool_)
+    for v in range(1, h - 1):
+        for u in range(1, w - 1):
+            d = out[v, u]
+            step = max(FLYING_PIXEL_STEP, FLYING_PIXEL_WIDTHS * d / focal)
+            a, b, c, e = out[v, u - 1], out[v, u + 1], out[v - 1, u], out[v + 1, u]
+            across = (a > _ZERO) & (b > _ZERO) & (min(a, b) < d - step) & (max(a, b) > d + step)
+            along = (c > _ZERO) & (e > _ZERO) & (min(c, e) < d - step) & (max(c, e) > d + step)
+            flying[v, u] = across | along
+    for v in range(h):
+        for u in range(w):
+            if flying[v, u]:
+                out[v, u] = NO_RETURN
+    return out
+
+
+@kernel(fastmath=FASTMATH)
+def _arm_pixels(depth, intrinsics, spheres):
+    """Which pixels have points inside the spheres, [n, 4] x y z radius in the camera's frame."""
+    h, w = depth.shape
+    fx, fy, cx, cy = intrinsics
+    mask = np.zeros((h, w), np.bool_)
+    for s in range(len(spheres)):
+        x, y, z, r = spheres[s]
+        v0, v1, u0, u1 = rectangle(x, y, z, r, intrinsics, h, w)
+        for v in range(v0, v1 + 1):
+            ry = (np.float32(v) - cy) / fy
+            for u in range(u0, u1 + 1):
+                d = depth[v, u]
+                dx, dy, dz = (np.float32(u) - cx) / fx * d - x, ry * d - y, d - z
+                if dx * dx + dy * dy + dz * dz < r * r:
+                    mask[v, u] = True
+    return mask
+
+
+@kernel(fastmath=FASTMATH)
+def _min_pooled(depth, factor):
+    """Minimum depth of blocks of pixels, and the summed-area table of missing returns."""
+    h, w = (depth.shape[0] + factor - 1) // factor, (depth.shape[1] + factor - 1) // factor
+    least = np.full((h, w), MAX_DEPTH, np.float32)
+    missing = np.zeros((h + 1, w + 1), np.int32)
+    nearest, lost = np.empty(depth.shape[1], np.float32), np.empty(depth.shape[1], np.int32)
+    for block in range(h):
+        nearest[:], lost[:] = MAX_DEPTH, 0
+        for v in range(block * factor, min((block + 1) * factor, depth.shape[0])):
+            row = depth[v]
+            for u in range(depth.shape[1]):
+                known = row[u] > _ZERO
+                nearest[u] = min(nearest[u], row[u] if known else MAX_DEPTH)
+                lost[u] += np.int32(0) if known else np.int32(1)
+        total = np.int32(0)
+        for u in range(depth.shape[1]):
+            cell = u // factor
+            least[block, cell] = min(least[block, cell], nearest[u])
+            total += lost[u]
+            missing[block + 1, cell + 1] = missing[block, cell + 1] + total
+    return least, missing
+
+
+@kernel(fastmath=FASTMATH)
+def _minimum_table(least, levels):
+    """Sparse table for range minima: minimum depth of the square of 2^k cells below and right of each
+    cell."""
+    h, w = least.shape
+    table = np.empty((levels, h, w), np.float32)
+    table[0] = least
+    for k in range(1, levels):
+        step = 1 << (k - 1)
+        before, now = table[k - 1], table[k]
+        for v in range(h):
+            a, b = before[v], before[min(v + step, h - 1)]
+            for u in range(w - step):
+                now[v, u] = min(min(a[u], a[u + step]), min(b[u], b[u + step]))
+            for u in range(w - step, w):
+                now[v, u] = min(a[u], b[u])
+    return table
+
+
+@kernel(fastmath=FASTMATH)
+def _rectangle_minimum(table, v0, v1, u0, u1):
+    """Minimum depth of the cells of a rectangle, whose bounds are inclusive."""
+    k = 0
+    while 2 << k <= min(v1 - v0, u1 - u0) + 1 and k + 1 < len(table):
+        k += 1
+    step, least = 1 << k, MAX_DEPTH
+    for v in range(v0, v1 + step, step):
+        row = table[k, max(v0, min(v, v1 - step + 1))]
+        for u in range(u0, u1 + step, step):
+            least = min(least, row[max(u0, min(u, u1 - step + 1))])
+    return least
+
+
+@kernel(fastmath=FASTMATH)
+def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
+    """Counts the points in each voxel, without those of the arm."""
+    fx, fy, cx, cy = intrinsics
+    h, w = depth.shape
+    nx, ny, nz = counts.shape
+    flat = counts.ravel()
+    fnx, fny, fnz = np.float32(nx), np.float32(ny), np.float32(nz)
+    scale = _ONE / voxel
+    ox, oy, oz = (T[0, 3] - low[0]) * scale, (T[1, 3] - low[1]) * scale, (T[2, 3] - low[2]) * scale
+    at = np.empty(w, np.int32)
+    for v in range(h):
+        b = (np.float32(v) - cy) / fy
+        rx, ry, rz = T[0, 1] * b + T[0, 2], T[1, 1] * b + T[1, 2], T[2, 1] * b + T[2, 2]
+        row, hidden = depth[v], arm[v]
+        for u in range(w):
+            a, d = (np.float32(u) - cx) / fx, row[u] * scale
+            x, y, z = ox + (rx + T[0, 0] * a) * d, oy + (ry + T[1, 0] * a) * d, oz + (rz + T[2, 0] * a) * d
+            inside = (x >= _ZERO) & (y >= _ZERO) & (z >= _ZERO) & (x < fnx) & (y < fny) & (z < fnz)
+            inside &= (d > _ZERO) & ~hidden[u]
+            x, y, z = min(max(x, _ZERO), fnx), min(max(y, _ZERO), fny), min(max(z, _ZERO), fnz)
+            index = (np.int32(x) * np.int32(ny) + np.int32(y)) * np.int32(nz) + np.int32(z)
+            at[u] = index if inside else np.int32(-1)
+        for u in range(w):
+            if at[u] >= 0:
+                flat[at[u]] += 1
+
+
+@kernel(fastmath=FASTMATH)
+def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
+    """Writes the state of each voxel [nx ny nz], its depth behind a surface [m], and its number of points.
+
+    intrinsics: fx, fy, cx, cy; T: T_base_camera [4 4]; spheres: those of the arm in the camera's frame; low:
+    lower corner of the grid; counts: number of points in each voxel in excess of outliers. All arrays are
+    float32, except state, uint8, and counts, int32.
+    """
+    nx, ny, nz = state.shape
+    raw = usable_depth(depth, intrinsics[0])
+    arm = _arm_pixels(raw, intrinsics, spheres)
+    counts[:] = 0
+    _count_points(raw, arm, intrinsics, T, low, voxel, counts)
+    factor = max(1, int(intrinsics[0] / POOLED_FOCAL_LENGTH))
+    least, missing = _min_pooled(raw, factor)
+    table = _minimum_table(least, 6)
+    for i in range(0, nx, BLOCK):
+        for j in range(0, ny, BLOCK):
+            for k in range(0, nz, BLOCK):
+                first, end = (i, j, k), (min(i + BLOCK, nx), min(j + BLOCK, ny), min(k + BLOCK, nz))
+                whole = _state_of_block(first, intrinsics, T, low, voxel, raw.shape, factor, table, missing)
+                if whole >= 0:
+                    state[i : end[0], j : end[1], k : end[2]] = whole
+                    behind[i : end[0], j : end[1], k : end[2]] = _ZERO
+                else:
+                    _carve_block(
+                        first,
+                        end,
+                        raw,
+                        arm,
+                        intrinsics,
+                        T,
+                        low,
+                        voxel,
+                        factor,
+                        table,
+                        missing,
+                        state,
+                        behind,
+                        counts,
+                    )
+
+
+@kernel(fastmath=FASTMATH)
+def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missing):
+    """OUT or FREE if all voxels of a block are so, by the rectangle that it covers in the image, else -1.
+
+    first: indices of its first voxel.
+    """
+    fx, fy, cx, cy = intrinsics
+    middle = _HALF * np.float32(BLOCK)
+    px = low[0] + (np.float32(first[0]) + middle) * voxel - T[0, 3]
+    py = low[1] + (np.float32(first[1]) + middle) * voxel - T[1, 3]
+    pz = low[2] + (np.float32(first[2]) + middle) * voxel - T[2, 3]
+    z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
+    ez = _HALF * voxel * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
+    near, far = z - np.float32(BLOCK) * ez, z + np.float32(BLOCK) * ez
+    if far <= ez:
+        return OUT
+    if near <= voxel:
+        return -1
+    x = (T[0, 0] * px + T[1, 0] * py + T[2, 0] * pz) / z
+    y = (T[0, 1] * px + T[1, 1] * py + T[2, 1] * pz) / z
+    du, dv = _ZERO, _ZERO
+    for c in range(3):
+        du += abs(T[c, 0] - x * T[c, 2])
+        dv += abs(T[c, 1] - y * T[c, 2])
+    # no rectangle of a voxel, which is a little larger than the voxel in the image, reaches beyond this
+    wide = middle * voxel / near * (_ONE + ez / near)
+    u, v, du, dv = fx * x + cx, fy * y + cy, fx * wide * du + PIXEL_SLACK, fy * wide * dv + PIXEL_SLACK
+    h, w = size
+    if (
+        u + du < -_HALF
+        or v + dv < -_HALF
+        or u - du >= np.float32(w) - _HALF
+        or v - dv >= np.float32(h) - _HALF
+    ):
+        return OUT
+    share = _ONE / np.float32(factor)
+    u0, u1 = int((u - du + _HALF) * share), int((u + du + _HALF) * share)
+    v0, v1 = int((v - dv + _HALF) * share), int((v + dv + _HALF) * share)
+    if u - du < -_HALF or v - dv < -_HALF or u1 >= table.shape[2] or v1 >= table.shape[1]:
+        return -1
+    if missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]:
+        return -1
+    return FREE if _rectangle_minimum(table, v0, v1, u0, u1) > far + DEPTH_SLACK else -1
+
+
+@kernel(fastmath=FASTMATH)
+def _carve_block(
+    first, end, raw, arm, intrinsics, T, low, voxel, factor, table, missing, state, behind, counts
+):
+    """Does for the voxels of a block what `carve` does for all."""
+    fx, fy, cx, cy = intrinsics
+    h, w = table.shape[1:]
+    share = _ONE / np.float32(factor)
+    half = _HALF * voxel
+    ez = half * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
+    for i in range(first[0], end[0]):
+        px = low[0] + (np.float32(i) + _HALF) * voxel - T[0, 3]
+        for j in range(first[1], end[1]):
+            py = low[1] + (np.float32(j) + _HALF) * voxel - T[1, 3]
+            for k in range(first[2], end[2]):
+                pz = low[2] + (np.float32(k) + _HALF) * voxel - T[2, 3]
+                z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
+                behind[i, j, k] = _ZERO
+                state[i, j, k] = OUT
+                if z <= ez:
+                    continue
+                x, y = T[0, 0] * px + T[1, 0] * py + T[2, 0] * pz, T[0, 1] * px + T[1, 1] * py + T[2, 1] * pz
+                x, y = x / z, y / z
+                u, v = fx * x + cx, fy * y + cy
+                column, row = int(np.floor(u + _HALF)), int(np.floor(v + _HALF))
+                if column < 0 or row < 0 or column >= raw.shape[1] or row >= raw.shape[0]:
+                    continue
+                if counts[i, j, k] > 0:
+                    pixels = fx * fy * (voxel / z) ** 2
+                    counts[i, j, k] = max(0, counts[i, j, k] - int(MIN_POINT_FRACTION * pixels))
+                front = raw[row, column]
+                if front > z + ez or front <= _ZERO:
+                    # half the width and height of the rectangle that the voxel covers in the image
+                    du, dv = _ZERO, _ZERO
+                    for c in range(3):
+                        du += abs(T[c, 0] - x * T[c, 2])
+                        dv += abs(T[c, 1] - y * T[c, 2])
+                    du, dv = fx * half * du / (z - ez), fy * half * dv / (z - ez)
+                    u0, u1 = int((u - du + _HALF) * share), int((u + du + _HALF) * share)
+                    v0, v1 = int((v - dv + _HALF) * share), int((v + dv + _HALF) * share)
+                    inside = u - du >= -_HALF and v - dv >= -_HALF and u1 < w and v1 < h
+                    u0, v0, u1, v1 = max(0, u0), max(0, v0), min(w - 1, u1), min(h - 1, v1)
+                    lost = (
+                        missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]
+                    )
+                    pixels = np.float32((v1 + 1 - v0) * (u1 + 1 - u0) * factor * factor)
+                    nearest = _rectangle_minimum(table, v0, v1, u0, u1)
+                    if (
+                        inside
+                        and nearest > z + ez
+                        and np.float32(lost) <= (_ONE - MIN_RETURN_FRACTION) * pixels
+                    ):
+                        state[i, j, k] = FREE
+                        continue
+                    front = nearest if front <= _ZERO else front
+                state[i, j, k] = HIDDEN
+                if arm[row, column]:
+                    state[i, j, k] = SHADOW
+                elif front < z:
+                    state[i, j, k] = BEHIND
+                    behind[i, j, k] = z - front
+
+
+@kernel()
+def add_evidence(state, counts, evidence, hit, miss, largest):
+    """Add what a view shows to the evidence for each voxel [nx ny nz]; returns for how many there was none:
+    `hit` for voxels with points, else -`miss` for those that are free. It stays within `largest`."""
+    state, counts, evidence, new = state.ravel(), counts.ravel(), evidence.ravel(), 0
+    for v in range(len(evidence)):
+        points, free, before = counts[v] > 0, state[v] == FREE, evidence[v]
+        gain = hit if points else (-miss if free else _ZERO)
+        new += (points | free) & (before == _ZERO)
+        evidence[v] = min(max(before + gain, -largest), largest)
+    return new
+
+
 ARM_MARGIN = 0.015
 """Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise: see
 `grown_for_noise`."""
@@ -81,8 +401,7 @@ def _observed(view: DepthView, robot: Robot, start: Float[ndarray, "dof"]) -> Ob
     q = start if view.configuration is None else view.configuration
     if len(q) != robot.dof:
         raise InputError(f"view.configuration has {len(q)} numbers; {robot.name} plans {robot.dof} joints")
-    state, depth, counts = np.empty(SHAPE, np.uint8), np.empty(SHAPE, np.float32), np.empty(SHAPE, np.int32)
-    carve_view(view, robot, q, ARM_MARGIN, LOW, VOXEL, state, depth, counts)
+    state, depth, counts = carve_view(view, robot, q, ARM_MARGIN, COARSE)
     occupied = counts > 0
     depth[(state != BEHIND) | occupied] = 0.0
     return ObservedVolume(
@@ -95,29 +414,28 @@ def carve_view(
     robot: Robot,
     q: Float[ndarray, "dof"],
     arm_margin: float,
-    low: tuple[float, float, float],
-    voxel: float,
-    state: UInt8[ndarray, "nx ny nz"],
-    behind: Float32[ndarray, "nx ny nz"],
-    counts: Int32[ndarray, "nx ny nz"],
-) -> None:
-    """Write what one view tells of each voxel from the corner `low` on, by its filtered image; see `carve`.
+    grid: VoxelGrid,
+) -> tuple[UInt8[ndarray, "nx ny nz"], Float32[ndarray, "nx ny nz"], Int32[ndarray, "nx ny nz"]]:
+    """What one view tells of each voxel, by its filtered image: its state, its depth behind a surface [m],
+    and its number of points; see `carve`.
 
     q: the arm's configuration in the view. arm_margin: points within this distance of its covering spheres
-    are points of the arm; more with noise [m]. voxel: edge of a voxel [m].
+    are points of the arm; more with noise [m].
     """
     T, (depth, spread) = view.T_base_camera, filtered(view)
     spheres = grown_for_noise(placed_spheres(robot, q), T, spread)
     spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
     spheres[:, 3] += arm_margin
+    state, behind = np.empty(grid.shape, np.uint8), np.empty(grid.shape, np.float32)
+    counts = np.empty(grid.shape, np.int32)
     carve(
         depth,
         np.array(view.intrinsics, np.float32),
         T.astype(np.float32),
         spheres.astype(np.float32),
-        np.array(low, np.float32),
-        np.float32(voxel),
+        *grid.frame,
         state,
         behind,
         counts,
     )
+    return state, behind, counts

@@ -1,29 +1,33 @@
-"""OccupancyMap: what many depth views tell of each voxel of 2 cm around the arm, view by view."""
+"""OccupancyMap: what many depth views tell of each voxel of 2 cm around the arm, view by view; and
+ViewMemory: the views that showed most, with what each of them shows, computed once.
+"""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 from numpy import ndarray
+from scipy.spatial import KDTree
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
-from robotdiffuse.perception.assumptions import FINE_SHAPE, FINE_VOXEL_SIZE, VoxelGrid, voxels_of
+from robotdiffuse.perception.depth_filter import filtered
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.free_space_kernel import FREE, HIDDEN, add_evidence
-from robotdiffuse.perception.observed_volume import LOW, carve_view
+from robotdiffuse.perception.observed_volume import (
+    FREE,
+    HIDDEN,
+    ObservedVolume,
+    add_evidence,
+    carve_view,
+    merged,
+    observe,
+)
+from robotdiffuse.perception.seen_points import CELL, seen_points
+from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.robots.robot import Robot
 
-LAYERS_BELOW = 20
-"""Layers of voxels of the map below the observed volume."""
-MAP = VoxelGrid(
-    (LOW[0], LOW[1], LOW[2] - LAYERS_BELOW * FINE_VOXEL_SIZE),
-    (FINE_SHAPE[0], FINE_SHAPE[1], FINE_SHAPE[2] + LAYERS_BELOW),
-    FINE_VOXEL_SIZE,
-)
-"""The voxels of a map: those of `ObservedVolume`, halved, and 0.4 m below it, where an arm on a stand
-reaches."""
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Low and high corner of a box [m]."""
 
@@ -60,8 +64,6 @@ class OccupancyMap:
         self._seen_at = np.full(MAP.shape, -np.inf, np.float64)
         self._declared = np.zeros(MAP.shape, np.bool_)
         self._now = -np.inf
-        self._state, self._behind = np.empty(MAP.shape, np.uint8), np.empty(MAP.shape, np.float32)
-        self._counts = np.empty(MAP.shape, np.int32)
         self._known: tuple[Bool[ndarray, "nx ny nz"], ...] | None = None
 
     @locked
@@ -77,19 +79,18 @@ class OccupancyMap:
                 f"view.configuration is {shown(q)}; a map needs the {self.robot.dof} joint positions of"
                 f" {self.robot.name} when the view was taken"
             )
-        arrays = self._state, self._behind, self._counts
-        carve_view(view, self.robot, q, self.settings.arm_margin, MAP.low, MAP.edge, *arrays)
-        return self._update(stamp)
+        state, _, counts = carve_view(view, self.robot, q, self.settings.arm_margin, MAP)
+        return self._update(state, counts, stamp)
 
     @locked
     def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
         or of `rd.PointCloud.from_file`. They say nothing about free space."""
-        at = voxels_of(np.asarray(points), MAP)
+        at = MAP.indices(np.asarray(points))
         at = at[MAP.contains(at)]
-        self._state[:], self._counts[:] = HIDDEN, 0
-        self._counts[tuple(at.T)] = 1
-        self._update(stamp)
+        counts = np.zeros(MAP.shape, np.int32)
+        counts[tuple(at.T)] = 1
+        self._update(np.full(MAP.shape, HIDDEN, np.uint8), counts, stamp)
 
     @locked
     def declare_free(self, zone: Corners) -> None:
@@ -139,14 +140,95 @@ class OccupancyMap:
         assert self.settings.max_age is not None
         return self._seen_at >= self._now - self.settings.max_age
 
-    def _update(self, stamp: float) -> int:
-        """Take what `_state` and `_counts` show into account; returns the number of voxels that nothing was
+    def _update(
+        self, state: UInt8[ndarray, "nx ny nz"], counts: Int32[ndarray, "nx ny nz"], stamp: float
+    ) -> int:
+        """Take what a view shows of each voxel into account; returns the number of voxels that nothing was
         known of before."""
         self._now = max(self._now, stamp)
         self._known = None
         settings = self.settings
         if settings.max_age is not None:
             self._evidence[~self._fresh] = 0.0
-            self._seen_at[(self._counts > 0) | (self._state == FREE)] = stamp
+            self._seen_at[(counts > 0) | (state == FREE)] = stamp
         weights = np.array([settings.hit, settings.miss, settings.largest], np.float32)
-        return add_evidence(self._state, self._counts, self._evidence, *weights)
+        return add_evidence(state, counts, self._evidence, *weights)
+
+
+ALONE_DISTANCE = 0.02
+"""With noise, a point of one view with no other point within this distance is stray [m]. Of surfaces at 1 m,
+99 of 100 points have three or more there."""
+
+
+class _Kept:
+    """A view, and what it shows, computed when it is first needed."""
+
+    def __init__(self, view: DepthView, robot: Robot, new_voxels: int) -> None:
+        self.view, self._robot, self.new_voxels = view, robot, new_voxels
+
+    @cached_property
+    def volume(self) -> ObservedVolume:
+        return observe([self.view], self._robot, self._configuration)
+
+    @cached_property
+    def points(self) -> Float32[ndarray, "n 3"]:
+        return seen_points([self.view], self._robot, self._configuration)
+
+    @property
+    def _configuration(self) -> Float[ndarray, "dof"]:
+        assert self.view.configuration is not None
+        return self.view.configuration
+
+
+class ViewMemory:
+    """Keeps a number of views: a new one takes the place of the kept one that showed least."""
+
+    def __init__(self, robot: Robot, most: int) -> None:
+        self._robot, self._most = robot, most
+        self._kept = list[_Kept]()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def add(self, view: DepthView, new_voxels: int) -> None:
+        """Keep a view with a configuration. new_voxels: the number of voxels that it showed first."""
+        if len(self) >= self._most:
+            self._kept.remove(min(self._kept, key=lambda kept: kept.new_voxels))
+        self._kept.append(_Kept(view, self._robot, new_voxels))
+
+    @property
+    def views(self) -> list[DepthView]:
+        """The kept views."""
+        return [kept.view for kept in self._kept]
+
+    def volume(self) -> ObservedVolume:
+        """What the kept views together tell of each voxel of 4 cm."""
+        return merged([kept.volume for kept in self._kept])
+
+    def points(self, free: Bool[ndarray, "nx ny nz"]) -> Float[ndarray, "n 3"]:
+        """The mean of the points that the kept views observed in each cell of a grid [m]; see `seen_points`.
+
+        Stray points are left out: those in the free voxels of a map, since more views see through them, and
+        with noise those of one view that have no other point near: surfaces show more.
+        """
+        every = np.concatenate([kept.points for kept in self._kept]).astype(np.float64)
+        _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)
+        sums = [np.bincount(cell, every[:, axis], len(counts)) for axis in range(3)]
+        points = np.stack(sums, axis=1) / counts[:, None]
+        at = MAP.indices(points)
+        inside = MAP.contains(at)
+        stray = np.zeros(len(points), np.bool_)
+        stray[inside] = free[tuple(at[inside].T)]
+        if any(filtered(kept.view).spread for kept in self._kept):
+            once = counts == 1
+            distances, _ = KDTree(points).query(points[once], k=2, distance_upper_bound=ALONE_DISTANCE)
+            stray[once] |= np.isinf(distances[:, 1])
+        return points[~stray]
+
+
+def _cells(points: Float[ndarray, "n 3"]) -> ndarray:
+    """A number for the cell of each point."""
+    at = np.floor(points / CELL).astype(np.int64)
+    at -= at.min(axis=0, initial=0)
+    _, ny, nz = at.max(axis=0, initial=0) + 1
+    return (at[:, 0] * ny + at[:, 1]) * nz + at[:, 2]

@@ -1,4 +1,5 @@
-"""Reduces depth views to few points, which are added to the scene of a problem."""
+"""Reduces depth views to few points, which are added to the scene of a problem: the mean points of the cells
+of a grid, in a hash table."""
 
 from collections.abc import Sequence
 
@@ -7,21 +8,227 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
+from robotdiffuse.collision.kernels.distance import scene_distance
 from robotdiffuse.core.bounds import for_kernels
+from robotdiffuse.core.kernels import kernel
 from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
-from robotdiffuse.perception.seen_points_kernel import (
-    gather_cloud,
-    gather_image,
-    near_scene,
-    sphere_distances,
-    supported,
-)
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-VOXEL = 0.015
+SAME_SURFACE_PIXELS, SAME_SURFACE_FRACTION = np.float32(4.0), np.float32(0.01)
+"""Neighbouring pixels are on the same surface if their depths differ by less than this many widths of a pixel
+at that depth, or by less than this fraction of the depth."""
+MAX_DEPTH = np.float32(1e6)
+"""Larger depths are no returns [m]."""
+_ZERO = np.float32(0.0)
+
+
+@kernel(nogil=True, inline="always")
+def _slot(keys, key):
+    """Index of a key in an open-addressing hash table, or of the slot for it."""
+    mask = len(keys) - 1
+    x = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    at = np.int64(x >> np.uint64(32)) & mask
+    while keys[at] != key and keys[at] != -1:
+        at = (at + 1) & mask
+    return at
+
+
+@kernel(nogil=True, fastmath=True, inline="never")
+def _within(x, y, z, xs, ys, zs, radii):
+    """Whether a point is inside one of the spheres."""
+    inside = np.int32(0)
+    for s in range(len(xs)):
+        dx, dy, dz = x - xs[s], y - ys[s], z - zs[s]
+        inside |= np.int32(dx * dx + dy * dy + dz * dz < radii[s] * radii[s])
+    return inside != 0
+
+
+@kernel(nogil=True, inline="always")
+def _key(x, y, z, voxel):
+    """The key of a point's cell."""
+    span = np.int64(1) << 20
+    i, j, k = np.int64(np.floor(x / voxel)), np.int64(np.floor(y / voxel)), np.int64(np.floor(z / voxel))
+    return ((i + span) << 42) | ((j + span) << 21) | (k + span)
+
+
+@kernel(nogil=True, inline="always")
+def _row(keys, cells, count, key):
+    """The row of a cell in the sums, and the number of rows; a new cell gets a new row."""
+    at = _slot(keys, key)
+    if keys[at] == -1:
+        keys[at], cells[at] = key, count
+        count += 1
+    return cells[at], count
+
+
+@kernel(nogil=True, inline="always")
+def _add(sums, row, x, y, z):
+    sums[row, 0] += x
+    sums[row, 1] += y
+    sums[row, 2] += z
+    sums[row, 3] += np.float32(1.0)
+
+
+@kernel(nogil=True)
+def gather_cloud(points, reach, spheres, voxel, keys, cells, sums, count):
+    """Adds a point cloud to the cells; arguments and result as in `gather_image`."""
+    box, columns = _box(spheres), _columns(spheres)
+    before, row = np.int64(-1), np.int32(0)
+    for p in range(len(points)):
+        if count >= len(sums):
+            return -1
+        x, y, z = np.float32(points[p, 0]), np.float32(points[p, 1]), np.float32(points[p, 2])
+        if not x * x + y * y + z * z <= reach * reach:
+            continue
+        if _in_box(box, x, y, z) and _within(x, y, z, *columns):
+            continue
+        key = _key(x, y, z, voxel)
+        if key != before:  # most points are in the cell of the previous point
+            before = key
+            row, count = _row(keys, cells, count, key)
+        _add(sums, row, x, y, z)
+    return count
+
+
+@kernel(nogil=True)
+def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums, count):
+    """Adds a depth image to cells `voxel` wide. Returns the number of cells; -1 if `sums` is too small.
+
+    depth [h, w], intrinsics fx, fy, cx, cy, T: T_base_camera [4, 4]. Points beyond `reach` of the origin,
+    points inside one of the spheres [n, 4] and flying pixels are left out. keys, int64, and cells, int32, are
+    an open-addressing hash table, with keys of -1 in empty slots; sums [m, 4] are the sums of coordinates and
+    the number of points of each cell.
+    """
+    h, w = depth.shape
+    fx, fy, cx, cy = intrinsics
+    box, columns = _box(spheres), _columns(spheres)
+    around = np.full((h + 2, w + 2), np.nan, np.float32)
+    around[1:-1, 1:-1] = depth
+    x, y, z = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    kept, cell = np.empty(w, np.bool_), np.empty(w, np.int64)
+    # cells of the row of pixels above: most points are in the cell of a neighbouring pixel
+    known, rows = np.full(w + 1, -1, np.int64), np.zeros(w + 1, np.int32)
+    for v in range(h):
+        b = (np.float32(v) - cy) / fy
+        _place_row(around[v : v + 3], b, fx, cx, T, reach, voxel, x, y, z, kept, cell)
+        for u in range(w):
+            if not kept[u]:
+                continue
+            if count >= len(sums):
+                return -1
+            if _in_box(box, x[u], y[u], z[u]) and _within(x[u], y[u], z[u], *columns):
+                continue
+            if known[u] == cell[u]:
+                rows[u + 1] = rows[u]
+            elif known[u + 1] != cell[u]:
+                rows[u + 1], count = _row(keys, cells, count, cell[u])
+            known[u + 1] = cell[u]
+            _add(sums, rows[u + 1], x[u], y[u], z[u])
+    return count
+
+
+@kernel(nogil=True)
+def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
+    """Computes the points of a row of pixels, their cells, and which of them to keep.
+
+    Points within reach are kept, except flying pixels: those with fewer than two of their eight neighbours on
+    the same surface. At edges, sensors mix the depths of the near and the far surface.
+    around [3, w + 2]: the row above, the row and the row below, with one more pixel at either end.
+    """
+    above, middle, below = around[0], around[1], around[2]
+    rx, ry, rz = T[0, 1] * b + T[0, 2], T[1, 1] * b + T[1, 2], T[2, 1] * b + T[2, 2]
+    pixel, most = SAME_SURFACE_PIXELS / fx, reach * reach
+    for u in range(len(x)):
+        d, a = middle[u + 1], (np.float32(u) - cx) / fx
+        px = (T[0, 0] * a + rx) * d + T[0, 3]
+        py = (T[1, 0] * a + ry) * d + T[1, 3]
+        pz = (T[2, 0] * a + rz) * d + T[2, 3]
+        jump = max(pixel, SAME_SURFACE_FRACTION) * d
+        alike = np.int32(0)
+        for row in (above, middle, below):
+            alike += np.int32(abs(row[u] - d) < jump)
+            alike += np.int32(abs(row[u + 1] - d) < jump)
+            alike += np.int32(abs(row[u + 2] - d) < jump)
+        x[u], y[u], z[u], cell[u] = px, py, pz, _key(px, py, pz, voxel)
+        # the pixel itself is one of three
+        kept[u] = (alike > 2) & (d > _ZERO) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= most)
+
+
+@kernel(nogil=True)
+def supported(keys, cells, sums, count, least):
+    """Which cells hold at least `least` points, or are next to one that does."""
+    out = np.empty(count, np.bool_)
+    for at in range(len(keys)):
+        if keys[at] == -1:
+            continue
+        enough = sums[cells[at], 3] >= least
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                for k in range(-1, 2):
+                    if not enough:
+                        near = _slot(keys, keys[at] + (i << 42) + (j << 21) + k)
+                        enough = keys[near] != -1 and sums[cells[near], 3] >= least
+        out[cells[at]] = enough
+    return out
+
+
+@kernel(nogil=True)
+def _box(spheres):
+    """Lower and upper corner of a box around spheres, in one array."""
+    box = np.zeros(6, np.float32)
+    for axis in range(3):
+        for s in range(len(spheres)):
+            low, high = spheres[s, axis] - spheres[s, 3], spheres[s, axis] + spheres[s, 3]
+            box[axis] = low if s == 0 else min(box[axis], low)
+            box[3 + axis] = high if s == 0 else max(box[3 + axis], high)
+    return box
+
+
+@kernel(nogil=True)
+def _columns(spheres):
+    """The columns of spheres [n, 4], each contiguous in memory."""
+    return spheres[:, 0].copy(), spheres[:, 1].copy(), spheres[:, 2].copy(), spheres[:, 3].copy()
+
+
+@kernel(nogil=True, inline="always")
+def _in_box(box, x, y, z):
+    return box[0] < x < box[3] and box[1] < y < box[4] and box[2] < z < box[5]
+
+
+@kernel(nogil=True)
+def sphere_distances(points, spheres):
+    """Signed distance of each point [n, 3] to the nearest sphere [m, 4]; infinite without spheres."""
+    out = np.empty(len(points), np.float32)
+    x, y, z, radii = _columns(spheres)
+    for p in range(len(points)):
+        at = np.float32(points[p, 0]), np.float32(points[p, 1]), np.float32(points[p, 2])
+        out[p] = _nearest(at, x, y, z, radii)
+    return out
+
+
+@kernel(nogil=True, fastmath={"contract", "reassoc", "nnan", "nsz"})
+def _nearest(at, x, y, z, radii):
+    least = np.float32(np.inf)
+    for s in range(len(x)):
+        dx, dy, dz = at[0] - x[s], at[1] - y[s], at[2] - z[s]
+        least = min(least, np.sqrt(dx * dx + dy * dy + dz * dz) - radii[s])
+    return least
+
+
+@kernel(nogil=True)
+def near_scene(scene, points, limit):
+    """Whether each point [n, 3] is inside an obstacle of SceneArrays, or nearer to one than `limit` [m]."""
+    out = np.empty(len(points), np.bool_)
+    for p in range(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        out[p] = scene_distance(scene, x, y, z, limit)[0] < limit
+    return out
+
+
+CELL = 0.015
 """Edge length of the cells whose points are replaced by their mean [m]."""
 POINT_RADIUS = 0.01
 """Radius of the obstacle around each point [m]."""
@@ -43,7 +250,7 @@ INITIAL_CELLS = 1 << 16
 
 
 def seen_points(
-    views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"], voxel: float = VOXEL
+    views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"], voxel: float = CELL
 ) -> Float32[ndarray, "n 3"]:
     """The mean of the observed points in each cell of a grid, in the base frame [m].
 

@@ -1,24 +1,231 @@
-"""Space that no view saw, and the part of it that a motion passes through."""
+"""Space that no view saw: assumptions about it, the part of it that a motion passes through, and the
+probability that this part is free.
 
+Assumptions are obstacles in addition to what was seen. The space that the arm occupies at its start and goals
+is carved out of them.
+
+In a sampled world, unknown space is filled at random, so that near voxels are filled together: a voxel is
+occupied where a smooth random field is below the voxel's probability. At each point the field is uniform
+between 0 and 1 over the worlds, so each voxel keeps its probability; and as obstacles are larger than voxels,
+so are the parts where the field is low. Independent voxels would call a motion through a thousand of them,
+each free with a probability of 0.999, free with one of 0.37.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int64
 from numpy import ndarray
 
-from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
+from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.loading import loading
 from robotdiffuse.core.types import Path
-from robotdiffuse.perception.assumptions import (
-    CARVING_MARGIN,
+from robotdiffuse.perception.depth_view import AssumedPoints
+from robotdiffuse.perception.observed_volume import ObservedVolume
+from robotdiffuse.perception.seen_points import near_scene, sphere_distances
+from robotdiffuse.perception.voxel_grid import (
+    COARSE,
     FINE,
+    SHAPE,
+    VOXEL,
     VoxelGrid,
-    voxels_in,
+    heaviest_part,
+    summed,
+    surface,
 )
-from robotdiffuse.perception.sampled_worlds import free_share
-from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, sweep
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.point_cloud import voxel_thin
+from robotdiffuse.scenes.scene import Scene
+
+PADDINGS = (0.09, 0.06, 0.04)
+"""Paddings of observed points, the largest first [m]."""
+PADDING_FACTOR, PADDING_MARGIN = 1.3, 0.01
+"""Points nearer to the arm's covering spheres than this factor of their padding and this margin [m] are not
+padded: thinning may enlarge them by so much."""
+THINNING_CELL = 1 / 3
+"""One point is kept of each cell of this size, as a fraction of the padding."""
+THRESHOLDS = (0.1, 0.2, 0.35, 0.5)
+"""Probabilities above which a predicted voxel is an obstacle, the most careful first."""
+CARVING_MARGIN = 0.02
+"""Voxels nearer to the arm's covering spheres than this are carved out [m]."""
+
+
+class Assumption(ABC):
+    """Obstacles in addition to what was seen."""
+
+    name: str
+
+    @abstractmethod
+    def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "..."]:
+        """Which obstacles are in the way of the arm's covering spheres: x y z radius [m]."""
+
+    def touched(self, spheres: Float32[ndarray, "n 4"]) -> int:
+        """The number of obstacles that have to be carved out for these spheres."""
+        return int(self._touched(spheres).sum())
+
+    @abstractmethod
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
+        """The obstacles that are left once those in the way of these spheres are carved out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Padded(Assumption):
+    """Observed points, inflated."""
+
+    points: Float[ndarray, "points 3"]
+    padding: float
+    """[m]"""
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return f"points padded by {100 * self.padding:.0f} cm"
+
+    def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "points"]:
+        return sphere_distances(self.points, spheres) < PADDING_FACTOR * self.padding + PADDING_MARGIN
+
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
+        """See `Assumption`."""
+        return AssumedPoints(self.points[~self._touched(spheres)], self.padding, name="padded")
+
+
+@dataclass(frozen=True, eq=False)
+class Voxels(Assumption):
+    """Occupied voxels of the observed volume, coarse or fine."""
+
+    name: str
+    occupied: Bool[ndarray, "nx ny nz"]
+    robot: Robot
+    known_scene: Scene
+    """What is known without views; voxels within it are left out."""
+
+    @property
+    def grid(self) -> VoxelGrid:
+        return COARSE if self.occupied.shape == SHAPE else FINE
+
+    def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "nx ny nz"]:
+        return self.occupied & self.grid.within(spheres, CARVING_MARGIN + self.grid.edge / 2)
+
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
+        """The voxels at the surface of what is occupied: the arm starts outside and cannot get within. Those
+        out of reach, and those in the known scene, are left out."""
+        edge = self.grid.edge
+        points = self.grid.centers(surface(self.occupied & ~self._touched(spheres)))
+        points = points[np.linalg.norm(points, axis=1) < reach_bound(self.robot) + edge]
+        points = without_known(points, edge, self.robot, self.known_scene)
+        return AssumedPoints(points, edge / 2, name="unknown")
+
+
+def without_known(
+    centers: Float[ndarray, "n 3"], edge: float, robot: Robot, known_scene: Scene
+) -> Float[ndarray, "m 3"]:
+    """The centres of voxels with this edge, without those of voxels in the known scene [m]."""
+    if not known_scene.shapes:
+        return centers
+    scene, inside = compile_scene_for(robot, known_scene), np.float32(edge / 2 - 1e-3)
+    return centers[~near_scene(scene, centers.astype(np.float32), inside)]
+
+
+def padded_assumptions(points: Float[ndarray, "points 3"]) -> Iterator[Assumption]:
+    """Observed points, inflated: the largest padding first."""
+    for padding in PADDINGS:
+        yield Padded(voxel_thin(points, padding * THINNING_CELL), padding)
+
+
+def predicted_assumptions(
+    predicted: Float32[ndarray, "nx ny nz"], robot: Robot, known_scene: Scene
+) -> Iterator[Assumption]:
+    """Voxels that are occupied with a probability above a threshold: the lowest threshold first.
+
+    predicted: the probability that each fine voxel is occupied.
+    """
+    for threshold in THRESHOLDS:
+        yield Voxels(f"predicted, p > {threshold:g}", predicted > threshold, robot, known_scene)
+
+
+def occupied_assumption(volume: ObservedVolume, robot: Robot, known_scene: Scene) -> Assumption:
+    """Every voxel that no view saw is occupied."""
+    return Voxels("unknown is occupied", volume.unknown, robot, known_scene)
+
+
+TILE = 64
+"""Coarse voxels of the periodic field along each axis: a power of two, and more than the observed volume."""
+
+
+@kernel(nogil=True)
+def highest_in_cells(probability, marked):
+    """Coarse voxels with marked fine voxels that may be occupied: indices int64[n, 3], and the highest
+    probability of these in each, float32[n], the highest first."""
+    nx, ny, nz = marked.shape
+    highest = np.zeros((nx // 2, ny // 2, nz // 2), np.float32)
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                if marked[i, j, k] and probability[i, j, k] > highest[i // 2, j // 2, k // 2]:
+                    highest[i // 2, j // 2, k // 2] = probability[i, j, k]
+    cells = np.argwhere(highest > 0)
+    values = np.empty(len(cells), np.float32)
+    for n in range(len(cells)):
+        values[n] = highest[cells[n, 0], cells[n, 1], cells[n, 2]]
+    order = np.argsort(-values)
+    return cells[order], values[order]
+
+
+@kernel(nogil=True)
+def count_free(field, shifts, cells, values):
+    """The number of shifts of the field at which it is nowhere below the values of the cells.
+
+    field: float32[TILE, TILE, TILE], periodic; shifts int64[m, 3]; cells int64[n, 3]; values float32[n].
+    """
+    free = 0
+    for s in range(len(shifts)):
+        blocked = False
+        for n in range(len(cells)):
+            i, j, k = (cells[n, 0] + shifts[s, 0], cells[n, 1] + shifts[s, 1], cells[n, 2] + shifts[s, 2])
+            if field[i & (TILE - 1), j & (TILE - 1), k & (TILE - 1)] < values[n]:
+                blocked = True
+                break
+        free += not blocked
+    return free
+
+
+CORRELATION_LENGTH = 0.25
+"""Distance at which the field's correlation has fallen to exp(-1/2), before its values are made uniform [m].
+Chosen on problems of `benchmarks/cameras.py` with even numbers."""
+WORLDS = 256
+"""Sampled worlds of a probability."""
+
+
+def free_share(probability: Float32[ndarray, "nx ny nz"], voxels: Bool[ndarray, "nx ny nz"]) -> float:
+    """The part of the sampled worlds in which all of these fine voxels are free.
+
+    probability: that each fine voxel is occupied. The worlds are the same in every call.
+    """
+    return count_free(_field(), _shifts(), *highest_in_cells(probability, voxels)) / WORLDS
+
+
+@cache
+@loading()
+def _field() -> Float32[ndarray, "n n n"]:
+    """A periodic random field on coarse voxels; its values are evenly spread between 0 and 1."""
+    white = np.random.default_rng(0).standard_normal((TILE, TILE, TILE))
+    k = 2 * np.pi * np.fft.fftfreq(TILE, VOXEL)
+    squared = k[:, None, None] ** 2 + k[:, None] ** 2 + k**2
+    smooth = np.fft.ifftn(np.fft.fftn(white) * np.exp(-squared * CORRELATION_LENGTH**2 / 4)).real
+    ranks = np.empty(smooth.size, np.float32)
+    ranks[np.argsort(smooth, axis=None)] = (np.arange(smooth.size) + 0.5) / smooth.size
+    return ranks.reshape(smooth.shape)
+
+
+@cache
+def _shifts() -> Int64[ndarray, "worlds 3"]:
+    """How far the field is shifted in each world, in coarse voxels."""
+    return np.random.default_rng(1).integers(TILE, size=(WORLDS, 3))
+
 
 Box = tuple[tuple[float, ...], tuple[float, ...]]
 """Low and high corner [m]."""
@@ -43,15 +250,13 @@ class UnknownSpace:
         predicted: the probability that each voxel is occupied; None without a prediction.
         margin: voxels nearer than this to the arm at those configurations count as occupied by it [m].
         """
-        self._robot, self._grid = compile_robot(robot), grid
-        spheres = [placed_spheres(robot, q).astype(np.float32) for q in occupied_by_arm]
-        self.unknown = unknown & ~voxels_in(np.concatenate(spheres), margin, grid)
+        self._robot, self._grid = robot, grid
+        self.unknown = unknown & ~grid.filled(robot, occupied_by_arm, margin)
         self.probability = None if predicted is None else np.where(self.unknown, predicted, np.float32(0))
 
     def crossed(self, path: Path) -> "CrossedSpace":
         """The unknown voxels that the arm passes through on a path."""
-        swept, positions = np.zeros(self._grid.shape, np.bool_), path.positions.astype(np.float32)
-        sweep(self._robot, positions, np.float32(0.0), *self._grid.frame, swept)
+        swept = self._grid.swept(self._robot, path)
         return CrossedSpace(swept & self.unknown, self.probability, self._grid)
 
 
@@ -84,3 +289,45 @@ class CrossedSpace:
         corners = heaviest_part(self.voxels, weights) * self.grid.edge + np.array(self.grid.low)
         low, high = corners.round(3).tolist()
         return tuple(low), tuple(high)
+
+
+RATES: dict[str, float] = {
+    "as seen": 0.64,
+    "points padded by 9 cm": 0.82,
+    "points padded by 6 cm": 0.7,
+    "points padded by 4 cm": 0.5,
+    "unknown is occupied": 0.99,
+}
+"""Part of the motions under an assumption that were free in the true scene, without a prediction, as
+`python benchmarks/cameras.py --fit` prints it for the calibration half of its problems."""
+
+MAX_CONFIDENCE = 0.995
+"""Of a motion that is free in every sampled world: the network and 256 worlds cannot tell more."""
+
+
+def confidence(assumption: str, crossed: CrossedSpace) -> float:
+    """The probability that a motion under an assumption is free in the true scene.
+
+    It is the share of sampled worlds in which the motion is free; see `sampled_worlds`. Without a prediction,
+    it is the assumption's rate.
+    """
+    share = crossed.free_share
+    return RATES[assumption] if share is None else min(share, MAX_CONFIDENCE)
+
+
+EXPLORED = (4.05, -1.15)
+"""Of an Explorer's motions: the log odds of one that sweeps a summed probability of 1, and the slope of the
+log odds over its logarithm, fitted to 493 motions of `benchmarks/exploring.py`, half of them with noise; see
+its report."""
+MIN_RISK = 0.2
+"""Smaller summed probabilities are raised to this."""
+
+
+def explored_confidence(risk: float) -> float:
+    """The probability that a motion is free in the true scene, where an Explorer's views left little unknown.
+
+    Sampled worlds, which suit the large parts that one view leaves unknown, state too little there.
+    risk: the predicted probability that the motion sweeps, summed over voxels.
+    """
+    odds, slope = EXPLORED
+    return 1 / (1 + math.exp(-(odds + slope * math.log(max(risk, MIN_RISK)))))

@@ -11,10 +11,10 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.perception.assumptions import FINE_VOXEL_SIZE, refined
-from robotdiffuse.perception.observed_volume import LOW, observe
+from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at
-from robotdiffuse.perception.visibility_kernel import seen_weights
+from robotdiffuse.perception.visibility import seen_weights
+from robotdiffuse.perception.voxel_grid import FINE_VOXEL_SIZE, LOW, refined
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
 from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
 

@@ -15,8 +15,8 @@ from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
-from robotdiffuse.perception.occupancy_map import MAP
-from robotdiffuse.perception.seen_points_kernel import near_scene
+from robotdiffuse.perception.seen_points import near_scene
+from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
 from robotdiffuse.planning.exploration.steps import DONE, LOOK
 from robotdiffuse.scenes.scene import Scene

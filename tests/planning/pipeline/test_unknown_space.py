@@ -13,22 +13,18 @@ from numpy import ndarray
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.results import load_result
 from robotdiffuse.core.types import FIRST, Status
-from robotdiffuse.perception.assumptions import (
-    CARVING_MARGIN,
-    COARSE,
-    FINE_SHAPE,
-    FINE_VOXEL_SIZE,
-    PADDINGS,
-    THRESHOLDS,
-    Padded,
-    Voxels,
-    voxels_in,
-)
-from robotdiffuse.perception.confidence import RATES
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, observe
+from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
-from robotdiffuse.perception.swept_voxels_kernel import sweep
+from robotdiffuse.perception.unknown_space import CARVING_MARGIN, PADDINGS, RATES, THRESHOLDS, Padded, Voxels
+from robotdiffuse.perception.voxel_grid import (
+    COARSE,
+    FINE,
+    FINE_SHAPE,
+    SHAPE,
+    VOXEL,
+    sweep,
+)
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.attempt import attempt
 from robotdiffuse.planning.context import PlanRequest
@@ -69,7 +65,7 @@ def partial(unknown: str, *views: DepthView) -> Problem:
 
 
 def true_voxels() -> Float32[ndarray, "nx ny nz"]:
-    return voxels_within(DEEP, LOW, FINE_VOXEL_SIZE, FINE_SHAPE).astype(np.float32)
+    return voxels_within(DEEP, FINE).astype(np.float32)
 
 
 @pytest.mark.parametrize("unknown", ["optimistic", "padded", "occupied"])
@@ -104,18 +100,9 @@ def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Plann
     first = attempt(planner, replace(problem, views=()), PlanRequest(1.0))
     unknown = observe(problem.views, PANDA, START).unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
-    swept = np.zeros(FINE_SHAPE, np.bool_)
     assert first.path is not None and chosen.swept_probability is not None
-    path = first.path.positions.astype(np.float32)
-    sweep(
-        compile_robot(PANDA),
-        path,
-        np.float32(0),
-        np.array(LOW, np.float32),
-        np.float32(FINE_VOXEL_SIZE),
-        swept,
-    )
-    assert chosen.swept_probability <= 0.01 * (swept & unknown & ~voxels_in(ends)).sum() * (1 + 1e-3)
+    swept = FINE.swept(PANDA, first.path)
+    assert chosen.swept_probability <= 0.01 * (swept & unknown & ~FINE.within(ends)).sum() * (1 + 1e-3)
 
 
 def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> None:
@@ -130,7 +117,7 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, near)]).astype(np.float32)
     swept, path = np.zeros(SHAPE, np.bool_), result.path.positions.astype(np.float32)
     sweep(compile_robot(PANDA), path, np.float32(0), *COARSE.frame, swept)
-    filled = voxels_in(ends, CARVING_MARGIN + VOXEL / 2, COARSE)
+    filled = COARSE.within(ends, CARVING_MARGIN + VOXEL / 2)
     unknown = observe(problem.views, PANDA, START).unknown & ~filled
     assert unknown.any() and not (swept & unknown).any()
 

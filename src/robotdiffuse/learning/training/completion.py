@@ -33,7 +33,7 @@ from robotdiffuse.learning.completion import (
 from robotdiffuse.learning.completion_network import CompletionNetwork, folded
 from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSettings
 from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, on_cpu, train
-from robotdiffuse.perception.observed_volume import VOXEL
+from robotdiffuse.perception.voxel_grid import VOXEL
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot

@@ -8,9 +8,9 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.perception.confidence import explored_confidence
-from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, MAP, OccupancyMap
-from robotdiffuse.perception.unknown_space import UnknownSpace
+from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.perception.unknown_space import UnknownSpace, explored_confidence
+from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.planning.planner import Planner

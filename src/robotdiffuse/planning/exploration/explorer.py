@@ -30,10 +30,9 @@ from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.occupancy_map import MAP, Corners, OccupancyMap
+from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
 from robotdiffuse.perception.seen_points import point_shapes
-from robotdiffuse.perception.swept_voxels_kernel import surface
-from robotdiffuse.perception.view_memory import ViewMemory
+from robotdiffuse.perception.voxel_grid import MAP, surface
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.cameras import ArmCamera

@@ -14,14 +14,13 @@ from numpy import ndarray
 
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path
-from robotdiffuse.perception.assumptions import CARVING_MARGIN, voxels_of
 from robotdiffuse.perception.depth_filter import MARGIN_SPREADS, filtered
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.occupancy_map import MAP, OccupancyMap
-from robotdiffuse.perception.seen_balls_kernel import see_through, within_voxels
-from robotdiffuse.perception.seen_points_kernel import sphere_distances
-from robotdiffuse.perception.surface_balls import BALL_RADIUS, surface_balls
-from robotdiffuse.perception.view_memory import ViewMemory
+from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
+from robotdiffuse.perception.seen_points import sphere_distances
+from robotdiffuse.perception.unknown_space import CARVING_MARGIN
+from robotdiffuse.perception.visibility import BALL_RADIUS, see_through, surface_balls, within_voxels
+from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
@@ -76,7 +75,7 @@ class GoalSeen:
         """The voxels that looks are to show of the surface where a path ends."""
         out = np.zeros(MAP.shape, np.bool_)
         if self._required:
-            at = voxels_of(self.unseen(path.positions[0], path.positions[-1]), MAP)
+            at = MAP.indices(self.unseen(path.positions[0], path.positions[-1]))
             out[tuple(at[MAP.contains(at)].T)] = True
         return out
 

@@ -8,9 +8,9 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.types import Path
-from robotdiffuse.perception.occupancy_map import MAP, OccupancyMap
-from robotdiffuse.perception.swept_voxels_kernel import sweep
-from robotdiffuse.perception.visibility_kernel import seen_weights
+from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.perception.visibility import seen_weights
+from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.reachable import ReachableTree
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, near_ends
@@ -41,8 +41,7 @@ SIMILAR_LOOK = 0.2
 def swept_unseen(known: OccupancyMap, path: Path) -> Bool[ndarray, "nx ny nz"]:
     """The voxels that the map does not know and whose covering balls a path touches, without those near its
     ends, which count as free."""
-    swept, positions = np.zeros(MAP.shape, np.bool_), path.positions.astype(np.float32)
-    sweep(compile_robot(known.robot), positions, np.float32(COVER_RADIUS), *MAP.frame, swept)
+    swept = MAP.swept(known.robot, path, COVER_RADIUS)
     return swept & known.unknown & ~near_ends(known, (path.positions[0], path.positions[-1]))
 
 

@@ -7,7 +7,8 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.perception.observed_volume import ObservedVolume
-from robotdiffuse.perception.occupancy_map import LAYERS_BELOW, OccupancyMap
+from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.perception.voxel_grid import LAYERS_BELOW
 from robotdiffuse.robots.robot import Robot
 
 PROBABILITY_BELOW = np.float32(0.1)

@@ -8,10 +8,10 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import reach_ball
 from robotdiffuse.collision.motions import with_covering_spheres
-from robotdiffuse.perception.assumptions import CARVING_MARGIN, voxels_in, without_known
 from robotdiffuse.perception.depth_view import AssumedPoints
-from robotdiffuse.perception.occupancy_map import MAP, OccupancyMap
-from robotdiffuse.perception.swept_voxels_kernel import surface
+from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.perception.unknown_space import CARVING_MARGIN, without_known
+from robotdiffuse.perception.voxel_grid import MAP, surface
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -41,8 +41,7 @@ def not_seen_free(
 
 def near_ends(known: OccupancyMap, ends: Sequence[Float[ndarray, "dof"]]) -> Bool[ndarray, "nx ny nz"]:
     """The voxels around the arm at these configurations that count as free."""
-    spheres = np.concatenate([placed_spheres(known.robot, q) for q in ends]).astype(np.float32)
-    return voxels_in(spheres, CARVING_MARGIN + MAP.edge / 2, MAP)
+    return MAP.filled(known.robot, ends, CARVING_MARGIN + MAP.edge / 2)
 
 
 def hardly_seen(known: OccupancyMap, start: Float[ndarray, "dof"], goal: Float[ndarray, "dof"]) -> bool:
@@ -62,12 +61,7 @@ def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], 
 
 def least_unknown(known: OccupancyMap, goals: Float[ndarray, "n dof"]) -> Float[ndarray, "dof"]:
     """The configuration at which the arm fills the fewest unknown voxels."""
-
-    def filled(q: Float[ndarray, "dof"]) -> int:
-        arm = voxels_in(placed_spheres(known.robot, q).astype(np.float32), grid=MAP)
-        return int((known.unknown & arm).sum())
-
-    return min(goals, key=filled)
+    return min(goals, key=lambda q: int((known.unknown & MAP.filled(known.robot, [q])).sum()))
 
 
 def reaches_outside(robot: Robot, q: Float[ndarray, "dof"]) -> bool:

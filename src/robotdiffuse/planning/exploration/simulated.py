@@ -10,10 +10,9 @@ from numpy import ndarray
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.perception.depth_noise import DepthNoise
-from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.perception.seen_points_kernel import near_scene
+from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.planning.exploration.cameras import ArmCamera
 from robotdiffuse.planning.exploration.explorer import Explorer
 from robotdiffuse.planning.exploration.recorded import RecordedExplorer

@@ -15,10 +15,9 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.perception.assumptions import voxels_of
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.occupancy_map import MAP
 from robotdiffuse.perception.seen_points import seen_shapes
+from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -89,7 +88,7 @@ def stop_before(
 
 def _within(points: Float[ndarray, "n 3"], free: Bool[ndarray, "nx ny nz"]) -> Bool[ndarray, "n"]:
     """Which points lie in free voxels with free voxels on all six sides."""
-    at = voxels_of(points, MAP)
+    at = MAP.indices(points)
     within = np.asarray(((at > 0) & (at < np.array(free.shape) - 1)).all(axis=1))
     for side in ((0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)):
         within[within] = free[tuple((at[within] + side).T)]

@@ -27,18 +27,18 @@ from numpy import ndarray
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST
-from robotdiffuse.perception.assumptions import (
+from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
+from robotdiffuse.perception.observed_volume import ObservedVolume, observe
+from robotdiffuse.perception.unknown_space import (
     Assumption,
+    UnknownSpace,
     Voxels,
+    confidence,
     occupied_assumption,
     padded_assumptions,
     predicted_assumptions,
-    refined,
 )
-from robotdiffuse.perception.confidence import confidence
-from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
-from robotdiffuse.perception.observed_volume import ObservedVolume, observe
-from robotdiffuse.perception.unknown_space import UnknownSpace
+from robotdiffuse.perception.voxel_grid import refined
 from robotdiffuse.planning.attempt import Solver, attempt
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import usable_start_goal

@@ -19,7 +19,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.drawables import ASSUMED, GOAL, OBSERVED, drawables
-from robotdiffuse.perception.depth_noise import DepthNoise
+from robotdiffuse.perception.depth_view import DepthNoise
 from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
 from robotdiffuse.planning.exploration.simulated import explore, simulated_explorer
 from robotdiffuse.planning.exploration.steps import CHANCE, DONE, LOOK, POLICIES, STRICT, ExplorerSettings

@@ -1,14 +1,104 @@
-"""The voxels that an arm sweeps, in compiled code."""
+"""Grids of voxels around an arm, and the voxels that it fills and sweeps."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from numpy import ndarray
 
+from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.kernels.distance import frames_of, placed
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.types import Path
+from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.robots.robot import Robot
 
+VOXEL = 0.04
+"""Edge length of a voxel [m]."""
+LOW = (-1.12, -1.12, -0.1)
+"""Lower corner of the volume, in the frame of the base [m]. A floor at z = 0 is in the middle of a layer of
+voxels, not between two layers."""
+SHAPE = (56, 56, 32)
+"""Number of voxels along x, y and z: the space around an arm with a reach of 1.1 m on a table."""
 JOINT_STEP = np.float32(0.05)
 """Largest motion of a joint between two samples [rad], [m] for prismatic joints."""
 MIN_MOVE = np.float32(0.1)
 """A sphere is marked again once it has moved by more than this, as a fraction of a voxel's edge."""
+
+
+FINE_VOXEL_SIZE = VOXEL / 2
+"""Edge of a predicted voxel [m]."""
+FINE_SHAPE = (2 * SHAPE[0], 2 * SHAPE[1], 2 * SHAPE[2])
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """Cubic voxels in the frame of the base."""
+
+    low: tuple[float, float, float]
+    """Lower corner [m]."""
+    shape: tuple[int, int, int]
+    """Number of voxels along x, y and z."""
+    edge: float
+    """Of a voxel [m]."""
+
+    @property
+    def frame(self) -> tuple[Float32[ndarray, "3"], np.float32]:
+        """The lower corner and the edge as compiled code takes them."""
+        return np.array(self.low, np.float32), np.float32(self.edge)
+
+    def centers(self, at: Int[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+        """The centres of the voxels of these indices [m]."""
+        return (at + 0.5) * self.edge + self.low
+
+    def indices(self, points: Float[ndarray, "n 3"]) -> Int[ndarray, "n 3"]:
+        """The indices of the voxels that points in the base frame lie in; they may be outside of the grid."""
+        return np.floor((points - self.low) / self.edge).astype(np.int64)
+
+    def contains(self, at: Int[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+        """Which of these indices are of voxels of the grid."""
+        return np.asarray(((at >= 0) & (at < self.shape)).all(axis=1))
+
+    def filled(
+        self, robot: Robot, configurations: Iterable[Float[ndarray, "dof"]], margin: float = 0.0
+    ) -> Bool[ndarray, "nx ny nz"]:
+        """Voxels with their centres in the arm's covering spheres, inflated by `margin` [m], at any of these
+        configurations."""
+        return self.within(np.concatenate([placed_spheres(robot, q) for q in configurations]), margin)
+
+    def within(self, spheres: Float[ndarray, "n 4"], margin: float = 0.0) -> Bool[ndarray, "nx ny nz"]:
+        """Voxels with their centres in spheres, inflated by `margin` [m]."""
+        out = np.zeros(self.shape, np.bool_)
+        mark(spheres.astype(np.float32) + np.array([0, 0, 0, margin], np.float32), *self.frame, out)
+        return out
+
+    def swept(self, robot: Robot, path: Path, margin: float = 0.0) -> Bool[ndarray, "nx ny nz"]:
+        """Voxels with their centres in the arm's covering spheres, inflated by `margin` [m], anywhere on a
+        path."""
+        out = np.zeros(self.shape, np.bool_)
+        sweep(compile_robot(robot), path.positions.astype(np.float32), np.float32(margin), *self.frame, out)
+        return out
+
+
+COARSE, FINE = VoxelGrid(LOW, SHAPE, VOXEL), VoxelGrid(LOW, FINE_SHAPE, FINE_VOXEL_SIZE)
+"""The voxels of the observed volume, and those halved."""
+
+
+LAYERS_BELOW = 20
+"""Layers of voxels of the map below the observed volume."""
+MAP = VoxelGrid(
+    (LOW[0], LOW[1], LOW[2] - LAYERS_BELOW * FINE_VOXEL_SIZE),
+    (FINE_SHAPE[0], FINE_SHAPE[1], FINE_SHAPE[2] + LAYERS_BELOW),
+    FINE_VOXEL_SIZE,
+)
+"""The voxels of a map: those of `ObservedVolume`, halved, and 0.4 m below it, where an arm on a stand
+reaches."""
+
+
+def refined(voxels: Bool[ndarray, "mx my mz"]) -> Bool[ndarray, "nx ny nz"]:
+    """Coarse voxels of the observed volume as fine ones, of half the edge."""
+    return voxels.repeat(2, 0).repeat(2, 1).repeat(2, 2)
 
 
 @kernel(nogil=True)

@@ -3,8 +3,7 @@
 import numpy as np
 
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL
-from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, surface, sweep
+from robotdiffuse.perception.voxel_grid import LOW, SHAPE, VOXEL, heaviest_part, summed, surface, sweep
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import placed_spheres
 

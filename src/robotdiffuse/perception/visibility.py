@@ -1,0 +1,222 @@
+"""What cameras would see: voxels past an arm and through voxels that may be occupied, and the small balls
+that cover an arm's surface."""
+
+import numpy as np
+from jaxtyping import Float, Float32
+from numpy import ndarray
+
+from robotdiffuse.collision.convex_geometry import Part, parts_of
+from robotdiffuse.collision.exact_meshes import forward_frames
+from robotdiffuse.collision.kernels.distance import frames_of, placed
+from robotdiffuse.core.kernels import kernel
+from robotdiffuse.perception.observed_volume import MAX_DEPTH, usable_depth
+from robotdiffuse.robots.robot import Robot, once_per_robot
+
+OCCLUSION_START = np.float32(2.0)
+"""Voxels nearer to a voxel than this do not hide it, in edges: its neighbours are as unknown as it is."""
+MIN_VISIBILITY = np.float32(0.02)
+"""Smaller probabilities of seeing through count as zero."""
+ARM_CELL = 16
+"""The arm hides cells of so many pixels by as many."""
+
+
+@kernel(nogil=True)
+def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, weights, filled, low, edge):
+    """For each camera the sum of the weights of the voxels, each times the probability that the camera sees
+    it.
+
+    robot: RobotArrays; configurations float32[m, dof]: of the arm when a camera looks; poses [m, 4, 4]:
+    T_base_camera; intrinsics fx, fy, cx, cy; size: height and width of the image; reach: farther voxels are
+    not seen [m]; voxels int64[n, 3]; weights [n]; filled [nx, ny, nz]: the probability that a voxel hides
+    what is behind; low corner of the grid and edge of a voxel [m].
+    """
+    fx, fy, cx, cy = intrinsics
+    half, one = np.float32(0.5), np.float32(1.0)
+    nx, ny, nz = filled.shape
+    out = np.zeros(len(poses))
+    arm = np.empty((-(-size[0] // ARM_CELL), -(-size[1] // ARM_CELL)), np.float32)
+    for c in range(len(poses)):
+        T = poses[c]
+        _arm_ahead(robot, configurations[c], T, intrinsics, half * edge, arm)
+        ox, oy, oz = (T[0, 3] - low[0]) / edge, (T[1, 3] - low[1]) / edge, (T[2, 3] - low[2]) / edge
+        for n in range(len(voxels)):
+            x, y, z = voxels[n, 0] + half, voxels[n, 1] + half, voxels[n, 2] + half
+            dx, dy, dz = ox - x, oy - y, oz - z
+            ahead = -(T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz)
+            if ahead <= one or ahead * edge > reach:
+                continue
+            u = -fx * (T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz) / ahead + cx
+            v = -fy * (T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz) / ahead + cy
+            if not (-half <= u < size[1] - half and -half <= v < size[0] - half):
+                continue
+            if arm[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < ahead * edge:
+                continue
+            far = np.sqrt(dx * dx + dy * dy + dz * dz)
+            dx, dy, dz = dx / far, dy / far, dz / far
+            chance, way = one, OCCLUSION_START
+            while way < far and chance > MIN_VISIBILITY:
+                i, j, k = (
+                    int(np.floor(x + way * dx)),
+                    int(np.floor(y + way * dy)),
+                    int(np.floor(z + way * dz)),
+                )
+                if not (0 <= i < nx and 0 <= j < ny and 0 <= k < nz):
+                    break
+                chance *= one - filled[i, j, k]
+                way += one
+            out[c] += weights[n] * chance if chance > MIN_VISIBILITY else 0.0
+    return out
+
+
+@kernel(nogil=True)
+def _arm_ahead(robot, q, T, intrinsics, margin, depth):
+    """Set `depth` of each cell of an image to that of the arm's nearest covering sphere, inflated by
+    `margin`, on the ray through the cell's middle [m]; infinite without one. Spheres around the camera are
+    left out."""
+    fx, fy, cx, cy = intrinsics
+    depth[:] = np.inf
+    frames = np.zeros((len(q) + 1, 12), np.float32)
+    frames_of(robot, q, frames)
+    for g in range(len(robot.frame)):
+        for s in range(robot.first[g], robot.first[g + 1]):
+            sphere = robot.spheres[s]
+            x, y, z = placed(frames[robot.frame[g]], sphere[0], sphere[1], sphere[2])
+            x, y, z, r = x - T[0, 3], y - T[1, 3], z - T[2, 3], sphere[3] + margin
+            square = x * x + y * y + z * z - r * r
+            u = T[0, 0] * x + T[1, 0] * y + T[2, 0] * z
+            v = T[0, 1] * x + T[1, 1] * y + T[2, 1] * z
+            w = T[0, 2] * x + T[1, 2] * y + T[2, 2] * z
+            if square <= 0 or w <= -r:
+                continue
+            for i in range(len(depth)):
+                b = ((i + np.float32(0.5)) * ARM_CELL - cy) / fy
+                for j in range(depth.shape[1]):
+                    a = ((j + np.float32(0.5)) * ARM_CELL - cx) / fx
+                    along = a * u + b * v + w
+                    if along > 0 and square * (a * a + b * b + np.float32(1.0)) < along * along:
+                        depth[i, j] = min(depth[i, j], max(w - r, np.float32(0.0)))
+
+
+MAX_LOST_FRACTION = 0.2
+"""Largest fraction of a ball's pixels without a return."""
+_HALF, _ZERO = np.float32(0.5), np.float32(0.0)
+
+
+@kernel(nogil=True)
+def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
+    """Mark the balls that an image sees through: their projection lies within the image, and all returns of
+    its pixels are behind the ball; a few pixels may have none.
+
+    depth: float32[h, w], infinite where nothing is in range, and not above 0 without a return; intrinsics fx,
+    fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centres, and their radius [m]; noise: how far
+    behind a ball a return must lie, at a distance of 1 m; it grows with the square of the distance [m];
+    border: pixels around the projection that count too. All numbers are float32; seen bool[n].
+    """
+    raw = usable_depth(depth, intrinsics[0])
+    h, w = raw.shape
+    fx, fy, cx, cy = intrinsics
+    for n in range(len(balls)):
+        if seen[n]:
+            continue
+        dx, dy, dz = balls[n, 0] - T[0, 3], balls[n, 1] - T[1, 3], balls[n, 2] - T[2, 3]
+        z = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
+        near, far = z - radius, z + radius
+        if near <= _ZERO:
+            continue
+        x, y = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz, T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
+        u0 = np.floor(fx * (x - radius) / (near if x < radius else far) + cx) - border
+        u1 = np.ceil(fx * (x + radius) / (near if x > -radius else far) + cx) + border
+        v0 = np.floor(fy * (y - radius) / (near if y < radius else far) + cy) - border
+        v1 = np.ceil(fy * (y + radius) / (near if y > -radius else far) + cy) + border
+        if u0 < _ZERO or v0 < _ZERO or u1 > np.float32(w - 1) or v1 > np.float32(h - 1):
+            continue
+        behind = min(far + noise * far * far, MAX_DEPTH * _HALF)
+        seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), behind)
+
+
+@kernel(nogil=True)
+def _all_behind(depth, v0, v1, u0, u1, least):
+    """Whether all returns of a rectangle of pixels, whose bounds are inclusive, are deeper than `least`, and
+    no more pixels than may are without one."""
+    lost, most = 0, MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
+    for v in range(v0, v1 + 1):
+        for u in range(u0, u1 + 1):
+            if depth[v, u] > least:
+                continue
+            lost += 1
+            if depth[v, u] > _ZERO or lost > most:
+                return False
+    return True
+
+
+@kernel(nogil=True)
+def within_voxels(balls, radius, marked, low, edge, within):
+    """Mark the balls all of whose voxels are marked; arguments as above, marked bool[nx, ny, nz]."""
+    nx, ny, nz = marked.shape
+    for n in range(len(balls)):
+        x, y, z = balls[n, 0] - low[0], balls[n, 1] - low[1], balls[n, 2] - low[2]
+        i0, i1 = int(np.floor((x - radius) / edge)), int(np.floor((x + radius) / edge))
+        j0, j1 = int(np.floor((y - radius) / edge)), int(np.floor((y + radius) / edge))
+        k0, k1 = int(np.floor((z - radius) / edge)), int(np.floor((z + radius) / edge))
+        if i0 < 0 or j0 < 0 or k0 < 0 or i1 >= nx or j1 >= ny or k1 >= nz:
+            continue
+        all_marked = True
+        for i in range(i0, i1 + 1):
+            for j in range(j0, j1 + 1):
+                for k in range(k0, k1 + 1):
+                    all_marked = all_marked and marked[i, j, k]
+        within[n] |= all_marked
+
+
+BALL_CELL, SAMPLE_DISTANCE = 0.005, 0.0012
+"""Edge of the cells of a grid of which those on the surface are kept; largest distance of a point of the
+surface from a sample of it [m]."""
+BALL_RADIUS = BALL_CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
+"""Radius of a ball around a cell that covers the samples in it, and what is near them [m]."""
+
+
+def surface_balls(robot: Robot, q: Float[ndarray, "dof"]) -> Float32[ndarray, "n 3"]:
+    """The centres of balls of BALL_RADIUS that cover the surface of moving links and of what they hold, at a
+    configuration, in the base frame [m]."""
+    placed = [
+        points @ T[:3, :3].T + T[:3, 3]
+        for T, points in zip(forward_frames(robot, q[None])[0], _balls_by_frame(robot), strict=True)
+    ]
+    return np.concatenate(placed).astype(np.float32)
+
+
+@once_per_robot
+def _balls_by_frame(robot: Robot) -> list[Float[ndarray, "n 3"]]:
+    """The balls' centres by frame, in its coordinates; none in that of the base."""
+    parts = [part for of_link in parts_of(robot).values() for part in of_link]
+    out = [np.zeros((0, 3)) for _ in range(robot.dof + 1)]
+    for frame in range(1, robot.dof + 1):
+        of_frame = [part for part in parts if part.frame == frame]
+        if of_frame:
+            cells = np.floor(np.concatenate([_samples(part) for part in of_frame]) / BALL_CELL)
+            out[frame] = (np.unique(cells, axis=0) + 0.5) * BALL_CELL
+    return out
+
+
+def _samples(part: Part) -> Float[ndarray, "n 3"]:
+    """Points within SAMPLE_DISTANCE of each point of a part's surface."""
+    if not len(part.faces):
+        return _sphere(part.center, part.radius)
+    return np.concatenate([_triangle(part.vertices[face]) for face in part.faces])
+
+
+def _triangle(corners: Float[ndarray, "3 3"]) -> Float[ndarray, "n 3"]:
+    longest = max(np.linalg.norm(corners[i] - corners[i - 1]) for i in range(3))
+    count = int(np.ceil(longest / (SAMPLE_DISTANCE * 3**0.5))) + 1
+    i, j = np.divmod(np.arange((count + 1) ** 2), count + 1)
+    weights = np.stack([i, j, count - i - j], axis=1)[i + j <= count] / count
+    return weights @ corners
+
+
+def _sphere(center: Float[ndarray, "3"], radius: float) -> Float[ndarray, "n 3"]:
+    """Points on a sphere, on a spiral."""
+    count = max(int(4 * np.pi * (radius / SAMPLE_DISTANCE) ** 2), 1)
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    around = np.sqrt(1 - z * z)
+    return center + radius * np.stack([around * np.cos(angle), around * np.sin(angle), z], axis=1)
