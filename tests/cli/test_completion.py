@@ -62,7 +62,7 @@ def test_bash_completes_commands_and_options(
 ) -> None:
     assert run("completion", "bash") == 0
     script = capsys.readouterr().out
-    assert completed(script, "robotdiffuse", "pl") == ["plan", "planners"]
+    assert completed(script, "robotdiffuse", "pl") == ["plan", "planner"]
     assert completed(script, "robotdiffuse", "plan", "--cl") == ["--clearance"]
     assert completed(script, "robotdiffuse", "data", "inf") == ["info"]
     assert "--page" in completed(script, "robotdiffuse", "data", "info", "folder", "--")

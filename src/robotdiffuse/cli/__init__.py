@@ -5,6 +5,7 @@ import argparse
 import errno
 import io
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -13,31 +14,24 @@ from typing import NoReturn
 from robotdiffuse import __version__
 from robotdiffuse.cli import bench, completion, data, explore, export, plan, robot, serve, train, verify, view
 from robotdiffuse.cli.arguments import BAD_INPUT, STOPPED, WRITE_FAILED
-from robotdiffuse.core.errors import InputError, OutputError
+from robotdiffuse.core.errors import InputError, OutputError, suggestion
 from robotdiffuse.core.registry import import_modules
 
-COMMANDS = (
-    plan.add_plan,
-    plan.add_demo,
-    explore.add_explore,
-    view.add_view,
-    verify.add_verify,
-    verify.add_certificate,
-    export.add_export,
-    export.add_publish,
-    explore.add_live,
-    view.add_simulate,
-    completion.add_planners,
-    robot.add,
-    data.add,
-    train.add,
-    bench.add_bench,
-    bench.add_reproduce,
-    serve.add,
-    completion.add_schema,
-    completion.add_completion,
-)
-"""Each function adds one command to the parser and sets its `run` function."""
+COMMANDS = {
+    "plan": (plan.add_plan, plan.add_demo, explore.add_explore, explore.add_live, serve.add),
+    "check and show": (
+        verify.add_verify,
+        verify.add_certificate,
+        view.add_view,
+        view.add_simulate,
+        export.add_export,
+        export.add_publish,
+    ),
+    "robots and planners": (robot.add, completion.add_planner),
+    "data, training, comparisons": (data.add, train.add, bench.add_bench, bench.add_reproduce),
+    "editor and shell": (completion.add_schema, completion.add_completion),
+}
+"""Commands by topic. Each function adds one command to the parser and sets its `run` function."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -46,23 +40,40 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[override]
         known, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+            similar = suggestion(unknown[0].partition("=")[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{similar}")
         return known, unknown
 
     def error(self, message: str) -> NoReturn:
+        choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if choice:
+            message += suggestion(choice[1], re.findall(r"'(.*?)'", choice[2]))
         self.exit(BAD_INPUT, f"{self.prog}: error: {InputError(message)}; see {self.prog} --help\n")
 
 
 def build_parser() -> Parser:
     """The parser of all commands."""
     parser = Parser(
-        prog="robotdiffuse", description="Motion planning for redundant robot arms; every motion is verified."
+        prog="robotdiffuse",
+        description="Motion planning for robot arms; every motion is verified.",
+        usage="robotdiffuse [-h] [--version] COMMAND ...",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"robotdiffuse {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for add in COMMANDS:
-        add(commands)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, help=argparse.SUPPRESS)
+    topics = list[str]()
+    for topic, group in COMMANDS.items():
+        for add in group:
+            add(commands)
+        topics.append("\n".join([f"{topic}:", *map(_summary, commands._choices_actions)]))
+        commands._choices_actions.clear()  # or argparse lists all of them without topics
+    parser.epilog = "\n\n".join(topics)
     return parser
+
+
+def _summary(added: argparse.Action) -> str:
+    """The line on a command in the help of all."""
+    return f"  {added.dest:<12} {added.help}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -7,9 +7,7 @@ from typing import Any
 
 SOLVED, NO_PLAN, BAD_INPUT, WRITE_FAILED, STOPPED = 0, 1, 2, 3, 130
 """Exit statuses: done; no valid motion; bad input; the output could not be written; stopped by the user."""
-IGNORE_JOINTS = (
-    "note joints of MoveIt files that the robot lacks rather than refuse them; what they move is ignored"
-)
+IGNORE_JOINTS = "ignore joints of MoveIt files that the robot does not have, with a note, instead of failing"
 
 
 def command(
@@ -64,8 +62,8 @@ def add_import_option(parser: argparse.ArgumentParser) -> None:
     option(
         parser,
         "--import MODULE *",
-        "import a module first, of the current folder too, which may add planners, families, "
-        "costs or metrics to their tables; repeatable",
+        "import MODULE first (also from the current folder), for example to register planners or families; "
+        "repeatable",
         dest="modules",
     )
 

@@ -29,17 +29,17 @@ def add_bench(commands: argparse._SubParsersAction) -> None:
         "run planners on problems and record every call",
         "Run planners on the same problems, in turns, each planner in a process of its own. "
         "Results are lines of JSON in the folder. Ctrl-C or a crash loses at most the running calls; run "
-        "the same command again to continue. A call whose result a longer time limit cannot change is not "
-        "repeated.",
+        "the same command again to continue; with a longer --time-limit it repeats only calls that could "
+        "improve.",
         run_run,
     )
     options(
         run,
         (
             "--planners NAME,...",
-            "names from `robotdiffuse planners`, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
+            "names that `planner list` shows, or all. NAME:SETTING=VALUE:SETTING=VALUE changes settings, "
             "or until=first|converged|time_limit, objective=length|time and clearance=M of the calls; "
-            "NAME@FOLDER uses other weights",
+            "NAME@FOLDER uses other weights. Example: aorrtc:range=0.5,diffusion@runs/mine",
         ),
         (
             "--problems SET,...",

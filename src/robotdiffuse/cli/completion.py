@@ -1,4 +1,4 @@
-"""The commands `robotdiffuse planners`, `schema` and `completion`: what can be named."""
+"""The commands `robotdiffuse planner`, `schema` and `completion`: what can be named."""
 
 import argparse
 import json
@@ -7,26 +7,35 @@ from collections.abc import Iterator
 from robotdiffuse.cli.arguments import add_import_option, command, option
 
 
-def add_planners(commands: argparse._SubParsersAction) -> None:
-    parser = command(
-        commands,
-        "planners",
-        "list the planners, or the settings of one",
-        "List the planners, or the settings of one for `robotdiffuse plan --set`.",
-        run_planners,
+def add_planner(commands: argparse._SubParsersAction) -> None:
+    parser = command(commands, "planner", "list or show planners", "List the planners, or show one.")
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    listing = command(actions, "list", "list the planners", "List the planners.", run_planner_list)
+    add_import_option(listing)
+    info = command(
+        actions,
+        "info",
+        "show the settings of a planner",
+        "Show the settings of a planner, for `robotdiffuse plan --set`.",
+        run_planner_info,
     )
-    option(parser, "planner NAME", "list the settings of this planner", nargs="?")
-    add_import_option(parser)
+    option(info, "planner NAME", "a planner that `planner list` shows")
+    add_import_option(info)
 
 
-def run_planners(arguments: argparse.Namespace) -> int:
+def run_planner_list(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.core.tables import Column, Table, show
+    from robotdiffuse.planning import PLANNERS
+
+    rows = [(name, one.kind, one.description) for name, one in PLANNERS.load_installed().items()]
+    show(Table.of("", ("planner", Column("kind", left=True), Column("description", left=True)), rows))
+    return 0
+
+
+def run_planner_info(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.tables import Column, Table, show
     from robotdiffuse.planning import PLANNERS, planner_settings
 
-    if arguments.planner is None:
-        rows = [(name, one.kind, one.description) for name, one in PLANNERS.load_installed().items()]
-        show(Table.of("", ("planner", Column("kind", left=True), Column("description", left=True)), rows))
-        return 0
     settings = planner_settings(arguments.planner, ())
     rows = [(one.name, one.value, one.rule, one.description) for one in settings.describe()]
     columns = ("setting", *(Column(name, left=True) for name in ("default", "values", "description")))

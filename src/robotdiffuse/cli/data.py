@@ -68,8 +68,8 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
             "fraction to keep of the problems that a straight line solves (default: 1, as in the paper)",
             share,
         ),
-        ("--target KIND", "what targets give: position (default) or pose of the tip"),
-        ("--goals N", "most goal configurations per target (default: 10)", count),
+        ("--target KIND", "goal type: tip position (default) or full pose"),
+        ("--goals N", "maximum number of goal configurations per target (default: 10)", count),
     )
     parser.add_argument(
         "--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion (default: 254)"

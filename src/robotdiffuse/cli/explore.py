@@ -40,7 +40,7 @@ def add_live(commands: argparse._SubParsersAction) -> None:
     options(
         parser,
         ("--robot NAME", "instead of PROBLEM: name or URDF file of an arm"),
-        ("--planner NAME", "planner; see `robotdiffuse planners` (default: robotdiffuse)"),
+        ("--planner NAME", "planner; see `robotdiffuse planner list` (default: robotdiffuse)"),
         ("--time-limit S", "time limit of each plan (default: 1 s)", positive, 1.0),
     )
     add_address(parser)
@@ -112,7 +112,7 @@ def add_explore(commands: argparse._SubParsersAction) -> None:
     parser = command(
         commands,
         "explore",
-        "simulate an arm that sees its scene by a camera at its tip",
+        "explore an unknown scene with a simulated wrist camera",
         "Simulate an arm that goes from a problem's start to its goal and knows of the scene "
         "only what depth cameras have seen: one at its tip, and one beside it that takes one image. Shapes "
         "named floor are known. Each motion is validated in the true scene. Exit status: 0 at the goal, 1 "
@@ -123,18 +123,18 @@ def add_explore(commands: argparse._SubParsersAction) -> None:
     option(
         parser,
         "--policy POLICY",
-        "strict: only through space seen free; chance: where the stated confidence is high; "
+        "strict: only through space that was seen free; chance: where the stated confidence is high; "
         "strict_then_chance (default: strict)",
         default="strict",
     )
     options(
         parser,
-        ("--confidence P", "least, of chance (0.98)", float, 0.98),
+        ("--confidence P", "minimum confidence for policy chance (default: 0.98)", float, 0.98),
         (
             "--see-goal",
             "go only to goals at which all of the arm's surface was seen to be free (policy strict)",
         ),
-        ("--time-limit S", "of each search (1)", float, 1.0),
+        ("--time-limit S", "time limit of each search [s] (default: 1)", float, 1.0),
         ("--noise", "simulate the noise of depth cameras"),
         ("--seed N", "random seed", int, 0),
         (

@@ -46,7 +46,7 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         parser,
         ("problem PROBLEM", "problem file (.yaml, .json or .jsonl)"),
         ("--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0),
-        ("--planner NAME", "see `robotdiffuse planners` (default: robotdiffuse)"),
+        ("--planner NAME", "see `robotdiffuse planner list` (default: robotdiffuse)"),
         (
             "--weights FOLDER",
             "weights of `robotdiffuse train`, for a learned planner, or panda_points, those of the package "
@@ -56,7 +56,7 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
     option(
         parser,
         "--set NAME=VALUE *",
-        "a setting of the planner; see `robotdiffuse planners NAME`; repeatable",
+        "a setting of the planner; see `robotdiffuse planner info NAME`; repeatable",
         dest="settings",
     )
     option(parser, "--time-limit S", "time limit for planning (default: 1 s)", positive, 1.0)

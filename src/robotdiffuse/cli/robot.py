@@ -87,7 +87,7 @@ def add(commands: argparse._SubParsersAction) -> None:
             folder,
         ),
         ("--limits FILE", "file of joint limits, as MoveIt's joint_limits.yaml"),
-        ("--licence TEXT", "licence of the URDF's geometry, to keep in the folder"),
+        ("--license TEXT", "license of the URDF's geometry, to keep in the folder"),
         ("--seed N", "random seed (default: 0)", natural, 0),
     )
 
@@ -149,7 +149,7 @@ def run_add(arguments: argparse.Namespace) -> int:
             locked=dict(arguments.lock),
             limits=arguments.limits,
             out=arguments.out,
-            licence=arguments.licence or "see the URDF",
+            license=arguments.license or "see the URDF",
             seed=arguments.seed,
             group=arguments.group,
             srdf=arguments.srdf,

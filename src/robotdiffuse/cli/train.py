@@ -162,8 +162,8 @@ def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> N
     options(
         parser,
         ("--seed N", "random seed", natural),
-        ("--batch N", "samples per step", count),
-        ("--learning-rate X", "largest learning rate", positive),
+        ("--batch N", "batch size", count),
+        ("--learning-rate X", "peak learning rate", positive),
         ("--threads N", "number of PyTorch threads", count),
         ("--checkpoint-seconds S", "time between checkpoints [s] (default: 120)", positive),
     )

@@ -43,7 +43,7 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
         ("--index INDEX", "which problem of a .jsonl file (default: 0)", natural, 0),
         ("--robot NAME", "bundled name or URDF, with --scene"),
         ("--ignore-joints", IGNORE_JOINTS),
-        ("--topic NAME", "topic of the motion in a bag or MCAP file with several"),
+        ("--topic NAME", "topic to read if the bag or MCAP file has several"),
         ("--all", "print all violations, not only the first"),
         (
             "--certificate FILE.json",

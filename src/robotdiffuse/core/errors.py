@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable
+from difflib import get_close_matches
 
 import numpy as np
 
@@ -82,7 +83,14 @@ def repeated(names: Iterable[str]) -> list[str]:
 
 def unknown_name(what: str, name: object, known: Iterable[object]) -> InputError:
     """An InputError for a name that is not in a table; it lists the known names."""
-    return InputError(f"unknown {what} {shown(name)}; known: {joined(sorted(map(str, known)))}")
+    names = sorted(map(str, known))
+    return InputError(f"unknown {what} {shown(name)}; known: {joined(names)}{suggestion(name, names)}")
+
+
+def suggestion(name: object, known: Iterable[str]) -> str:
+    """The end of a message about an unknown name: the known name that is most like it, or nothing."""
+    similar = get_close_matches(str(name)[:MAX_WORD], list(known)[:MAX_NAMES], n=1)
+    return f"; did you mean {similar[0]}?" if similar else ""
 
 
 def _printable(text: str) -> str:

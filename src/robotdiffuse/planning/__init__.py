@@ -36,7 +36,7 @@ PLANNERS = Registry(
             "diffusion.hybrid:RobotDiffuse",
             "RobotDiffuseSettings",
             HYBRID,
-            "the diffusion model with guidance and refinement, and a search around them (the default)",
+            "AORRTC search first, then batches of the diffusion model too (the default)",
             PATH_CONSTRAINTS,
             CLEARANCE,
         ),
@@ -51,7 +51,7 @@ PLANNERS = Registry(
             "search.rrt:AORRTC",
             "AORRTCSettings",
             SEARCH,
-            "two trees below a falling bound on path length: the shortest paths for the time",
+            "AORRTC: anytime, asymptotically optimal RRT-Connect",
             PATH_CONSTRAINTS,
             CLEARANCE,
         ),
@@ -207,7 +207,7 @@ def plan(
         to 1.
     jerk: largest jerk of any joint [rad/s³]; None: the robot's limits, infinite: no limit.
     objective: what searches minimize: "length" of the path, or "time", the motion's duration.
-    planner: a name that `robotdiffuse planners` lists. A planner is loaded once for its settings.
+    planner: a name that `robotdiffuse planner list` lists. A planner is loaded once for its settings.
     settings: of the planner: a table of those that differ from the defaults, such as {"range": 0.5}, or its
         dataclass.
 

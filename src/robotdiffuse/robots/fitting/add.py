@@ -127,7 +127,7 @@ def add_robot(
     locked: dict[str, float] | None = None,
     limits: str | Path | None = None,
     out: str | Path | None = None,
-    licence: str = "see the URDF",
+    license: str = "see the URDF",
     settings: PreparationSettings | None = None,
     seed: int = 0,
     progress: Progress = lambda what, step, steps: None,
@@ -144,7 +144,7 @@ def add_robot(
         base: See `UrdfTree.robot`, also for `tip`, `locked` and `group`.
         limits: Joint limits, a file in the form of MoveIt's joint_limits.yaml.
         out: Folder to write; by default `user_robots() / name`.
-        licence: Licence of the geometry, kept in the folder.
+        license: License of the geometry, kept in the folder.
         settings: Settings of the preparation.
         seed: The same input and seed give the same robot.
         progress: Called at each step.
@@ -192,7 +192,7 @@ def add_robot(
         if semantics is not None and (pair.reason == CHECKED) == (frozenset(pair.links) in known)
     )
     folder = user_robots() / name if out is None else Path(out)
-    source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": licence}
+    source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": license}
     measured = made.false_collisions
     shares = {"free": round(measured.free, 4), "refused": round(measured.by_spheres, 4)}
     note = (
