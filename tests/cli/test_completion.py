@@ -9,7 +9,7 @@ import yaml
 
 from helpers.code_blocks import PAGES, code_blocks
 from helpers.commands import PROBLEM, run
-from robotdiffuse.problems.files.schema import problem_schema
+from robotdiffuse.problems.fields import problem_schema
 
 ROOT = Path(__file__).parents[2]
 BLOCKS = [

@@ -85,7 +85,7 @@ def add_completion(commands: argparse._SubParsersAction) -> None:
 
 
 def run_schema(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.problems.files.schema import problem_schema
+    from robotdiffuse.problems.fields import problem_schema
 
     print(json.dumps(problem_schema(), indent=1))
     return 0

@@ -135,7 +135,7 @@ def _read(
     elif arguments.problem is not None:
         problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     else:
-        from robotdiffuse.problems.files.moveit.scene import read_moveit_scene
+        from robotdiffuse.problems.moveit import read_moveit_scene
         from robotdiffuse.robots import load_robot
 
         robot = load_robot(arguments.robot)

@@ -1,7 +1,8 @@
 """InputError, the exception for bad input, and helpers that quote values in its message."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 import numpy as np
@@ -33,6 +34,16 @@ class InputError(ValueError):
 
 class OutputError(InputError):
     """Output that could not be written, as on a full disk. The command line exits with status 3."""
+
+
+@contextmanager
+def located(where: object) -> Iterator[None]:
+    """Names the place in the message of an InputError, unless it begins with it already."""
+    try:
+        yield
+    except InputError as error:
+        at = "" if str(error).startswith(str(where)) else f"{where}: "
+        raise InputError(f"{at}{error}") from None
 
 
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:

@@ -5,7 +5,7 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, no_type_check
+from typing import TYPE_CHECKING, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -35,6 +35,10 @@ class JointGoal(Value):
     if TYPE_CHECKING:
 
         def __init__(self, positions: ArrayLike) -> None: ...
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "JointGoal":
+        """The goal itself: configurations do not move."""
+        return self
 
 
 @no_type_check
@@ -83,6 +87,10 @@ class PoseGoal(Value):
             rpy_tolerance: ArrayLike | None = None,
         ) -> None: ...
 
+    def moved(self, T: Float[ndarray, "4 4"]) -> "PoseGoal":
+        """The goal after the rigid motion T."""
+        return replace(self, T_base_frame=T @ self.T_base_frame)
+
     @property
     def tolerant(self) -> bool:
         """Whether more than one pose reaches the goal."""
@@ -109,6 +117,10 @@ class PosesGoal(Value):
 
         def __init__(self, poses: Sequence[PoseGoal]) -> None: ...
 
+    def moved(self, T: Float[ndarray, "4 4"]) -> "PosesGoal":
+        """The goal after the rigid motion T."""
+        return PosesGoal([pose.moved(T) for pose in self.poses])
+
     @property
     def tolerant(self) -> bool:
         """Whether any link has more than one pose that reaches the goal."""
@@ -131,6 +143,10 @@ class AnyGoal(Value):
             )
         object.__setattr__(self, "goals", tuple(goals))
 
+    def moved(self, T: Float[ndarray, "4 4"]) -> "AnyGoal":
+        """The goals after the rigid motion T."""
+        return AnyGoal(tuple(goal.moved(T) for goal in self.goals))
+
 
 OneGoal = JointGoal | PoseGoal | PosesGoal
 Goal = OneGoal | AnyGoal
@@ -141,14 +157,3 @@ def poses_of(goal: Goal) -> tuple[PoseGoal, ...]:
     if isinstance(goal, PosesGoal):
         return goal.poses
     return (goal,) if isinstance(goal, PoseGoal) else ()
-
-
-def moved_goal(goal: Any, T: Float[ndarray, "4 4"]) -> Any:
-    """The goal after the rigid motion T: poses are moved, configurations are not."""
-    if isinstance(goal, AnyGoal):
-        return AnyGoal(tuple(moved_goal(one, T) for one in goal.goals))
-    if isinstance(goal, PosesGoal):
-        return PosesGoal([moved_goal(pose, T) for pose in goal.poses])
-    if isinstance(goal, list | tuple):
-        return [moved_goal(one, T) for one in goal]
-    return replace(goal, T_base_frame=T @ goal.T_base_frame) if isinstance(goal, PoseGoal) else goal

@@ -20,7 +20,7 @@ from robotdiffuse.core.transforms import inverse
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.problems.constraints import CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
-from robotdiffuse.problems.goals import Goal, OneGoal, moved_goal
+from robotdiffuse.problems.goals import Goal, OneGoal
 from robotdiffuse.problems.goals import JointGoal as JointGoal
 from robotdiffuse.problems.goals import PoseGoal as PoseGoal
 from robotdiffuse.problems.goals import PosesGoal as PosesGoal
@@ -210,12 +210,9 @@ class Problem(Value):
         """
         T = rigid_transform("T_world_base", T_world_base)
         T_base_world = inverse(T)
-        moved: dict[str, Any] = dict(options)
-        for name in ("waypoints", "views", "constraints", "moving"):
-            if name in moved:
-                moved[name] = _moved(moved[name], T_base_world)
-        scene, goal = _moved(scene, T_base_world), _moved(goal, T_base_world)
-        return cls(robot, scene, start, goal, T_world_base=T, **moved)
+        given = {name: moved(value, T_base_world) for name, value in options.items()}
+        scene, goal = moved(scene, T_base_world), moved(goal, T_base_world)
+        return cls(robot, scene, start, goal, T_world_base=T, **given)  # type: ignore[arg-type]
 
     def standing(self) -> tuple[Robot, Scene]:
         """The robot and the scene in the world's frame, for pictures and simulators."""
@@ -320,13 +317,11 @@ def _is_empty(value: object) -> bool:
     return isinstance(value, tuple) and not value
 
 
-def _moved(value: Any, T: Float[ndarray, "4 4"]) -> Any:
+def moved(value: Any, T: Float[ndarray, "4 4"]) -> Any:
     """The value, or each of a list, after the rigid motion T; what has no pose is returned unchanged."""
     if isinstance(value, list | tuple):
-        return [_moved(one, T) for one in value]
-    if isinstance(value, Scene | DepthView | MovingObstacle | Constraint):
-        return value.moved(T)
-    return moved_goal(value, T)
+        return [moved(one, T) for one in value]
+    return value.moved(T) if hasattr(value, "moved") else value
 
 
 def _scene_with_views(

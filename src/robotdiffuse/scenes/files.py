@@ -33,7 +33,7 @@ def check_fields(
     Raises InputError unless it is a mapping with all required and no unknown fields.
     """
     required = tuple(required)
-    known = (*required, *optional)
+    known = tuple(dict.fromkeys((*required, *optional)))
     if not isinstance(data, dict):
         raise InputError(f"{where} is {shown(data)}; it must be a mapping with the fields {', '.join(known)}")
     if "rpy" in data and "wxyz" in known:

@@ -11,8 +11,7 @@ from helpers.moveit_files import MOTION_BENCH_MAKER
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.problems.files import load_problem
-from robotdiffuse.problems.files.moveit.contacts import matrix_contacts
-from robotdiffuse.problems.files.moveit.scene import read_moveit_scene
+from robotdiffuse.problems.moveit import matrix_contacts, read_moveit_scene
 from robotdiffuse.robots import load_robot
 
 LINKS = ("hand", "finger")

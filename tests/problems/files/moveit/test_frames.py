@@ -12,8 +12,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import (
     rotation_about,
 )
-from robotdiffuse.problems.files.moveit.frames import moveit_frames
-from robotdiffuse.problems.files.moveit.scene import moveit_scene
+from robotdiffuse.problems.moveit import moveit_frames, moveit_scene
 from robotdiffuse.robots import Robot, load_robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.shapes import Sphere

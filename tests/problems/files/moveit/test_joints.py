@@ -13,10 +13,7 @@ from robotdiffuse.problems.files import (
     load_motion_bench_maker,
     load_problem,
 )
-from robotdiffuse.problems.files.moveit.frames import moveit_frames
-from robotdiffuse.problems.files.moveit.joints import scene_robot_notes
-from robotdiffuse.problems.files.moveit.objects import object_shapes
-from robotdiffuse.problems.files.moveit.scene import read_moveit_scene
+from robotdiffuse.problems.moveit import moveit_frames, object_shapes, read_moveit_scene, scene_robot_notes
 from robotdiffuse.robots import load_robot
 
 UR5_JOINTS = [

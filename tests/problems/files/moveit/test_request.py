@@ -19,8 +19,7 @@ from robotdiffuse.problems.files import (
     load_motion_bench_maker,
     problem_record,
 )
-from robotdiffuse.problems.files.moveit.frames import MoveItFrames, moveit_frames
-from robotdiffuse.problems.files.moveit.request import moveit_request
+from robotdiffuse.problems.moveit import MoveItFrames, moveit_frames, moveit_request
 from robotdiffuse.problems.problem import PoseGoal
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose

@@ -14,8 +14,7 @@ from robotdiffuse.problems.files import (
     load_motion_bench_maker,
     load_problems,
 )
-from robotdiffuse.problems.files.moveit.frames import moveit_frames
-from robotdiffuse.problems.files.moveit.scene import moveit_scene, read_moveit_scene
+from robotdiffuse.problems.moveit import moveit_frames, moveit_scene, read_moveit_scene
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.mesh import Mesh

@@ -4,8 +4,8 @@ Also reads folders of MotionBenchMaker, which hold MoveIt files.
 """
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -13,52 +13,33 @@ from typing import Any
 import yaml
 
 from robotdiffuse.core.bounds import numbers
-from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_type, located, shown, unknown_name
 from robotdiffuse.core.input_files import file_name, no_files, parse_json, parse_yaml, read_text, read_yaml
 from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.transforms import pose_entry
-from robotdiffuse.perception.depth_view_files import read_views, view_entry
-from robotdiffuse.problems.files.constraints import constraint_entry, read_constraints
-from robotdiffuse.problems.files.goals import goal_entry, read_goal, read_waypoints
-from robotdiffuse.problems.files.moveit.frames import moveit_frames
-from robotdiffuse.problems.files.moveit.joints import (
-    mimic_notes,
-    moveit_model,
-    request_robot_notes,
-    scene_robot_notes,
-)
-from robotdiffuse.problems.files.moveit.request import MoveItRequest, holding_at, linkable, moveit_request
-from robotdiffuse.problems.files.moveit.scene import moveit_scene
-from robotdiffuse.problems.files.moving_obstacles import moving_entry, read_moving
-from robotdiffuse.problems.files.robot_setup import (
+from robotdiffuse.problems.fields import (
+    FIELDS,
+    SETUP,
+    Setting,
     equipment_entries,
     equipped,
-    payload_entry,
-    read_payload,
     read_pose,
     rounded,
 )
-from robotdiffuse.problems.problem import (
-    Goal,
-    JointGoal,
-    PoseGoal,
-    Problem,
-    ProblemOptions,
-    check_clearance,
-    moved_goal,
+from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal
+from robotdiffuse.problems.moveit import (
+    MoveItRequest,
+    moveit_frames,
+    moveit_model,
+    moveit_request,
+    moveit_scene,
+    scene_robot_notes,
 )
+from robotdiffuse.problems.problem import Problem, moved
 from robotdiffuse.robots import ROBOTS, load_robot
-from robotdiffuse.robots.robot import MOVING_KINDS, Robot
-from robotdiffuse.scenes.files import check_fields, contacts_entry, read_scene, scene_entries
+from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
+from robotdiffuse.scenes.files import check_fields, read_scene
 from robotdiffuse.scenes.scene import Scene
-
-REQUIRED_FIELDS = ("robot", "scene", "start", "goal")
-REQUIRED_WITH_REQUEST = ("robot", "scene", "request")
-OPTIONAL_FIELDS = (
-    *("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unknown"),
-    *("moving", "start_velocity", "blend", "payload", "allowed_contacts"),
-)
-NOT_WITH_REQUEST = ("waypoints", "blend", "moving", "start_velocity")
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,42 +129,21 @@ def problem_record(
                 "robot"
             )
     folder = None if folder is None else Path(folder)
-    scene, goal, views, waypoints = problem.known_scene, problem.goal, problem.views, problem.waypoints
-    constraints, moving, T = problem.constraints, problem.moving, problem.T_world_base
+    T, scene = problem.T_world_base, problem.known_scene
     record: dict[str, object] = {"robot": robot, "locked": problem.robot.locked}
-    if T is not None:  # files are in the world's frame
-        scene, goal = scene.moved(T), moved_goal(goal, T)
-        views, moving = [view.moved(T) for view in views], [obstacle.moved(T) for obstacle in moving]
-        waypoints = [moved_goal(waypoint, T) for waypoint in waypoints]
-        constraints = [constraint.moved(T) for constraint in constraints]
+    if T is not None:
         record["base"] = rounded(pose_entry(T))
-    written = rounded if T is not None else lambda data: data
     record |= equipment_entries(problem.robot, folder)
-    record |= {
-        "scene": written(scene_entries(scene, folder)),
-        "start": problem.start.tolist(),
-        "goal": written(goal_entry(goal)),
-    }
-    if scene.allowed_contacts:
-        record["allowed_contacts"] = contacts_entry(scene)
-    if waypoints:
-        record["waypoints"] = written([goal_entry(waypoint) for waypoint in waypoints])
-    if any(problem.blend):
-        record["blend"] = list(problem.blend)
-    if constraints:
-        record["constraints"] = written([constraint_entry(constraint) for constraint in constraints])
-    if moving:
-        record["moving"] = written([moving_entry(obstacle, folder) for obstacle in moving])
-    if problem.start_velocity is not None:
-        record["start_velocity"] = problem.start_velocity.tolist()
-    if problem.payload is not None:
-        record["payload"] = payload_entry(problem.payload)
-    if problem.clearance is not None:
-        record["clearance"] = problem.clearance
-    if views:
-        record["views"] = written([view_entry(view, folder) for view in views])
-    if problem.unknown is not None:
-        record["unknown"] = problem.unknown
+    for name, field in FIELDS.items():
+        value = scene if name in ("scene", "allowed_contacts") else getattr(problem, name)
+        if value is None:
+            continue
+        if field.in_world and T is not None:
+            entry = rounded(field.write(moved(value, T), folder))
+        else:
+            entry = field.write(value, folder)
+        if name == "scene" or entry not in (None, [], {}):
+            record[name] = entry
     return record
 
 
@@ -261,32 +221,41 @@ def load_motion_bench_maker(
 
 def _moveit_problem(scene_file: Path, robot: Robot | None, ignore_joints: bool) -> Problem:
     request_file = scene_file.with_name(scene_file.name.replace("scene", "request", 1))
-    where = scene_file
-    try:
+    with located(scene_file):
         data = read_yaml(scene_file)
         if robot is None:
             robot_name = data.get("robot_model_name") if isinstance(data, dict) else None
             robot = _robot(robot_name, {}, scene_file.parent)
         notes = scene_robot_notes(data, robot, ignore_joints)
         frames = moveit_frames(data, robot)
-        where = request_file
+    with located(request_file):
         request = moveit_request(read_yaml(request_file), frames, scene_file.parent)
-        where = scene_file
-        scene = moveit_scene(data, frames, scene_file.parent, linkable(robot, request))
-        where = request_file
-        notes += request_robot_notes(request, robot, moveit_model(data), ignore_joints)
-        return _requested(robot, scene, replace(request, notes=(*request.notes, *notes)), {})
-    except InputError as error:
-        prefix = "" if str(error).startswith(str(where)) else f"{where}: "
-        raise InputError(f"{prefix}{error}") from None
+    with located(scene_file):
+        scene = moveit_scene(data, frames, scene_file.parent, _linkable(robot, request))
+    with located(request_file):
+        notes += request.robot_notes(robot, moveit_model(data), ignore_joints)
+        return _requested(robot, scene, request, notes, {})
 
 
-def _requested(robot: Robot, scene: Scene, request: MoveItRequest, options: ProblemOptions) -> Problem:
+def _linkable(robot: Robot, request: MoveItRequest | None) -> tuple[str, ...]:
+    """Names of the robot's links and of what it holds at the start."""
+    return (*robot.link_names, *(held.name for held in (request.attached if request else ())))
+
+
+def _requested(
+    robot: Robot, scene: Scene, request: MoveItRequest, notes: Iterable[str], options: dict[str, Any]
+) -> Problem:
     """The problem of a MoveIt request. Joints that are not planned are locked at its start state."""
     unplanned = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     unplanned -= {*robot.joint_names}
     robot = robot.with_locked({name: value for name, value in request.start.items() if name in unplanned})
-    notes = (*request.notes, *mimic_notes(robot, request.start))
+    notes = [*request.notes, *notes]
+    for joint in robot.joints:
+        given, locked = request.start.get(joint.name), robot.locked.get(joint.name)
+        if joint.mimic is None or given is None or locked is None or abs(locked - given) <= MIMIC_SLACK:
+            continue
+        implied = f"planned at {locked:g}, which {joint.mimic.joint} implies"
+        notes.append(f"start_state: {joint.name} is {given:g}; {implied}")
 
     def values(where: str, positions: dict[str, float]) -> list[float]:
         missing = [name for name in robot.joint_names if name not in positions]
@@ -296,14 +265,13 @@ def _requested(robot: Robot, scene: Scene, request: MoveItRequest, options: Prob
 
     start = values("start_state", request.start)
     for held in request.attached:
-        robot = holding_at(robot, held, start)
-    goal: Goal
+        robot = held.held_by(robot, start)
     if request.pose_goal is not None:
-        goal = PoseGoal(*request.pose_goal)
+        goal: Goal = PoseGoal(*request.pose_goal)
     else:
         rows = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
         goal = JointGoal(rows)
-    return Problem(robot, scene, start, goal, **{**options, "notes": notes})
+    return Problem(robot, scene, start, goal, notes=tuple(notes), **options)
 
 
 def _problem(
@@ -313,64 +281,51 @@ def _problem(
     robots: Mapping[str, Robot] | None = None,
     ignore_joints: bool = False,
 ) -> Problem:
-    try:
+    with located(where):
         if isinstance(data, dict) and {"status", "planner"} <= data.keys():
             raise InputError(
                 "it is a result, not a problem; `robotdiffuse view` draws it and `robotdiffuse verify` "
                 "validates it"
             )
         requested = isinstance(data, dict) and "request" in data
-        required = REQUIRED_WITH_REQUEST if requested else REQUIRED_FIELDS
-        values = check_fields("problem", data, required, OPTIONAL_FIELDS)
-        robot = _robot(values["robot"], values.get("locked", {}), folder, robots)
-        robot, notes = equipped(robot, values.get("tool"), values.get("attached"), folder)
+        required = ("robot", "scene", *(("request",) if requested else ("start", "goal")))
+        values = check_fields("problem", data, required, SETUP | FIELDS)
+        robot, notes = _robot(values["robot"], values.get("locked", {}), folder, robots), list[str]()
+        robot = equipped(robot, values, folder, notes)
         base = read_pose("base", values["base"]) if "base" in values else None
-        if base is not None and (requested or isinstance(values["scene"], str)):
+        from_moveit = isinstance(values["scene"], str)
+        if base is not None and (requested or from_moveit):
             raise InputError(
                 "base cannot be combined with MoveIt files, which contain the pose of their robot's base"
             )
-        options: dict[str, Any] = {}
-        if "clearance" in values:
-            options["clearance"] = check_clearance(values["clearance"])
-        frames, model = moveit_frames({}, robot), ""
-        contacts = values.get("allowed_contacts", {})
-        if isinstance(values["scene"], str):
-            file = folder / values["scene"]
-            content = read_yaml(file)
+        content, request, contacts = {}, None, values.get("allowed_contacts", {})
+        if from_moveit:
+            content = read_yaml(folder / values["scene"])
             notes += scene_robot_notes(content, robot, ignore_joints)
-            frames, model = moveit_frames(content, robot), moveit_model(content)
-        request = None
+        frames = moveit_frames(content, robot)
         if requested:
+            for name, field in FIELDS.items():
+                if name in values and not field.with_request:
+                    raise InputError(f"{name} cannot be combined with request")
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
-        if isinstance(values["scene"], str):
-            scene = moveit_scene(content, frames, file.parent, linkable(robot, request), contacts)
+        if from_moveit:
+            of_file = (folder / values["scene"]).parent
+            scene = moveit_scene(content, frames, of_file, _linkable(robot, request), contacts)
         else:
-            scene, scene_notes = read_scene(values["scene"], folder, contacts)
-            notes += scene_notes
-        options["views"], view_notes = read_views(values.get("views", []), folder)
-        options["unknown"] = values.get("unknown")
-        for name in NOT_WITH_REQUEST:
-            if requested and name in values:
-                raise InputError(f"{name} cannot be combined with request")
-        options["constraints"] = read_constraints(values.get("constraints", []))
-        options["payload"] = read_payload(values["payload"]) if "payload" in values else None
-        if request is not None:
-            notes += request_robot_notes(request, robot, model, ignore_joints)
-            request = replace(request, notes=(*request.notes, *notes, *view_notes))
-            return _requested(robot, scene, request, options)  # type: ignore[arg-type]
-        goal = read_goal("goal", values["goal"], scene, robot)
-        options |= {
-            "notes": (*notes, *view_notes),
-            "waypoints": read_waypoints(values.get("waypoints", []), scene, robot),
-            "moving": read_moving(values.get("moving", []), folder),
-            "start_velocity": values.get("start_velocity"),
-            "blend": values.get("blend", ()),
+            scene, more = read_scene(values["scene"], folder, contacts)
+            notes += more
+        setting = Setting(robot, scene, folder, notes)
+        options = {
+            name: field.read(values[name], setting)
+            for name, field in FIELDS.items()
+            if name in values and name not in ("scene", "allowed_contacts")
         }
+        if request is not None:
+            notes += request.robot_notes(robot, moveit_model(content), ignore_joints)
+            return _requested(robot, scene, request, notes, options)
         if base is None:
-            return Problem(robot, scene, values["start"], goal, **options)
-        return Problem.in_world(base, robot, scene, values["start"], goal, **options)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+            return Problem(robot, scene, notes=tuple(notes), **options)
+        return Problem.in_world(base, robot, scene, notes=tuple(notes), **options)
 
 
 def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robot] | None = None) -> Robot:

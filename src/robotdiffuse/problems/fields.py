@@ -1,0 +1,503 @@
+"""The fields of problem files: how each is read, written, moved between frames and described.
+
+base: {xyz: [0, 0, 0.7], wxyz: [1, 0, 0, 0]}
+tool: {link: panda_hand, xyz: [0, 0, 0.15], shapes: [{cylinder: {...}}]}
+attached:
+  - {link: panda_hand, box: {center: [0, 0, 0.12], size: [0.05, 0.05, 0.1], name: cup}}
+goal: [...], the name of a pose of the robot, or one of
+  {joints: [...]}
+  {joint_set: [[...], [...]]}
+  {pose: {frame: panda_hand, xyz: [...], wxyz: [...]}}
+  {pose: {..., relative_to: shelf, xyz_tolerance: [0.1, 0.1, 0], rpy_tolerance: [0, 0, 3.1416]}}
+  {poses: {left_gripper: {xyz: [...], wxyz: [...]}, right_gripper: {...}}}
+  {any: [{pose: {...}}, {joints: [...]}]}
+constraints:
+  - axis_cone: {frame: panda_hand, axis: [0, 0, 1], direction: [0, 0, -1], angle: 0.1745}
+  - position_box: {frame: panda_hand, low: [0.2, -0.5, 0.1], high: [0.7, 0.5, 0.9], xyz: ..., wxyz: ...}
+  - on_plane: {frame: panda_hand, point: [0, 0, 0.4], normal: [0, 0, 1], tolerance: 0.002}
+  - on_line: {frame: panda_hand, point: [0.5, 0, 0.4], direction: [0, 1, 0], tolerance: 0.002}
+  - cartesian_line: {frame: panda_hand, tolerance: 0.001, angle: 0.05, speed: 0.1}
+moving:
+  - {sphere: {center: [0.5, -0.6, 0.5], radius: 0.1}, velocity: [0, 0.3, 0]}
+  - {box: {center: [0.6, 0, 0.3], size: [0.2, 0.2, 0.2]}, times: [0, 2], poses: [{xyz: [0.6, 0, 0.3]}, {...}]}
+  - {sphere: {center: [0.5, 0.6, 0.5], radius: 0.1, name: hand}, max_speed: 0.5}
+payload: {mass: 1.5, com: [0, 0, 0.12], link: panda_hand}
+"""
+
+from collections.abc import Callable
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.bounds import numbers, unit_quaternion, vector
+from robotdiffuse.core.errors import InputError, located, shown, unknown_name
+from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
+from robotdiffuse.perception.depth_view_files import read_views, view_entry
+from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
+from robotdiffuse.problems.problem import UNKNOWN_POLICIES, check_clearance
+from robotdiffuse.robots import ROBOTS
+from robotdiffuse.robots.bodies import TOOL
+from robotdiffuse.robots.inertias import Payload
+from robotdiffuse.robots.named_poses import named_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.files import (
+    FILE_CONTENT,
+    SHAPES,
+    check_fields,
+    contacts_entry,
+    read_scene,
+    scene_entries,
+)
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
+from robotdiffuse.scenes.scene import ALL_LINKS, Scene
+from robotdiffuse.scenes.shapes import IDENTITY, Shape
+
+Schema = dict[str, Any]
+NUMBER: Schema = {"type": "number"}
+TEXT: Schema = {"type": "string"}
+OBJECT: Schema = {"type": "object"}
+
+
+def _array(items: Schema, size: int | None = None) -> Schema:
+    """The schema of a list, of a size if it is given."""
+    return {"type": "array", "items": items} | ({} if size is None else {"minItems": size, "maxItems": size})
+
+
+def _object(properties: Schema, *required: str) -> Schema:
+    return OBJECT | {"properties": properties, "required": [*required], "additionalProperties": False}
+
+
+def _one_of(kinds: Schema) -> Schema:
+    """The schema of a mapping of exactly one of these names to what it may hold."""
+    return _object(kinds) | {"minProperties": 1, "maxProperties": 1}
+
+
+NUMBERS, TEXTS = _array(NUMBER), _array(TEXT)
+ROWS = _array(NUMBERS)
+SHAPE, GOAL, POSE_OF_LINK = ({"$ref": f"#/$defs/{name}"} for name in ("shape", "goal", "pose"))
+VALUES: dict[str, Schema] = {
+    **dict.fromkeys(("name", "file", "frame"), TEXT),
+    **dict.fromkeys(("points", "vertices", "faces", "heights"), ROWS),
+    **dict.fromkeys(
+        ("center", "size", "xyz", "axis", "direction", "normal", "point", "low", "high"), NUMBERS
+    ),
+}
+"""Fields of shapes and constraints that are no single numbers."""
+POSE = {
+    "xyz": _array(NUMBER, 3),
+    "wxyz": _array(NUMBER, 4) | {"description": "quaternion, scalar first"},
+    "rpy": _array(NUMBER, 3) | {"description": "roll, pitch, yaw [rad], as in URDFs"},
+}
+TOLERANCES = ("xyz_tolerance", "rpy_tolerance")
+GOAL_POSE = {"frame": TEXT, "relative_to": TEXT, **POSE, **dict.fromkeys(TOLERANCES, NUMBERS)}
+GOALS = {
+    "joints": {"oneOf": [NUMBERS, TEXT]},
+    "joint_set": ROWS,
+    "pose": _object(GOAL_POSE, "frame"),
+    "poses": OBJECT | {"additionalProperties": POSE_OF_LINK},
+    "any": _array(GOAL),
+}
+TOOL_FIELDS = {"link": TEXT, "name": TEXT, **POSE, "shapes": _array(SHAPE), "touch_links": TEXTS}
+PAYLOAD_FIELDS = {"mass": NUMBER, "com": NUMBERS, "link": TEXT, "moments": NUMBERS}
+MOTION_FIELDS = ("velocity", "times", "poses", "max_speed")
+WRITTEN_DECIMALS = 12
+"""Decimals of computed poses in files: enough to restore the values that were read."""
+
+
+def _fields_of(kind: type) -> tuple[dict[str, Schema], list[str]]:
+    """The fields of the entry of a shape or constraint, and those that it must have."""
+    found: dict[str, Schema] = {}
+    for field in fields(kind):
+        found |= (
+            POSE if field.name in ("wxyz", "T_base_box") else {field.name: VALUES.get(field.name, NUMBER)}
+        )
+    return found, [field.name for field in fields(kind) if field.default is MISSING]
+
+
+def _entry_schema(kind: type[Shape] | type[Constraint]) -> Schema:
+    known, required = _fields_of(kind)
+    content = FILE_CONTENT.get(kind.kind)
+    if content is None:
+        return _object(known, *required)
+    in_file = ["file", *(name for name in required if name not in content)]
+    return _object(known) | {"anyOf": [{"required": required}, {"required": in_file}]}
+
+
+def read_pose(where: str, data: object) -> Float[ndarray, "4 4"]:
+    """The transform of {xyz: [...], wxyz: [...]}, both optional. Raises InputError for anything else."""
+    return pose_of(where, check_fields(where, data, (), POSE))
+
+
+def pose_of(where: str, values: dict[str, Any]) -> Float[ndarray, "4 4"]:
+    """The transform of the fields xyz and wxyz, both optional; other fields are ignored."""
+    xyz = vector(where, "xyz", values.get("xyz", (0.0, 0.0, 0.0)), 3)
+    return transform(xyz, rotation_from_quaternion(unit_quaternion(where, values.get("wxyz", IDENTITY))))
+
+
+def entries_of(where: str, data: object, what: str) -> list[tuple[str, Any]]:
+    """The entries of a list, each with its place. Raises InputError for anything else; `what`
+    is in its message."""
+    if not isinstance(data, list):
+        raise InputError(f"{where} is {shown(data)}; it must be a list of {what}")
+    return [(f"{where}[{i}]", entry) for i, entry in enumerate(data)]
+
+
+def rounded(value: Any) -> Any:
+    """Plain data with its numbers rounded to WRITTEN_DECIMALS decimals."""
+    if isinstance(value, float):
+        return round(value, WRITTEN_DECIMALS) + 0.0
+    if isinstance(value, list):
+        return [rounded(item) for item in value]
+    return {key: rounded(item) for key, item in value.items()} if isinstance(value, dict) else value
+
+
+def _text(where: str, value: object) -> str:
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{where} is {shown(value)}; it must be a name")
+    return value
+
+
+def _touch_links(where: str, entry: dict[str, Any]) -> tuple[str, ...]:
+    where, value = f"{where}.touch_links", entry.get("touch_links", [])
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise InputError(f"{where} is {shown(value)}; it must be a list of link names")
+    return tuple(value)
+
+
+def _one_shape(where: str, entry: dict[str, Any], folder: Path, notes: list[str]) -> Shape:
+    """The shape of an entry such as {box: {...}}."""
+    try:
+        scene, more = read_scene([entry], folder, field=where)
+    except InputError as error:
+        raise InputError(str(error).replace(f"{where}[0]", where, 1)) from None
+    notes += more
+    return scene.shapes[0]
+
+
+def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str]) -> Robot:
+    """The robot with the tool and the attached objects of a problem file; adds to the notes.
+
+    Raises InputError that names the field, for unknown fields and whatever `Robot.attach` does not accept.
+    """
+    if values.get("tool") is not None:
+        tool = check_fields("tool", values["tool"], ("link",), TOOL_FIELDS)
+        shapes, more = read_scene(tool.get("shapes", []), folder, field="tool.shapes")
+        notes += more
+        link, name = _text("tool.link", tool["link"]), _text("tool.name", tool.get("name", TOOL))
+        robot = robot.with_tool(link, pose_of("tool", tool), shapes.shapes, _touch_links("tool", tool), name)
+    attached = values.get("attached")
+    for where, entry in entries_of("attached", attached or [], "objects, each with a link"):
+        if not isinstance(entry, dict) or "link" not in entry:
+            raise InputError(
+                f"{where} is {shown(entry)}; it must be a shape with its link, e.g. "
+                "{link: panda_hand, box: {...}}"
+            )
+        shape = {key: value for key, value in entry.items() if key not in ("link", "touch_links")}
+        with located(where):
+            held, touch = _one_shape(where, shape, folder, notes), _touch_links(where, entry)
+            robot = robot.attach(held, _text(f"{where}.link", entry["link"]), touch)
+    return robot
+
+
+def equipment_entries(robot: Robot, folder: Path | None) -> dict[str, Any]:
+    """The fields `tool` and `attached` of a robot, as `equipped` reads them."""
+    entries: dict[str, Any] = {}
+    for body in robot.attached:
+        shapes = scene_entries(Scene([s for s in body.shapes if isinstance(s, Shape)]), folder)
+        touch = {"touch_links": list(body.touch_links)} if body.touch_links else {}
+        if body.tool:
+            at = {"link": body.link, "name": body.name, **rounded(pose_entry(body.T_link_body))}
+            entries["tool"] = at | ({"shapes": shapes} if shapes else {}) | touch
+        else:
+            entries.setdefault("attached", []).append({"link": body.link, **shapes[0], **touch})
+    return entries
+
+
+class Setting(NamedTuple):
+    """What entries of a problem file refer to."""
+
+    robot: Robot
+    scene: Scene
+    folder: Path
+    notes: list[str]
+    """Changes to the input, to which readers add."""
+
+
+def read_goal(where: str, data: object, setting: Setting) -> Goal:
+    """The goal of an entry of a problem file. Raises InputError that names the field.
+
+    As in Python, it may also be a configuration, a list of them, the name of a pose of the robot, or a list
+    of goals, any of which may be reached.
+
+    Poses are in the frame of the scene, or of the object of the scene that `relative_to` names.
+    """
+    if isinstance(data, str):
+        return JointGoal(named_pose(setting.robot, where, data))
+    if isinstance(data, list):
+        several = "joint_set" if data and all(isinstance(one, list) for one in data) else "joints"
+        data = {"any" if any(isinstance(one, dict | str) for one in data) else several: data}
+    if not isinstance(data, dict) or len(data) != 1:
+        raise InputError(
+            f"{where} is {shown(data)}; it must be one of {', '.join(GOALS)}, or a configuration"
+        )
+    [(kind, value)] = data.items()
+    if kind not in GOALS:
+        raise unknown_name(f"field of {where}:", kind, GOALS)
+    where = f"{where}.{kind}"
+    if kind == "any":
+        if not isinstance(value, list) or not value:
+            raise InputError(f"{where} is {shown(value)}; it must be a non-empty list of goals")
+        return AnyGoal(tuple(read_goal(*entry, setting) for entry in entries_of(where, value, "goals")))  # type: ignore[arg-type]
+    if kind == "pose":
+        return _pose_goal(where, value, setting.scene)
+    if kind == "poses":
+        if not isinstance(value, dict) or not value:
+            raise InputError(f"{where} is {shown(value)}; it must map link names to poses")
+        return PosesGoal(
+            [_pose_goal(f"{where}.{frame}", one, setting.scene, frame) for frame, one in value.items()]
+        )
+    if kind == "joints" and isinstance(value, str):
+        value = named_pose(setting.robot, where, value)
+    array = numbers(value)
+    if array is None or array.ndim != (1 if kind == "joints" else 2):
+        form = "a list of numbers" if kind == "joints" else "a list of configurations of one length"
+        raise InputError(f"{where} is {shown(value)}; it must be {form}")
+    return JointGoal(array)
+
+
+def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) -> PoseGoal:
+    """The goal of a pose entry. frame: the link, if the entry itself does not name it."""
+    known = GOAL_POSE if frame is None else {name: GOAL_POSE[name] for name in GOAL_POSE if name != "frame"}
+    required = [name for name in ("frame", "xyz", "wxyz") if name in known]
+    pose = {"frame": frame, **check_fields(where, value, required, known)}
+    T = pose_of(where, pose)
+    if "relative_to" in pose:
+        shapes, name = {shape.name: shape for shape in scene.shapes}, pose["relative_to"]
+        if name not in shapes:
+            raise unknown_name(f"object in {where}.relative_to:", str(name), shapes)
+        with located(f"{where}.relative_to"):
+            T = shapes[name].T_base_shape @ T
+    return PoseGoal(pose["frame"], T, *(pose.get(name) for name in TOLERANCES))  # type: ignore[arg-type]
+
+
+def goal_entry(goal: Goal) -> dict[str, Any]:
+    """The entry of a goal, as `read_goal` reads it."""
+    if isinstance(goal, AnyGoal):
+        return {"any": [goal_entry(one) for one in goal.goals]}
+    if isinstance(goal, JointGoal):
+        rows = goal.positions.tolist()
+        return {"joints": rows[0]} if len(rows) == 1 else {"joint_set": rows}
+    if isinstance(goal, PosesGoal):
+        return {"poses": {pose.frame: _pose_goal_entry(pose) for pose in goal.poses}}
+    return {"pose": {"frame": goal.frame, **_pose_goal_entry(goal)}}
+
+
+def _pose_goal_entry(pose: PoseGoal) -> dict[str, Any]:
+    tolerances = {name: getattr(pose, name) for name in TOLERANCES}
+    given = {name: value.tolist() for name, value in tolerances.items() if value is not None}
+    return {**pose_entry(pose.T_base_frame), **given}
+
+
+def _constraint(where: str, entry: object) -> Constraint:
+    if not isinstance(entry, dict) or len(entry) != 1:
+        raise InputError(
+            f"{where} is {shown(entry)}; it must be one constraint, e.g. {{axis_cone: {{...}}}}; known: "
+            f"{', '.join(CONSTRAINTS)}"
+        )
+    [(name, given)] = entry.items()
+    if name not in CONSTRAINTS:
+        raise unknown_name(f"constraint in {where}:", name, CONSTRAINTS)
+    known, required = _fields_of(CONSTRAINTS[name])
+    at = f"{where}.{name}"
+    values = dict(check_fields(at, given, required, known))
+    posed = {key: values.pop(key) for key in ("xyz", "wxyz") if key in values}
+    if posed:
+        values["T_base_box"] = pose_of(at, posed)
+    try:
+        return CONSTRAINTS[name](**values)
+    except InputError as error:
+        raise InputError(f"{where}.{error}") from None
+
+
+def constraint_entry(constraint: Constraint) -> dict[str, Any]:
+    """The entry of a constraint, as it is read."""
+    values: dict[str, Any] = {}
+    for field in fields(constraint):
+        value = getattr(constraint, field.name)
+        if field.name != "T_base_box":
+            values[field.name] = value.tolist() if isinstance(value, ndarray) else value
+        elif not np.array_equal(value, np.eye(4)):
+            values |= pose_entry(value)
+    return {constraint.kind: values}
+
+
+def _moving(where: str, entry: object, setting: Setting) -> MovingObstacle:
+    if not isinstance(entry, dict):
+        raise InputError(
+            f"{where} is {shown(entry)}; it must be a shape and its motion, e.g. "
+            "{sphere: {...}, velocity: [0, 0.3, 0]}"
+        )
+    motion = {name: value for name, value in entry.items() if name in MOTION_FIELDS}
+    shape = {name: value for name, value in entry.items() if name not in motion}
+    if len(shape) != 1 or not shape.keys() <= SHAPES.keys():
+        raise InputError(
+            f"{where} has the fields {', '.join(map(str, entry))}; it must have one shape of "
+            f"{', '.join(SHAPES)}, and a motion of {', '.join(MOTION_FIELDS)}"
+        )
+    held = _one_shape(where, shape, setting.folder, [])
+    with located(where):
+        if "poses" in motion:
+            poses = entries_of("poses", motion["poses"], "{xyz, wxyz}")
+            motion["poses"] = [read_pose(*pose) for pose in poses]
+        return MovingObstacle(held, **motion)
+
+
+def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, object]:
+    """The entry of a moving obstacle, as it is read."""
+    [shape] = scene_entries(Scene([obstacle.shape]), folder)
+    entry: dict[str, object] = dict(shape)
+    if obstacle.velocity is not None:
+        return entry | {"velocity": obstacle.velocity.tolist()}
+    if obstacle.times is not None and obstacle.poses is not None:
+        return entry | {
+            "times": obstacle.times.tolist(),
+            "poses": [pose_entry(T) for T in obstacle.poses],
+        }
+    return entry | {"max_speed": obstacle.max_speed}
+
+
+def payload_entry(payload: Payload) -> dict[str, object]:
+    """The entry of a payload, as it is read."""
+    data: dict[str, object] = {"mass": payload.mass, "com": payload.com.tolist()}
+    if payload.link is not None:
+        data["link"] = payload.link
+    if payload.moments.any():
+        data["moments"] = payload.moments.tolist()
+    return data
+
+
+def _views(data: object, setting: Setting) -> Any:
+    views, notes = read_views(data, setting.folder)
+    setting.notes.extend(notes)
+    return views
+
+
+class Field(NamedTuple):
+    """A field of `Problem` in its file."""
+
+    schema: Schema
+    read: Callable[[Any, Setting], Any] = lambda data, setting: data
+    write: Callable[[Any, Path | None], Any] = lambda value, folder: value
+    in_world: bool = False
+    """Whether it is in the world's frame."""
+    with_request: bool = True
+    """Whether a MoveIt request leaves it open."""
+
+
+FIELDS = {
+    "scene": Field(
+        {"oneOf": [_array(SHAPE), TEXT | {"description": "a MoveIt planning scene"}]},
+        write=scene_entries,
+        in_world=True,
+    ),
+    "start": Field(
+        {"oneOf": [NUMBERS, TEXT], "description": "joint values [rad or m], or a named pose"},
+        write=lambda value, folder: value.tolist(),
+        with_request=False,
+    ),
+    "goal": Field(
+        GOAL,
+        lambda data, setting: read_goal("goal", data, setting),
+        lambda goal, folder: goal_entry(goal),
+        in_world=True,
+        with_request=False,
+    ),
+    "allowed_contacts": Field(
+        OBJECT
+        | {
+            "additionalProperties": {"oneOf": [TEXTS, {"const": ALL_LINKS}]},
+            "description": "obstacles, each with the links that may touch it",
+        },
+        write=lambda scene, folder: contacts_entry(scene),
+    ),
+    "waypoints": Field(
+        _array(GOAL),
+        lambda data, setting: [
+            read_goal(*entry, setting) for entry in entries_of("waypoints", data, "goals")
+        ],
+        lambda goals, folder: [goal_entry(goal) for goal in goals],
+        in_world=True,
+        with_request=False,
+    ),
+    "blend": Field(
+        {"oneOf": [NUMBER, NUMBERS]},
+        write=lambda blend, folder: list(blend) if any(blend) else None,
+        with_request=False,
+    ),
+    "constraints": Field(
+        _array(_one_of({kind: _entry_schema(one) for kind, one in CONSTRAINTS.items()})),
+        lambda data, setting: [
+            _constraint(*entry) for entry in entries_of("constraints", data, "constraints")
+        ],
+        lambda constraints, folder: [constraint_entry(one) for one in constraints],
+        in_world=True,
+    ),
+    "moving": Field(
+        _array(OBJECT),
+        lambda data, setting: [
+            _moving(*entry, setting) for entry in entries_of("moving", data, "shapes with their motions")
+        ],
+        lambda moving, folder: [moving_entry(one, folder) for one in moving],
+        in_world=True,
+        with_request=False,
+    ),
+    "start_velocity": Field(NUMBERS, write=lambda value, folder: value.tolist(), with_request=False),
+    "payload": Field(
+        _object(PAYLOAD_FIELDS, "mass"),
+        lambda data, setting: Payload(**check_fields("payload", data, ("mass",), PAYLOAD_FIELDS)),
+        lambda payload, folder: payload_entry(payload),
+    ),
+    "clearance": Field(
+        NUMBER | {"minimum": 0, "maximum": 0.5, "description": "[m]"},
+        lambda data, setting: check_clearance(data),
+    ),
+    "views": Field(
+        _array(OBJECT | {"required": ["camera"]}),
+        _views,
+        lambda views, folder: [view_entry(view, folder) for view in views],
+        in_world=True,
+    ),
+    "unknown": Field({"enum": list(UNKNOWN_POLICIES)}),
+}
+"""Fields of problems in the order of files."""
+SETUP: dict[str, Schema] = {
+    "robot": TEXT | {"description": f"a URDF file, an added robot, or {', '.join(ROBOTS)}"},
+    "locked": OBJECT | {"additionalProperties": NUMBER},
+    "base": _object(POSE),
+    "tool": _object(TOOL_FIELDS),
+    "attached": _array(OBJECT | {"required": ["link"]}),
+    "request": TEXT | {"description": "a MoveIt motion plan request, in place of start and goal"},
+}
+"""Fields that make up the robot, its place and its request."""
+
+
+def problem_schema() -> Schema:
+    """The schema of a problem file, as JSON values, for editors that complete and check them.
+
+    It is made of the tables by which files are read. It says what fields there are; `load_problem` says what
+    is right.
+    """
+    shapes = {kind: _entry_schema(shape) for kind, shape in SHAPES.items()}
+    goal = {"anyOf": [TEXT, _array({"anyOf": [NUMBER, GOAL]}), _one_of(GOALS)]}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "RobotDiffuse problem",
+        **_object(SETUP | {name: field.schema for name, field in FIELDS.items()}, "robot", "scene"),
+        "anyOf": [{"required": ["start", "goal"]}, {"required": ["request"]}],
+        "$defs": {"shape": _one_of(shapes), "goal": goal, "pose": _object(GOAL_POSE)},
+    }

@@ -1,0 +1,540 @@
+"""Reads planning scenes and motion plan requests of MoveIt in YAML, as MotionBenchMaker and robowflex write
+them.
+
+Messages: PlanningScene and MotionPlanRequest in https://docs.ros.org/en/noetic/api/moveit_msgs/html/.
+Vectors may be lists or mappings (x, y, z), and quaternions are xyzw.
+"""
+
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.bounds import unit_quaternion, vector
+from robotdiffuse.core.errors import InputError, joined, located, shortened, shown, unknown_name
+from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.core.mesh_files import read_triangles
+from robotdiffuse.core.transforms import (
+    inverse,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    rotation_z_to,
+    transform,
+)
+from robotdiffuse.robots.bodies import AttachedBody
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
+from robotdiffuse.scenes.mesh import Mesh
+from robotdiffuse.scenes.octomap import cover_radius, occupied_voxels
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
+
+SCENE, REQUEST = "a planning scene", "a motion plan request"
+MATRIX, OCTOMAP = "allowed_collision_matrix", "<octomap>"
+"""Names in planning scenes: of the matrix, and in it of the octomap."""
+CONE_SIDES = 32
+"""Sides of the pyramid around a cone, which is 0.5 % wider than the cone."""
+PLANE_EXTENT, PLANE_THICKNESS = 20.0, 0.01
+"""Edge and thickness of the box below a plane [m]."""
+MAX_PLANES = 1000
+"""Most planes of a collision object; each is a box of its own."""
+NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
+TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
+"""Numbers of the types in messages (shape_msgs/SolidPrimitive)."""
+
+
+def mapping_of(where: str, value: object, *names: str) -> dict[str, Any]:
+    """The mapping, or the one in nested fields of it; None counts as empty, as in the messages."""
+    for name in names:
+        value = mapping_of(where, value).get(name)
+        where = name if where in (SCENE, REQUEST) else f"{where}.{name}"
+    if value is not None and not isinstance(value, dict):
+        raise InputError(f"{where} is {shown(value)}; it must be a mapping")
+    return value or {}
+
+
+def list_of(where: str, entry: dict[str, Any], name: str) -> list[Any]:
+    """The list in a field; None counts as empty."""
+    value = entry.get(name)
+    if value is not None and not isinstance(value, list):
+        raise InputError(f"{where}{name} is {shown(value)}; it must be a list")
+    return value or []
+
+
+def mappings_of(where: str, entry: dict[str, Any], name: str) -> list[tuple[str, dict[str, Any]]]:
+    """The mappings in the list in a field, each with its place."""
+    places = [(f"{where}{name}[{i}]", value) for i, value in enumerate(list_of(where, entry, name))]
+    return [(place, mapping_of(place, value)) for place, value in places]
+
+
+def xyz_of(where: str, value: object) -> Float[ndarray, "3"]:
+    return vector(where, "xyz", [value.get(axis) for axis in "xyz"] if isinstance(value, dict) else value, 3)
+
+
+def pose_of(
+    where: str, value: object, position: str = "position", orientation: str = "orientation"
+) -> Float[ndarray, "4 4"]:
+    """The transform of a geometry_msgs/Pose, or of a Transform with other names of its two fields."""
+    value = mapping_of(where, value)
+    turn = value.get(orientation)
+    xyzw = [turn.get(axis) for axis in "xyzw"] if isinstance(turn, dict) else turn
+    wxyz = np.roll(unit_quaternion(where, xyzw, orientation), 1)
+    return transform(xyz_of(f"{where}.{position}", value.get(position)), rotation_from_quaternion(wxyz))
+
+
+def joint_state(state: dict[str, Any], where: str) -> dict[str, float]:
+    """Joint values by name of the state of a robot."""
+    joints = mapping_of(where, state, "joint_state")
+    where = f"{where}.joint_state"
+    names = list_of(f"{where}.", joints, "name")
+    positions = vector(where, "position", list_of(f"{where}.", joints, "position"), len(names))
+    return dict(zip(map(str, names), positions.tolist(), strict=True))
+
+
+def frame_name(where: str, entry: dict[str, Any]) -> str:
+    """The name of the frame in the header of an entry."""
+    return str(mapping_of(where, entry, "header").get("frame_id") or "").removeprefix("/")
+
+
+def read_moveit_scene(
+    file: str | Path, robot: Robot | None = None, ignore_joints: bool = False
+) -> tuple[Scene, tuple[str, ...]]:
+    """The collision objects of a planning scene, in the frame of the robot's base, and notes on differences
+    between the scene's robot and `robot`.
+
+    The pose of the root of the robot's URDF comes from robot_state.multi_dof_joint_state, the pose of its
+    base relative to the root from the robot (None: base and root are the same), and frames from
+    fixed_frame_transforms and from the links that are fixed to the base. Contacts of the robot's links with
+    objects are allowed as in the allowed collision matrix; its pairs of links are ignored, because the robot
+    has its own. Raises InputError, naming file and object, for a missing or
+    damaged file, unknown frames, shapes that are not supported (prisms), and, unless
+    `ignore_joints`, joints that the robot lacks.
+    """
+    data = read_yaml(file)
+    with located(file):
+        notes = () if robot is None else scene_robot_notes(data, robot, ignore_joints)
+        links = () if robot is None else robot.link_names
+        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent, links), notes
+
+
+class MoveItFrames(dict[str, ndarray]):
+    """T_base_frame of the frames that objects of a planning scene may be given in; '' is the scene's own.
+
+    These are the scene's own frame, the frames that the file defines, and the links that fixed joints connect
+    with the robot's base. Looking up an unknown frame raises InputError, which lists the known frames, or
+    says why the pose of the robot's base in the scene is unknown.
+    """
+
+    def __init__(
+        self, robot: Robot | None, T_own_root: Float[ndarray, "4 4"], own: tuple[str, ...] = ("", "world")
+    ) -> None:
+        """own: names of the scene's own frame; T_own_root: pose of the URDF's root in it."""
+        super().__init__({} if robot is None else robot.above | robot.links_fixed_to_base)
+        self.links = frozenset(self)
+        """Frames of the robot, whose poses a file cannot change."""
+        T_base_root = np.eye(4) if robot is None else robot.T_base_root
+        self.lost = ""
+        """Why the pose of the scene's own frame is unknown; empty if it is known."""
+        if T_base_root is not None:
+            T_base_own = T_base_root @ inverse(T_own_root)
+            self.update({name: T_base_own for name in own if name not in self.links})
+        elif robot is not None:
+            self.lost = f"a joint moves {robot.base} in {robot.root}"
+
+    def of(self, where: str, entry: dict[str, Any]) -> Float[ndarray, "4 4"]:
+        """T_base_frame of the frame that the header of an entry names."""
+        name = frame_name(where, entry)
+        if name in self:
+            return self[name]
+        known = [frame for frame in self if frame]
+        if self.lost:
+            raise InputError(
+                f"frame_id of {where} is {shown(name)}, and the pose of the robot's base in it is unknown: "
+                f"{self.lost}; known frames: {', '.join(known)}"
+            )
+        raise unknown_name(f"frame_id of {where}:", name, known)
+
+
+def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
+    """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`.
+
+    The scene's own frame is the one in which robot_state.multi_dof_joint_state gives the pose of the robot,
+    by default `world`. Raises InputError if it has more than one transform, that of the robot's root.
+    """
+    if mapping_of(SCENE, data, "robot_state").get("attached_collision_objects"):
+        raise InputError("attached_collision_objects are for the start_state of a request")
+    where = "multi_dof_joint_state"
+    floating = mapping_of(SCENE, data, "robot_state", where)
+    transforms = list_of(f"{where}.", floating, "transforms")
+    if len(transforms) > 1:
+        raise InputError(f"{where} has {len(transforms)} transforms; it must have one, of the robot's root")
+    T_own_root = np.eye(4)
+    if transforms:
+        T_own_root = pose_of(f"{where}.transforms[0]", transforms[0], "translation", "rotation")
+    named = frame_name(where, floating)
+    root = "" if robot is None else robot.root or robot.base
+    frames = MoveItFrames(robot, T_own_root, ("", "world" if named in ("", root) else named))
+    for where, entry in mappings_of("", mapping_of(SCENE, data), "fixed_frame_transforms"):
+        child = str(entry.get("child_frame_id", "")).removeprefix("/")
+        T = pose_of(f"{where}.transform", entry.get("transform"), "translation", "rotation")
+        if not frames.lost and child not in frames.links:
+            frames[child] = frames.of(where, entry) @ T
+    return frames
+
+
+def moveit_scene(
+    data: object, frames: MoveItFrames, folder: Path, links: Collection[str] = (), contacts: object = ()
+) -> Scene:
+    """`read_moveit_scene` for a parsed file; names of mesh files are relative to `folder`.
+
+    links: names of the robot's links and held objects; contacts: allowed contacts besides those of the file,
+    as in `Scene`.
+    """
+    world = mapping_of(SCENE, data, "world")
+    shapes = _octomap(mapping_of("world", world, "octomap"), frames)
+    for i, entry in enumerate(list_of("world.", world, "collision_objects")):
+        given = mapping_of(f"collision object {i}", entry)
+        with located(f"collision object {given.get('id', i)}"):
+            shapes.extend(object_shapes(given, frames, folder))
+    names = dict.fromkeys(shape.name for shape in shapes)
+    allowed = matrix_contacts(mapping_of(SCENE, data, MATRIX), names, links)
+    given = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
+    return Scene(shapes, (*allowed.items(), *given))
+
+
+def matrix_contacts(
+    matrix: object, obstacles: Iterable[str], links: Collection[str]
+) -> dict[str, tuple[str, ...]]:
+    """For each obstacle, the links that may touch it; obstacles without any are left out.
+
+    An entry for a pair decides; without one, the defaults of its names do: contact is allowed if either has a
+    default and none forbids. Pairs of links, and names that are neither links nor obstacles, are ignored.
+    Raises InputError for a matrix that is not square.
+    """
+    matrix = mapping_of(MATRIX, matrix)
+    names, rows, default_names, defaults = (
+        list_of(f"{MATRIX}.", matrix, f"{part}entry_{what}")
+        for part in ("", "default_")
+        for what in ("names", "values")
+    )
+    # a row may be a list or a message AllowedCollisionEntry
+    rows = [
+        list_of(f"{MATRIX}.", row if isinstance(row, dict) else {"enabled": row}, "enabled") for row in rows
+    ]
+    if any(len(one) != len(names) for one in (rows, *rows)):
+        raise InputError(f"{MATRIX} has {len(names)} entry_names; entry_values must be square, of this size")
+    pairs = {
+        (str(one), str(other)): bool(value)
+        for one, row in zip(names, rows, strict=True)
+        for other, value in zip(names, row, strict=True)
+    }
+    default = dict(zip(map(str, default_names), map(bool, defaults), strict=False))
+
+    def allowed(link: str, obstacle: str) -> bool:
+        given = [default[name] for name in (link, obstacle) if name in default]
+        return pairs.get((link, obstacle), bool(given) and all(given))
+
+    found = {
+        obstacle: tuple(
+            link for link in links if allowed(link, OCTOMAP if obstacle == "octomap" else obstacle)
+        )
+        for obstacle in obstacles
+    }
+    return {obstacle: touching for obstacle, touching in found.items() if touching}
+
+
+def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
+    """The occupied voxels of an OctomapWithPose as a cloud of spheres around them; none without data."""
+    where = "world.octomap"
+    message = mapping_of(where, entry, "octomap")
+    data = list_of(f"{where}.octomap.", message, "data")
+    if not data:
+        return []
+    if not message.get("binary"):
+        raise InputError(f"{where} is not binary; publish it as a binary octomap (octomap_binary)")
+    numbers = vector(f"{where}.octomap", "data", data, len(data)).astype(np.int64)
+    edge = float(vector(f"{where}.octomap", "resolution", [message.get("resolution")], 1)[0])
+    T = frames.of(where, entry) @ pose_of(f"{where}.origin", entry.get("origin") or NO_POSE)
+    with located(where):
+        voxels = occupied_voxels((numbers % 256).astype(np.uint8).tobytes(), edge)
+        return [PointCloud(voxels, cover_radius(edge), name="octomap").moved(T)]
+
+
+def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> list[Shape]:
+    """The shapes of a CollisionObject, all with its name, in the frame of the robot's base.
+
+    folder: where names of mesh files begin.
+    """
+    T_base_object = frames.of("header", entry) @ pose_of("pose", entry.get("pose") or NO_POSE)
+    name = str(entry.get("id") or "object")
+    shapes: list[Shape] = []
+    for key, plural in (("plane", "planes"), ("primitive", "primitives"), ("mesh", "meshes")):
+        parts = mappings_of("", entry, plural)
+        poses = list_of("", entry, f"{key}_poses")
+        if key == "plane" and len(parts) > MAX_PLANES:
+            raise InputError(f"has {len(parts):,} planes; at most {MAX_PLANES:,} are read")
+        if not poses and (key == "plane" or entry.get("pose")):
+            poses = [NO_POSE] * len(parts)
+        if len(poses) != len(parts):
+            raise InputError(
+                f"has {len(parts)} {plural} and {len(poses)} {key}_poses; it must be one for each"
+            )
+        for i, ((where, part), pose) in enumerate(zip(parts, poses, strict=True)):
+            T = T_base_object @ pose_of(f"{key}_poses[{i}]", pose)
+            if key == "plane":
+                shapes.append(_plane(vector(where, "coef", part.get("coef"), 4), name).moved(T))
+                continue
+            placed = T[:3, 3], quaternion_from_rotation(T[:3, :3]), name
+            if key == "mesh":
+                shapes.append(Mesh(*_triangles(where, part, folder), *placed[:2], name=name))
+                continue
+            kind = part.get("type")
+            kind = TYPE_NUMBERS.get(kind, kind) if isinstance(kind, int) else kind
+            if not isinstance(kind, str) or kind not in PRIMITIVES:
+                raise unknown_name(f"type of {where}:", kind, PRIMITIVES)
+            count, build = PRIMITIVES[kind]
+            shapes.append(build(vector(where, "dimensions", part.get("dimensions"), count), *placed))
+    return shapes
+
+
+def _triangles(where: str, part: dict[str, Any], folder: Path) -> tuple[ndarray, ndarray]:
+    """Vertices and faces of a mesh."""
+    if "resource" in part:
+        file = str(part["resource"]).removeprefix("file://")
+        if "://" in file:
+            raise InputError(f"{where}.resource is {file}; it must be a file, or the mesh must have vertices")
+        vertices, faces = read_triangles(folder / file)
+        return vertices * vector(where, "dimensions", part.get("dimensions", [1, 1, 1]), 3), faces
+    rows = [xyz_of(f"{where}.vertices", row) for row in list_of(f"{where}.", part, "vertices")]
+    triangles = list_of(f"{where}.", part, "triangles")
+    indices = [t.get("vertex_indices") if isinstance(t, dict) else t for t in triangles]
+    faces = np.array([vector(where, "triangles", triangle, 3) for triangle in indices])
+    return np.array(rows).reshape(-1, 3), faces
+
+
+def _cone(size: Float[ndarray, "2"], xyz: Float[ndarray, "3"], wxyz: Float[ndarray, "4"], name: str) -> Mesh:
+    """A pyramid around a cone of height and radius [m] about its z axis, with the tip at half the height."""
+    height, radius = size
+    if not (size > 0).all():
+        raise InputError(f"dimensions of a cone are {shown(size)}; they must be positive")
+    angles = 2 * np.pi * np.arange(CONE_SIDES) / CONE_SIDES
+    ring = radius / np.cos(np.pi / CONE_SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
+    bottom = np.column_stack([ring, np.full(CONE_SIDES, -height / 2)])
+    vertices = np.concatenate([bottom, [[0, 0, -height / 2], [0, 0, height / 2]]])
+    one, following = np.arange(CONE_SIDES), np.roll(np.arange(CONE_SIDES), -1)
+    base = np.column_stack([following, one, np.full(CONE_SIDES, CONE_SIDES)])
+    side = np.column_stack([one, following, np.full(CONE_SIDES, CONE_SIDES + 1)])
+    return Mesh(vertices, np.concatenate([base, side]), xyz, wxyz, name=name)
+
+
+PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shape]]] = {
+    "box": (3, lambda size, xyz, wxyz, name: Box(xyz, size, wxyz, name)),
+    "sphere": (1, lambda size, xyz, wxyz, name: Sphere(xyz, size[0], name)),
+    "cylinder": (2, lambda size, xyz, wxyz, name: Cylinder(xyz, size[1], size[0], wxyz, name)),
+    "cone": (2, _cone),
+}
+"""For each type, the number of its dimensions and the shape (of cylinders and cones height and radius)."""
+
+
+def _plane(coefficients: Float[ndarray, "4"], name: str) -> Box:
+    """A large, thin box below the plane a x + b y + c z + d = 0; (a, b, c) points away from it.
+
+    Raises InputError if a, b and c are all zero.
+    """
+    normal = coefficients[:3]
+    length = np.linalg.norm(normal)
+    if length < 1e-9:
+        raise InputError(f"coef of a plane is {shown(coefficients)}; a, b and c must not all be zero")
+    normal = normal / length
+    center = -normal * (coefficients[3] / length + PLANE_THICKNESS / 2)
+    wxyz = quaternion_from_rotation(rotation_z_to(normal))
+    return Box(center, [PLANE_EXTENT, PLANE_EXTENT, PLANE_THICKNESS], wxyz, name)
+
+
+def moveit_model(data: object) -> str:
+    """The robot_model_name of a parsed planning scene; empty if it has none."""
+    return str((data.get("robot_model_name") if isinstance(data, dict) else None) or "")
+
+
+def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -> tuple[str, ...]:
+    """Notes on differences between a robot and the one of a parsed planning scene.
+
+    Raises InputError for joints that the robot lacks, unless `ignore_joints`. A different model name alone is
+    only noted: the same arm has many names, and all joints are known. Names of multi-dof joints are ignored:
+    they are virtual joints of an SRDF, whose transforms give the pose of the robot's root.
+    """
+    values = joint_state(mapping_of(SCENE, data, "robot_state"), "robot_state")
+    model = moveit_model(data)
+    notes = []
+    if model not in ("", robot.name):
+        notes.append(f"the scene's robot_model_name is {shortened(model)}; planned for {robot.name}")
+    notes += joint_notes("robot_state.joint_state", values, robot, model, ignore_joints)
+    for name, neutral in (("padding", 0), ("scale", 1)):
+        entries = mappings_of("", mapping_of(SCENE, data), f"link_{name}")
+        changed = [str(entry.get("link_name")) for _, entry in entries if entry.get(name, neutral) != neutral]
+        if changed:
+            notes.append(f"the scene's link_{name} of {joined(changed)} is ignored")
+    return tuple(notes)
+
+
+def joint_notes(
+    where: str, values: dict[str, float], robot: Robot, model: str, ignore_joints: bool
+) -> tuple[str, ...]:
+    """A note on joints that the robot lacks. Raises InputError for them unless `ignore_joints`.
+
+    A fixed joint of the robot counts as known if its value is zero.
+    """
+    kinds = {joint.name: joint.kind for joint in robot.joints}
+    lacking = [
+        name
+        for name, value in values.items()
+        if kinds.get(name) not in MOVING_KINDS and (name not in kinds or abs(value) > MIMIC_SLACK)
+    ]
+    if not lacking:
+        return ()
+    if ignore_joints:
+        return (f"{where}: ignored {joined(lacking)}, which {robot.name} lacks",)
+    of_model = f" (robot_model_name is {shortened(model)})" if model not in ("", robot.name) else ""
+    own = joined(name for name, kind in kinds.items() if kind in MOVING_KINDS)
+    raise InputError(
+        f"{where} has values of {joined(lacking)}, movable joints that {robot.name} lacks{of_model}; its own "
+        f"are {own}: give the robot that is meant, or ignore these joints (--ignore-joints, "
+        f"ignore_joints=True)"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class MoveItAttached:
+    """An object that the robot holds at the start."""
+
+    name: str
+    link: str
+    shapes: tuple[Shape, ...]
+    in_link: bool
+    """Whether the shapes are in the frame of the link; otherwise they are in the frame of the base, at the
+    start."""
+    touch_links: tuple[str, ...] = ()
+
+    def held_by(self, robot: Robot, start: list[float]) -> Robot:
+        """The robot that holds it at the start. touch_links that the robot lacks are ignored."""
+        shapes = self.shapes
+        if not self.in_link and self.link in robot.link_names:
+            T_link_base = inverse(link_pose(robot, np.array(start), self.link))
+            shapes = tuple(shape.moved(T_link_base) for shape in shapes)
+        touch = tuple(link for link in self.touch_links if link in robot.link_names)
+        T_link_body = shapes[0].solid()[0] if shapes else np.eye(4)
+        return robot.with_body(AttachedBody(self.name, self.link, T_link_body, shapes, touch))
+
+
+@dataclass(frozen=True, eq=False)
+class MoveItRequest:
+    """The content of a motion plan request. Either `joint_goals` is not empty or `pose_goal` is not None."""
+
+    start: dict[str, float]
+    """Joint values by name [rad] or [m], including fingers."""
+    joint_goals: tuple[dict[str, float], ...] = ()
+    """Alternative goals, each with joint values by name."""
+    pose_goal: tuple[str, Float[ndarray, "4 4"]] | None = None
+    """A link and its goal pose T_base_link."""
+    attached: tuple[MoveItAttached, ...] = ()
+    notes: tuple[str, ...] = ()
+    """Notes on parts of the request that are ignored."""
+
+    def robot_notes(self, robot: Robot, model: str, ignore_joints: bool) -> tuple[str, ...]:
+        """`scene_robot_notes` for a request; `model` is its scene's robot_model_name."""
+        notes = joint_notes("start_state.joint_state", self.start, robot, model, ignore_joints)
+        for i, goal in enumerate(self.joint_goals):
+            notes += joint_notes(f"goal_constraints[{i}]", goal, robot, model, ignore_joints)
+        return notes
+
+
+def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) -> MoveItRequest:
+    """Start, attached objects and goals of a parsed request; `frames` and `folder` are those of its scene.
+
+    Several joint goal constraints are alternative goals. A position and an orientation constraint of one link
+    are a pose goal at the centre of the region, whose size and tolerances are ignored. Raises InputError for
+    anything else, and for path constraints, because ignoring them would change the problem.
+    """
+    data = mapping_of(REQUEST, data)
+    for name in ("path_constraints", "trajectory_constraints"):
+        if any(mapping_of(REQUEST, data, name).values()):
+            raise InputError(f"{name} are not supported")
+    for name in ("reference_trajectories", "max_cartesian_speed"):
+        if data.get(name):
+            raise InputError(f"{name} is not supported; leave it out")
+    notes = []
+    for what in ("velocity", "acceleration"):
+        name = f"max_{what}_scaling_factor"
+        share = float(vector("request", name, [data.get(name) or 0], 1)[0])  # 0 means 1 in MoveIt
+        if not 0 <= share <= 1:
+            raise InputError(f"{name} is {shown(data[name])}; it must be a number from 0 to 1")
+        if 0 < share < 1:
+            notes.append(f"the request's {name} {share:g} is ignored: plan with {what}_scaling={share:g}")
+    state = mapping_of(REQUEST, data, "start_state")
+    attached = tuple(
+        _attached(where, entry, frames, folder)
+        for where, entry in mappings_of("", state, "attached_collision_objects")
+    )
+    start = joint_state(state, "start_state")
+    velocity = list_of("", mapping_of("start_state", state, "joint_state"), "velocity")
+    if any(velocity):
+        notes.append(
+            f"start_state.joint_state.velocity {shown(velocity)} is ignored: the motion begins at rest"
+        )
+    goals = mappings_of("", data, "goal_constraints")
+    if not goals:
+        raise InputError("goal_constraints is empty; it must hold at least one goal")
+    joint_goals, pose_goal = (), None
+    if len(goals) == 1 and goals[0][1].get("position_constraints"):
+        pose_goal = _pose_goal(*goals[0], frames)
+    else:
+        joint_goals = tuple(_joint_goal(*goal) for goal in goals)
+    return MoveItRequest(start, joint_goals, pose_goal, attached, tuple(notes))
+
+
+def _attached(where: str, entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> MoveItAttached:
+    link = str(entry.get("link_name") or "")
+    where, given = f"{where}.object", mapping_of(where, entry, "object")
+    in_link = frame_name(where, given) == link
+    if in_link:  # the shapes are already in the frame of the link
+        frames = MoveItFrames(None, np.eye(4), (link,))
+    with located(where):
+        shapes = tuple(object_shapes(given, frames, folder))
+    touch = tuple(map(str, list_of(f"{where}.", entry, "touch_links")))
+    return MoveItAttached(str(given.get("id") or "object"), link, shapes, in_link, touch)
+
+
+def _joint_goal(where: str, goal: dict[str, Any]) -> dict[str, float]:
+    if any(goal.get(f"{kind}_constraints") for kind in ("position", "orientation", "visibility")):
+        raise InputError(f"{where} must have joint_constraints alone, or be the only goal and a pose")
+    return {
+        str(entry.get("joint_name")): float(vector(at, "position", [entry.get("position")], 1)[0])
+        for at, entry in mappings_of(f"{where}.", goal, "joint_constraints")
+    }
+
+
+def _pose_goal(where: str, goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray]:
+    places, turns = (
+        mappings_of(f"{where}.", goal, f"{what}_constraints") for what in ("position", "orientation")
+    )
+    if len(places) != 1 or len(turns) != 1 or goal.get("joint_constraints"):
+        raise InputError(f"{where} must have one position and one orientation constraint, and no others")
+    [(at, place)], [(_, turn)] = places, turns
+    link = place.get("link_name")
+    if link != turn.get("link_name"):
+        raise InputError(
+            f"{where} constrains {link} and {turn.get('link_name')}; both must constrain one link"
+        )
+    if xyz_of("target_point_offset", place.get("target_point_offset") or [0, 0, 0]).any():
+        raise InputError(f"{at}.target_point_offset must be zero")
+    region = "constraint_region"
+    poses = mappings_of(f"{region}.", mapping_of(at, place, region), "primitive_poses")
+    if len(poses) != 1:
+        raise InputError(f"{where}: {region} has {len(poses)} primitive_poses; it must have one")
+    T_base_region = frames.of("header", place) @ pose_of(*poses[0])
+    turned = pose_of(where, {"position": [0, 0, 0], "orientation": turn.get("orientation")})
+    return str(link), transform(T_base_region[:3, 3], (frames.of("header", turn) @ turned)[:3, :3])
