@@ -30,8 +30,7 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.search.rrt import RRTConnectSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import base_spheres
-from robotdiffuse.problems.families.rop import ROP
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot

@@ -29,8 +29,7 @@ from robotdiffuse.datasets.loader import RopDataset
 from robotdiffuse.datasets.shards import SPLITS, Manifest, write_manifest, write_shard
 from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.factory import solve
-from robotdiffuse.problems.families.rop import ROP
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes

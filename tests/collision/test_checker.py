@@ -33,8 +33,7 @@ from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.collision.point_cloud_grid import THINNING
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families.family import base_spheres
-from robotdiffuse.problems.families.rop import ROP
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.mesh import Mesh

@@ -22,8 +22,7 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import ArmDistance, ForwardKinematics
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.problems.families.rop import ROP
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes

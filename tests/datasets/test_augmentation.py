@@ -6,7 +6,7 @@ import pytest
 from helpers.example_robots import example_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.datasets.rows import turned, turns_about_vertical
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes

@@ -17,7 +17,7 @@ from robotdiffuse.learning.guidance_kernel import OFF
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraint_kernel import DISTANCE
 from robotdiffuse.problems.constraints import Constraint
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.problems.projection_kernel import ANGLE_WEIGHT
 from robotdiffuse.robots import load_robot

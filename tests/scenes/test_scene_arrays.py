@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP_DENSE
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere

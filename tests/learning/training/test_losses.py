@@ -13,8 +13,7 @@ from robotdiffuse.learning.training.losses import (
     SurfacePoints,
     hinge,
 )
-from robotdiffuse.problems.families.rop import ROP
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene

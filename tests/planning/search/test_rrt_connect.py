@@ -16,8 +16,7 @@ from robotdiffuse.planning import start_goal
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.search.rrt import RRTConnect, RRTConnectSettings
 from robotdiffuse.planning.start_goal import retreat
-from robotdiffuse.problems.families.rop import ROP
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose

@@ -9,22 +9,22 @@ import pytest
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families import furniture
-from robotdiffuse.problems.families.cabinet import CABINET
-from robotdiffuse.problems.families.clutter import CLUTTER
-from robotdiffuse.problems.families.crate import CRATE
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.furniture import (
+    CABINET,
+    CLUTTER,
+    CRATE,
     FLOOR,
+    KITCHEN,
     REGION_MARGIN,
+    SHELF,
     SHOULDER,
+    TABLE,
     FurnishedScene,
     Furniture,
     Region,
     sample_target,
 )
-from robotdiffuse.problems.families.kitchen import KITCHEN
-from robotdiffuse.problems.families.shelf import SHELF
-from robotdiffuse.problems.families.table import TABLE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot

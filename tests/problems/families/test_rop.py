@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.problems.families.rop import ROP, Rop
-from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, Rop
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere

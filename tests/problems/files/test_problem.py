@@ -424,7 +424,7 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
     loaded = load_problem(written(tmp_path, {"robot": "panda", "scene": scene, "request": request}))
     assert loaded.robot.locked["panda_finger_joint2"] == 0.065
     assert isinstance(loaded.goal, JointGoal) and loaded.goal.positions[0, 0] == 1.2
-    with pytest.raises(InputError, match="(start|goal) cannot be combined with request"):
+    with pytest.raises(InputError, match=r"(start|goal) cannot be combined with request"):
         load_problem(written(tmp_path, GOOD | {"request": request}))
 
 

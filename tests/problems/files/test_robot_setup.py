@@ -167,7 +167,7 @@ def test_commands_plan_verify_simulate_and_draw(tmp_path: Path, monkeypatch: pyt
 
 WRONG = {
     "base of MoveIt": ({"base": {}, "scene": "scene.yaml"}, "base cannot be combined with MoveIt files"),
-    "base": ({"base": {"euler": [0, 0, 0]}}, "unknown field of base: .euler.; known: wxyz, xyz"),
+    "base": ({"base": {"euler": [0, 0, 0]}}, "unknown field of base: .euler.; known: rpy, wxyz, xyz"),
     "base xyz": ({"base": {"xyz": [0, 0]}}, r"base.xyz is \[0, 0\]; it must be 3 finite numbers"),
     "tool link": ({"tool": {"xyz": [0, 0, 0]}}, "tool has no link"),
     "unknown tool link": ({"tool": {"link": "hand"}}, "unknown link in tool.link: 'hand'"),

@@ -12,13 +12,15 @@ FAMILIES = Registry(
     "family",
     {
         "rop": Entry(f"{HERE}.rop:ROP", "the paper's: two spheres or cubes around the arm, and a floor"),
-        "rop_dense": Entry(f"{HERE}.rop_dense:ROP_DENSE", "3 to 12 smaller spheres or cubes of varied size"),
-        "shelf": Entry(f"{HERE}.shelf:SHELF", "from one compartment of a bookcase to another"),
-        "crate": Entry(f"{HERE}.crate:CRATE", "in and out of open-topped boxes on the ground"),
-        "table": Entry(f"{HERE}.table:TABLE", "between the objects on a table, and beneath it"),
-        "clutter": Entry(f"{HERE}.clutter:CLUTTER", "between many small objects on a table"),
-        "kitchen": Entry(f"{HERE}.kitchen:KITCHEN", "in ovens and cupboards and on a counter"),
-        "cabinet": Entry(f"{HERE}.cabinet:CABINET", "in cabinets of any proportions, with doors and drawers"),
+        "rop_dense": Entry(f"{HERE}.rop:ROP_DENSE", "3 to 12 smaller spheres or cubes of varied size"),
+        "shelf": Entry(f"{HERE}.furniture:SHELF", "from one compartment of a bookcase to another"),
+        "crate": Entry(f"{HERE}.furniture:CRATE", "in and out of open-topped boxes on the ground"),
+        "table": Entry(f"{HERE}.furniture:TABLE", "between the objects on a table, and beneath it"),
+        "clutter": Entry(f"{HERE}.furniture:CLUTTER", "between many small objects on a table"),
+        "kitchen": Entry(f"{HERE}.furniture:KITCHEN", "in ovens and cupboards and on a counter"),
+        "cabinet": Entry(
+            f"{HERE}.furniture:CABINET", "in cabinets of any proportions, with doors and drawers"
+        ),
     },
     group="robotdiffuse.families",
 )

@@ -7,6 +7,7 @@ table. `sample_target` samples poses with the fingers in a region.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.settings import Natural, Positive, Share
+from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Share
 from robotdiffuse.core.transforms import rotation_about, rotation_z_to, transform
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
@@ -53,6 +54,18 @@ PLACE_TRIES = 30
 """Samples of a free place for one object before the scene is sampled anew."""
 MIN_GAP = 0.01
 """Minimum distance between the objects on a table or on the ground [m]."""
+MIN_TABLE_HEIGHT, MIN_COUNTER_HEIGHT = 0.3, 0.25
+"""Minimum height of tables with a region beneath them, and of counters with one inside [m]."""
+MIN_OPENING = 0.16
+"""Minimum height and width of an opening that the hand is to enter [m]."""
+TOP_HEIGHT = 0.3
+"""Height of the region above a cabinet [m]."""
+MIN_REGION = 0.1
+"""Minimum edge of a region [m]."""
+DRAWER_SHAPES = 5
+Cell = tuple[float, float, float, float]
+"""Right and left side, bottom and top [m]."""
+AtLeastTwo = Annotated[int, Bound(least=2.0)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,6 +298,529 @@ def is_free(square: Rectangle, taken: list[Rectangle]) -> bool:
     return all(abs(x - u) >= a + c + MIN_GAP or abs(y - v) >= b + d + MIN_GAP for u, v, c, d in taken)
 
 
+def loose_in_cells(
+    settings: Furniture,
+    frame: FurnitureFrame,
+    depth: float,
+    cells: list[list[float]],
+    rng: Generator,
+    at_sides: bool = False,
+) -> list[Box | Sphere]:
+    """Random loose objects, at most one a cell (see `Cell`), whose free part becomes narrower. Objects that
+    would leave too little space are left out."""
+    shapes: list[Box | Sphere] = []
+    things = min(count(settings.objects, rng), len(cells))
+    for i in rng.permutation(len(cells))[:things]:
+        low, high, z, ceiling = cells[i]
+        loose = LooseObject(settings, rng, ceiling - z - MIN_GAP)
+        half = loose.half
+        if 3 * half > high - low:
+            continue
+        x = rng.uniform(min(half, depth / 2), max(depth - half, depth / 2))
+        if at_sides:
+            y = low + half if rng.random() < 0.5 else high - half
+        else:
+            y = rng.uniform(low + half, high - half)
+        shapes.append(loose.placed(frame, x, y, z))
+        cells[i][:2] = (y + half, high) if y < (low + high) / 2 else (low, y - half)
+    return shapes
+
+
+def edges(sizes: Float[ndarray, "n"], t: float) -> Float[ndarray, "n+1"]:
+    """Positions of the boards between gaps of these sizes, beginning with 0."""
+    return np.concatenate([[0.0], np.cumsum(sizes + t)])
+
+
 def count(numbers: tuple[int, int], rng: Generator) -> int:
     """A random number between two, inclusive."""
     return int(rng.integers(numbers[0], numbers[1] + 1))
+
+
+@dataclass(frozen=True)
+class Shelf(Furniture):
+    """A bookcase that faces the arm: boards between uprights, open in front. Lengths in [m].
+
+    Regions are its compartments and the space on its top board; the hand points into it. A compartment has at
+    most one loose object, at one of its sides; objects that would leave too little space are left out.
+    """
+
+    reach: Positive = 0.85
+    """Larger than for other furniture: a hand that points forward reaches farther than one that points
+    down."""
+    distance: PositiveRange = (0.45, 0.7)
+    """From the base to the middle of the front."""
+    boards: tuple[AtLeastTwo, AtLeastTwo] = (2, 4)
+    """Number of boards."""
+    lowest: tuple[NotNegative, NotNegative] = (0.0, 0.33)
+    """Height of the underside of the lowest board."""
+    row_height: PositiveRange = (0.26, 0.42)
+    """Free height between two boards, sampled for each row."""
+    columns: tuple[Count, Count] = (1, 3)
+    column_width: PositiveRange = (0.3, 0.5)
+    """Free width between two uprights, sampled for each column."""
+    depth: PositiveRange = (0.2, 0.35)
+    thickness: PositiveRange = (0.01, 0.03)
+    """Thickness of all boards of a shelf."""
+    back_share: Share = 0.6
+    """Fraction of the shelves with a back."""
+
+    @property
+    def max_obstacles(self) -> int:
+        return self.boards[1] + self.columns[1] + 2 + self.objects[1]
+
+    def build(self, rng: Generator) -> Build:
+        frame = FurnitureFrame(self, self.distance, rng)
+        depth, t = rng.uniform(*self.depth), rng.uniform(*self.thickness)
+        rows = rng.uniform(*self.row_height, count(self.boards, rng) - 1)
+        tops = rng.uniform(*self.lowest) + t + edges(rows, t)
+        columns = rng.uniform(*self.column_width, count(self.columns, rng))
+        sides = edges(columns, t)
+        sides -= (sides[-1] + t) / 2
+        left, right, height = sides[0], sides[-1] + t, tops[-1]
+        shapes: list[Box | Sphere] = [
+            frame.box((0.0, left + t, z - t), (depth, right - t, z), "board") for z in tops
+        ]
+        shapes += [frame.box((0.0, y, 0.0), (depth, y + t, height), "upright") for y in sides]
+        if rng.random() < self.back_share:
+            shapes.append(frame.box((depth, left, 0.0), (depth + t, right, height), "back"))
+        ceilings = [*(tops[1:] - t), height + self.row_height[1]]
+        compartments = [
+            [y + t, y + t + w, z, ceiling]
+            for z, ceiling in zip(tops, ceilings, strict=True)
+            for y, w in zip(sides[:-1], columns, strict=True)
+        ]
+        shapes += loose_in_cells(self, frame, depth, compartments, rng, at_sides=True)
+        regions = [
+            frame.region((0.0, low, z), (depth, high, ceiling), AHEAD)
+            for low, high, z, ceiling in compartments
+        ]
+        return shapes, regions
+
+
+SHELF = Shelf()
+
+
+@dataclass(frozen=True)
+class Crate(Furniture):
+    """Open crates on the ground or on blocks, with loose objects around them. Lengths in [m].
+
+    Regions are the insides of the crates and free spots on the ground; the hand points down.
+    """
+
+    object_height: PositiveRange = (0.1, 0.5)
+    crates: tuple[Count, Count] = (1, 2)
+    distance: PositiveRange = (0.4, 0.65)
+    """From the base to the middle of a crate, a loose object or a spot."""
+    length: PositiveRange = (0.25, 0.45)
+    """Inner length and width of a crate."""
+    height: PositiveRange = (0.12, 0.3)
+    """Inner height of the walls."""
+    thickness: PositiveRange = (0.01, 0.03)
+    """Thickness of the walls and the bottom of a crate."""
+    raised_share: Share = 0.4
+    """Fraction of the crates that stand on a block."""
+    block_height: PositiveRange = (0.05, 0.3)
+    spots: tuple[Natural, Natural] = (1, 2)
+    """Number of free spots on the ground."""
+    spot_size: PositiveRange = (0.12, 0.2)
+
+    @property
+    def max_obstacles(self) -> int:
+        return 6 * self.crates[1] + self.objects[1]
+
+    def build(self, rng: Generator) -> Build:
+        shapes: list[Box | Sphere] = []
+        regions: list[Region] = []
+        taken: list[Rectangle] = []
+        for _ in range(count(self.crates, rng)):
+            x, y = rng.uniform(*self.length, 2) / 2
+            h, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
+            frame = _free_place(self, float(np.hypot(x + t, y + t)), taken, rng)
+            low = 0.0
+            if rng.random() < self.raised_share:
+                low = rng.uniform(*self.block_height)
+                shapes.append(frame.box((-x - t, -y - t, 0.0), (x + t, y + t, low), "block"))
+            bottom, top = low + t, low + t + h
+            shapes.append(frame.box((-x - t, -y - t, low), (x + t, y + t, bottom), "bottom"))
+            for side in (-1, 1):
+                a, b = sorted((side * x, side * (x + t)))
+                shapes.append(frame.box((a, -y - t, bottom), (b, y + t, top), "wall"))
+                a, b = sorted((side * y, side * (y + t)))
+                shapes.append(frame.box((-x, a, bottom), (x, b, top), "wall"))
+            regions.append(frame.region((-x, -y, bottom), (x, y, top), DOWN))
+        for _ in range(count(self.spots, rng)):
+            half = rng.uniform(*self.spot_size) / 2
+            frame = _free_place(self, float(np.sqrt(2) * half), taken, rng)
+            regions.append(frame.region((-half, -half, 0.0), (half, half, 2 * half), DOWN))
+        for _ in range(count(self.objects, rng)):
+            loose = LooseObject(self, rng)
+            frame = _free_place(self, loose.half, taken, rng)
+            shapes.append(loose.placed(frame, 0.0, 0.0, 0.0))
+        return shapes, regions
+
+
+def _free_place(crate: Crate, half: float, taken: list[Rectangle], rng: Generator) -> FurnitureFrame:
+    """A free place on the ground for an object of this half width, which is then marked as taken.
+
+    Raises NoRoomError.
+    """
+    for _ in range(PLACE_TRIES):
+        frame = FurnitureFrame(crate, crate.distance, rng)
+        square = (float(frame.xy[0]), float(frame.xy[1]), half, half)
+        if is_free(square, taken):
+            taken.append(square)
+            return frame
+    raise NoRoomError
+
+
+CRATE = Crate()
+
+
+@dataclass(frozen=True)
+class Table(Furniture):
+    """A table with loose objects, sometimes divided by a wall or with a pillar. Lengths in [m].
+
+    Regions are free spots between the objects, where the hand points down, and the space beneath a table on
+    legs, where it points forward.
+    """
+
+    objects: tuple[Natural, Natural] = (3, 10)
+    object_height: PositiveRange = (0.08, 0.35)
+    distance: PositiveRange = (0.25, 0.4)
+    """From the base to the middle of the near edge of the table."""
+    height: PositiveRange = (0.1, 0.5)
+    """Height of the table's top."""
+    length: PositiveRange = (0.45, 0.7)
+    """Extent away from the arm."""
+    width: PositiveRange = (0.8, 1.4)
+    thickness: PositiveRange = (0.02, 0.04)
+    """Thickness of the top and of a dividing wall."""
+    legs_share: Share = 0.5
+    """Fraction of the tables with four legs; the others are solid."""
+    leg_width: PositiveRange = (0.04, 0.07)
+    wall_share: Share = 0.5
+    """Fraction of the tables with a wall, near the middle, that runs away from the arm."""
+    pillar_share: Share = 0.3
+    """Fraction of the tables with a pillar."""
+    divider_height: PositiveRange = (0.25, 0.6)
+    """Height of walls and pillars."""
+    pillar_width: PositiveRange = (0.06, 0.12)
+    spots: tuple[Natural, Natural] = (2, 4)
+    spot_size: PositiveRange = (0.12, 0.2)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.wall_share + self.pillar_share > 1:
+            raise InputError(
+                f"wall_share is {self.wall_share} and pillar_share {self.pillar_share}; "
+                "together they must be at most 1"
+            )
+
+    @property
+    def max_obstacles(self) -> int:
+        return 6 + self.objects[1]
+
+    def build(self, rng: Generator) -> Build:
+        frame = FurnitureFrame(self, self.distance, rng)
+        length, side = rng.uniform(*self.length), rng.uniform(*self.width) / 2
+        height, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
+        legs = rng.random() < self.legs_share
+        under = height - t
+        bottom = under if legs else 0.0
+        shapes: list[Box | Sphere] = [frame.box((0.0, -side, bottom), (length, side, height), "table")]
+        regions: list[Region] = []
+        if legs:
+            w = rng.uniform(*self.leg_width)
+            for x, y in ((0.0, -side), (0.0, side - w), (length - w, -side), (length - w, side - w)):
+                shapes.append(frame.box((x, y, 0.0), (x + w, y + w, under), "leg"))
+            if under > MIN_TABLE_HEIGHT:
+                inner = side - w
+                regions.append(frame.region((0.0, -inner, 0.0), (length / 2, inner, under), AHEAD))
+        surface = Surface(frame, length, side, height)
+        kind, top = rng.random(), height + rng.uniform(*self.divider_height)
+        if kind < self.wall_share:
+            start, y = rng.uniform(0.0, length / 3), rng.uniform(-side / 3, side / 3)
+            shapes.append(frame.box((start, y - t / 2, height), (length, y + t / 2, top), "wall"))
+            surface.taken.append(((start + length) / 2, y, (length - start) / 2, t / 2))
+        elif kind < self.wall_share + self.pillar_share:
+            w = rng.uniform(*self.pillar_width) / 2
+            x, y = surface.place(w, w, rng)
+            shapes.append(frame.box((x - w, y - w, height), (x + w, y + w, top), "pillar"))
+        regions += surface.spots(self.spots, self.spot_size, rng)
+        shapes += surface.loose_objects(self, rng)
+        return shapes, regions
+
+
+TABLE = Table()
+
+
+CLUTTER = Table(
+    objects=(10, 20),
+    object_width=(0.03, 0.1),
+    object_height=(0.04, 0.28),
+    wall_share=0.0,
+    pillar_share=0.2,
+)
+"""Many small objects close together; those in front hide most of those behind."""
+
+
+@dataclass(frozen=True)
+class Kitchen(Furniture):
+    """A counter against a wall, with ovens that are open in front, solid appliances and loose objects on it,
+    and cupboards above it, some with an open door. Lengths in [m].
+
+    Regions are the insides of ovens, of cupboards and of a counter that is open in front, where the hand
+    points forward, and free spots on the counter, where it points down.
+    """
+
+    reach: Positive = 0.85
+    """Larger than for other furniture: a hand that points forward reaches farther than one that points
+    down."""
+    objects: tuple[Natural, Natural] = (1, 5)
+    distance: PositiveRange = (0.3, 0.45)
+    """From the base to the middle of the near edge of the counter."""
+    height: PositiveRange = (0.05, 0.4)
+    """Height of the counter's top."""
+    depth: PositiveRange = (0.4, 0.55)
+    width: PositiveRange = (0.9, 1.5)
+    thickness: PositiveRange = (0.01, 0.03)
+    """Thickness of all boards and walls."""
+    open_share: Share = 0.6
+    """Fraction of the sufficiently high counters that are open in front."""
+    ovens: tuple[Natural, Natural] = (0, 2)
+    solids: tuple[Natural, Natural] = (0, 2)
+    """Number of solid appliances."""
+    appliance_width: PositiveRange = (0.3, 0.45)
+    """Width of ovens; solid appliances have between half of it and all of it."""
+    appliance_depth: PositiveRange = (0.22, 0.38)
+    appliance_height: PositiveRange = (0.22, 0.36)
+    cupboards: tuple[Natural, Natural] = (0, 3)
+    """Number of cupboards, side by side in the middle of the wall."""
+    cupboard_width: PositiveRange = (0.28, 0.45)
+    cupboard_depth: PositiveRange = (0.2, 0.33)
+    cupboard_height: PositiveRange = (0.26, 0.4)
+    above: PositiveRange = (0.38, 0.55)
+    """From the counter to the cupboards."""
+    door_share: Share = 0.3
+    """Fraction of the cupboards with a door, which is open."""
+    spots: tuple[Natural, Natural] = (1, 2)
+    spot_size: PositiveRange = (0.12, 0.2)
+
+    @property
+    def max_obstacles(self) -> int:
+        wall, hollow, cupboards = 1, 5, 3 + 2 * self.cupboards[1]
+        return wall + hollow * (1 + self.ovens[1]) + self.solids[1] + cupboards + self.objects[1]
+
+    def build(self, rng: Generator) -> Build:
+        frame = FurnitureFrame(self, self.distance, rng)
+        depth, side = rng.uniform(*self.depth), rng.uniform(*self.width) / 2
+        height, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
+        shapes: list[Box | Sphere] = []
+        regions: list[Region] = []
+
+        def hollow(low: Corner, high: Corner, name: str) -> None:
+            """Adds a box that is open in front, and its inside as a region."""
+            (x, y, z), (far, left, top) = low, high
+            shapes.append(frame.box(low, (far, left, z + t), name))
+            shapes.append(frame.box((x, y, top - t), high, name))
+            shapes.append(frame.box((x, y, z + t), (far, y + t, top - t), name))
+            shapes.append(frame.box((x, left - t, z + t), (far, left, top - t), name))
+            shapes.append(frame.box((far - t, y + t, z + t), (far, left - t, top - t), name))
+            regions.append(frame.region((x, y + t, z + t), (far - t, left - t, top - t), AHEAD))
+
+        if height > MIN_COUNTER_HEIGHT and rng.random() < self.open_share:
+            hollow((0.0, -side, 0.0), (depth, side, height), "counter")
+        else:
+            shapes.append(frame.box((0.0, -side, 0.0), (depth, side, height), "counter"))
+        hang = height + rng.uniform(*self.above)
+        top = self._cupboards(frame, depth, hang, t, shapes, regions, rng)
+        shapes.append(frame.box((depth, -side, 0.0), (depth + t, side, top), "wall"))
+        counter = Surface(frame, depth, side, height)
+        ovens, solids = count(self.ovens, rng), count(self.solids, rng)
+        for i in range(ovens + solids):
+            a, b = rng.uniform(*self.appliance_depth) / 2, rng.uniform(*self.appliance_width) / 2
+            b *= 1.0 if i < ovens else rng.uniform(0.5, 1.0)
+            (x, y), high = counter.place(a, b, rng), height + rng.uniform(*self.appliance_height)
+            low_corner, high_corner = (x - a, y - b, height), (x + a, y + b, high)
+            if i < ovens:
+                hollow(low_corner, high_corner, "oven")
+            else:
+                shapes.append(frame.box(low_corner, high_corner, "appliance"))
+        regions += counter.spots(self.spots, self.spot_size, rng)
+        shapes += counter.loose_objects(self, rng)
+        return shapes, regions
+
+    def _cupboards(
+        self,
+        frame: FurnitureFrame,
+        depth: float,
+        low: float,
+        t: float,
+        shapes: list[Box | Sphere],
+        regions: list[Region],
+        rng: Generator,
+    ) -> float:
+        """Adds the cupboards and their insides; returns the height of their top."""
+        widths = rng.uniform(*self.cupboard_width, count(self.cupboards, rng))
+        front, top = depth - rng.uniform(*self.cupboard_depth), low + rng.uniform(*self.cupboard_height)
+        if not len(widths):
+            return top
+        sides = edges(widths, t)
+        sides -= (sides[-1] + t) / 2
+        left, right = float(sides[0]), float(sides[-1]) + t
+        for z in (low, top - t):
+            shapes.append(frame.box((front, left, z), (depth, right, z + t), "cupboard"))
+        shapes += [
+            frame.box((front, y, low + t), (depth, y + t, top - t), "cupboard") for y in sides.tolist()
+        ]
+        for y, w in zip(sides[:-1].tolist(), widths.tolist(), strict=True):
+            regions.append(frame.region((front, y + t, low + t), (depth, y + t + w, top - t), AHEAD))
+            if rng.random() < self.door_share:  # open at a right angle, hinged on the left or the right
+                hinge = y if rng.random() < 0.5 else y + w + t
+                shapes.append(frame.box((front - w, hinge, low), (front, hinge + t, top), "door"))
+        return top
+
+
+KITCHEN = Kitchen()
+
+
+@dataclass(frozen=True)
+class Cabinet(Furniture):
+    """A grid of cells between thin or thick boards, from a desk to a tall bookcase. Lengths in [m].
+
+    A cell is open, has a door that is shut or stands at any angle, or a drawer that is pulled out. The
+    cabinet stands on the ground or on legs, or hangs. Regions are open cells, the insides of drawers, where
+    the hand points down, the top, and the space between the legs.
+    """
+
+    turn: Range = (-0.5, 0.5)
+    reach: Positive = 0.85
+    object_width: PositiveRange = (0.03, 0.14)
+    object_height: PositiveRange = (0.03, 0.35)
+    objects: tuple[Natural, Natural] = (0, 6)
+    distance: PositiveRange = (0.35, 0.65)
+    """From the base to the middle of the front."""
+    lowest: tuple[NotNegative, NotNegative] = (0.0, 0.7)
+    """Height of the underside of the lowest board of a cabinet that does not stand on the ground."""
+    ground_share: Share = 0.4
+    """Fraction of the cabinets whose lowest board is on the ground."""
+    legs_share: Share = 0.6
+    """Fraction of the other cabinets that have legs; the rest hang."""
+    rows: tuple[Count, Count] = (1, 4)
+    row_height: PositiveRange = (0.18, 0.55)
+    columns: tuple[Count, Count] = (1, 3)
+    column_width: PositiveRange = (0.24, 0.7)
+    depth: PositiveRange = (0.15, 0.5)
+    thickness: PositiveRange = (0.004, 0.05)
+    """Thickness of all boards; its logarithm is uniform."""
+    back_share: Share = 0.6
+    """Fraction of the cabinets with a back."""
+    top_share: Share = 0.85
+    """Fraction of the cabinets with a board on top."""
+    door_share: Share = 0.2
+    """Fraction of the cells with a door."""
+    door_angle: PositiveRange = (0.3, 2.8)
+    """Angle at which an open door stands [rad]."""
+    shut_share: Share = 0.3
+    """Fraction of the doors that are shut."""
+    drawer_share: Share = 0.15
+    """Fraction of the cells with a drawer, up to `max_drawers`. Beside drawers, doors open to a right angle
+    at most."""
+    max_drawers: Natural = 2
+    pulled: PositiveRange = (0.3, 0.95)
+    """How far a drawer is pulled out, as a fraction of the depth."""
+
+    @property
+    def max_obstacles(self) -> int:
+        boards, uprights, doors = self.rows[1] + 1, self.columns[1] + 1, self.rows[1] * self.columns[1]
+        legs, back = 4, 1
+        return boards + uprights + legs + back + doors + DRAWER_SHAPES * self.max_drawers + self.objects[1]
+
+    def build(self, rng: Generator) -> Build:
+        frame = FurnitureFrame(self, self.distance, rng)
+        depth, t = rng.uniform(*self.depth), float(np.exp(rng.uniform(*np.log(self.thickness))))
+        on_ground = rng.random() < self.ground_share
+        low = 0.0 if on_ground else rng.uniform(*self.lowest)
+        tops = low + t + edges(rng.uniform(*self.row_height, count(self.rows, rng)), t)
+        sides = edges(rng.uniform(*self.column_width, count(self.columns, rng)), t)
+        sides -= (sides[-1] + t) / 2
+        left, right, height = float(sides[0]), float(sides[-1]) + t, float(tops[-1])
+        boards = tops if rng.random() < self.top_share else tops[:-1]
+        shapes: list[Box | Sphere] = [
+            frame.box((0.0, left + t, z - t), (depth, right - t, z), "board") for z in boards.tolist()
+        ]
+        shapes += [frame.box((0.0, y, low), (depth, y + t, height), "upright") for y in sides.tolist()]
+        if rng.random() < self.back_share:
+            shapes.append(frame.box((depth, left, low), (depth + t, right, height), "back"))
+        regions: list[tuple[Corner, Corner, Float[ndarray, "3"]]] = []
+        if not on_ground and rng.random() < self.legs_share:
+            w = 2 * t
+            for x in (0.0, depth - w):
+                for y in (left, right - w):
+                    shapes.append(frame.box((x, y, 0.0), (x + w, y + w, low), "leg"))
+        if low > MIN_OPENING:
+            regions.append(((0.0, left + 2 * t, 0.0), (depth / 2, right - 2 * t, low), AHEAD))
+        if len(boards) == len(tops):
+            regions.append(((0.0, left, height), (depth, right, height + TOP_HEIGHT), AHEAD))
+        cells = [
+            (y + t, end, z, ceiling)
+            for z, ceiling in zip(tops[:-1].tolist(), (tops[1:] - t).tolist(), strict=True)
+            for y, end in zip(sides[:-1].tolist(), sides[1:].tolist(), strict=True)
+        ]
+        kinds = rng.random(len(cells))
+        drawers = np.flatnonzero(kinds < self.drawer_share)[: self.max_drawers]
+        widest = min(self.door_angle[1], np.pi / 2) if len(drawers) else self.door_angle[1]
+        free = []
+        for i, cell in enumerate(cells):
+            if i in drawers:
+                walls, inside = self._drawer(frame, cell, depth, t, rng)
+                shapes += walls
+                regions.append((*inside, DOWN))
+            elif kinds[i] > 1 - self.door_share:
+                shut = rng.random() < self.shut_share
+                angle = 0.0 if shut else rng.uniform(self.door_angle[0], widest)
+                shapes.append(_door(frame, cell, t, angle, rng.random() < 0.5))
+                free += [] if shut else [[*cell]]
+            else:
+                free.append([*cell])
+        shapes += loose_in_cells(self, frame, depth, free, rng)
+        regions += [((t, y, z), (depth, end, ceiling), AHEAD) for y, end, z, ceiling in free]
+        return shapes, [frame.region(*region) for region in regions if _is_wide(*region)]
+
+    def _drawer(
+        self, frame: FurnitureFrame, cell: Cell, depth: float, t: float, rng: Generator
+    ) -> tuple[list[Box | Sphere], tuple[Corner, Corner]]:
+        """The bottom, front, back and sides of a drawer that is pulled out of a cell, and the part of its
+        inside that is in front of the cabinet."""
+        y, end, z, ceiling = cell
+        x, top = -depth * rng.uniform(*self.pulled), z + (ceiling - z) * rng.uniform(0.4, 1.0)
+        far = x + depth
+        corners = (
+            ((x, y, z), (far, end, z + t)),
+            ((x, y, z + t), (x + t, end, top)),
+            ((far - t, y, z + t), (far, end, top)),
+            ((x + t, y, z + t), (far - t, y + t, top)),
+            ((x + t, end - t, z + t), (far - t, end, top)),
+        )
+        inside = (x + t, y + t, z + t), (min(0.0, far - t), end - t, top)
+        return [frame.box(a, b, "drawer") for a, b in corners], inside
+
+
+def _is_wide(low: Corner, high: Corner, approach: Float[ndarray, "3"]) -> bool:
+    """Whether the hand gets into a region."""
+    size = np.subtract(high, low)
+    return bool(size.min() > MIN_REGION and (approach is DOWN or size[1:].min() > MIN_OPENING))
+
+
+def _door(frame: FurnitureFrame, cell: Cell, t: float, angle: float, on_left: bool) -> Box:
+    """A door of a cell, open by an angle about its left or right edge [rad]."""
+    y, end, z, ceiling = cell
+    hinge, side = (end, -1.0) if on_left else (y, 1.0)
+    half = (end - y) / 2
+    middle = np.array([-half * np.sin(angle), hinge + side * half * np.cos(angle)])
+    low = (middle[0] - t / 2, middle[1] - half, z)
+    high = (middle[0] + t / 2, middle[1] + half, ceiling)
+    return frame.box(low, high, "door", side * angle)
+
+
+CABINET = Cabinet()

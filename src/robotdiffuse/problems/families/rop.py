@@ -166,3 +166,7 @@ class Rop(Ranges):
 
 
 ROP = Rop()
+
+
+ROP_DENSE = Rop(obstacles=(3, 12), sphere_radius=(0.08, 0.2), cube_side=(0.1, 0.3))
+"""More and smaller obstacles of varied size: in about half of these problems the straight line is blocked."""
