@@ -5,13 +5,16 @@ import signal
 import sys
 import time
 
+import numpy as np
+
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning import Entry
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.problems.problem import Problem
 
-SOLVES, RAISES, DIES, HANGS, TALKS, SEARCHES, EXITS = range(7)
+SOLVES, RAISES, DIES, HANGS, TALKS, SEARCHES, EXITS, EATS, KEEPS = range(9)
+kept: list[np.ndarray] = []
 
 
 class Faulty(RRTConnect):
@@ -25,6 +28,10 @@ class Faulty(RRTConnect):
         if seed == DIES:
             print("about to die", flush=True)
             os.kill(os.getpid(), signal.SIGKILL)
+        if seed == EATS:
+            np.ones(2**30)  # 8 GB
+        if seed == KEEPS:
+            kept.append(np.ones(2**26))  # 0.5 GB
         while seed == HANGS:
             time.sleep(1.0)
         context = PlanningContext(self.name, problem, PlanRequest(time_limit, seed))

@@ -15,13 +15,15 @@ ROOT = Path(__file__).parents[2]
 
 
 @contextmanager
-def serving(*arguments: str, **environment: str) -> Iterator[tuple[httpx.Client, subprocess.Popen]]:
+def serving(
+    *arguments: str, stderr: int = subprocess.DEVNULL, **environment: str
+) -> Iterator[tuple[httpx.Client, subprocess.Popen]]:
     """A client of a server that is ready, and its process, which ends afterwards."""
     paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
     process = subprocess.Popen(
         [sys.executable, "-m", "helpers.serving", "serve", "--port", "0", *arguments],
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=stderr,
         text=True,
         env=os.environ | {"PYTHONPATH": paths} | environment,
     )

@@ -22,6 +22,7 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.server import connection, worker
 from robotdiffuse.server.connection import Connection
+from robotdiffuse.server.settings import ServeSettings
 
 
 def answer(server: httpx.Client, sent: bytes) -> tuple[int, Any]:
@@ -131,6 +132,12 @@ def test_half_a_head_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     assert closed and written.startswith(b"HTTP/1.1 408") and b"took more than 0.05 s" in written
 
 
+def test_half_a_body_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = WHOLE[:-2] + b"Content-Length: 9\r\n\r\n{"
+    written, closed = talked(sent, monkeypatch)
+    assert closed and written.startswith(b"HTTP/1.1 408") and b"took more than 0.05 s" in written
+
+
 def test_silence_is_not_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     assert talked(b"", monkeypatch) == (b"", True)
 
@@ -189,7 +196,7 @@ def test_bytes_after_the_last_request_do_not_cut_its_answer_off(head: bytes) -> 
 def test_a_call_cancelled_before_it_began_is_left() -> None:
     """A call cancelled while its worker was still reading it went on planning, and the worker was killed."""
     shared = worker.Shared(cancelled=7)
-    worker.accept({}, 1.0, shared)
+    worker.accept({}, ServeSettings(), shared)
     with pytest.raises(worker.Cancelled):
         worker.respond(7, worker.PLAN, b"{}")
     assert worker.respond(8, worker.PLAN, b"{}").code == 400
@@ -199,7 +206,7 @@ def test_a_cancelled_call_is_left_when_it_checks_its_time(monkeypatch: pytest.Mo
     """A signal handler raised the exception anywhere in the call; inside a callback of compiled code it
     killed the worker."""
     shared = worker.Shared()
-    worker.accept({}, 1.0, shared)
+    worker.accept({}, ServeSettings(), shared)
 
     def planning(*_: object) -> worker.Answer:
         call = PlanningContext("aorrtc", Problem(box_arm(), Scene(), np.zeros(3), np.ones(3)))

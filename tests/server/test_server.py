@@ -5,9 +5,11 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ import pytest
 import robotdiffuse as rd
 from helpers import waiting
 from helpers.commands import run
-from helpers.faulty_planner import DIES, EXITS, HANGS, RAISES, SEARCHES
+from helpers.faulty_planner import DIES, EATS, EXITS, HANGS, KEEPS, RAISES, SEARCHES
 from helpers.serving import serving
 from robotdiffuse.cli.serve import served_robots
 from robotdiffuse.core.types import UNTIL
@@ -34,6 +36,8 @@ LEFT = [0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
 RIGHT = [-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
 JSON, LINES = {"Content-Type": "application/json"}, {"Content-Type": "application/x-ndjson"}
+PROMPT = 10.0
+"""For an answer that must not wait for other requests [s]."""
 TRAJECTORY = ("joint_names", "times", "positions", "velocities", "accelerations")
 
 
@@ -131,6 +135,8 @@ def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None
         ("/plan", asked(clearance=-1.0), 400, "clearance is -1.0"),
         ("/plan", asked(velocity_scaling=1e-300), 400, "velocity_scaling is 1e-300; it must be between"),
         ("/plan", asked(acceleration_scaling=1e-6), 400, "acceleration_scaling is 1e-06; it must be between"),
+        ("/plan", asked(rate=0), 400, "rate is 0; it must be a positive number, at most 100000"),
+        ("/plan", asked(rate=True), 400, "rate is True; it must be a positive number"),
         ("/plan", asked(jerk=1e-300), 400, "jerk is 1e-300; it must be at least 0.01"),
         ("/plan", {"problem": problem(robot="/etc/passwd")}, 400, "unknown robot '/etc/passwd'; known: "),
         ("/plan", {"problem": problem(robot="../panda")}, 400, "unknown robot"),
@@ -150,7 +156,7 @@ def test_a_batch_is_answered_line_by_line_in_order(server: httpx.Client) -> None
             400,
             "its numbers must be finite and within",
         ),
-        ("/plan", b" " * (2**20 + 1), 413, "it may have 1048576 bytes"),
+        ("/plan", b" " * (2**21 + 1), 413, "it may have 2097152 bytes"),
     ],
 )
 def test_wrong_requests_are_one_line(
@@ -177,7 +183,7 @@ def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -
     assert "robotdiffuse" in {planner["name"] for planner in server.get("/planners").json()}
     assert server.get("/health").json()["status"] == "ok"
     assert gauge(server, "workers_ready") == 1
-    page = server.get("/docs").text
+    page = server.get("/").text
     assert "/requests/{name}" in page and "http://" not in page and "https://" not in page
     description = server.get("/openapi.json").json()
     assert set(description["paths"]) >= {"/plan", "/verify", "/batch", "/robots"}
@@ -187,6 +193,129 @@ def test_lists_health_metrics_and_a_page_without_scripts(server: httpx.Client) -
     assert tuple(schemas["PlanRequest"]["properties"]["until"]["enum"]) == UNTIL
     assert set(schemas["PlanRequest"]["properties"]) == {"problem", *worker.ARGUMENTS}
     assert schemas["Error"]["required"] == ["error"] and "HTTPValidationError" not in schemas
+
+
+def test_the_interactive_page_has_an_answer_for_each_of_its_examples(server: httpx.Client) -> None:
+    """It fills requests with these; without its scripts it is the plain list."""
+    page = server.get("/docs").text
+    assert "SwaggerUIBundle(" in page and "pip install fastapi-offline" in page
+    assert "/requests/{name}" in page
+    for script in re.findall(r'"(/docs/scripts/[^"]+)"', page):
+        assert server.get(script).status_code == 200
+    schemas = server.get("/openapi.json").json()["components"]["schemas"]
+    fields = schemas["PlanRequest"]["properties"]
+    example = {name: field["default"] for name, field in fields.items() if name != "problem"}
+    example["problem"] = fields["problem"]["examples"][0]
+    assert server.post("/plan", json=example).json()["status"] == "solved"
+    assert "valid" in server.post("/verify", json=schemas["VerifyRequest"]["example"]).json()
+
+
+def test_rows_of_a_motion_at_a_rate(server: httpx.Client) -> None:
+    plain = server.post("/plan", json=asked(3)).json()
+    record = server.post("/plan", json=asked(3, rate=100)).json()
+    assert record["waypoints"] == plain["waypoints"]
+    times = np.array(record["times"])
+    assert np.allclose(times[:-1], np.arange(len(times) - 1) / 100) and record["duration"] == times[-1]
+    motion = {name: record[name] for name in TRAJECTORY}
+    assert server.post("/verify", json={"problem": problem(), "trajectory": motion}).json()["valid"]
+
+
+def cones(count: int) -> list[dict[str, Any]]:
+    cone = {"frame": "panda_hand", "axis": [0, 0, 1], "direction": [0, 0, 1], "angle": 3.0}
+    return [{"axis_cone": cone}] * count
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "count", "most"),
+    [
+        ("constraints", cones(5000), 5000, 50),
+        ("waypoints", [{"joints": LEFT}] * 1000, 1000, 200),
+        ("goal", {"any": [{"joints": LEFT}] * 2000}, 2000, 1000),
+    ],
+)
+def test_lists_of_a_problem_have_bounds(
+    server: httpx.Client, field: str, value: Any, count: int, most: int
+) -> None:
+    """5,000 constraints kept a worker busy for 29 s."""
+    answer = server.post("/plan", json=asked() | {"problem": problem(**{field: value})})
+    assert answer.status_code == 400
+    assert error(answer) == f"problem.{field} has {count} entries; a request may have {most}"
+
+
+def test_rows_of_motions_have_bounds(server: httpx.Client) -> None:
+    path = {"joint_names": ["a"], "positions": [[0]] * 100_001}
+    answer = server.post("/verify", json={"problem": problem(), "path": path})
+    assert answer.status_code == 400
+    assert error(answer) == "path.positions has 100001 rows; a request may have 100000"
+    dense = server.post("/plan", json=asked(3, rate=1e5))
+    assert dense.status_code == 400 and "an answer may have 20000 rows" in error(dense)
+
+
+def test_a_request_that_needs_too_much_memory_costs_its_worker(server: httpx.Client) -> None:
+    """One of 4.5 MB took 6.2 GB."""
+    renewed = gauge(server, "workers_renewed_total")
+    with ThreadPoolExecutor(2) as threads:
+        hungry = threads.submit(server.post, "/plan", json=asked(EATS, "faulty"))
+        after = threads.submit(server.post, "/plan", json=asked(3))
+        assert server.get("/health", timeout=PROMPT).status_code in (200, 503)
+    assert hungry.result().status_code == 413
+    assert error(hungry.result()) == "the request needs more memory than a worker may use, 2048 MB"
+    assert after.result().json()["status"] == "solved"
+    assert gauge(server, "workers_renewed_total") == renewed + 1
+
+
+def test_a_request_beyond_its_time_limit_is_stopped(server: httpx.Client) -> None:
+    lost = gauge(server, "workers_lost_total")
+    with ThreadPoolExecutor(1) as threads:
+        late = threads.submit(server.post, "/plan", json=asked(HANGS, "faulty", time_limit=0.1), timeout=60.0)
+        until(lambda: gauge(server, "workers_busy") == 1 or late.done())
+        assert server.get("/health", timeout=PROMPT).status_code == 200
+    assert late.result().status_code == 503
+    assert re.fullmatch(
+        r"the request was stopped after \d+\.\d s, 5 s beyond its time limit, and its worker replaced",
+        error(late.result()),
+    )
+    assert server.post("/plan", json=asked(3)).json()["status"] == "solved"
+    assert gauge(server, "workers_lost_total") == lost + 1
+
+
+def test_large_requests_take_little_time(server: httpx.Client) -> None:
+    keys = ", ".join(f'"k{i}": 0' for i in range(60_000))
+    for body in (
+        f'{{{keys}, "k0": 1}}',
+        '"' + "[{" * 500_000,
+        '{"problem": {"goal": "' + "\\u00e9" * 150_000,
+    ):
+        assert server.post("/plan", content=body, headers=JSON, timeout=PROMPT).status_code == 400
+
+
+def test_slow_bodies_take_no_place_in_the_queue(server: httpx.Client) -> None:
+    """Twenty clients that sent a byte a second filled the queue."""
+    head = (
+        b"POST /plan HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n"
+    )
+    address = server.base_url.host, server.base_url.port or 0
+    with ExitStack() as stack:
+        slow = [stack.enter_context(socket.create_connection(address, 60.0)) for _ in range(20)]
+        for client in slow:
+            client.sendall(head + b"Content-Length: 99\r\n\r\n{")
+        assert server.post("/plan", json=asked(3), timeout=PROMPT).json()["status"] == "solved"
+        for client in slow:
+            client.sendall(b" ")
+        assert slow[0].makefile("rb").readline().startswith(b"HTTP/1.1 408")
+    assert server.get("/health").json()["requests_waiting"] == 0
+
+
+def test_each_request_is_logged() -> None:
+    with serving("--workers", "1", stderr=subprocess.PIPE) as (client, process):
+        client.post("/plan", content=b"{}", headers=JSON | {"X-Request-ID": "mine\t1"})
+        client.get("/nothing%0Ahere?token=secret")
+        process.send_signal(signal.SIGTERM)
+        assert process.stderr is not None
+        lines = process.stderr.read().splitlines()
+    mine, nothing = [line for line in lines if " 127.0.0.1:" in line]
+    assert re.search(r" 127\.0\.0\.1:\d+ POST /plan 400 \d+\.\d{3} s 'mine\\t1'$", mine)
+    assert re.search(r" 127\.0\.0\.1:\d+ GET /nothing%0Ahere 404 \d+\.\d{3} s -$", nothing)
 
 
 def test_an_exception_is_one_line(server: httpx.Client) -> None:
@@ -267,10 +396,10 @@ def test_a_full_queue_says_when_to_try_again(server: httpx.Client) -> None:
 
 @pytest.mark.slow
 def test_a_worker_that_holds_too_much_memory_is_replaced_between_requests() -> None:
-    with serving("--workers", "1", "--max-worker-memory", "1") as (client, _):
-        for _ in range(2):
-            assert client.post("/plan", json=asked(3)).json()["status"] == "solved"
-        assert gauge(client, "workers_renewed_total") == 2 and gauge(client, "workers_lost_total") == 0
+    with serving("--workers", "1", "--max-worker-memory", "1000") as (client, _):
+        assert client.post("/plan", json=asked(KEEPS, "faulty")).json()["status"] == "solved"
+        assert client.post("/plan", json=asked(3)).json()["status"] == "solved"
+        assert gauge(client, "workers_renewed_total") == 1 and gauge(client, "workers_lost_total") == 0
 
 
 @pytest.mark.slow

@@ -105,5 +105,7 @@ def test_the_work_for_a_body_in_pieces_grows_with_their_number() -> None:
         return {"type": "http.request", "body": body, "more_body": bool(pieces)}
 
     scope = {"type": "http", "method": "POST", "headers": [(b"content-type", JSON.encode())]}
-    assert asyncio.run(read_body(Request(scope, receive), 300, JSON)) == b"x" * 300
+    pool = WorkerPool({}, ServeSettings(max_request_size=300))
+    assert asyncio.run(read_body(Request(scope, receive), pool, JSON)) == b"x" * 300
+    assert pool.arriving == 0
     assert Piece.asked < 3000

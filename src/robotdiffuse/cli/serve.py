@@ -43,7 +43,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         ("--max-request-size MB", "largest size of a request (default: 8 MB)", count, 8),
         (
             "--max-worker-memory MB",
-            "a worker that holds more memory than this after an answer is replaced (default: 2048 MB)",
+            "memory of a worker, at least 512; requests that need more are refused (default: 2048 MB)",
             count,
             2048,
         ),

@@ -99,6 +99,18 @@ class State(NamedTuple):
     jerks: Float[ndarray, "*n dof"]
 
 
+def check_sample_rate(rate: object) -> None:
+    """Raise InputError unless the rate is a number in (0, MAX_SAMPLE_RATE]."""
+    if (
+        not isinstance(rate, int | float | np.number)
+        or isinstance(rate, bool)
+        or not 0 < rate <= MAX_SAMPLE_RATE
+    ):
+        raise InputError(
+            f"rate is {shown(rate)}; it must be a positive number, at most {MAX_SAMPLE_RATE:g} [Hz]"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory(Value):
     """Positions, velocities and accelerations over time.
@@ -195,14 +207,7 @@ class Trajectory(Value):
         Validate the new motion: between its rows it may differ from this one. Raises InputError for a rate
         that is not in (0, MAX_SAMPLE_RATE].
         """
-        if (
-            not isinstance(rate, int | float | np.number)
-            or isinstance(rate, bool)
-            or not 0 < rate <= MAX_SAMPLE_RATE
-        ):
-            raise InputError(
-                f"rate is {shown(rate)}; it must be a positive number, at most {MAX_SAMPLE_RATE:g} [Hz]"
-            )
+        check_sample_rate(rate)
         if len(self.times) == 1:
             return self
         count = int(np.ceil((self.duration - TIME_TOLERANCE) * rate))

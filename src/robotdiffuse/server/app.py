@@ -2,22 +2,28 @@
 
 import asyncio
 import secrets
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from html import escape
+from importlib.util import find_spec
 from ipaddress import ip_address
 from math import ceil
+from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 from fastapi import FastAPI, Header, Request, Response
 from fastapi.openapi.constants import REF_TEMPLATE
-from fastapi.responses import JSONResponse, PlainTextResponse
+from fastapi.openapi.docs import get_swagger_ui_html
+from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse
+from fastapi.staticfiles import StaticFiles
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import shown
@@ -32,6 +38,7 @@ from robotdiffuse.server.answers import (
     send_lines,
     wait_for_disconnect,
 )
+from robotdiffuse.server.connection import REFUSED, log_access
 from robotdiffuse.server.schemas import (
     Cancelled,
     Error,
@@ -44,7 +51,7 @@ from robotdiffuse.server.schemas import (
     VerifyAnswer,
     VerifyRequest,
 )
-from robotdiffuse.server.settings import READ_TIMEOUT, ServeSettings
+from robotdiffuse.server.settings import MAX_ARRIVING, ServeSettings
 from robotdiffuse.server.worker import PLAN, VERIFY, Answer, failed
 from robotdiffuse.server.worker_pool import QueueFullError, WorkerPool
 
@@ -72,6 +79,10 @@ ERRORS = {
     500: "the worker failed on this request",
     503: "the server is stopping, or the request took too long",
 }
+NO_SCRIPTS = (
+    "This page becomes interactive with the scripts of Swagger UI, which the browser loads from "
+    "cdn.jsdelivr.net, or from this server if it has them: pip install fastapi-offline\n\n"
+)
 REQUEST_ERRORS = (400, 401, 408, 409, 413, 415, 421, 429, 500, 503)
 RequestID = Annotated[str, Header(alias=REQUEST_ID, description="names the request, to cancel it")]
 
@@ -82,6 +93,31 @@ class RequestError(Exception):
     def __init__(self, code: int, message: str, **headers: str) -> None:
         super().__init__(message)
         self.code, self.headers = code, headers
+
+
+class AccessLog:
+    """Middleware: logs a line for each request."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        began, code = time.monotonic(), CLIENT_GONE
+
+        async def noting(message: Message) -> None:
+            nonlocal code
+            if message["type"] == "http.response.start":
+                code = message["status"]
+            await send(message)
+
+        try:
+            await self.app(scope, receive, noting)
+        finally:
+            if scope["type"] == "http":
+                name = Request(scope).headers.get(REQUEST_ID, "")
+                target = f"{scope['method']} {scope['raw_path'].decode('latin-1')}"
+                code = scope.get("state", {}).get(REFUSED, code)
+                log_access(scope["client"], target, code, time.monotonic() - began, name)
 
 
 class AccessControl:
@@ -124,17 +160,19 @@ def make_app(pool: WorkerPool, robots: dict[str, Robot]) -> FastAPI:
         title="RobotDiffuse",
         version=__version__,
         description=ABOUT,
-        docs_url=None,  # FastAPI's pages load scripts from a CDN; this server also works offline
+        docs_url=None,  # see `_add_docs`
         redoc_url=None,
         redirect_slashes=False,
     )
     app.add_middleware(AccessControl, settings=pool.settings)
+    app.add_middleware(AccessLog)
     app.exception_handler(RequestError)(_request_error)
     app.exception_handler(QueueFullError)(_queue_full)
     app.exception_handler(HTTPException)(_http_error)
     app.exception_handler(Exception)(_unexpected)
     _add_requests(app, pool, pool.settings)
     _add_lists(app, pool, robots)
+    _add_docs(app)
     _describe_bodies(app)
     return app
 
@@ -170,8 +208,8 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
     running: dict[str, Callable[[], None]] = {}
 
     async def single(request: Request, endpoint: str, name: str) -> Response:
+        body = await read_body(request, pool, JSON)
         with pool.admit(1):
-            body = await read_body(request, settings.max_request_size, JSON)
             task = asyncio.ensure_future(pool.run(endpoint, body))
             with _cancellable(name, running, [task]):
                 answer = await answer_of(task, asyncio.ensure_future(wait_for_disconnect(request)))
@@ -212,18 +250,17 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
         soon as it and all before it are done."""
 
         async def write(send: Send) -> None:
-            with pool.admit(1):
-                body = await read_body(request, settings.max_request_size, LINES)
-                lines = [line for line in body.split(b"\n") if line.strip()]
-                if not 1 <= len(lines) <= settings.max_batch:
-                    raise RequestError(
-                        400, f"the batch has {len(lines)} lines; it must have 1 to {settings.max_batch}"
-                    )
-                at_once = min(len(lines), settings.workers)
-                with pool.admit(at_once - 1):
-                    tasks = plan_tasks(pool, lines, at_once)
-                    with _cancellable(name, running, tasks):
-                        await send_lines(send, tasks, asyncio.ensure_future(wait_for_disconnect(request)))
+            body = await read_body(request, pool, LINES)
+            lines = [line for line in body.split(b"\n") if line.strip()]
+            if not 1 <= len(lines) <= settings.max_batch:
+                raise RequestError(
+                    400, f"the batch has {len(lines)} lines; it must have 1 to {settings.max_batch}"
+                )
+            at_once = min(len(lines), settings.workers)
+            with pool.admit(at_once):
+                tasks = plan_tasks(pool, lines, at_once)
+                with _cancellable(name, running, tasks):
+                    await send_lines(send, tasks, asyncio.ensure_future(wait_for_disconnect(request)))
 
         return StreamedResponse(write)
 
@@ -270,10 +307,33 @@ def _add_lists(app: FastAPI, pool: WorkerPool, robots: dict[str, Robot]) -> None
     async def metrics() -> Response:
         return Response(pool.metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
+
+def _add_docs(app: FastAPI) -> None:
+    """A plain list of endpoints, and FastAPI's interactive page, whose scripts are those of the package
+    fastapi-offline if it is installed; else the browser loads them from the internet."""
+    urls: dict[str, Any] = {}
+    offline = find_spec("fastapi_offline")
+    if offline is not None and offline.origin is not None:
+        folder = Path(offline.origin).with_name("static")
+        app.mount("/docs/scripts", StaticFiles(directory=folder))
+        urls = {
+            "swagger_js_url": "/docs/scripts/swagger-ui-bundle.js",
+            "swagger_css_url": "/docs/scripts/swagger-ui.css",
+            "swagger_favicon_url": "/docs/scripts/favicon.png",
+        }
+    page = bytes(get_swagger_ui_html(openapi_url="/openapi.json", title=app.title, **urls).body).decode()
+    empty = '<div id="swagger-ui">'
+    assert empty in page
+
     @app.get("/", include_in_schema=False)
+    async def plain() -> Response:
+        return PlainTextResponse(endpoint_list(app))
+
     @app.get("/docs", include_in_schema=False)
     async def docs() -> Response:
-        return PlainTextResponse(endpoint_list(app))
+        return HTMLResponse(
+            page.replace(empty, f"{empty}<pre>{escape(NO_SCRIPTS + endpoint_list(app))}</pre>")
+        )
 
 
 def endpoint_list(app: FastAPI) -> str:
@@ -314,9 +374,10 @@ def _cancellable(
         cancel()
 
 
-async def read_body(request: Request, max_size: int, kind: str) -> bytes:
-    """The body of a request. Raises RequestError if it is too large, too slow or not of Content-Type
-    `kind`."""
+async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
+    """The body of a request. Raises RequestError if it is too large or not of Content-Type `kind`, or if too
+    much data of other requests is arriving. `Connection` ends requests that arrive slowly."""
+    max_size = pool.settings.max_request_size
     given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if given != kind:
         raise RequestError(415, f"Content-Type is {shown(given)}; it must be {kind}")
@@ -328,17 +389,17 @@ async def read_body(request: Request, max_size: int, kind: str) -> bytes:
         raise too_large
     body = bytearray()
     try:
-        async with asyncio.timeout(READ_TIMEOUT):
-            async for part in request.stream():
-                body += part
-                if len(body) > max_size:
-                    raise too_large
-    except TimeoutError:
-        raise RequestError(
-            408, f"the request took more than {READ_TIMEOUT:g} s to arrive", Connection="close"
-        ) from None
+        async for part in request.stream():
+            body += part
+            pool.arriving += len(part)
+            if len(body) > max_size:
+                raise too_large
+            if pool.arriving > MAX_ARRIVING * max_size:
+                raise RequestError(429, "too many requests are arriving", Connection="close")
     except ClientDisconnect:
         raise RequestError(CLIENT_GONE, "the client closed the connection") from None
+    finally:
+        pool.arriving -= len(body)
     return bytes(body)
 
 

@@ -1,20 +1,34 @@
 """Uvicorn's HTTP/1.1 connection, with errors as one line of JSON and timeouts for slow clients."""
 
 import asyncio
+import logging
 from typing import Any
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from robotdiffuse.core.errors import shown
 from robotdiffuse.server.settings import READ_TIMEOUT, WRITE_TIMEOUT
 from robotdiffuse.server.worker import failed
+
+LOG = logging.getLogger("robotdiffuse.server")
+REFUSED = "refused"
+"""State of a request whose connection has answered it: with this status code."""
+
+
+def log_access(
+    client: tuple[str, int] | None, target: str, code: int, seconds: float, request_id: str = ""
+) -> None:
+    """Log a line for a request: client, method and path, status code, duration and X-Request-ID."""
+    address = f"{client[0]}:{client[1]}" if client else "-"
+    LOG.info("%s %s %d %.3f s %s", address, target, code, seconds, shown(request_id) if request_id else "-")
 
 
 class Connection(H11Protocol):
     """Closes itself when the client stops sending a request or stops reading its answer."""
 
     _read_timer: asyncio.TimerHandle | None = None
-    """Runs while the application has no request."""
+    """Runs until a request is complete."""
     _write_timer: asyncio.TimerHandle | None = None
     """Runs while the write buffer is full."""
 
@@ -48,14 +62,15 @@ class Connection(H11Protocol):
         self._refuse(400, "not an HTTP/1.1 request, or its head is too large")
 
     def _watch(self) -> None:
-        if self.cycle is None or self.cycle.response_complete:
+        arriving = self.conn.their_state is h11.SEND_BODY
+        if arriving or self.cycle is None or self.cycle.response_complete:
             self._read_timer = self._read_timer or self.loop.call_later(READ_TIMEOUT, self._give_up)
         elif self._read_timer is not None:
             self._read_timer.cancel()
             self._read_timer = None
 
     def _give_up(self) -> None:
-        if self.conn.trailing_data[0]:
+        if self.conn.trailing_data[0] or self.conn.their_state is h11.SEND_BODY:
             self._refuse(408, f"the request took more than {READ_TIMEOUT:g} s to arrive")
         else:
             self.transport.close()
@@ -65,7 +80,10 @@ class Connection(H11Protocol):
         if self.transport.is_closing():
             return
         begun = self.cycle is not None and not self.cycle.response_complete
-        if begun:
+        if not begun:
+            log_access(self.client, "-", code, 0.0)
+        else:
+            self.scope.setdefault("state", {})[REFUSED] = code
             self.cycle.disconnected = True  # tells the application to stop
             self.cycle.message_event.set()
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):

@@ -3,9 +3,11 @@
 from dataclasses import asdict
 from typing import Any
 
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.motion_arrays import RATES, check_motion_arrays
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.scenes.files import check_fields
+from robotdiffuse.server.settings import MAX_ROWS
 from robotdiffuse.validation.report import Report
 
 MOTIONS = ("path", "trajectory")
@@ -19,6 +21,9 @@ def read_motion(name: str, data: object) -> Path | Trajectory:
     """
     fields = ("positions", "times", *RATES) if name == "trajectory" else ("positions",)
     values = check_fields(name, data, ("joint_names", *fields))
+    rows = values["positions"]
+    if isinstance(rows, list) and len(rows) > MAX_ROWS:
+        raise InputError(f"{name}.positions has {len(rows)} rows; a request may have {MAX_ROWS}")
     arrays = {field: values[field] for field in fields}
     names, checked = check_motion_arrays(values["joint_names"], arrays, f"{name}.")
     return Trajectory(names, **checked) if name == "trajectory" else Path(names, **checked)

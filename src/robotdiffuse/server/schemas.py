@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from robotdiffuse.core.types import CONVERGED, TIME, Status
+from robotdiffuse.core.types import CONVERGED, MAX_SAMPLE_RATE, TIME, Status
 from robotdiffuse.planning import DEFAULT_PLANNER
 
 PROBLEM: dict[str, Any] = {
@@ -19,6 +19,7 @@ PROBLEM: dict[str, Any] = {
 }
 WAYPOINTS = [PROBLEM["start"], PROBLEM["goal"]["joints"]]
 JOINT_NAMES = [f"panda_joint{i}" for i in range(1, 8)]
+VERIFY_EXAMPLE: Any = {"problem": PROBLEM, "path": {"joint_names": JOINT_NAMES, "positions": WAYPOINTS}}
 
 Rows = list[list[float]]
 Scaling = Annotated[float, Field(gt=0, le=1)]
@@ -50,6 +51,12 @@ class PlanRequest(_Request):
     jerk: float | None = Field(
         None, gt=0, description="largest jerk of any joint [rad/s³]; null: the robot's limits"
     )
+    rate: float | None = Field(
+        None,
+        gt=0,
+        le=MAX_SAMPLE_RATE,
+        description="rows per second of the answer's motion, which is validated so [Hz]; null: its own rows",
+    )
 
 
 class PathMotion(_Request):
@@ -70,6 +77,7 @@ class TrajectoryMotion(PathMotion):
 class VerifyRequest(_Request):
     """A problem, and a path, a trajectory or both."""
 
+    model_config = ConfigDict(json_schema_extra={"example": VERIFY_EXAMPLE})
     problem: ProblemField
     path: PathMotion | None = None
     trajectory: TrajectoryMotion | None = None

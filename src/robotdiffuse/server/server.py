@@ -1,6 +1,7 @@
 """Starts, runs and stops the server."""
 
 import asyncio
+import logging
 import signal
 import socket
 from collections.abc import Callable, Iterator
@@ -11,7 +12,7 @@ import uvicorn
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.app import make_app
-from robotdiffuse.server.connection import Connection
+from robotdiffuse.server.connection import LOG, Connection
 from robotdiffuse.server.settings import GRACE_TIME, KEEP_ALIVE_TIMEOUT, ServeSettings
 from robotdiffuse.server.worker_pool import WorkerPool
 
@@ -46,10 +47,15 @@ class _Server(uvicorn.Server):
 
 
 def serve(robots: dict[str, Robot], settings: ServeSettings, say: Callable[[str], None] = print) -> None:
-    """Answer requests until SIGTERM or Ctrl-C. `say` receives a line with the address, and one when ready.
+    """Answer requests until SIGTERM or Ctrl-C. `say` receives a line with the address, and one when ready;
+    standard error gets a line for each request.
 
     Raises InputError if the address cannot be listened on or no worker can be started.
     """
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.INFO)
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # TCP, for asyncio
     with listener:

@@ -3,22 +3,39 @@
 import os
 from dataclasses import dataclass
 from ipaddress import ip_address
+from typing import Annotated
 
-from robotdiffuse.core.settings import Count, Natural, Positive, Settings
+from robotdiffuse.core.settings import Bound, Count, Natural, Positive, Settings
 
-PREPARE_TIMEOUT = 300.0
-"""Time for a worker to read a request and compile code for it, until the worker is killed [s]."""
-GRACE_TIME = 10.0
-"""Time that a call may take beyond its time limit, e.g. for validation and timing, until its worker is killed
-[s]."""
+COMPILE_TIMEOUT, WARM_UP_TIMEOUT = 300.0, 60.0
+"""Time for a worker to compile code for a request, and to load code and weights, until it is killed [s]."""
+GRACE_TIME = 5.0
+"""Time that a call may take beyond its time limit, for reading the request, validation and timing, until its
+worker is killed [s]."""
 CANCEL_TIMEOUT = 1.0
 """Time for a worker to leave a cancelled call, until the worker is killed [s]."""
 READ_TIMEOUT = 10.0
-"""Time for a client to send a request [s]."""
+"""Time for a client to send a request, from its first byte [s]."""
 WRITE_TIMEOUT = 60.0
 """Time for a client to read an answer that is waiting for it [s]."""
 KEEP_ALIVE_TIMEOUT = 5
 """Time that an idle connection stays open [s]."""
+MAX_ARRIVING = 64
+"""Most data of incomplete requests, as a multiple of the largest request."""
+MAX_ENTRIES = {
+    "scene": 10_000,
+    "goal": 1000,
+    "waypoints": 200,
+    "constraints": 50,
+    "moving": 200,
+    "views": 20,
+    "attached": 50,
+}
+"""Most entries of the lists of a problem."""
+MAX_ROWS, MAX_ANSWER_ROWS = 100_000, 20_000
+"""Most rows of a motion in a request, and in an answer at its rate."""
+MAX_SEED = 2**32 - 1
+"""Largest seed that all random generators accept."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +56,9 @@ class ServeSettings(Settings):
     """Largest body of a request [bytes]."""
     max_batch: Count = 1000
     """Most lines of a batch."""
-    max_worker_memory: Count = 2 * 2**30
-    """Memory that a worker may hold after an answer [bytes]; one that holds more is replaced before its next
-    request."""
+    max_worker_memory: Annotated[int, Bound(least=512.0 * 2**20)] = 2 * 2**30
+    """Memory that a worker may use [bytes]: a request that needs more is refused. A worker that holds more
+    than half of it after an answer is replaced before its next request."""
     token: str = ""
     """Bearer token that requests must carry; "" for none."""
 

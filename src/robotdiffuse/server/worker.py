@@ -2,10 +2,13 @@
 
 import json
 import os
+import resource
 import signal
 import sys
 import time
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from ctypes import Structure, c_double, c_int64
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -14,11 +17,12 @@ from typing import Any, NamedTuple
 
 import orjson
 
+from robotdiffuse.core import loading
 from robotdiffuse.core.deadline import cancel_check, check_cancelled
 from robotdiffuse.core.errors import InputError, shortened, shown
-from robotdiffuse.core.input_files import parse_json
-from robotdiffuse.core.loading import compile_seconds
+from robotdiffuse.core.input_files import MEGABYTE, parse_json
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Trajectory, check_sample_rate
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
@@ -29,13 +33,19 @@ from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.server.motions import MOTIONS, read_motion, report_record
-from robotdiffuse.server.settings import GRACE_TIME
+from robotdiffuse.server.settings import (
+    COMPILE_TIMEOUT,
+    GRACE_TIME,
+    MAX_ANSWER_ROWS,
+    MAX_ENTRIES,
+    MAX_SEED,
+    WARM_UP_TIMEOUT,
+    ServeSettings,
+)
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import Verifier
 
 PLAN, VERIFY = "plan", "verify"
-MAX_SEED = 2**32 - 1
-"""Largest seed that all random generators accept."""
 
 
 class Answer(NamedTuple):
@@ -57,7 +67,7 @@ class Shared(Structure):
     cancelled: int
     """Number of the call to cancel."""
     due: float
-    """Monotonic time by which the running call will have ended [s]; 0 while code is compiled for it."""
+    """Monotonic time at which the worker is killed if its call is still running [s]."""
 
 
 class Cancelled(BaseException):
@@ -70,8 +80,7 @@ class _State:
 
     robots: dict[str, Robot]
     """Robots that requests may name."""
-    max_time_limit: float
-    """Largest time limit of a request [s]."""
+    settings: ServeSettings
     shared: Shared
 
 
@@ -79,18 +88,20 @@ _state: _State | None = None
 _warm: set[tuple[str, str]] = set()
 
 
-def prepare(robots: dict[str, Robot], max_time_limit: float, shared: Shared) -> None:
+def prepare(robots: dict[str, Robot], settings: ServeSettings, shared: Shared) -> None:
     """Set up a new worker process."""
-    accept(robots, max_time_limit, shared)
+    accept(robots, settings, shared)
+    most = settings.max_worker_memory
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     signal.signal(
         signal.SIGTERM, signal.SIG_IGN
     )  # service managers signal all processes; the server ends its workers itself
 
 
-def accept(robots: dict[str, Robot], max_time_limit: float, shared: Shared) -> None:
+def accept(robots: dict[str, Robot], settings: ServeSettings, shared: Shared) -> None:
     """Accept requests from now on; see `_State`."""
     global _state
-    _state = _State(robots, max_time_limit, shared)
+    _state = _State(robots, settings, shared)
 
 
 def warm_up() -> bool:
@@ -103,7 +114,7 @@ def warm_up() -> bool:
     goal[0] += (robot.upper[0] - start[0]) / 2
     far = Scene([Box([2.0, 2.0, 2.0], [0.1, 0.1, 0.1])])
     _warm_up_once(_planner(DEFAULT_PLANNER), Problem(robot, far, start, goal), name)
-    return compile_seconds() > 0
+    return loading.compile_seconds() > 0
 
 
 def respond(number: int, endpoint: str, body: bytes) -> Answer:
@@ -115,6 +126,10 @@ def respond(number: int, endpoint: str, body: bytes) -> Answer:
         if state.shared.cancelled == number:
             raise Cancelled
 
+    def compiling() -> None:
+        state.shared.due = time.monotonic() + COMPILE_TIMEOUT
+
+    loading.on_first_compilation = compiling
     try:
         with cancel_check(raise_if_cancelled):
             raise_if_cancelled()  # it may have been cancelled before it began
@@ -124,6 +139,10 @@ def respond(number: int, endpoint: str, body: bytes) -> Answer:
         return failed(400, str(error))
     except Cancelled:
         raise
+    except MemoryError:
+        most = state.settings.max_worker_memory
+        message = f"the request needs more memory than a worker may use, {most / MEGABYTE:.0f} MB"
+        return failed(413, message)._replace(memory=most)
     except BaseException as error:  # a SystemExit of a planner would end the server's event loop
         traceback.print_exc(file=sys.stderr)
         return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
@@ -153,27 +172,69 @@ def _record(body: bytes) -> object:
     return parse_json(text, "the request")
 
 
+def _problem(state: _State, record: Any) -> Problem:
+    """The problem of a request. Raises InputError if it is wrong or too large."""
+    for name, most in MAX_ENTRIES.items() if isinstance(record, dict) else ():
+        value = record.get(name)
+        if name == "goal" and isinstance(value, dict) and len(value) == 1:
+            [value] = value.values()
+        if isinstance(value, list | dict) and len(value) > most:
+            raise InputError(f"problem.{name} has {len(value)} entries; a request may have {most}")
+    return problem_from_record(record, state.robots)
+
+
 def answer_plan(state: _State, body: bytes) -> Answer:
     """The answer to a request to plan. Raises InputError for a bad request."""
+    began = time.monotonic()
     requested = check_fields("the request", _record(body), ("problem",), ARGUMENTS)
-    problem = problem_from_record(requested["problem"], state.robots)
-    given = {name: value for name, value in requested.items() if name not in ("problem", "planner")}
+    given = {name: value for name, value in requested.items() if name in CALL_ARGUMENTS}
     request = PlanRequest(**given)
-    if request.time_limit > state.max_time_limit:
-        most = f"it must be at most {state.max_time_limit:g} s here"
+    if request.time_limit > state.settings.max_time_limit:
+        most = f"it must be at most {state.settings.max_time_limit:g} s here"
         raise InputError(f"time_limit is {shown(request.time_limit)}; {most}")
+    rate = requested.get("rate")
+    if rate is not None:
+        check_sample_rate(rate)
+    state.shared.due = began + request.time_limit + GRACE_TIME
+    problem = _problem(state, requested["problem"])
     if request.seed > MAX_SEED:
         raise InputError(f"seed is {shown(request.seed)}; it must be at most {MAX_SEED}")
     planner = _planner(requested.get("planner", DEFAULT_PLANNER))
-    planner.prepare(problem.robot)
-    _warm_up_once(planner, problem, requested["problem"]["robot"])
-    state.shared.due = time.monotonic() + request.time_limit + GRACE_TIME
+    with _more_time(state, WARM_UP_TIMEOUT):
+        planner.prepare(problem.robot)
+        _warm_up_once(planner, problem, requested["problem"]["robot"])
     result: PlanResult = planner.plan(problem, **given)
-    return _answer(result.record(), result.status.value)
+    record = result.record()
+    if rate is not None and result.trajectory is not None:
+        motion = _resampled(problem, result.trajectory, rate)
+        record |= motion.record() | {"duration": motion.duration}
+    return _answer(record, result.status.value)
 
 
-ARGUMENTS = ("planner", *(field.name for field in fields(PlanRequest)))
+CALL_ARGUMENTS = tuple(field.name for field in fields(PlanRequest))
+ARGUMENTS = ("planner", "rate", *CALL_ARGUMENTS)
 """Fields of a plan request besides its problem."""
+
+
+def _resampled(problem: Problem, trajectory: Trajectory, rate: float) -> Trajectory:
+    """The motion with rows at `rate` [Hz]. Raises InputError if the validator rejects it."""
+    if trajectory.duration * rate > MAX_ANSWER_ROWS:
+        rows = f"for {trajectory.duration:.3g} s; an answer may have {MAX_ANSWER_ROWS} rows"
+        raise InputError(f"rate is {rate:g} Hz {rows}")
+    rows = trajectory.resample(rate)
+    violation = Verifier(problem).trajectory(rows).violation
+    if violation is not None:
+        raise InputError(f"rate is {rate:g} Hz; the motion with these rows is not valid: {violation.message}")
+    return rows
+
+
+@contextmanager
+def _more_time(state: _State, seconds: float) -> Iterator[None]:
+    """The block may take `seconds` [s], which do not count as time of the call."""
+    left = state.shared.due - time.monotonic()
+    state.shared.due = time.monotonic() + seconds
+    yield
+    state.shared.due = time.monotonic() + left
 
 
 def _planner(name: object) -> Planner:
@@ -197,11 +258,10 @@ def _warm_up_once(planner: Planner, problem: Problem, robot: str) -> None:
 def answer_verify(state: _State, body: bytes) -> Answer:
     """The answer to a request to validate. Raises InputError for a bad request."""
     values = check_fields("the request", _record(body), ("problem",), MOTIONS)
-    problem = problem_from_record(values["problem"], state.robots)
+    problem = _problem(state, values["problem"])
     motions = {name: read_motion(name, values[name]) for name in MOTIONS if name in values}
     if not motions:
         raise InputError("the request has neither path nor trajectory")
-    state.shared.due = time.monotonic() + state.max_time_limit + GRACE_TIME
     validator = Verifier(problem)
     reports: dict[str, Report] = {}
     for name, motion in motions.items():

@@ -19,11 +19,13 @@ from robotdiffuse.core.processes import SingleWorker
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server import worker
 from robotdiffuse.server.metrics import Metrics
-from robotdiffuse.server.settings import CANCEL_TIMEOUT, GRACE_TIME, PREPARE_TIMEOUT, ServeSettings
+from robotdiffuse.server.settings import CANCEL_TIMEOUT, GRACE_TIME, ServeSettings
 from robotdiffuse.server.worker import Answer, failed
 
 RESTART_DELAY = 1.0
 """Time between two attempts to start a worker [s]."""
+CHECK_INTERVAL = 0.1
+"""Time between two checks whether a call takes too long [s]."""
 INITIAL_REQUEST_SECONDS = 0.5
 """Assumed time of a request until some have been answered [s]."""
 STOPPING = "the server is stopping"
@@ -50,10 +52,10 @@ class StoppingError(Exception):
 class _Slot:
     """A worker process, and the memory through which its call can be cancelled."""
 
-    def __init__(self, robots: dict[str, Robot], max_time_limit: float) -> None:
+    def __init__(self, robots: dict[str, Robot], settings: ServeSettings) -> None:
         self.shared = multiprocessing.get_context("spawn").RawValue(worker.Shared)
         bare = {name: replace(robot) for name, robot in robots.items()}  # without compiled arrays
-        self.process = SingleWorker(worker.prepare, (bare, max_time_limit), (self.shared,))
+        self.process = SingleWorker(worker.prepare, (bare, settings), (self.shared,))
 
 
 class WorkerPool:
@@ -67,8 +69,10 @@ class WorkerPool:
         self.settings, self.metrics = settings, Metrics()
         self.ready = self.admitted = self.busy = 0
         """Workers that are ready; requests admitted; workers that answer a request."""
+        self.arriving = 0
+        """Data of incomplete requests [bytes]."""
         self.stopping = False
-        self._slots = [_Slot(robots, settings.max_time_limit) for _ in range(settings.workers)]
+        self._slots = [_Slot(robots, settings) for _ in range(settings.workers)]
         self._idle: list[_Slot] = []
         self._waiting: deque[asyncio.Future[_Slot]] = deque()
         self._numbers = itertools.count(1)
@@ -121,13 +125,14 @@ class WorkerPool:
         number, began = next(self._numbers), time.monotonic()
         current: Future[Answer] | None = None
         try:
-            slot.shared.due = 0.0
+            slot.shared.due = began + self.settings.max_time_limit + GRACE_TIME
             current = slot.process.submit(worker.respond, number, endpoint, body)
             answer = await self._result(slot, current)
         except TimeoutError:
             took = time.monotonic() - began
             self._spawn(self._replace_lost(slot))
-            return failed(503, f"the request was stopped after {took:.0f} s, and its worker replaced")
+            why = f"after {took:.1f} s, {GRACE_TIME:g} s beyond its time limit"
+            return failed(503, f"the request was stopped {why}, and its worker replaced")
         except BrokenProcessPool:
             self._spawn(self._replace_lost(slot))
             return failed(500, "the worker process died on this request, or was killed")
@@ -140,7 +145,7 @@ class WorkerPool:
             return failed(500, _described(error))
         finally:
             self.busy -= 1
-        if answer.memory > self.settings.max_worker_memory:
+        if answer.memory > self.settings.max_worker_memory / 2:
             self.metrics.renewed_workers.inc()
             self._spawn(self._renew(slot))
         else:
@@ -149,16 +154,13 @@ class WorkerPool:
         return answer
 
     async def _result(self, slot: _Slot, current: "Future[Answer]") -> Answer:
-        """The answer of a call. Raises TimeoutError if the call exceeds both the limit and its own announced
-        end."""
-        began, waiting = time.monotonic(), asyncio.wrap_future(current)
+        """The answer of a call. Raises TimeoutError if the call is still running when it is due."""
+        waiting = asyncio.wrap_future(current)
         waiting.add_done_callback(_retrieve_error)
-        until = began + self.settings.max_time_limit + GRACE_TIME
-        while time.monotonic() < until:
-            await asyncio.wait({waiting}, timeout=until - time.monotonic())
+        while time.monotonic() < slot.shared.due:
+            await asyncio.wait({waiting}, timeout=CHECK_INTERVAL)
             if waiting.done():
                 return waiting.result()
-            until = slot.shared.due or began + PREPARE_TIMEOUT
         raise TimeoutError
 
     async def _next_idle(self) -> _Slot:
