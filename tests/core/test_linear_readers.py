@@ -6,7 +6,7 @@ import pytest
 
 from robotdiffuse.core.errors import InputError, repeated
 from robotdiffuse.core.input_files import parse_json
-from robotdiffuse.core.motion_arrays import check_motion_arrays
+from robotdiffuse.core.types import check_motion_arrays
 from robotdiffuse.scenes.scene import MAX_CONTACT_LINKS, Scene
 from robotdiffuse.scenes.shapes import Box
 

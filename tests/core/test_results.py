@@ -182,7 +182,7 @@ DAMAGE = [
     ({"planning_time": "soon"}, "planning_time is 'soon'; it must be a finite number"),
     ({"progress": [[0.1]]}, "progress is an array of 1 x 1; it must be n x 2"),
     ({"reason": 7}, "reason is 7; it must be a string"),
-    ({"problem": [1]}, "problem is a list; it must be an object"),
+    ({"problem": [1]}, r"problem is \[1\]; it must be an object"),
 ]
 
 

@@ -58,7 +58,7 @@ class Search(Settings, name="search"):
         ({"levels": (0.1, 0.0)}, "search.levels is 0.0; it must be positive"),
         ({"levels": [0.0]}, "search.levels is 0.0; it must be positive"),
         ({"step": np.float32(-1)}, "search.step is -1.0; it must be positive"),
-        ({"order": "worst"}, "unknown search.order 'worst'; known: best, first"),
+        ({"order": "worst"}, "unknown search.order 'worst'; known: best, first; did you mean first?"),
         ({"grid": "round"}, "unknown search.grid 'round'; known: coarse, fine"),
         ({"grid_settings": Fine()}, "grid is coarse, but its settings are Fine; they must be Coarse"),
     ],
@@ -101,9 +101,9 @@ def test_json_and_back() -> None:
     ("values", "message"),
     [
         ({"stp": 1}, "file.stp is not a setting; known: step, clearance"),
-        ({"step": "far"}, "file.step is 'far'; it must be of type float"),
+        ({"step": "far"}, "file.step is 'far'; it takes float positive"),
         ({"inner": {"cells": 0}}, "cells is 0; it must be at least 1"),
-        ({"inner": {"cells": 1.5}}, "file.inner.cells is 1.5; it must be of type int"),
+        ({"inner": {"cells": 1.5}}, "file.inner.cells is 1.5; it takes int"),
         ({"grid": "fine", "grid_settings": {"cells": 2}}, "file.grid_settings.cells is not a setting"),
         ({"s" * 1000: 1}, f"file.{'s' * 57}... is not a setting"),
         ([], "must be a table of settings"),
@@ -130,9 +130,9 @@ def test_assignments() -> None:
             "search has no setting 'reach'; it has step=1.0, .*range=none, .*inner.cells=3, greedy=false",
         ),
         ("step", "'step' is not NAME=VALUE"),
-        ("step=big", "search.step is 'big'; it must be of type float"),
+        ("step=big", "search.step is 'big'; it takes float positive"),
         ("step=-1", "search.step is -1.0; it must be positive"),
-        ("greedy=1", "search.greedy is 1; it must be of type bool"),
+        ("greedy=1", "search.greedy is 1; it takes bool"),
     ],
 )
 def test_assignments_that_are_wrong(text: str, message: str) -> None:

@@ -12,13 +12,11 @@ from numpy import ndarray
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.certificates.checker import Findings, check
 from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof, Tolerances
-from robotdiffuse.core.bounds import MAX_RATE, numbers, within
+from robotdiffuse.core.bounds import MAX_RATE, numbers, one_line, within
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_json
-from robotdiffuse.core.motion_arrays import check_motion_arrays
-from robotdiffuse.core.one_line import one_line
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Path, Trajectory, check_motion_arrays
 from robotdiffuse.problems.problem import Problem
 
 FILE_MARK, VERSION = "robotdiffuse certificate", 1

@@ -30,10 +30,10 @@ MAX_YAML_SIZE = 16 * MEGABYTE
 """Parsing this much YAML takes ten seconds; the same JSON takes less than one [bytes]."""
 MAX_DEPTH = 64
 """Deepest nesting of lists and mappings."""
-MAX_VALUES = 2_000_000
-"""Most values in a YAML file after its aliases are expanded."""
 MAX_SHOWN_NAME = 300
 """Longest file name that a message shows in full [characters]."""
+MAX_VALUES = 2_000_000
+"""Most values in a YAML file after its aliases are expanded."""
 MAX_DIGITS = 30
 """Most digits of an integer."""
 
@@ -244,64 +244,63 @@ class _Composer:
         return value
 
     def _node(self, depth: int) -> Any:
-        event: Any = self.loader.get_event()
+        event, begun = self._event(), self.count
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self.anchors:
                 self._refuse(event, f"alias {shown(event.anchor)} has no anchor before it")
             value, size = self.anchors[event.anchor]
-            self._add(size, event)
-            return value
-        if event.tag is not None:
-            self._refuse(event, f"tag {shown(event.tag)} is not supported")
-        begun = self.count
-        self._add(1, event)
-        if isinstance(event, yaml.ScalarEvent):
-            value = self._scalar(event)
-        elif depth >= MAX_DEPTH:
-            _too_deep(self.where)
-        elif isinstance(event, yaml.SequenceStartEvent):
-            value = []
-            while not self.loader.check_event(yaml.SequenceEndEvent):
-                value.append(self._node(depth + 1))
-            self.loader.get_event()
+            self.count += size
         else:
-            value = {}
-            while not self.loader.check_event(yaml.MappingEndEvent):
-                key: Any = self.loader.get_event()
-                if not isinstance(key, yaml.ScalarEvent) or key.tag is not None:
-                    self._refuse(key, "a key is not a plain string")
-                if key.value in value:
-                    self._refuse(key, f"{key.value} appears twice")
-                value[key.value] = self._node(depth + 1)
-            self.loader.get_event()
+            value = self._value(event, depth)
+            self.count += 1
+        if self.count > MAX_VALUES:
+            self._refuse(event, f"it stands for more than {MAX_VALUES:,} values")
         if event.anchor is not None:
             self.anchors[event.anchor] = value, self.count - begun
         return value
+
+    def _value(self, event: Any, depth: int) -> Any:
+        loader = self.loader
+        if isinstance(event, yaml.ScalarEvent):
+            return self._scalar(event)
+        if depth >= MAX_DEPTH:
+            _too_deep(self.where)
+        if isinstance(event, yaml.SequenceStartEvent):
+            values = []
+            while not loader.check_event(yaml.SequenceEndEvent):
+                values.append(self._node(depth + 1))
+            loader.get_event()
+            return values
+        found: dict[str, Any] = {}
+        while not loader.check_event(yaml.MappingEndEvent):
+            key = self._event()
+            if not isinstance(key, yaml.ScalarEvent):
+                self._refuse(key, "a key is not a plain string")
+            if key.value in found:
+                self._refuse(key, f"{key.value} appears twice")
+            found[key.value] = self._node(depth + 1)
+        loader.get_event()
+        return found
+
+    def _event(self) -> Any:
+        event: Any = self.loader.get_event()
+        if getattr(event, "tag", None) is not None:
+            self._refuse(event, f"tag {shown(event.tag)} is not supported")
+        return event
 
     def _scalar(self, event: yaml.ScalarEvent) -> Any:
         text = event.value
         if not event.implicit[0]:
             return text
         kind = self.loader.resolve(yaml.ScalarNode, text, event.implicit).rpartition(":")[2]
-        node = yaml.ScalarNode("", text)
-        if kind == "null":
-            return None
-        if kind == "bool":
-            return self.loader.construct_yaml_bool(node)
-        if kind not in ("float", "int"):
+        if kind not in ("null", "bool", "float", "int"):
             return text
         if kind == "int":
             _check_digits(text, self.where)
         try:
-            construct = getattr(self.loader, f"construct_yaml_{kind}")
-            return construct(node)
+            return getattr(self.loader, f"construct_yaml_{kind}")(yaml.ScalarNode("", text))
         except ValueError:  # 0x_ has no digits
             self._refuse(event, f"{shown(text)} is not a number")
-
-    def _add(self, count: int, event: Any) -> None:
-        self.count += count
-        if self.count > MAX_VALUES:
-            self._refuse(event, f"it stands for more than {MAX_VALUES:,} values")
 
     def _refuse(self, event: Any, why: str) -> NoReturn:
         raise InputError(f"{self.where} is not valid YAML: {why} in line {event.start_mark.line + 1}")

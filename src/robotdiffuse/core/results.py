@@ -2,16 +2,26 @@
 
 import json
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path as FilePath
+from types import NoneType
 from typing import Any
 
 from robotdiffuse.core.bounds import MAX_RATE, rows
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, check_type, located, shown
 from robotdiffuse.core.input_files import read_json
-from robotdiffuse.core.motion_arrays import RATES, check_increasing, check_motion_arrays
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.types import Path, Status, Trajectory, Tree
+from robotdiffuse.core.types import (
+    RATES,
+    ROWS,
+    Path,
+    Status,
+    Trajectory,
+    Tree,
+    check_increasing,
+    check_motion_arrays,
+)
 
 PROBLEM_ENDINGS = (".yaml", ".yml", ".jsonl")
 """Endings of problem files that no result has."""
@@ -157,50 +167,84 @@ def load_result(file: str | FilePath) -> ResultFile:
     missing = [name for name in REQUIRED if name not in record]
     if missing:
         raise InputError(f"{file} is not a result file: {', '.join(missing)} missing")
-    try:
-        return ResultFile(_result(record), _optional(record, "problem", dict))
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from None
+    with located(file):
+        problem = record.get("problem")
+        check_type("problem", problem, (dict, NoneType), "an object")
+        return ResultFile(_result(record), problem)
+
+
+def _text(name: str, value: object) -> str:
+    if not isinstance(value, str):
+        raise InputError(f"{name} is {shown(value)}; it must be a string")
+    return value
+
+
+def _texts(name: str, value: object) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise InputError(f"{name} is {shown(value)}; it must be a list of strings")
+    return tuple(value)
+
+
+def _number(name: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{name} is {shown(value)}; it must be a finite number")
+    return float(value)
+
+
+def _index(name: str, value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise InputError(f"{name} is {shown(value)}; it must be a whole number from 0 on")
+    return value
+
+
+def _rows(name: str, value: object, count: int | None, columns: int) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, rows(name, value, count, columns, MAX_RATE).tolist()))
+
+
+READERS: dict[str, Callable[[str, Any], Any]] = {
+    "reason": _text,
+    "planner": _text,
+    "stage": _text,
+    "robot": _text,
+    "planning_time": _number,
+    "seed": lambda name, value: int(_number(name, value)),
+    "min_clearance": _number,
+    "scene_clearance": _number,
+    "self_clearance": _number,
+    "notes": _texts,
+    "goal_index": _index,
+    "progress": lambda name, value: _rows(name, value, None, 2) if value else (),
+    "refused": _text,
+    "assumption": _text,
+    "confidence": _number,
+    "swept_probability": _number,
+    "unknown_region": lambda name, value: _rows(name, value, 2, 3),
+}
+"""Fields that files hold as they are, in this order, and what reads them."""
+NONE_ALLOWED = {"progress"} | {one.name for one in fields(PlanResult) if one.default is None}
 
 
 def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any]:
-    record: dict[str, Any] = {
-        "status": result.status.value,
-        "reason": result.reason,
-        "planner": result.planner,
-        "stage": result.stage,
-        "robot": result.robot,
-        "planning_time": result.planning_time,
+    path = result.path
+    record: dict[str, Any] = {"status": result.status.value}
+    record |= {name: _plain(getattr(result, name)) for name in READERS}
+    record |= {
         "verified": result.solved,
-        "seed": result.seed,
         "path_length": result.path_length,
         "duration": result.duration,
         "stops": result.stops,
-        "min_clearance": result.min_clearance,
-        "scene_clearance": result.scene_clearance,
-        "self_clearance": result.self_clearance,
-        "notes": list(result.notes),
-        "goal_index": result.goal_index,
-        "progress": [list(found) for found in result.progress],
-        "refused": result.refused,
-        "assumption": result.assumption,
-        "confidence": result.confidence,
-        "swept_probability": result.swept_probability,
-        "unknown_region": None
-        if result.unknown_region is None
-        else [list(at) for at in result.unknown_region],
-        "joint_names": [],
-        "waypoints": None if result.path is None else result.path.positions.tolist(),
+        "joint_names": [] if path is None else list(path.joint_names),
+        "waypoints": None if path is None else path.positions.tolist(),
         "times": [],
-        "positions": [],
-        "velocities": [],
-        "accelerations": [],
+        **{name: [] for name in ROWS},
     }
-    if result.path is not None:
-        record["joint_names"] = list(result.path.joint_names)
     if result.trajectory is not None:
         record |= result.trajectory.record()
     return record if problem is None else record | {"problem": problem}
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(one) for one in value] if isinstance(value, tuple) else value
 
 
 def _result(record: dict[str, Any]) -> PlanResult:
@@ -211,43 +255,15 @@ def _result(record: dict[str, Any]) -> PlanResult:
     solved = status is Status.SOLVED
     if record["verified"] is not solved:
         raise InputError(f"verified is {shown(record['verified'])}, but status is {shown(status.value)}")
-    path = _path(record) if solved else None
-    trajectory = _trajectory(record) if solved and record.get("times") else None
-    return PlanResult(
-        status=status,
-        reason=_text(record, "reason"),
-        planner=_text(record, "planner"),
-        robot=_text(record, "robot"),
-        planning_time=_number(record, "planning_time"),
-        seed=int(_number(record, "seed")),
-        stage=_text(record, "stage") if "stage" in record else "",
-        path=path,
-        trajectory=trajectory,
-        min_clearance=_number_or_none(record, "min_clearance"),
-        scene_clearance=_number_or_none(record, "scene_clearance"),
-        self_clearance=_number_or_none(record, "self_clearance"),
-        notes=_texts(record, "notes") if "notes" in record else (),
-        goal_index=_index_or_none(record, "goal_index"),
-        progress=_progress(record.get("progress")),
-        refused=_text(record, "refused") if "refused" in record else "",
-        assumption=_text(record, "assumption") if "assumption" in record else "",
-        confidence=_number_or_none(record, "confidence"),
-        swept_probability=_number_or_none(record, "swept_probability"),
-        unknown_region=_box(record.get("unknown_region")),
-    )
-
-
-def _box(value: object) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    if value is None:
-        return None
-    low, high = rows("unknown_region", value, 2, 3).tolist()
-    return tuple(low), tuple(high)
-
-
-def _progress(value: object) -> tuple[tuple[float, float], ...]:
-    if not value:
-        return ()
-    return tuple((at, length) for at, length in rows("progress", value, None, 2, MAX_RATE).tolist())
+    values = {
+        name: read(name, record[name])
+        for name, read in READERS.items()
+        if name in record and not (record[name] is None and name in NONE_ALLOWED)
+    }
+    if solved:
+        values["path"] = _path(record)
+        values["trajectory"] = _trajectory(record) if record.get("times") else None
+    return PlanResult(status=status, **values)
 
 
 def _path(record: dict[str, Any]) -> Path:
@@ -262,41 +278,3 @@ def _trajectory(record: dict[str, Any]) -> Trajectory:
         raise InputError(f"times begin at {arrays['times'][0]:g} s; they must begin at 0")
     check_increasing(arrays["times"])
     return Trajectory(names, **arrays)
-
-
-def _optional(record: dict[str, Any], name: str, kind: type) -> Any:
-    value = record.get(name)
-    if value is not None and not isinstance(value, kind):
-        raise InputError(f"{name} is a {type(value).__name__}; it must be an object")
-    return value
-
-
-def _text(record: dict[str, Any], name: str) -> str:
-    if not isinstance(record[name], str):
-        raise InputError(f"{name} is {shown(record[name])}; it must be a string")
-    return record[name]
-
-
-def _texts(record: dict[str, Any], name: str) -> tuple[str, ...]:
-    value = record[name]
-    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise InputError(f"{name} is {shown(value)}; it must be a list of strings")
-    return tuple(value)
-
-
-def _number(record: dict[str, Any], name: str) -> float:
-    value = record[name]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{name} is {shown(value)}; it must be a finite number")
-    return float(value)
-
-
-def _number_or_none(record: dict[str, Any], name: str) -> float | None:
-    return None if record.get(name) is None else _number(record, name)
-
-
-def _index_or_none(record: dict[str, Any], name: str) -> int | None:
-    value = record.get(name)
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 0):
-        raise InputError(f"{name} is {shown(value)}; it must be a whole number from 0 on")
-    return value

@@ -9,17 +9,20 @@
 Each instance checks itself on creation; error messages name the field, its value and what would be right.
 """
 
+import ast
 import dataclasses
+import inspect
 import math
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from numbers import Integral, Real
 from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
-from robotdiffuse.core.field_docstrings import field_docstrings
 from robotdiffuse.core.input_files import parse_yaml
 from robotdiffuse.core.registry import Registry
 
@@ -136,13 +139,7 @@ class Settings:
         """
         prefix = f"{self.settings_name}." if self.settings_name else ""
         for name, hint in _hints(type(self)).items():
-            given = getattr(self, name)
-            value = _plain(given)
-            if _fits(hint, value):
-                object.__setattr__(self, name, value)
-            else:  # the error shows what was given
-                value = given
-            _check(prefix + name, hint, value, self)
+            object.__setattr__(self, name, _converted(prefix + name, hint, getattr(self, name), self))
 
     def to_json(self) -> dict[str, Any]:
         """All fields as plain JSON values."""
@@ -172,7 +169,7 @@ class Settings:
                 if kind is not None:
                     found[name] = kind.from_json(values[name], at)
                 else:
-                    found[name] = _typed(hints[name], values[name], at)
+                    found[name] = _converted(at, hints[name], values[name])
             elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
                 raise InputError(f"{where}.{name} is missing")
         return cls(**found)
@@ -205,39 +202,23 @@ class Settings:
 
         Raises InputError as `changed` does.
         """
-        known = {setting.name: setting.assignment for setting in self.describe()}
-        where = self.settings_name or type(self).__name__
-        changes: dict[str, Any] = {}
-        for name, value in self._flat(values):
-            if name not in known:
-                raise InputError(f"{where} has no setting {shown(name)}; it has {', '.join(known.values())}")
-            *outer, last = name.split(".")
-            inner = changes
-            for part in outer:
-                inner = inner.setdefault(part, {})
-            inner[last] = value
-        return self._merged(changes, where)
+        known = [setting.assignment for setting in self.describe()]
+        return self._replaced(values, self.settings_name or type(self).__name__, known)
 
-    def _flat(self, values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-        """Names and values of nested settings, with dots between the names."""
-        for key, value in values.items():
-            name = f"{prefix}{key}"
-            at: Any = self
-            for part in name.split("."):
-                at = getattr(at, part, None)
-            if isinstance(value, Mapping) and isinstance(at, Settings):
-                yield from self._flat(value, f"{name}.")
+    def _replaced(self: Given, values: Mapping[str, Any], where: str, known: list[str]) -> Given:
+        hints, found, within = _hints(type(self)), {}, dict[str, dict[str, Any]]()
+        for name, value in values.items():
+            first, dot, rest = str(name).partition(".")
+            nested = first in hints and isinstance(getattr(self, first), Settings)
+            if nested and (dot or isinstance(value, Mapping)):
+                within.setdefault(first, {}).update({rest: value} if dot else value)
+            elif nested or name not in hints:
+                root, _, path = f"{where}.{name}".partition(".")
+                raise InputError(f"{root} has no setting {shown(path)}; it has {', '.join(known)}")
             else:
-                yield name, value
-
-    def _merged(self: Given, changes: dict[str, Any], where: str) -> Given:
-        hints, found = _hints(type(self)), {}
-        for name, value in changes.items():
-            now = getattr(self, name)
-            if isinstance(now, Settings):
-                found[name] = now._merged(value, f"{where}.{name}")
-            else:
-                found[name] = _typed(hints[name], value, f"{where}.{name}")
+                found[name] = _converted(f"{where}.{name}", hints[name], value)
+        for name, changes in within.items():
+            found[name] = getattr(self, name)._replaced(changes, f"{where}.{name}", known)
         return dataclasses.replace(self, **found)  # type: ignore[type-var]
 
     def describe(self) -> list[Setting]:
@@ -272,15 +253,6 @@ def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     return hint, ()
 
 
-def _plain(value: Any) -> Any:
-    """The value with lists as tuples, and other kinds of numbers, such as NumPy's, as Python's."""
-    if isinstance(value, list | tuple):
-        return tuple(_plain(entry) for entry in value)
-    if isinstance(value, Real) and not isinstance(value, bool):
-        return int(value) if isinstance(value, Integral) else float(value)
-    return value
-
-
 def _fits(hint: Any, value: Any) -> bool:
     """Whether a value is of a type; entries of tuples are not looked at."""
     for option in _options(_split(hint)[0]):
@@ -291,30 +263,41 @@ def _fits(hint: Any, value: Any) -> bool:
         elif kind in (int, float):
             fits = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
         else:
-            fits = kind is Any or not isinstance(kind, type) or isinstance(value, kind)
+            kind = list | tuple if kind is tuple else kind
+            fits = kind is Any or isinstance(value, kind)
         if fits:
             return True
     return False
 
 
-def _check(where: str, hint: Any, value: Any, owner: object) -> None:
+def _converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
+    """The value as its field keeps it: lists as tuples, other kinds of numbers, such as NumPy's, as Python's.
+
+    owner: the settings that hold the field, once all their fields are set. Raises InputError for a value of
+    the wrong type or out of bounds.
+    """
     if not _fits(hint, value):
         raise InputError(f"{where} is {shown(value)}; it takes {_rule(hint)}")
-    if value is None:
-        return
-    for option in _options(hint):
-        bare, marks = _split(option)
-        for mark in marks:
-            _check_mark(where, mark, value, owner)
-        if get_origin(bare) is tuple and isinstance(value, tuple):
-            for entry in value:
-                _check(where, get_args(bare)[0], entry, owner)
-        elif get_origin(bare) in (Union, UnionType):
-            _check(where, bare, value, owner)
+    bare, marks = _split(hint)
+    kind, kinds = get_origin(bare), get_args(bare)
+    if kind in (Union, UnionType):
+        fitting = next(option for option in kinds if _fits(option, value))
+        value = _converted(where, fitting, value, owner)
+    elif kind is tuple:
+        if kinds[-1] is not Ellipsis and len(value) != len(kinds):
+            raise InputError(f"{where} is {shown(value)}; it must have {len(kinds)} entries")
+        value = tuple(_converted(where, kinds[0], entry, owner) for entry in value)
+    elif kind is dict:
+        value = {str(key): _converted(where, kinds[1], entry, owner) for key, entry in value.items()}
+    elif bare in (int, float):
+        value = bare(value)
+    for mark in marks:
+        _check_mark(where, mark, value, owner)
+    return value
 
 
 def _check_mark(where: str, mark: Any, value: Any, owner: object) -> None:
-    if isinstance(mark, Bound) and isinstance(value, int | float):
+    if isinstance(mark, Bound):
         problem = mark.problem(value)
         if problem is not None:
             raise InputError(f"{where} is {value}; it must be {problem}")
@@ -322,7 +305,7 @@ def _check_mark(where: str, mark: Any, value: Any, owner: object) -> None:
         raise InputError(f"{where} is (); it must have at least one entry")
     elif isinstance(mark, OneOf) and isinstance(value, str) and value not in mark.names:
         raise unknown_name(where, value, mark.names)
-    elif isinstance(mark, SettingsOf):
+    elif isinstance(mark, SettingsOf) and owner is not None and value is not None:
         name = getattr(owner, mark.field)
         wanted = mark.table.settings(name) if name in mark.table else None
         if wanted is not None and type(value) is not wanted:
@@ -346,30 +329,6 @@ def _settings_class(
     return None
 
 
-def _typed(hint: Any, value: Any, where: str) -> Any:
-    """The value converted to the field's type: lists become tuples, integers floats. Raises InputError for
-    other types."""
-    bare, _ = _split(hint)
-    options = [_split(option)[0] for option in _options(bare)]
-    if Any in options:
-        return value
-    for option in options:
-        if get_origin(option) is tuple and isinstance(value, list | tuple):
-            count = len(get_args(option))
-            if get_args(option)[-1] is not Ellipsis and len(value) != count:
-                raise InputError(f"{where} is {shown(value)}; it must have {count} entries")
-            return tuple(_typed(get_args(option)[0], entry, where) for entry in value)
-        if get_origin(option) is dict and isinstance(value, dict):
-            return {str(key): _typed(get_args(option)[1], entry, where) for key, entry in value.items()}
-    plain = [type(None) if option is None else get_origin(option) or option for option in options]
-    if type(value) in plain:
-        return value
-    if float in plain and type(value) is int:
-        return float(value)
-    wanted = " or ".join("none" if kind is type(None) else kind.__name__ for kind in plain)
-    raise InputError(f"{where} is {shown(value)}; it must be of type {wanted}")
-
-
 def _number(text: str) -> float | str:
     """The text as a number if it is one, else unchanged."""
     try:
@@ -391,3 +350,23 @@ def _rule(hint: Any) -> str:
             yield " ".join(names or [kind, *rules])
 
     return " or ".join(parts(hint))
+
+
+def field_docstrings(kind: type) -> dict[str, str]:
+    """The docstring below each field of a class and of its base classes."""
+    found: dict[str, str] = {}
+    for cls in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(cls):
+            continue
+        [tree] = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+        body = tree.body if isinstance(tree, ast.ClassDef) else []
+        for field, text in pairwise(body):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(field.target, ast.Name)
+                and isinstance(text, ast.Expr)
+                and isinstance(text.value, ast.Constant)
+                and isinstance(text.value.value, str)
+            ):
+                found[field.target.id] = " ".join(text.value.value.split())
+    return found

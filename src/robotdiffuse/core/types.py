@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path as FilePath
@@ -12,11 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import Value, numbers
-from robotdiffuse.core.errors import InputError, distinct, shown
-from robotdiffuse.core.one_line import one_line
+from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_DURATION, MAX_RATE, Value, numbers, one_line, rows
+from robotdiffuse.core.errors import InputError, distinct, joined, repeated, shown
 from robotdiffuse.core.output_files import check_output, write_atomically
-from robotdiffuse.core.splines import spline_rows
 
 ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
@@ -252,3 +251,93 @@ class Trajectory(Value):
         columns = (self.times[:, None], *(getattr(self, rows) for rows in ROWS))
         writer.writerows([repr(value) for value in row] for row in np.concatenate(columns, axis=1).tolist())
         return stream.getvalue()
+
+
+Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]
+"""Times, positions, velocities and accelerations."""
+
+
+def spline_rows(
+    controls: Float[ndarray, "m dof"],
+    step: float,
+    window: int = 1,
+    velocity: Float[ndarray, "dof"] | float = 0.0,
+) -> Rows:
+    """The uniform cubic B-spline whose control points are moving averages of the configurations of a motion
+    that ends at rest, `step` [s] apart, over `window` of them. Before these the arm moved with `velocity`.
+
+    Velocities and accelerations are weighted means of the motion's, and so within the same limits at every
+    time; jerks are constant between rows. The spline leaves the motion's path by no more than about a sixth
+    of the acceleration times `step` squared, and stays on straight lines.
+    """
+    before = np.arange(-window - 2, 0)[:, None] * step * np.broadcast_to(velocity, controls.shape[1])
+    moved = np.concatenate(
+        [
+            before,
+            controls - controls[0],
+            np.repeat(controls[-1:] - controls[0], window + 1, axis=0),
+        ]
+    )
+    total = np.cumsum(moved, axis=0)
+    points = (total[window:] - total[:-window]) / window
+    before, at, after = points[:-2], points[1:-1], points[2:]
+    q = controls[0] + (before + 4 * at + after) / 6
+    v, a = (after - before) / (2 * step), (after - 2 * at + before) / step**2
+    q[-1] = controls[-1]
+    v[0], v[-1], a[[0, -1]] = velocity, 0.0, 0.0
+    return step * np.arange(len(q)), q, v, a
+
+
+RATES = ("velocities", "accelerations")
+
+
+def check_motion_arrays(
+    joint_names: object, arrays: Mapping[str, object], where: str = ""
+) -> tuple[tuple[str, ...], dict[str, ndarray]]:
+    """The joint names and the arrays of a motion, as a tuple and as float64 arrays of equal length.
+
+    `arrays` has the positions first, under any name, and may have `times`, `velocities` and `accelerations`.
+    `where` precedes the names of fields in messages, e.g. "trajectory.". Raises InputError, naming the field,
+    for missing or repeated joint names, no rows, wrong shapes, and numbers that are not finite or too large.
+    Times may begin anywhere and need not increase; see `check_increasing`.
+    """
+    names = joint_names
+    if not isinstance(names, list | tuple) or not names or not all(isinstance(n, str) and n for n in names):
+        raise InputError(f"{where}joint_names is {shown(names)}; it must be a list of names, not empty")
+    twice = repeated(names)
+    if twice:
+        raise InputError(f"{where}joint_names has {joined(twice)} more than once")
+    checked: dict[str, ndarray] = {}
+    count = None
+    for name, value in arrays.items():
+        if name == "times":
+            checked[name] = _times(where + name, value, count)
+        else:
+            most = MAX_RATE if name in RATES else MAX_COORDINATE
+            checked[name] = rows(where + name, value, count, len(names), most, ", a column for each joint")
+        count = len(checked[name])
+    return tuple(names), checked
+
+
+def check_increasing(times: ndarray) -> None:
+    """Raise InputError if finite times do not strictly increase."""
+    backwards = np.flatnonzero(np.diff(times) <= 0)
+    if len(backwards):
+        i = int(backwards[0])
+        time, following = distinct(times[i], times[i + 1])
+        raise InputError(f"times do not increase: {time} s in row {i}, {following} s in row {i + 1}")
+
+
+def _times(name: str, value: object, count: int | None) -> ndarray:
+    times = numbers(value)
+    if times is None or times.shape != (count,):
+        raise InputError(f"{name} is {shown(value)}; it must be {count} finite numbers, one for each row")
+    if not np.isfinite(times).all():
+        row = int(np.flatnonzero(~np.isfinite(times))[0])
+        raise InputError(f"{name}[{row}] is {times[row]}; it must be a finite number")
+    with np.errstate(over="ignore"):
+        span = float(np.ptp(times))
+    if not span <= MAX_DURATION:
+        duration, limit = distinct(span, MAX_DURATION)
+        raise InputError(f"{name} span {duration} s; a motion must not last longer than {limit} s")
+    return times

@@ -9,8 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, joined, shortened
-from robotdiffuse.core.motion_arrays import check_increasing, check_motion_arrays
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Path, Trajectory, check_increasing, check_motion_arrays
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot

@@ -13,9 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import Value, numbers, rigid_transform
+from robotdiffuse.core.bounds import Value, numbers, rigid_transform, short
 from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
-from robotdiffuse.core.one_line import short
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.problems.constraints import CartesianLine, Constraint

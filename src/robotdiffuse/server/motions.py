@@ -4,8 +4,7 @@ from dataclasses import asdict
 from typing import Any
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.motion_arrays import RATES, check_motion_arrays
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import RATES, Path, Trajectory, check_motion_arrays
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.server.settings import MAX_ROWS
 from robotdiffuse.validation.report import Report

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.deadline import check_timing
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Settings
-from robotdiffuse.core.splines import Rows, spline_rows
+from robotdiffuse.core.types import Rows, spline_rows
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import timing_kernel
