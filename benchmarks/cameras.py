@@ -56,7 +56,7 @@ from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
-from robotdiffuse.planning.next_view import next_view, poses_around
+from robotdiffuse.planning.exploration.looks import next_view, poses_around
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import load_problems

@@ -44,7 +44,7 @@ from robotdiffuse.evaluation.methods import (
 from robotdiffuse.evaluation.runs import Clock, Fields, Method, Record, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.learning.motion_model import MAX_CLEARANCE, ClearanceFn, MotionModel
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import Problem

@@ -42,8 +42,8 @@ from robotdiffuse.evaluation.methods import fields_of, from_network, measure_of,
 from robotdiffuse.evaluation.runs import Fields, Method, Record, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings
+from robotdiffuse.planning.hybrid import RobotDiffuse
 from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import Case

@@ -19,7 +19,7 @@ from robotdiffuse.learning.checkpoint import load_completion, load_network
 from robotdiffuse.learning.completion import BITS, exported_completion
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.perception.voxel_grid import SHAPE
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.robots import load_robot

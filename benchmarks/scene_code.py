@@ -58,7 +58,7 @@ from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.loop import Processes, Validation, train
 from robotdiffuse.learning.training.planner import PlannerTask, model_settings
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.planning.hybrid import smooth_noise
 from robotdiffuse.planning.search.rrt import AORRTC
 from robotdiffuse.problems.held_out import Case, goal_of
 from robotdiffuse.problems.problem import Problem

@@ -49,7 +49,7 @@ print(result.solved, result.assumption != "", 0 < result.confidence <= 1)
 def test_the_network_shortens_in_the_first_call() -> None:
     """Its batches are drawn within one call, in a process that loaded nothing before."""
     code = """
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.hybrid import RobotDiffuse, RobotDiffuseSettings
 drawn, draw = [], RobotDiffuse.draw
 RobotDiffuse.draw = lambda *given: drawn.append(1) or draw(*given)
 RobotDiffuse(RobotDiffuseSettings(network_share=0.9)).plan(

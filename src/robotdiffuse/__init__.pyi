@@ -16,11 +16,11 @@ from .interop.depth_recording import read_depth_views as read_depth_views
 from .perception.depth_view import DepthView as DepthView
 from .planning import load_planner as load_planner
 from .planning import plan as plan
-from .planning.exploration.cameras import ArmCamera as ArmCamera
 from .planning.exploration.explorer import Explorer as Explorer
-from .planning.exploration.explorer import ExplorerSettings as ExplorerSettings
-from .planning.next_view import NextView as NextView
-from .planning.next_view import next_view as next_view
+from .planning.exploration.looks import NextView as NextView
+from .planning.exploration.looks import next_view as next_view
+from .planning.exploration.steps import ArmCamera as ArmCamera
+from .planning.exploration.steps import ExplorerSettings as ExplorerSettings
 from .planning.plan_many import plan_many as plan_many
 from .planning.reactive.replanner import Replanner as Replanner
 from .planning.reactive.replanner import ReplannerSettings as ReplannerSettings

@@ -20,7 +20,7 @@ from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.training.config import planner_training
 from robotdiffuse.learning.training.loop import TrainingRun
 from robotdiffuse.learning.weight_files import user_weights, weights_for
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.robots import load_robot
 

@@ -9,7 +9,7 @@ import robotdiffuse as rd
 from robotdiffuse.collision import exact_meshes, kernel_arrays
 from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_timing, deadline
 from robotdiffuse.core.types import Status
-from robotdiffuse.planning.pipeline import start_velocity
+from robotdiffuse.planning.pipeline import waypoints
 from robotdiffuse.planning.planner import one_of_each
 from robotdiffuse.planning.search.rrt import RRTConnect
 from robotdiffuse.robots.kinematics import link_pose
@@ -71,14 +71,14 @@ def test_a_motion_whose_timing_takes_too_long_is_a_time_out(
 
 def test_a_start_velocity_whose_timing_takes_too_long_is_a_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
     moving = rd.Problem(PANDA, rd.Scene(), LEFT, RIGHT, start_velocity=-0.1 * np.eye(7)[0])
-    attempt = start_velocity.attempt
+    attempt = waypoints.attempt
 
     def then_slow(*arguments: object) -> object:
         found = attempt(*arguments)  # type: ignore[arg-type]
         monkeypatch.setattr(speed_limits, "SECONDS_PER_ROW", 1e3)
         return found
 
-    monkeypatch.setattr(start_velocity, "attempt", then_slow)
+    monkeypatch.setattr(waypoints, "attempt", then_slow)
     result = RRTConnect().plan(moving, 20.0)
     assert result.status is Status.TIMEOUT and "too short for timing" in result.reason
 

@@ -35,8 +35,8 @@ from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name,
 from robotdiffuse.evaluation.runs import Record, RecordFile, Run, read_records
 from robotdiffuse.learning.weight_files import BUNDLED
 from robotdiffuse.planning import PLANNERS
-from robotdiffuse.planning.diffusion.diffusion import Diffusion
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.planning.diffusion import Diffusion
+from robotdiffuse.planning.hybrid import RobotDiffuse
 from robotdiffuse.planning.search.rrt import AORRTCSettings, RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length

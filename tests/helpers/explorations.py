@@ -5,8 +5,7 @@ from functools import cache
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.planning.exploration.recorded import RecordedExplorer
-from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+from robotdiffuse.planning.exploration.simulated import RecordedExplorer, camera_beside, explore, wrist_camera
 from robotdiffuse.planning.exploration.steps import ExplorerSettings
 
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])

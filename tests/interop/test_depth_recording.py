@@ -19,8 +19,7 @@ from robotdiffuse.interop.depth_recording import (
 )
 from robotdiffuse.interop.mcap_file import McapWriter
 from robotdiffuse.perception.occupancy_map import OccupancyMap
-from robotdiffuse.planning.exploration.recorded import RecordedExplorer
-from robotdiffuse.planning.exploration.simulated import camera_beside, explore, wrist_camera
+from robotdiffuse.planning.exploration.simulated import RecordedExplorer, camera_beside, explore, wrist_camera
 from robotdiffuse.planning.exploration.steps import ExplorerSettings
 
 PANDA = rd.load_robot("panda")

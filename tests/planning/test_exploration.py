@@ -16,11 +16,9 @@ from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_with
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN
 from robotdiffuse.perception.visibility import surface_balls
 from robotdiffuse.perception.voxel_grid import FINE_SHAPE, LAYERS_BELOW, MAP, sweep
-from robotdiffuse.planning.exploration.goal_seen import GoalSeen
-from robotdiffuse.planning.exploration.looks import best_looks
-from robotdiffuse.planning.exploration.prediction import PROBABILITY_BELOW
-from robotdiffuse.planning.exploration.reachable import ReachableTree
-from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, hardly_seen, not_seen_free
+from robotdiffuse.planning.exploration.explorer import PROBABILITY_BELOW
+from robotdiffuse.planning.exploration.looks import ReachableTree, best_looks
+from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, GoalSeen, hardly_seen, not_seen_free
 from robotdiffuse.planning.exploration.simulated import (
     camera_beside,
     explore,

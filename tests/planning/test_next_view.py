@@ -12,7 +12,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.visibility import ARM_CELL, seen_weights
 from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.next_view import next_view, poses_around
+from robotdiffuse.planning.exploration.looks import next_view, poses_around
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene

@@ -153,7 +153,7 @@ def print_result(result: "PlanResult", asked: float | None = None) -> None:
 def print_next_view(problem: "Problem", result: "PlanResult") -> None:
     """Print the proposed next camera pose in the form of problem files."""
     from robotdiffuse.core.transforms import pose_entry
-    from robotdiffuse.planning.next_view import next_view
+    from robotdiffuse.planning.exploration.looks import next_view
 
     proposed = next_view(problem, result)
     camera = ", ".join(

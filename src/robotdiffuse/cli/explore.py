@@ -15,8 +15,7 @@ from robotdiffuse.interop import WRITERS
 
 if TYPE_CHECKING:
     from robotdiffuse.perception.depth_view import DepthNoise
-    from robotdiffuse.planning.exploration.recorded import RecordedExplorer
-    from robotdiffuse.planning.exploration.simulated import Event
+    from robotdiffuse.planning.exploration.simulated import Event, RecordedExplorer
     from robotdiffuse.planning.exploration.steps import ExplorerSettings
     from robotdiffuse.problems.problem import Problem
     from robotdiffuse.visualization.live.exploration import ExplorationPage

@@ -38,7 +38,7 @@ from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.training.config import CONFIGS, EncoderTraining, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.planning.hybrid import RobotDiffuse
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.held_out import Case

@@ -36,9 +36,8 @@ from robotdiffuse.evaluation.runs import (
     Run,
 )
 from robotdiffuse.learning.guidance import CollisionGuidance
-from robotdiffuse.planning.diffusion.diffusion import ModelSampler, encode
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuseSettings
-from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.planning.diffusion import ModelSampler, encode
+from robotdiffuse.planning.hybrid import RobotDiffuseSettings, smooth_noise
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.held_out import goal_of
 from robotdiffuse.problems.problem import JointGoal, Problem

@@ -32,8 +32,8 @@ from robotdiffuse.evaluation.statistics import Indicators, bootstrap_interval, c
 from robotdiffuse.learning.diffusion import SAMPLERS
 from robotdiffuse.learning.motion_model import MotionModelSettings, link_clearances
 from robotdiffuse.learning.weight_files import POINTS, folder_of, read_description, weights_for
-from robotdiffuse.planning.diffusion.diffusion import encode
-from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.diffusion import encode
+from robotdiffuse.planning.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.planning.pose_goals import GOAL_COUNT, pose_configurations
 from robotdiffuse.problems.families.family import POSITION
 from robotdiffuse.problems.families.rop import ROP, Rop

@@ -33,7 +33,7 @@ PLANNERS = Registry(
     "planner",
     {
         "robotdiffuse": _entry(
-            "diffusion.hybrid:RobotDiffuse",
+            "hybrid:RobotDiffuse",
             "RobotDiffuseSettings",
             HYBRID,
             "AORRTC search first, then batches of the diffusion model too (the default)",
@@ -41,7 +41,7 @@ PLANNERS = Registry(
             CLEARANCE,
         ),
         "diffusion": _entry(
-            "diffusion.diffusion:Diffusion",
+            "diffusion:Diffusion",
             "DiffusionSettings",
             LEARNED,
             "the diffusion model alone: sampling under guidance; no search, no simplification",
@@ -82,13 +82,13 @@ PLANNERS = Registry(
             "MPiNets: a policy on points of scene, arm and target is rolled out",
         ),
         "mpd": _entry(
-            "baselines.mpd:MPD",
+            "baselines.guided_prior:MPD",
             "MPDSettings",
             LEARNED,
             "MPD: an unconditional diffusion prior, guided by costs while it samples",
         ),
         "edmp": _entry(
-            "baselines.edmp:EDMP",
+            "baselines.guided_prior:EDMP",
             "EDMPSettings",
             LEARNED,
             "EDMP: such a prior, guided by an ensemble of costs",
@@ -100,10 +100,10 @@ PLANNERS = Registry(
             "no planner: the straight line in joint space, the control of every other row",
         ),
         "a_star": _entry(
-            "baselines.lattice.planner:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"
+            "baselines.lattice:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"
         ),
         "d_star_lite": _entry(
-            "baselines.lattice.planner:DStarLite",
+            "baselines.lattice:DStarLite",
             "DStarLiteSettings",
             SEARCH,
             "D* Lite on a lattice of joint values; repairs its search when the scene changes",

@@ -1,7 +1,7 @@
 """The base class of planners: a planner implements `solve`, and `plan` handles the rest of a call."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import ClassVar, Generic, TypeVar
 
@@ -13,7 +13,7 @@ from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import CONVERGED, TIME
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, planners_that_support
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.pipeline import pipeline_for
+from robotdiffuse.planning.pipeline import Solver, attempt
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.kinematics import link_pose
@@ -80,7 +80,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         - waypoints: the motion stops at each or passes within its blend (`planning/pipeline/waypoints.py`);
         - moving obstacles: the motion waits, slows down or retreats on its path
           (`planning/pipeline/moving_obstacles.py`);
-        - a start velocity: the arm is moving when the motion begins (`planning/pipeline/start_velocity.py`);
+        - a start velocity: the arm is moving when the motion begins (`planning/pipeline/waypoints.py`);
         - camera views: `problem.unknown` says how unknown space is treated
           (`planning/pipeline/unknown_space.py`).
 
@@ -101,17 +101,13 @@ class Planner(ABC, Generic[PlannerSettings]):
         return replace(result, problem=problem, notes=(*result.notes, note) if note else result.notes)
 
     def _plan(self, problem: Problem, request: PlanRequest) -> PlanResult:
-        self._check_support(problem, request)
-        self.prepare(problem.robot)
-        return pipeline_for(problem)(self, problem, request)
-
-    def _check_support(self, problem: Problem, request: PlanRequest) -> None:
-        """Raises InputError for a request that the planner does not support."""
         clearance = problem.clearance if request.clearance is None else request.clearance
         for what, wanted in ((PATH_CONSTRAINTS, bool(problem.constraints)), (CLEARANCE, bool(clearance))):
             if wanted and what not in self.supports:
                 able = ", ".join(planners_that_support(what))
                 raise InputError(f"planner {self.name} does not support {what}; these do: {able}")
+        self.prepare(problem.robot)
+        return pipeline_for(problem)(self, problem, request)
 
     def warm_up(self, problem: Problem, until: str = CONVERGED) -> list[PlanResult]:
         """Load or compile the code of later calls now, for programs that cannot wait in a first call.
@@ -149,6 +145,28 @@ class Planner(ABC, Generic[PlannerSettings]):
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """Search from the start to a goal until `context.finish` accepts a path; `context.unsolved`
         without."""
+
+
+def pipeline_for(problem: Problem) -> Callable[[Solver, Problem, PlanRequest], PlanResult]:
+    """The function that plans for a problem: the first part of the pipeline that applies, or `attempt` alone.
+    A part is imported when it is needed."""
+    if problem.moving:
+        from robotdiffuse.planning.pipeline.moving_obstacles import plan_among_moving_obstacles
+
+        return plan_among_moving_obstacles
+    if problem.waypoints:
+        from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
+
+        return plan_through_waypoints
+    if problem.start_velocity is not None:
+        from robotdiffuse.planning.pipeline.waypoints import plan_from_start_velocity
+
+        return plan_from_start_velocity
+    if problem.views:
+        from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
+
+        return plan_with_unknown_space
+    return attempt
 
 
 def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[tuple[PlannerSettings, int]]:

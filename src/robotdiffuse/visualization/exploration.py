@@ -17,7 +17,7 @@ from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.drawables import ASSUMED, OBSERVED, Color, Surface, drawables, painted
 from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import MAP
-from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
+from robotdiffuse.planning.exploration.simulated import RecordedAct, RecordedExplorer, RecordedView
 from robotdiffuse.planning.exploration.steps import DONE, LOOK
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization.arm import DrawnArm

@@ -31,13 +31,19 @@ from robotdiffuse.learning.training.config import planner_training
 from robotdiffuse.learning.training.loop import Processes
 from robotdiffuse.learning.training.planner import PlannerLoss, model_settings, planning_success
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.planning.baselines.edmp import EDMP, ENSEMBLE, EDMPSettings, GuideSettings, quadratic_levels
-from robotdiffuse.planning.baselines.guided_prior import collision_gradient, sample, shared_out
-from robotdiffuse.planning.baselines.mpd import (
+from robotdiffuse.planning.baselines.guided_prior import (
+    EDMP,
+    ENSEMBLE,
     MPD,
+    EDMPSettings,
+    GuideSettings,
     MPDSettings,
+    collision_gradient,
     exponential_levels,
     gaussian_process,
+    quadratic_levels,
+    sample,
+    shared_out,
     state_precision,
 )
 from robotdiffuse.problems.problem import JointGoal, Problem

@@ -15,8 +15,7 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
-from robotdiffuse.planning.baselines.lattice.kernel import Outcome
-from robotdiffuse.planning.baselines.lattice.planner import (
+from robotdiffuse.planning.baselines.lattice import (
     AStar,
     AStarSearch,
     AStarSettings,
@@ -24,6 +23,7 @@ from robotdiffuse.planning.baselines.lattice.planner import (
     DStarLiteSearch,
     DStarLiteSettings,
     LatticeSettings,
+    Outcome,
     lattice_moves,
 )
 from robotdiffuse.problems.problem import JointGoal, Problem

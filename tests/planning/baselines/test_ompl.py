@@ -17,8 +17,8 @@ from robotdiffuse.collision.exact_meshes import explain_collision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Status
+from robotdiffuse.planning.baselines import ompl
 from robotdiffuse.planning.baselines import ompl as planners
-from robotdiffuse.planning.baselines import ompl_checks
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
@@ -198,10 +198,10 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
         raise RuntimeError("broken kernel")
 
     with monkeypatch.context() as patched:
-        patched.setattr(ompl_checks, "motions_free", broken)
-        patched.setattr(ompl_checks.lane_collision, "free_many", broken)
+        patched.setattr(ompl, "motions_free", broken)
+        patched.setattr(ompl.lane_collision, "free_many", broken)
         # start and goal are checked by the kernel too
-        patched.setattr("robotdiffuse.planning.attempt.usable_start_goal", UncheckedStartGoal)
+        patched.setattr("robotdiffuse.planning.pipeline.usable_start_goal", UncheckedStartGoal)
         with pytest.raises(RuntimeError, match="broken kernel"):
             planner().plan(problem(RIGHT), time_limit=120.0)
     assert plan(planner, problem(RIGHT)).solved
@@ -247,6 +247,6 @@ def test_a_planner_without_a_range_refuses_one(planner):
 
 def test_without_ompl_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl", None)
-    monkeypatch.delitem(sys.modules, ompl_checks.__name__)
+    monkeypatch.delitem(sys.modules, ompl.__name__)
     with pytest.raises(InputError, match=r"pip install \"robotdiffuse\[baselines\]\""):
         runpy.run_path(planners.__file__)

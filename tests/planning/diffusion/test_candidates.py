@@ -5,7 +5,7 @@ import pytest
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.diffusion.candidates import draw_candidates
+from robotdiffuse.planning.hybrid import draw_candidates
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene

@@ -13,7 +13,7 @@ from robotdiffuse.learning.exported_model import ExportedModel
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
+from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene

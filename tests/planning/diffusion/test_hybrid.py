@@ -14,13 +14,11 @@ from robotdiffuse.core.types import Status
 from robotdiffuse.learning.diffusion import SAMPLERS
 from robotdiffuse.learning.exported_model import exported_model
 from robotdiffuse.learning.weight_files import weights_for
-from robotdiffuse.planning.diffusion import hybrid
-from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
-from robotdiffuse.planning.diffusion.hybrid import BATCH_WORK, RobotDiffuse, RobotDiffuseSettings
-from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.planning import hybrid
+from robotdiffuse.planning.diffusion import Diffusion, DiffusionSettings, encode
+from robotdiffuse.planning.hybrid import BATCH_WORK, RobotDiffuse, RobotDiffuseSettings, smooth_noise
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.anytime import AnytimeSearch
-from robotdiffuse.planning.search.rrt import AORRTCSettings
+from robotdiffuse.planning.search.rrt import AnytimeSearch, AORRTCSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -81,7 +79,7 @@ def test_any_sampler_plans(sampler, no_search):
 
 def test_weights_that_need_no_scene_encoding_get_none(planner, no_search, monkeypatch):
     """The encoding of the scene made none of the hybrid's paths shorter, and took 2 ms."""
-    monkeypatch.setattr("robotdiffuse.planning.diffusion.hybrid.encode", None)
+    monkeypatch.setattr("robotdiffuse.planning.hybrid.encode", None)
     assert planner.plan(PROBLEM, time_limit=10.0).stage == "network"
 
 

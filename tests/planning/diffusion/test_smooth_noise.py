@@ -3,7 +3,7 @@
 import numpy as np
 
 from robotdiffuse.learning.exported_model import exported_model
-from robotdiffuse.planning.diffusion.smooth_noise import MAX_HALF_RANGE, SPREAD, smooth_noise
+from robotdiffuse.planning.hybrid import MAX_HALF_RANGE, SPREAD, smooth_noise
 from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")

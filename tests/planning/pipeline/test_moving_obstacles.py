@@ -11,8 +11,7 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.deadline import OutOfTimeError, deadline
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS
-from robotdiffuse.planning.pipeline.moving_obstacles import GRID_STEP
-from robotdiffuse.planning.pipeline.moving_obstacles_kernel import WAITED, earliest
+from robotdiffuse.planning.pipeline.moving_obstacles import GRID_STEP, WAITED, earliest
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.trajectories.speed_limits import TimingSettings
 from robotdiffuse.trajectories.stops import StopGraph

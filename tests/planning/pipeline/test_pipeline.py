@@ -7,7 +7,7 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.planning.pipeline import pipeline_for
+from robotdiffuse.planning.planner import pipeline_for
 
 PANDA = rd.load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])

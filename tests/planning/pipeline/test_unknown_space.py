@@ -26,8 +26,8 @@ from robotdiffuse.perception.voxel_grid import (
     sweep,
 )
 from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.attempt import attempt
 from robotdiffuse.planning.context import PlanRequest
+from robotdiffuse.planning.pipeline import attempt
 from robotdiffuse.planning.pipeline.unknown_space import (
     AS_SEEN,
     assumptions_of,

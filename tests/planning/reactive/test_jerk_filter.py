@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.planning.reactive.jerk_filter import JerkFilter
-from robotdiffuse.planning.reactive.timed_path import SpeedProfile, TimedPath
+from robotdiffuse.planning.reactive.timed_path import JerkFilter, SpeedProfile, TimedPath
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 

@@ -16,8 +16,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status, Trajectory
 from robotdiffuse.planning import context
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.anytime import usual_clearances
-from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings, RRTConnect
+from robotdiffuse.planning.search.rrt import AORRTC, AORRTCSettings, RRTConnect, usual_clearances
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot

@@ -11,7 +11,7 @@ import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
 from robotdiffuse.core.types import Path, Status
 from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.search import constrained
+from robotdiffuse.planning.search import rrt
 from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose, link_poses
@@ -143,7 +143,7 @@ def test_more_iterations_give_no_slower_motion(case: int, monkeypatch: pytest.Mo
     """It returned the shortest path, whose motion may be slower than one found before."""
     durations = []
     for paths in (1, 2, 4, 8):
-        monkeypatch.setattr(constrained, "PATHS_TO_FIND", paths)
+        monkeypatch.setattr(rrt, "PATHS_TO_FIND", paths)
         result = rd.plan(problem(*CASES[case]), 60.0, planner="rrt_connect", seed=1)
         durations.append(result.duration)
     assert durations == sorted(durations, reverse=True)

@@ -3,7 +3,7 @@
 **Strict.** The arm enters no voxel that was not seen free: the validator accepts each motion among obstacles
 that cover all other space (`seen_free.py`). Exempt is the space within 2 cm of the arm where a motion begins
 and ends; seen points count there too. With `see_goal` the arm's surface at the goal must have been seen free
-as well (`goal_seen.py`). So the promise is as good as the map: in a scene that does not change,
+as well (`seen_free.GoalSeen`). So the promise is as good as the map: in a scene that does not change,
 with a camera whose poses and errors are as stated, such a motion meets nothing.
 
 **Chance.** The arm goes if the motion's stated `confidence` is high enough, and looks first if it is not. It
@@ -14,7 +14,7 @@ Looks are chosen by what a tentative motion, planned among what was seen alone, 
 own motion is subject to the same policy; by chance, too, a strict one comes first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import islice
 
@@ -30,18 +30,16 @@ from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
 from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.observed_volume import ObservedVolume
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
 from robotdiffuse.perception.seen_points import point_shapes
-from robotdiffuse.perception.voxel_grid import MAP, surface
+from robotdiffuse.perception.unknown_space import UnknownSpace, explored_confidence
+from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, surface
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
-from robotdiffuse.planning.exploration.cameras import ArmCamera
-from robotdiffuse.planning.exploration.chance import planned_by_chance, with_confidence
-from robotdiffuse.planning.exploration.goal_seen import GoalSeen
-from robotdiffuse.planning.exploration.looks import best_looks, swept_unseen
-from robotdiffuse.planning.exploration.prediction import predicted_occupancy
-from robotdiffuse.planning.exploration.reachable import ReachableTree, first_parts
+from robotdiffuse.planning.exploration.looks import ReachableTree, best_looks, first_parts, swept_unseen
 from robotdiffuse.planning.exploration.seen_free import (
+    GoalSeen,
     cover,
     hardly_seen,
     least_unknown,
@@ -57,16 +55,87 @@ from robotdiffuse.planning.exploration.steps import (
     STRICT,
     STRICT_THEN_CHANCE,
     STUCK,
+    ArmCamera,
     ExplorerSettings,
     Step,
 )
 from robotdiffuse.planning.exploration.stopping import Stop, stop_before
+from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.goals import Goal
-from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.problem import PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.tolerances import VerifySettings, goal_error
+
+PROBABILITY_BELOW = np.float32(0.1)
+"""That a voxel below the volume that the network predicts is occupied, where the map does not know it: the
+share of unknown voxels within reach that are."""
+
+
+def predicted_occupancy(
+    robot: Robot, known: OccupancyMap, volume: Callable[[], ObservedVolume]
+) -> Float32[ndarray, "nx ny nz"] | None:
+    """The probability that each voxel is occupied, 0 where the map knows it to be free; None if the network
+    does not cover the arm's reach. volume: gives what views observed."""
+    from robotdiffuse.learning.completion import covers, predict
+
+    if not covers(robot):
+        return None
+    below = ((0, 0), (0, 0), (LAYERS_BELOW, 0))
+    probability = np.pad(predict(volume()), below, constant_values=PROBABILITY_BELOW)
+    return np.where(known.free, np.float32(0), probability)
+
+
+def planned_by_chance(
+    planner: Planner,
+    known: OccupancyMap,
+    problem: Problem,
+    predicted: Float32[ndarray, "nx ny nz"] | None,
+    request: PlanRequest,
+    to_goal: bool = True,
+) -> PlanResult:
+    """A motion among what was seen and predicted, with its confidence; see `with_confidence`.
+
+    predicted: the probability that each voxel of the map is occupied; None without the network.
+    to_goal: whether the problem's goal is the Explorer's, not where a look ends.
+    """
+    asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
+    goals = problem.goal.positions if to_goal and isinstance(problem.goal, JointGoal) else ()
+    unknown = _unknown(known, problem, np.stack([problem.start, *goals]), predicted)
+    above = None if predicted is None else predicted[:, :, LAYERS_BELOW:]
+    result = plan_with_unknown_space(planner, asked, request, above, unknown)
+    return replace(with_confidence(known, problem, result, predicted, to_goal), problem=asked)
+
+
+def with_confidence(
+    known: OccupancyMap,
+    problem: Problem,
+    motion: PlanResult,
+    predicted: Float32[ndarray, "nx ny nz"] | None,
+    to_goal: bool = True,
+) -> PlanResult:
+    """The motion with the confidence that follows from the probability that it sweeps; None if the map holds
+    no measurement. The arm is taken to be
+    free where a motion begins, and at the goal, but not where a look ends."""
+    if motion.path is None or predicted is None:
+        return motion
+    ends = motion.path.positions[[0, -1] if to_goal else [0]]
+    swept = _unknown(known, problem, ends, predicted).crossed(motion.path).risk
+    stated = None if swept is None or known.is_blind else explored_confidence(swept)
+    return replace(motion, swept_probability=swept, confidence=stated)
+
+
+def _unknown(
+    known: OccupancyMap,
+    problem: Problem,
+    ends: Float[ndarray, "n dof"],
+    predicted: Float32[ndarray, "nx ny nz"] | None,
+) -> UnknownSpace:
+    """What the map does not know, without the voxels that the arm fills at these configurations."""
+    return UnknownSpace(problem.robot, ends, known.unknown, predicted, 0.0, MAP)
+
 
 NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2

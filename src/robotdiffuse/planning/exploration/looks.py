@@ -1,19 +1,89 @@
-"""Where to look: configurations from which the arm's camera sees what a motion would sweep."""
+"""Where to look: configurations that the arm can reach and from which its camera sees what a motion would
+sweep; and the next best view, the pose of a camera beside the arm that sees most of it.
+"""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.bounds import Value, rigid_transform
+from robotdiffuse.core.errors import InputError, check_type
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path
+from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.perception.visibility import seen_weights
-from robotdiffuse.perception.voxel_grid import MAP
-from robotdiffuse.planning.exploration.cameras import ArmCamera
-from robotdiffuse.planning.exploration.reachable import ReachableTree
+from robotdiffuse.perception.voxel_grid import FINE_VOXEL_SIZE, LOW, MAP, refined
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, near_ends
+from robotdiffuse.planning.exploration.steps import ArmCamera
+from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
+from robotdiffuse.planning.search.rrt_kernel import extend, make_trees
+from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.trajectories.simplification import simplify
+
+RESOLUTION = 0.02
+"""No point of the arm moves further than this between two checks of a motion [m]."""
+CAPACITY = 2000
+"""Most configurations of a tree."""
+PARTS = (0.25, 0.5, 1.0)
+"""Parts of a way that may be gone."""
+
+
+class ReachableTree:
+    """A tree of straight motions without collision from a configuration on.
+
+    Searches between two configurations fail where only a narrow gap leads out of the first one. The tree
+    knows what is beyond such gaps before anything there is chosen as a goal.
+    """
+
+    def __init__(self, robot: Robot, scene: Scene, start: Float[ndarray, "dof"]) -> None:
+        self._space = search_space(CollisionChecker(robot, scene), RESOLUTION)
+        self._start = start
+        self._trees = make_trees(start.astype(np.float32), np.zeros((0, robot.dof), np.float32), CAPACITY)
+
+    def __len__(self) -> int:
+        return int(self._trees.sizes[0])
+
+    @property
+    def configurations(self) -> Float[ndarray, "n dof"]:
+        """The start, and what is reached from it."""
+        return self._trees.nodes[0, : len(self)].astype(np.float64)
+
+    def grow(self, targets: Float[ndarray, "n dof"], longest: Float[ndarray, "n"]) -> None:
+        """Extend the tree from its nearest configuration towards each target, where that motion is free.
+
+        longest: the longest extension towards each [rad, joint-space L2].
+        """
+        targets = np.clip(targets, self._space.lower, self._space.upper)
+        extend(self._space, self._trees, targets.astype(np.float32), longest.astype(np.float32))
+
+    def way(self, number: int) -> Float[ndarray, "m dof"]:
+        """Waypoints from the start to one of the configurations."""
+        nodes, parents, path = self._trees.nodes[0], self._trees.parents[0], [number]
+        while parents[path[-1]] >= 0:
+            path.append(parents[path[-1]])
+        way = simplify(self._space, nodes[path[::-1]], 1).astype(np.float64)
+        way[0] = self._start
+        return way
+
+
+def first_parts(waypoints: Float[ndarray, "n dof"]) -> Iterator[Float[ndarray, "m dof"]]:
+    """The first parts of a way, the shortest first, and all of it."""
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
+    for part in PARTS:
+        end = part * at[-1]
+        last = np.array([np.interp(end, at, joint) for joint in waypoints.T])
+        yield np.concatenate([waypoints[at < end], last[None]])
+
 
 CONFIGURATIONS, TARGETS, ROUNDS = 900, 1200, 5
 """Reachable configurations that a look is chosen from, at first; random ones that they are sought by in a
@@ -112,3 +182,92 @@ def best_looks(
         if score[number] == 0:
             return
         yield tree.way(int(number))
+
+
+RING_RADIUS = 1.6
+"""Distance of the default camera poses from the base's axis [m]."""
+RING_HEIGHTS = (0.5, 0.95, 1.4)
+"""Heights of the default camera poses [m]."""
+POSES_PER_RING = 16
+"""Number of default camera poses at each height."""
+TARGET = (0.0, 0.0, 0.3)
+"""The point that the default camera poses look at [m]."""
+MIN_PROBABILITY = 1e-3
+"""Voxels less likely occupied than this are ignored."""
+
+
+@dataclass(frozen=True, eq=False)
+class NextView(Value):
+    """A camera pose, and how much of the crossed unknown space it sees."""
+
+    T_base_camera: Float[ndarray, "4 4"]
+    seen: float
+    """Expected part of the summed probability that a camera there sees, from 0 to 1."""
+
+
+def poses_around() -> list[Float[ndarray, "4 4"]]:
+    """Camera poses around the base, looking at the arm."""
+    angles = 2 * np.pi * np.arange(POSES_PER_RING) / POSES_PER_RING
+    ring = RING_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+    places = [(x, y, height) for height in RING_HEIGHTS for x, y in ring]
+    return [looking_at(np.array(place), np.array(TARGET)) for place in places]
+
+
+def next_view(
+    problem: Problem, result: PlanResult, poses: Sequence[Float[ndarray, "4 4"]] | None = None
+) -> NextView:
+    """The pose from which a camera like that of the first view sees most of the probability that the motion
+    of a result sweeps.
+
+    poses: camera poses to choose from, T_base_camera each; None: `poses_around`.
+
+    A voxel counts by the chance that nothing hides it: neither what was seen, nor what is predicted, nor the
+    arm at the problem's start. With a policy other than "predicted", all swept unknown voxels count the same.
+
+    Raises InputError without views, without a motion and without poses.
+    """
+    check_problem(problem)
+    check_type("result", result, PlanResult, "a PlanResult, as of rd.plan")
+    if not problem.views:
+        raise InputError("next_view: the problem has no views; it is for scenes that cameras saw")
+    if result.path is None:
+        raise InputError(f"next_view: the result has no motion ({result.status.value})")
+    candidates = (
+        poses_around() if poses is None else [rigid_transform("next_view: T_base_camera", T) for T in poses]
+    )
+    if not candidates:
+        raise InputError("next_view: poses is empty; at least one camera pose is needed")
+    volume = observe(problem.views, problem.robot, problem.start)
+    predicted = None
+    if policy_for(problem)[0] == PREDICTED:
+        from robotdiffuse.learning.completion import predict
+
+        predicted = predict(volume)
+    crossed = unknown_space_of(problem, volume, predicted).crossed(result.path)
+    likely = crossed.voxels.astype(np.float32)
+    if crossed.probability is not None:
+        likely *= crossed.probability
+    at = np.argwhere(likely > MIN_PROBABILITY)
+    weights = likely[tuple(at.T)]
+    if not len(at):
+        return NextView(candidates[0], 1.0)
+    filled = refined(volume.occupied).astype(np.float32)
+    if predicted is not None:
+        np.maximum(filled, predicted, out=filled)
+    image = problem.views[0]
+    start = problem.start.astype(np.float32)
+    seen = seen_weights(
+        compile_robot(problem.robot),
+        np.tile(start, (len(candidates), 1)),
+        np.stack(candidates).astype(np.float32),
+        np.array(image.intrinsics, np.float32),
+        image.depth.shape,
+        np.float32(np.inf),
+        at,
+        weights,
+        filled,
+        np.array(LOW, np.float32),
+        np.float32(FINE_VOXEL_SIZE),
+    )
+    best = int(seen.argmax())
+    return NextView(candidates[best], float(seen[best] / weights.sum()))

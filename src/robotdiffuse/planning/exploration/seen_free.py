@@ -1,16 +1,29 @@
-"""Obstacles that keep an arm within space that was seen free."""
+"""Obstacles that keep an arm within space that was seen free.
 
-from collections.abc import Sequence
+What was seen of the space that an arm fills at a goal.
+
+Voxels of 2 cm are too coarse for that: those that the arm touches at a goal are rarely seen free as a whole.
+So small balls cover the arm's surface there, and each must be free: an image sees through it, or it lies in
+voxels that the map knows to be free, or within a covering sphere of the arm when an image was taken, or in
+what is taken on trust where the motion begins. What is inside of the surface needs no view: nothing floats.
+"""
+
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import reach_ball
 from robotdiffuse.collision.motions import with_covering_spheres
-from robotdiffuse.perception.depth_view import AssumedPoints
-from robotdiffuse.perception.occupancy_map import OccupancyMap
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path
+from robotdiffuse.perception.depth_filter import MARGIN_SPREADS, filtered
+from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
+from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
+from robotdiffuse.perception.seen_points import sphere_distances
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN, without_known
+from robotdiffuse.perception.visibility import BALL_RADIUS, see_through, surface_balls, within_voxels
 from robotdiffuse.perception.voxel_grid import MAP, surface
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
@@ -86,3 +99,100 @@ def _walls() -> list[Box]:
             center[axis], size[axis] = at, WALL
             walls.append(Box(tuple(center), tuple(size), name=f"{name} the map, {'xyz'[axis]}"))
     return walls
+
+
+BORDER = np.float32(1.0)
+"""Pixels around a ball that count too in images that were filtered: the filter moves edges by about one."""
+KEY_DECIMALS = 5
+"""Digits of joint positions that tell configurations apart."""
+
+
+class GoalSeen:
+    """Which balls of the arm's surface at goal configurations nothing has shown to be free."""
+
+    def __init__(self, robot: Robot, known: OccupancyMap, views: ViewMemory, required: bool) -> None:
+        """views: kept ones, which count for new goals. required: False if goals need not be seen; nothing is
+        missing then."""
+        self._robot, self._known, self._views, self._required = robot, known, views, required
+        self._unseen: dict[tuple[float, ...], Float32[ndarray, "n 3"]] = {}
+        """Centres of the balls that no view has shown to be free, by configuration [m]."""
+        self.taken: list[Float[ndarray, "dof"]] = []
+        """Configurations of the views since the goal was set."""
+
+    def forget(self) -> None:
+        """Prepare for another goal."""
+        self._unseen.clear()
+        self.taken.clear()
+
+    def observe(self, view: DepthView) -> None:
+        """Take a new view with a configuration into account."""
+        if self._required and view.configuration is not None:
+            self.taken.append(view.configuration)
+            self._unseen = {q: self._not_shown(balls, [view]) for q, balls in self._unseen.items()}
+
+    def best(self, start: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> Float[ndarray, "dof"]:
+        """The goal of whose surface least is unseen."""
+        found = min(goals, key=lambda q: len(self.unseen(start, q)))
+        given = set(map(_key, goals))
+        self._unseen = {q: balls for q, balls in self._unseen.items() if q in given}
+        return found
+
+    def unseen(self, start: Float[ndarray, "dof"], q: Float[ndarray, "dof"]) -> Float32[ndarray, "n 3"]:
+        """The centres of the balls at a configuration that nothing has shown to be free [m]. start: where the
+        arm is."""
+        key = _key(q)
+        if key not in self._unseen:
+            self._unseen[key] = self._not_shown(surface_balls(self._robot, q), self._views.views)
+        balls = self._unseen[key]
+        within = self._distances(balls, start) < CARVING_MARGIN - BALL_RADIUS
+        within_voxels(balls, np.float32(BALL_RADIUS), self._known.free, *MAP.frame, within)
+        return balls[~within]
+
+    def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
+        """The voxels that looks are to show of the surface where a path ends."""
+        out = np.zeros(MAP.shape, np.bool_)
+        if self._required:
+            at = MAP.indices(self.unseen(path.positions[0], path.positions[-1]))
+            out[tuple(at[MAP.contains(at)].T)] = True
+        return out
+
+    def missing(self, motion: PlanResult) -> str:
+        """Says how much was not seen of the arm's surface where a motion ends; "" if nothing is missing."""
+        if not self._required or motion.path is None:
+            return ""
+        start, q = motion.path.positions[[0, -1]]
+        unseen = len(self.unseen(start, q))
+        if not unseen:
+            return ""
+        share = unseen / len(surface_balls(self._robot, q))
+        return f"{100 * share:.2g} % of the arm's surface at the goal was not seen"
+
+    def _not_shown(
+        self, balls: Float32[ndarray, "n 3"], views: Iterable[DepthView]
+    ) -> Float32[ndarray, "m 3"]:
+        """The balls that no view shows to be free: none sees through them, and the arm was elsewhere."""
+        for view in views:
+            depth, spread = filtered(view)
+            assert view.configuration is not None  # the map takes no other views
+            seen = self._distances(balls, view.configuration) < -BALL_RADIUS
+            see_through(
+                depth,
+                np.array(view.intrinsics, np.float32),
+                view.T_base_camera.astype(np.float32),
+                balls,
+                np.float32(BALL_RADIUS),
+                np.float32(MARGIN_SPREADS * spread),
+                BORDER if spread else np.float32(0),
+                seen,
+            )
+            balls = balls[~seen]
+        return balls
+
+    def _distances(self, balls: Float32[ndarray, "n 3"], q: Float[ndarray, "dof"]) -> Float32[ndarray, "n"]:
+        """Signed distances of the balls' centres to the arm's covering spheres at a configuration [m]."""
+        return sphere_distances(balls, placed_spheres(self._robot, q).astype(np.float32))
+
+
+def _key(q: Float[ndarray, "dof"]) -> tuple[float, ...]:
+    """The same for a goal and for the end of a motion there."""
+    return tuple(np.round(q, KEY_DECIMALS).tolist())

@@ -1,29 +1,36 @@
-"""What surrounds any planner: moving obstacles, waypoints, a start velocity, unknown space."""
+"""What surrounds any planner: moving obstacles, waypoints, a start velocity, unknown space. Each takes the
+planner as an argument, and makes one or several attempts with it at a problem in its scene as it is."""
 
-from collections.abc import Callable
-from importlib import import_module
+from typing import ClassVar, Protocol, runtime_checkable
 
+from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.planning.attempt import Solver, attempt
-from robotdiffuse.planning.context import PlanRequest
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
+from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.problem import Problem
 
-PlanFunction = Callable[[Solver, Problem, PlanRequest], PlanResult]
 
-STAGES: tuple[tuple[Callable[[Problem], bool], str], ...] = (
-    (lambda problem: bool(problem.moving), "moving_obstacles:plan_among_moving_obstacles"),
-    (lambda problem: bool(problem.waypoints), "waypoints:plan_through_waypoints"),
-    (lambda problem: problem.start_velocity is not None, "start_velocity:plan_from_start_velocity"),
-    (lambda problem: bool(problem.views), "unknown_space:plan_with_unknown_space"),
-)
-"""Which problems a function of this package handles, and module:function, imported when it is needed; the
-first that applies is used."""
+@runtime_checkable
+class Solver(Protocol):
+    """What the pipeline needs of a planner."""
+
+    name: ClassVar[str]
+
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        """Search from the start to a goal; see `planning.planner.Planner.solve`."""
+        ...
 
 
-def pipeline_for(problem: Problem) -> PlanFunction:
-    """The function that plans for a problem: the first of STAGES that applies, or `attempt` alone."""
-    for applies, location in STAGES:
-        if applies(problem):
-            module, _, function = location.partition(":")
-            return getattr(import_module(f"{__name__}.{module}"), function)
-    return attempt
+def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
+    """Plan from the problem's start to its goal, without its waypoints, moving obstacles, start velocity and
+    unknown space, which the pipeline handles."""
+    context = PlanningContext(solver.name, problem, request)
+    with context.deadline():
+        try:
+            start_goal = usable_start_goal(context)
+            if isinstance(start_goal, PlanResult):
+                return start_goal
+            context.begin_search()
+            return solver.solve(context, start_goal)
+        except OutOfTimeError as error:
+            return context.out_of_time(error)

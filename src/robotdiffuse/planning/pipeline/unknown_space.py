@@ -39,8 +39,8 @@ from robotdiffuse.perception.unknown_space import (
     predicted_assumptions,
 )
 from robotdiffuse.perception.voxel_grid import refined
-from robotdiffuse.planning.attempt import Solver, attempt
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
+from robotdiffuse.planning.pipeline import Solver, attempt
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres

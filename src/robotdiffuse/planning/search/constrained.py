@@ -12,22 +12,14 @@ little more than the tolerances, which rounding of corners and numbers needs; th
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from numba.extending import overload
-from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.core.types import LENGTH
-from robotdiffuse.planning.context import TOLERANCE_FRACTION, PlanningContext
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, usual_clearances
-from robotdiffuse.planning.search.time_optimization import estimated_duration
-from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.constraint_kernel import evaluate, make_work, proved
 from robotdiffuse.problems.projection_kernel import project
-from robotdiffuse.trajectories.speed_limits import scaled_limits
 
 MAX_DEPTH = 9
 """A motion is halved at most this many times."""
@@ -51,19 +43,6 @@ MIN_CORNER_MOVE = 0.005
 """Smoothing leaves corners that it would move by less than this [rad]."""
 MAX_INITIAL_PIECE = 0.15
 """Pieces of a path are split down to this length before simplification [rad]."""
-
-
-STAGE = "constrained_rrt_connect"
-CLOCK_INTERVAL = 20
-"""Iterations between two readings of the clock; they take longer than those without constraints."""
-END_MARGIN = 1e-6
-"""Tolerances are widened to the values at the start and the goals, plus this margin."""
-PATHS_TO_FIND = 2
-"""With until "converged": number of paths to find; the best is returned."""
-STRAIGHT_EXCESS = 0.02
-"""A path is the shortest if it exceeds the straight line by no more than this part."""
-SHORTCUTS = 60
-"""Shortcuts that are tried on each path found."""
 
 
 class Limits(NamedTuple):
@@ -267,66 +246,3 @@ def _smoothed(space, limits, path, scratch):
         ):
             finer[i] = trial
     return finer
-
-
-class ConstrainedSearch(AnytimeSearch):
-    """Restarts of RRT-Connect under constraints."""
-
-    clock_interval = CLOCK_INTERVAL
-    spare_nodes = MAX_PIECES
-
-    def __init__(self, context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> None:
-        constraints = context.validator.constraints
-        start = start_goal.start_lead
-        assert constraints is not None and start is not None  # problems without are planned otherwise
-        kept = constraints.limits(TOLERANCE_FRACTION)
-        at_ends = constraints.values(np.stack([start, *start_goal.goal_leads])).max(axis=0) + END_MARGIN
-        kept = np.minimum(np.maximum(kept, at_ends), constraints.rows.limit)
-        self.context = context
-        self.limits: Limits = make_limits(constraints.rows, kept)
-        self.cost = np.inf
-        """Of the best path: its estimated duration [s]; its length [rad] if that is the objective."""
-        self._speed_limits = scaled_limits(context.problem.robot, context.timing)
-        super().__init__(
-            start_goal,
-            settings,
-            STAGE,
-            context.request.seed,
-            usual_clearances(context.clearance),
-            bounded=False,
-            stop=lambda: context.remaining <= 0,
-            improved=context.improved,
-        )
-        self.start, self.goals = start, np.stack(start_goal.goal_leads)
-
-    @property
-    def shortest(self) -> bool:
-        """Whether no path can be shorter by more than a small part: the constraints hardly bend the straight
-        line."""
-        return self._near_straight(STRAIGHT_EXCESS)
-
-    def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
-        """Whether the polyline through configurations keeps the clearance and the constraints."""
-        return self.context.keeps_constraints(q) and super().keeps_clearance(q)
-
-    def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
-        """See `AnytimeSearch`; the path also keeps the constraints, and the one of the least cost is kept."""
-        path = simplify(self.space, self.limits, path, self.settings.smoothings, SHORTCUTS, self._state)
-        cost = self._cost_of(path)
-        if cost >= self.cost:
-            return False
-        self.cost = cost
-        return self._take(path, float(path_length(path)), STAGE)
-
-    def _cost_of(self, path: Float[ndarray, "n dof"]) -> float:
-        if self.context.request.objective == LENGTH:
-            return float(path_length(path))
-        return estimated_duration(path, self.context.timing.corner_deviation, self._speed_limits)
-
-    def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
-        """See `AnytimeSearch`."""
-        super().refuse(accepted)
-        self.cost = np.inf if accepted is None else self._cost_of(accepted)
-
-    def _line(self, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
-        return line(self.space, self.limits, self.start, goal)

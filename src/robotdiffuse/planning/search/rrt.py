@@ -1,16 +1,603 @@
-"""The planners RRT-Connect and AORRTC, anytime, also under path constraints."""
+"""The planners RRT-Connect and AORRTC, and their anytime search: rounds of two trees find a first path and
+shorter ones; paths are validated on the way.
 
-from dataclasses import dataclass
+Rounds run at falling clearances. Those of AORRTC grow new trees with paths little longer than the best one
+known; the path that a round finds is simplified and tightened, and bounds the next round if it is the
+shortest. Those of RRT-Connect are restarts without a bound.
+
+With the objective "length" a call returns the shortest path found. With "time", every path found is also
+the start of a local search for a faster motion, and the call returns the motion that takes the least time.
+Under path constraints there is no such local search: each path that is estimated to be the fastest so far is
+timed, and the call returns the fastest of these motions.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated
 
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.motions import finer_resolution
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative
+from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
+from robotdiffuse.core.types import FIRST, LENGTH, TIME, TIME_LIMIT, Tree
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import DEFAULT_CLEARANCE, TOLERANCE_FRACTION, PlanningContext
 from robotdiffuse.planning.planner import Planner
-from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.search.time_optimization import (
+    Candidate,
+    TimeOptimization,
+    estimated_duration,
+    still_improves,
+)
 from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.problems.goals import AnyGoal, JointGoal
+from robotdiffuse.trajectories.simplification import simplify, tighten
+from robotdiffuse.trajectories.speed_limits import scaled_limits
+
+MIN_CLEARANCE = 0.002
+"""Clearance that is tried even if none is requested [m]: telling contact from near contact is costly, and
+paths are hardly longer."""
+FALLING_FRACTIONS = (1.0, 0.5, 0.25)
+"""Fractions of a clearance that are tried; after those of one above the default clearance, the default's."""
+ITERATIONS_PER_CLEARANCE = 400
+"""Iterations at a clearance before the next lower one is tried."""
+FALLBACK_INTERVAL = 8_000
+"""Iterations without a path between two calls of the fallback."""
+BOUND_FACTOR = 1.15
+"""The length bound of a round is this factor of the best length: unsimplified tree paths are longer than
+simplified ones, so with a tight bound the trees would miss shorter ways than a long detour."""
+TIGHTENING_FACTOR = 1.05
+"""Paths longer than this factor of the best length are not tightened: tightening shortens by less."""
+OPTIMALITY_TOLERANCE = 1e-4
+"""A path that exceeds the straight line by no more than this part is optimal."""
+NEAR_FACTOR = 1.3
+"""Paths up to this factor of the best length may become the fastest motion."""
+VALIDATION_INTERVAL = 4_000
+"""Iterations between two validations of shorter paths. Validating only at the end could lose everything found
+since the last valid path."""
+ATTEMPTS_PER_ITERATION = 0.2
+"""Attempts to make a motion faster per iteration of the search; both then take about the same time."""
+ATTEMPTS_AFTER_SEARCH = 200
+"""Attempts between two checks whether to go on, once the search has ended."""
+TIME_GAIN, TIME_PATIENCE = 0.0025, 1_600
+"""With until "converged", attempts end when doubling them reduced the time by less than this part, but not
+before this many."""
+MIN_TIME_GAIN = 0.01
+"""A faster motion is validated before the search ends if its estimated time is less by this part."""
+MAX_DETOUR = 1.05
+"""To a pose, whose nearest configuration a straight line reaches, motions are at most this factor longer."""
+FINAL_CANDIDATES = 2
+"""Number of valid motions of which the fastest is returned, if there is time to validate as many."""
+END_MARGIN = 1e-6
+"""Under path constraints, tolerances are widened to the values at the start and the goals, plus this
+margin."""
+PATHS_TO_FIND = 2
+"""Under path constraints, with until "converged": number of paths to find; the best is returned."""
+STRAIGHT_EXCESS = 0.02
+"""Under path constraints, a path is the shortest if it exceeds the straight line by no more than this
+part."""
+SHORTCUTS = 60
+"""Under path constraints, shortcuts that are tried on each path found."""
+
+
+@dataclass(frozen=True)
+class SearchSettings(Settings):
+    """The settings that RRT-Connect and AORRTC share."""
+
+    range: Positive = 0.7
+    """Longest extension of a tree [rad, joint-space L2]: longer ones collide more often."""
+    resolution: Positive = 0.05
+    """No point of the arm moves further than this between two checks of a motion [m]; the validator's
+    certificate covers the rest. The search halves it after a path that the validator refuses."""
+    smoothings: Natural = 1
+    """Rounds of smoothing for each path found."""
+    tightenings: Natural = 200
+    """Attempts to shorten each path but the first by small moves of its waypoints."""
+    iterations: Count = 20_000
+    """Most iterations of a round; its trees hold at most as many nodes."""
+    keep_trees: bool = False
+    """Whether results hold the trees of the search, for drawing."""
+
+
+class AnytimeSearch:
+    """Rounds of RRT-Connect between a start and goals, and the best path so far.
+
+    The same seed gives the same rounds; `stop` only ends them.
+    """
+
+    clock_interval = 100
+    """Iterations between two calls of `stop`."""
+    spare_nodes = 0
+    """Nodes that an iteration may add to a tree besides one."""
+    limits: tuple | None = None
+    """Path constraints that the edges of trees keep."""
+
+    def __init__(
+        self,
+        start_goal: StartGoal,
+        settings: SearchSettings,
+        name: str,
+        seed: int,
+        clearances: Sequence[float],
+        bounded: bool = True,
+        tries: int = ITERATIONS_PER_CLEARANCE,
+        stop: Callable[[], bool] = lambda: False,
+        improved: Callable[[float], None] = lambda length: None,
+    ) -> None:
+        """
+        name: the stage that results name for paths found here.
+        clearances: clearances to try, falling [m].
+        bounded: whether rounds search below a bound on length (AORRTC); False: they are restarts.
+        tries: iterations without a path before the next clearance is tried.
+        improved: called with the length [rad] of each path that is the best so far.
+        """
+        self.start_goal = start_goal
+        self.settings = settings
+        self.name = name
+        self.bounded = bounded
+        self.start, self.goals = start_goal.rows()
+        self.best: Float[ndarray, "n dof"] | None = None
+        """The shortest path so far, free at the resolution of the search."""
+        self.length = np.float32(np.inf)
+        self.stage = ""
+        """The stage that it comes from."""
+        self.work = 0
+        """Iterations so far."""
+        self.found = 0
+        """Number of paths that the search found."""
+        self.history = list[tuple[ndarray, str]]()
+        """Each path that was the shortest when it was found, and its stage."""
+        self.motions: TimeOptimization | None = None
+        """The fastest motions near the paths found, if the objective is time."""
+        self._lengths = list[tuple[int, float]]()
+        self._untightened = False
+        """Whether the best path is not tightened yet: the first one is, once there is time to improve it."""
+        self._state = random_state(seed)
+        self._trees: rrt_kernel.Trees | None = None
+        self._round_end = 0
+        """The work at which the trees are given up."""
+        self._grown: rrt_kernel.Trees | None = None
+        """The trees that found the shortest path of the search; those that grow until there is one."""
+        self._clearances = clearances
+        self._tries = tries
+        self._stop = stop
+        self._improved = improved
+        self._set_level(0)
+
+    @classmethod
+    def of(
+        cls,
+        context: PlanningContext,
+        start_goal: StartGoal,
+        settings: SearchSettings,
+        name: str,
+        bounded: bool = True,
+    ) -> "AnytimeSearch":
+        """The search of a call of a planner, which ends with the call's time."""
+        return cls(
+            start_goal,
+            settings,
+            name,
+            context.request.seed,
+            usual_clearances(context.clearance),
+            bounded,
+            stop=lambda: context.remaining <= 0,
+            improved=context.improved,
+        )
+
+    @property
+    def clearance(self) -> float:
+        """The distance to obstacles that paths keep, except near the start and the goals [m]."""
+        return self._clearances[self._level]
+
+    @property
+    def shortest(self) -> bool:
+        """Whether no path to any goal can be shorter."""
+        return self._near_straight(OPTIMALITY_TOLERANCE)
+
+    def _near_straight(self, part: float) -> bool:
+        """Whether the best path exceeds the straight line by no more than this part."""
+        straight = np.linalg.norm(self.goals - self.start, axis=1).min()
+        return bool(self.length <= straight * (1 + part))
+
+    @property
+    def trees(self) -> tuple[Tree, ...]:
+        """See `PlanResult.trees`."""
+        if self._grown is None or not self.settings.keep_trees:
+            return ()
+        grown = self._grown
+        return tuple(
+            Tree(grown.nodes[i, :n].copy(), grown.parents[i, :n].copy()) for i, n in enumerate(grown.sizes)
+        )
+
+    def first(self, fallback: Callable[[], None] | None = None, work: float = np.inf) -> bool:
+        """Search for a first path, for at most `work` more iterations; returns whether there is a path.
+
+        fallback: called each time that all clearances failed.
+        """
+        if self.best is None:
+            self._try_straight_lines()
+        enough = self.work + work
+        while self.best is None and self.work < enough and not self._stop():
+            self._iterate()
+            if self.best is None and self._tried >= self._tries:
+                self._lower_clearance(fallback)
+        return self.best is not None
+
+    def improve(self, work: float) -> None:
+        """Search for shorter paths, for at most `work` more iterations, or until the path is optimal."""
+        enough = self.work + work
+        if self._untightened and self.best is not None:
+            self.offer(self.best, self.stage)
+            self._untightened = False
+        while not self.shortest and self.work < enough and not self._stop():
+            self._iterate()
+
+    def improves(self, gain: float, patience: int) -> bool:
+        """Whether to search on: the last doubling of the work shortened the path by at least the part `gain`,
+        or there were fewer than `patience` iterations."""
+        return still_improves(self._lengths, self.work, float(self.length), gain, patience)
+
+    def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
+        """Simplify a path from the start to a goal, free in `space`, and keep it if it is the shortest so
+        far; returns whether it was."""
+        path = for_kernels(path, np.float32)
+        settings = self.settings
+        path = simplify(self.space, path, settings.smoothings)
+        length = path_length(path)
+        if self.best is None:
+            self._untightened = True
+        elif length < TIGHTENING_FACTOR * self.length:
+            path = tighten(self.space, path, settings.tightenings, self._state)
+            length = path_length(path)
+        if self.motions is not None and length < NEAR_FACTOR * self.length:
+            self.motions.offer(self.space, path, stage)
+        return bool(length < self.length) and self._take(path, float(length), stage)
+
+    def _take(self, path: Float[ndarray, "n dof"], length: float, stage: str) -> bool:
+        """Make a path the best one."""
+        self.best, self.length, self.stage = path, np.float32(length), stage
+        self.history.append((path, stage))
+        self._lengths.append((self.work, length))
+        self._trees = None
+        self._improved(length)
+        return True
+
+    def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
+        """Whether the polyline through configurations keeps the clearance of the search."""
+        rows = np.ascontiguousarray(q if len(q) > 1 else np.repeat(q, 2, axis=0), np.float32)
+        return bool(motions_free(self.space, rows).all())
+
+    def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
+        """Halve the resolution after the validator refused the best path, and go back to the last accepted
+        one."""
+        self.settings = replace(self.settings, resolution=finer_resolution(self.settings.resolution))
+        self.best = accepted
+        self.length = np.float32(np.inf if accepted is None else path_length(accepted))
+        self._trees = None
+        self._set_level(self._level)
+
+    def _set_level(self, level: int) -> None:
+        self._level, self._tried = level, 0
+        self.space = self.start_goal.space(self.settings.resolution, self.clearance)
+
+    def _lower_clearance(self, fallback: Callable[[], None] | None) -> None:
+        """Go to the next lower clearance, at which the trees stay valid; call the fallback after the lowest
+        one."""
+        if self._level < len(self._clearances) - 1:
+            self._set_level(self._level + 1)
+            self._try_straight_lines()
+        else:
+            self._tried = self._tries - FALLBACK_INTERVAL
+            if fallback is not None and self.work >= FALLBACK_INTERVAL:
+                fallback()
+
+    def _try_straight_lines(self) -> None:
+        for goal in sorted(self.goals, key=lambda goal: float(np.linalg.norm(goal - self.start))):
+            path = self._line(goal)
+            if len(path) and self.offer(path, "straight_line"):
+                self.found += 1
+                return
+
+    def _line(self, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+        """The edge from the start to a goal; without rows if there is none."""
+        path = np.stack([self.start, goal])
+        return path if motions_free(self.space, path).all() else path[:0]
+
+    def _iterate(self) -> None:
+        """Run some iterations of a round, and offer the path that they find."""
+        most, trees = self.settings.iterations, self._trees
+        capacity = most + len(self.goals) + 2 * self.spare_nodes
+        if trees is None or self.work >= self._round_end or trees.sizes.max() + self.spare_nodes >= capacity:
+            trees = self._trees = rrt_kernel.make_trees(self.start, self.goals, capacity)
+            self._round_end = self.work + most
+        bound = np.float32(BOUND_FACTOR * self.length if self.bounded else np.inf)
+        longest = np.float32(self.settings.range)
+        path = rrt_kernel.search(
+            self.space, self.limits, trees, bound, longest, self.clock_interval, self._state
+        )
+        self.work += self.clock_interval
+        self._tried += self.clock_interval
+        if self.best is None:
+            self._grown = trees
+        if len(path):
+            self.found += 1
+            self._trees = None
+            if self.offer(path, self.name):
+                self._grown = trees
+
+
+class ConstrainedSearch(AnytimeSearch):
+    """Restarts of RRT-Connect under constraints."""
+
+    clock_interval = 20
+
+    def __init__(self, context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> None:
+        constraints = context.validator.constraints
+        start = start_goal.start_lead
+        assert constraints is not None and start is not None  # problems without are planned otherwise
+        with loading():  # its code is compiled apart, and rarely needed
+            from robotdiffuse.planning.search import constrained
+
+        self._code, self.spare_nodes = constrained, constrained.MAX_PIECES
+        kept = constraints.limits(TOLERANCE_FRACTION)
+        at_ends = constraints.values(np.stack([start, *start_goal.goal_leads])).max(axis=0) + END_MARGIN
+        kept = np.minimum(np.maximum(kept, at_ends), constraints.rows.limit)
+        self.context = context
+        self.limits = constrained.make_limits(constraints.rows, kept)
+        self.cost = np.inf
+        """Of the best path: its estimated duration [s]; its length [rad] if that is the objective."""
+        self._speed_limits = scaled_limits(context.problem.robot, context.timing)
+        super().__init__(
+            start_goal,
+            settings,
+            "constrained_rrt_connect",
+            context.request.seed,
+            usual_clearances(context.clearance),
+            bounded=False,
+            stop=lambda: context.remaining <= 0,
+            improved=context.improved,
+        )
+        self.start, self.goals = start, np.stack(start_goal.goal_leads)
+
+    @property
+    def shortest(self) -> bool:
+        """Whether no path can be shorter by more than a small part: the constraints hardly bend the straight
+        line."""
+        return self._near_straight(STRAIGHT_EXCESS)
+
+    def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
+        """Whether the polyline through configurations keeps the clearance and the constraints."""
+        return self.context.keeps_constraints(q) and super().keeps_clearance(q)
+
+    def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
+        """See `AnytimeSearch`; the path also keeps the constraints, and the one of the least cost is kept."""
+        path = self._code.simplify(
+            self.space, self.limits, path, self.settings.smoothings, SHORTCUTS, self._state
+        )
+        cost = self._cost_of(path)
+        if cost >= self.cost:
+            return False
+        self.cost = cost
+        return self._take(path, float(path_length(path)), self.name)
+
+    def _cost_of(self, path: Float[ndarray, "n dof"]) -> float:
+        if self.context.request.objective == LENGTH:
+            return float(path_length(path))
+        return estimated_duration(path, self.context.timing.corner_deviation, self._speed_limits)
+
+    def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
+        """See `AnytimeSearch`."""
+        super().refuse(accepted)
+        self.cost = np.inf if accepted is None else self._cost_of(accepted)
+
+    def _line(self, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+        return self._code.line(self.space, self.limits, self.start, goal)
+
+
+def usual_clearances(wanted: float) -> list[float]:
+    """The clearances that a search tries one after the other [m]: the wanted one and fractions of it, the
+    default one's if that is less, MIN_CLEARANCE and 0."""
+    falling = [share * wanted for share in FALLING_FRACTIONS]
+    if wanted > DEFAULT_CLEARANCE:
+        usual = [share * DEFAULT_CLEARANCE for share in FALLING_FRACTIONS]
+        falling = [*(clearance for clearance in falling if clearance > DEFAULT_CLEARANCE), *usual]
+    return [*(clearance for clearance in falling if clearance > MIN_CLEARANCE), MIN_CLEARANCE, 0.0]
+
+
+class _Validation:
+    """The best validated result of a search, and which of its paths was validated when."""
+
+    def __init__(self, context: PlanningContext, search: AnytimeSearch) -> None:
+        self.context, self.search = context, search
+        self.best: PlanResult | None = None
+        self._by_time = context.request.objective == TIME
+        self._path: ndarray | None = None
+        self._shortest: PlanResult | None = None
+        """The last valid path of the search, and its result."""
+        self._timed = list[ndarray]()
+        """The paths of the search that were validated."""
+        self._validated_at = 0
+        self._late = False
+        """Whether a path was validated after the time for searching had run out."""
+
+    @property
+    def due(self) -> bool:
+        """Whether to validate now: the first path at once, better ones every VALIDATION_INTERVAL iterations,
+        or at once under path constraints."""
+        interval = 0 if self.context.problem.constraints else VALIDATION_INTERVAL
+        rested = self.search.work >= self._validated_at + interval
+        return self.best is None or (rested and self._improved())
+
+    def _improved(self) -> bool:
+        motions = self.search.motions
+        if motions is None or motions.best is None:
+            return self.search.best is not self._path
+        return motions.best.time < (1 - MIN_TIME_GAIN) * _duration(self.best)
+
+    def run(self) -> bool:
+        """Validate the best path of the search; if it is refused, the search goes back to the last valid one.
+
+        Returns whether there is a valid path to answer with.
+        """
+        search, motions = self.search, self.search.motions
+        assert search.best is not None
+        self._validated_at = search.work
+        self._late = self.context.remaining <= 0
+        if motions is not None and motions.best is not None and (self.best is not None or self._late):
+            self._accepts_motion(motions.best)
+        if motions is not None and self.best is not None:
+            return True
+        if search.best is self._path or self._accepts(search.best, search.stage):
+            return True
+        if self.context.remaining <= 0 and self.best is None:
+            # no time to search on: try the path before it
+            return any(self._accepts(*before) for before in search.history[-2:-1])
+        search.refuse(self._path)
+        return False
+
+    def run_last(self) -> None:
+        """Make the best result the fastest of the best motions found and of the shortest path's.
+
+        Results before these count only if time ran out, or else the clock would decide which is returned.
+        """
+        search, motions, before = self.search, self.search.motions, self.best
+        if before is None or self.context.ended or self._late:
+            return
+        if motions is None:
+            for path, stage in reversed(search.history if self.context.problem.constraints else ()):
+                if self.context.remaining > 0 and not any(path is timed for timed in self._timed):
+                    self._accepts(path, stage)
+            return
+        self.best = None
+        accepted = 0
+        for candidate in motions.fastest():
+            accepted += self._accepts_motion(candidate)
+            if accepted == FINAL_CANDIDATES or self.context.remaining <= 0:
+                break
+        if self.context.remaining > 0 and search.best is not None:
+            if search.best is self._path:
+                self._keep(self._shortest)
+            else:
+                self._accepts(search.best, search.stage)
+        if self.best is None or self.context.remaining <= 0:
+            self._keep(before)
+
+    def _accepts(self, path: ndarray, stage: str) -> bool:
+        self._timed.append(path)
+        paths = [self.search.start_goal.complete(path, direct) for direct in (True, False)]
+        result = None
+        if len(paths[0]) < len(paths[1]):  # covering spheres touch at an end, but the meshes may be free
+            result = self._finished(paths[0], stage, None)
+        if result is None:
+            result = self._finished(paths[1], stage, None)
+        if result is not None:
+            self._path, self._shortest = path, result
+        return result is not None
+
+    def _accepts_motion(self, candidate: Candidate) -> bool:
+        start_goal, most = self.search.start_goal, self.context.timing.corner_deviation
+        path = start_goal.complete(candidate.path)
+        # the exact start or goal may be added beside the ends of the search
+        deviations = np.full(len(path), most)
+        begins = start_goal.start_lead
+        assert begins is not None  # else there would be no path
+        first = 1 if np.array_equal(begins, start_goal.start) else 2
+        deviations[first : first + len(candidate.deviations)] = candidate.deviations
+        return self._finished(path, candidate.stage, deviations) is not None
+
+    def _finished(self, path: ndarray, stage: str, deviations: ndarray | None) -> PlanResult | None:
+        """Validate and time a path, and keep its result."""
+        search, wanted = self.search, self.context.clearance
+        keeps = search.keeps_clearance
+        notes = ()
+        if search.clearance < wanted:
+            kept, asked = 100 * search.clearance, 100 * wanted
+            notes = (
+                f"searched with a clearance of {kept:.2g} cm, not {asked:.2g} cm: "
+                "no path was found with that",
+            )
+        result = self.context.finish(path, stage, notes=notes, keeps=keeps, deviations=deviations)
+        self._keep(result)
+        return result
+
+    def _keep(self, result: PlanResult | None) -> None:
+        """Make a result the best one, unless its motion takes longer and the objective is time."""
+        if result is not None and (not self._by_time or _duration(result) < _duration(self.best)):
+            self.best = result
+
+
+def _duration(result: PlanResult | None) -> float:
+    return np.inf if result is None or result.duration is None else result.duration
+
+
+def anytime(
+    context: PlanningContext,
+    search: AnytimeSearch,
+    improves: Callable[[], bool],
+    improve: Callable[[], None],
+    fallback: Callable[[], None] | None = None,
+) -> PlanResult:
+    """Search for a path, and for better ones for as long as the call's `until` says.
+
+    improves: whether more time is still likely to shorten the path.
+    improve: spends some time on shorter paths.
+    fallback: may offer paths where the search finds none at any clearance.
+    """
+    request, problem = context.request, context.problem
+    if request.objective == TIME and request.until != FIRST and not problem.constraints:
+        straight = float(np.linalg.norm(search.goals - search.start, axis=1).min())
+        several = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
+        given = all(isinstance(goal, JointGoal) for goal in several)
+        longest = np.inf if given else MAX_DETOUR * straight
+        search.motions = TimeOptimization(
+            problem.robot, context.timing, search.start, search.goals, request.seed, longest
+        )
+    motions = search.motions
+
+    def searches() -> bool:
+        return not search.shortest and (request.until == TIME_LIMIT or improves())
+
+    def optimizes() -> bool:
+        if motions is None or not motions.candidates:
+            return False
+        return request.until == TIME_LIMIT or motions.improves(TIME_GAIN, TIME_PATIENCE)
+
+    def ended() -> bool:
+        if request.until == FIRST or context.remaining <= 0 or (motions is not None and motions.optimal):
+            return True
+        return not (searches() or optimizes())
+
+    validation = _Validation(context, search)
+    while search.first(fallback):
+        done = ended()
+        if done and motions is not None and validation.best is not None:
+            break
+        if done or (context.validates_early and validation.due):
+            if validation.run() and ended():
+                break
+            if validation.best is None and context.remaining <= 0:
+                break
+        else:
+            searching = searches()
+            if searching:
+                improve()
+            if motions is not None:
+                share = ATTEMPTS_PER_ITERATION * search.work
+                wanted = share if searching else motions.attempts + ATTEMPTS_AFTER_SEARCH
+                while motions.attempts < wanted and context.remaining > 0 and motions.candidates:
+                    motions.improve(search.space)
+    validation.run_last()
+    return replace(validation.best or context.unsolved(), trees=search.trees)
+
 
 IMPROVEMENT_STEP = 1_000
 """Iterations of AORRTC between two checks whether to search on."""
@@ -78,9 +665,6 @@ class RRTConnect(Planner[RRTConnectSettings]):
 
 def plan_constrained(context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> PlanResult:
     """Plan for a problem with path constraints."""
-    with loading():
-        from robotdiffuse.planning.search.constrained import PATHS_TO_FIND, ConstrainedSearch
-
     search = ConstrainedSearch(context, start_goal, settings)
     return anytime(
         context, search, lambda: search.found < PATHS_TO_FIND, lambda: search.improve(search.clock_interval)

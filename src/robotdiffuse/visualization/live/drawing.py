@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory, Tree
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, thinned
-from robotdiffuse.planning.diffusion.candidates import Candidates
+from robotdiffuse.planning.hybrid import Candidates
 from robotdiffuse.robots.scaling import reach
 from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.shapes import PointCloud, Shape

@@ -20,8 +20,13 @@ from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.drawables import ASSUMED, GOAL, OBSERVED, drawables
 from robotdiffuse.perception.depth_view import DepthNoise
-from robotdiffuse.planning.exploration.recorded import RecordedAct, RecordedExplorer, RecordedView
-from robotdiffuse.planning.exploration.simulated import explore, simulated_explorer
+from robotdiffuse.planning.exploration.simulated import (
+    RecordedAct,
+    RecordedExplorer,
+    RecordedView,
+    explore,
+    simulated_explorer,
+)
 from robotdiffuse.planning.exploration.steps import CHANCE, DONE, LOOK, POLICIES, STRICT, ExplorerSettings
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem

@@ -27,7 +27,7 @@ from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.drawables import own_frame
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner, planner_settings
-from robotdiffuse.planning.diffusion.candidates import Candidates, draw_candidates
+from robotdiffuse.planning.hybrid import Candidates, draw_candidates
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.files import load_problem, problem_from_record, save_problem

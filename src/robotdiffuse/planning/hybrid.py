@@ -8,18 +8,23 @@ inputs are the clearances of the links and, by default, no encoding of the scene
 either bounds the next round of search. The validator checks every path, and the result names the stage that
 found it.
 
-For an arm without weights the batches are smooth noise, refined by the same steps (see smooth_noise.py). They
+For an arm without weights the batches are smooth noise, refined by the same steps (`smooth_noise`). They
 are drawn only once the search has a path: before that they solve fewer problems in the same time than search
 does, see benchmarks/results/hard_arms.txt.
 
 Under path constraints only the search runs: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
 shorter (the mean of 20 upright cups and of 20 lines; median: the same).
+
+Smooth noise: the noise of the model that comes with the Panda has the covariance of its training trajectories
+about the straight lines between their ends. Its eigenvectors are nearly sines of k half waves, its
+eigenvalues fall as k^-3.5, and its standard deviation is an eighth of half the range of a joint. So the noise
+has a closed form for any arm. Refined by many guidance steps, it replaces the samples of a network.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import islice
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,21 +34,64 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
-from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.diffusion.diffusion import GuidedSamplingSettings, ModelSampler, encode
-from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
+from robotdiffuse.planning.diffusion import GuidedSamplingSettings, ModelSampler, encode
 from robotdiffuse.planning.learned import nearest_goals
-from robotdiffuse.planning.search.anytime import AnytimeSearch, anytime
-from robotdiffuse.planning.search.rrt import AORRTC, IMPROVEMENT_STEP, AORRTCSettings, plan_constrained
-from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.planning.search.rrt import (
+    AORRTC,
+    IMPROVEMENT_STEP,
+    AnytimeSearch,
+    AORRTCSettings,
+    anytime,
+    plan_constrained,
+)
+from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import MotionModel
+
+SPREAD = 0.127
+"""Standard deviation over the waypoints, as a fraction of half a joint's range: the mean over the Panda's
+joints."""
+MAX_HALF_RANGE = np.pi
+"""Half a joint's range counts as no more than this [rad]: continuous joints have no limits."""
+WAVES = 8
+"""Number of sines; more would add less than a hundredth."""
+VARIANCE_EXPONENT = 3.5
+"""The variance of the sine of k half waves falls as k to this power."""
+
+
+def smooth_noise(
+    start: Float[ndarray, "dof"],
+    goals: Float[ndarray, "k dof"],
+    count: int,
+    waypoints: int,
+    robot: Robot,
+    rng: np.random.Generator,
+) -> Float[ndarray, "count waypoints dof"]:
+    """Straight lines from the start to the goals in turn, plus smooth noise; float32.
+
+    All waypoints but the ends are clipped to the joint limits.
+    """
+    t = np.linspace(0.0, 1.0, waypoints)
+    waves = np.arange(1, WAVES + 1)
+    deviations = waves ** (-VARIANCE_EXPONENT / 2)
+    deviations *= SPREAD * np.sqrt(2) / np.linalg.norm(deviations)  # a sine's mean square is a half
+    basis = np.sin(np.pi * t[:, None] * waves) * deviations
+    half = np.minimum(0.5 * (robot.upper - robot.lower), MAX_HALF_RANGE)
+    lines = start + t[:, None] * (goals[np.arange(count) % len(goals), None] - start)
+    q = lines + half * (basis @ rng.normal(size=(count, WAVES, len(start))))
+    q = np.clip(q, robot.lower, robot.upper).astype(np.float32)
+    q[:, 0], q[:, -1] = lines[:, 0], lines[:, -1]
+    return q
+
 
 BATCH_WORK = 12_000
 """Iterations of search that take about as long as a batch of 16 samples in two steps, or as its
@@ -226,3 +274,57 @@ class _NetworkBatches(_Batches):
             with self._timed("refinement"):
                 refined = planner.refine(checker, sampled)
             self._take(refined, "refinement")
+
+
+TIME_LIMIT = 1.0
+"""For finding configurations of the goal [s]."""
+PLACES_PER_SEGMENT = 4
+"""Places at which clearances are measured, from one waypoint to the next."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """A batch of trajectories and their clearances."""
+
+    source: str
+    """"network", or "smooth_noise" for an arm without weights."""
+    positions: Float[ndarray, "count waypoints dof"]
+    clearances: Float[ndarray, "count"]
+    """Smallest signed distance of the covering spheres to the obstacles along each trajectory, sampled [m],
+    at most 1 m; negative where spheres touch, though the meshes within may not."""
+
+
+def draw_candidates(problem: Problem, seed: int = 0) -> Candidates:
+    """Draw a batch as the planner `robotdiffuse` does.
+
+    Raises InputError if the start or the goal cannot be used.
+    """
+    planner = _planner()
+    model = planner.model(problem.robot)
+    context = PlanningContext(planner.name, problem, PlanRequest(TIME_LIMIT, seed))
+    start_goal = usable_start_goal(context)
+    if isinstance(start_goal, PlanResult):
+        raise InputError(f"nothing can be drawn: {start_goal.reason}")
+    start, goals = start_goal.rows()
+    if model is None:
+        goals = nearest_goals(start, goals, planner.settings.samples)
+        q = smooth_noise(start, goals, planner.settings.samples, WAYPOINTS, problem.robot, context.rng)
+        q = planner.refine(start_goal.checker, q)
+    else:
+        code = planner.code(model, start_goal.checker, context.rng)
+        q = planner.draw(model, start_goal.checker, code, start, goals, context.rng)
+    count, waypoints, dof = q.shape
+    at = np.linspace(0, waypoints - 1, PLACES_PER_SEGMENT * (waypoints - 1) + 1)
+    low = np.minimum(at.astype(int), waypoints - 2)
+    share = (at - low)[:, None]
+    dense = (1 - share) * q[:, low] + share * q[:, low + 1]
+    distances = start_goal.checker.link_clearances(dense.reshape(-1, dof)).reshape(count, -1)
+    source = "smooth_noise" if model is None else "network"
+    return Candidates(
+        source, np.asarray(q, np.float64), distances.min(axis=1, initial=1.0).astype(np.float64)
+    )
+
+
+@cache
+def _planner() -> RobotDiffuse:
+    return RobotDiffuse()
