@@ -13,9 +13,9 @@ import pytest
 import robotdiffuse as rd
 from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
 from robotdiffuse.certificates.certificate import Certificate, load_certificate
-from robotdiffuse.certificates.content_hashes import request_parts
+from robotdiffuse.certificates.proof import request_parts
+from robotdiffuse.certificates.requirements import inverse_dynamics, torque_bounds
 from robotdiffuse.certificates.search import certify
-from robotdiffuse.certificates.torques import inverse_dynamics, torque_bounds
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics

@@ -13,7 +13,7 @@ from helpers.example_robots import example_robot
 from helpers.made_arms import chain, row, written
 from helpers.urdfs import read_urdf
 from robotdiffuse.certificates.checker import check
-from robotdiffuse.certificates.constraints import constraint_bounds
+from robotdiffuse.certificates.requirements import constraint_bounds
 from robotdiffuse.cli import main
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision

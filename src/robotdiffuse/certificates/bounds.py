@@ -7,7 +7,7 @@ near. Only the joints between two links count: motion is seen from the last comm
 joints of the link further from the base, and for links on two arms those of both.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -27,6 +27,7 @@ from robotdiffuse.certificates.obstacles import (
 )
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 
 SCENE = "scene"
@@ -199,49 +200,58 @@ class Prover:
         ball = np.arange(counts.sum()) - begin[row] + self._first[links][row]
         return row, ball, begin
 
-    def _placed(self, postures: Postures, posture: ndarray, link: ndarray, points: ndarray) -> ndarray:
-        """Points of link frames in the base frame."""
-        T = postures.T[posture, link]
-        return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
+    def _ball_bounds(
+        self,
+        links: ndarray,
+        moved: ndarray,
+        posture: ndarray,
+        postures: Postures,
+        spans: ndarray,
+        distances: Callable[[ndarray, ndarray, ndarray], ndarray] | None = None,
+    ) -> tuple[ndarray, ndarray]:
+        """Clearances of the balls of links and upper bounds on their displacement by the joints `moved` [m].
+
+        distances: from each ball's row in `links`, its posture and its centre; None: only displacement.
+        """
+        row, ball, begin = self._expand(links)
+        at, radius = posture[row], self._balls[ball, 3]
+        T = postures.T[at, links[row]]
+        centers = _placed_points(T, self._balls[ball, :3])
+        went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
+        clearance = np.full(len(links), CLEARANCE_CAP)
+        if distances is not None:
+            apart = distances(row, at, centers) - radius
+            clearance = np.minimum(np.minimum.reduceat(apart, begin), CLEARANCE_CAP)
+        return clearance, np.maximum.reduceat(went, begin)
 
     def _by_spheres(
         self, claim: ndarray, posture: ndarray, postures: Postures, spans: ndarray, pairs: bool
     ) -> tuple[ndarray, ndarray]:
         further = np.array([self._of[c.link] for c in self.claims])[claim]
-        row, ball, begin = self._expand(further)
-        at, radius = posture[row], self._balls[ball, 3]
-        centers = self._placed(postures, at, further[row], self._balls[ball, :3])
         moved, others = self._moved[further], np.zeros(len(claim))
-        if pairs:
-            nearer = np.array([self._of.get(c.against, 0) for c in self.claims])[claim]
-            others = self._displaced(postures, posture, nearer, self._moved[nearer] & ~moved, spans)
-            moved = moved & ~self._moved[nearer]
-            distances = self._to_links(postures, at, centers, nearer[row])
-        else:
-            apart = self.obstacles.distances(centers)
-            if self.may_touch.any():
-                apart[self.may_touch[further[row]]] = CLEARANCE_CAP
-            distances = apart.min(axis=1, initial=CLEARANCE_CAP)
-        went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
-        clearance = np.minimum.reduceat(distances - radius, begin)
-        return np.minimum(clearance, CLEARANCE_CAP), np.maximum.reduceat(went, begin) + others
+        if not pairs:
 
-    def _displaced(
-        self, postures: Postures, posture: ndarray, links: ndarray, moved: ndarray, spans: ndarray
-    ) -> Float[ndarray, "n"]:
-        """Upper bounds on the displacement of links by these joints [m]; 0 for a link that none of them
-        moves."""
-        went = np.zeros(len(links))
-        some = np.flatnonzero(moved.any(axis=1))
+            def to_scene(row: ndarray, at: ndarray, centers: ndarray) -> ndarray:
+                apart = self.obstacles.distances(centers)
+                if self.may_touch.any():
+                    apart[self.may_touch[further[row]]] = CLEARANCE_CAP
+                return apart.min(axis=1, initial=CLEARANCE_CAP)
+
+            return self._ball_bounds(further, moved, posture, postures, spans, to_scene)
+        nearer = np.array([self._of.get(c.against, 0) for c in self.claims])[claim]
+        alone = self._moved[nearer] & ~moved
+        some = np.flatnonzero(alone.any(axis=1))
         if len(some):
-            row, ball, begin = self._expand(links[some])
-            at, link = posture[some][row], links[some][row]
-            centers = self._placed(postures, at, link, self._balls[ball, :3])
-            moves = self.linkage.displacement(
-                postures, at, centers, self._balls[ball, 3], moved[some][row], spans
-            )
-            went[some] = np.maximum.reduceat(moves, begin)
-        return went
+            others[some] = self._ball_bounds(nearer[some], alone[some], posture[some], postures, spans)[1]
+        clearance, went = self._ball_bounds(
+            further,
+            moved & ~self._moved[nearer],
+            posture,
+            postures,
+            spans,
+            lambda row, at, centers: self._to_links(postures, at, centers, nearer[row]),
+        )
+        return clearance, went + others
 
     def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
         """Distances of points to the spheres of one link each [m]."""
@@ -250,7 +260,7 @@ class Prover:
         for first in range(0, len(at), step):
             some = slice(first, first + step)
             row, ball, begin = self._expand(link[some])
-            others = self._placed(postures, at[some][row], link[some][row], self._balls[ball, :3])
+            others = _placed_points(postures.T[at[some][row], link[some][row]], self._balls[ball, :3])
             apart = np.sqrt(((centers[some][row] - others) ** 2).sum(axis=1)) - self._balls[ball, 3]
             found[some] = np.minimum.reduceat(apart, begin)
         return found
@@ -366,6 +376,10 @@ def placed(parts: tuple[Part, ...], T: Float[ndarray, "4 4"]) -> list[Part]:
     return [part._replace(vertices=part.vertices @ R.T + t, center=R @ part.center + t) for part in parts]
 
 
+def _placed_points(T: Float[ndarray, "n 4 4"], points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+    return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
+
+
 def _has_geometry(robot: Robot, link: str) -> bool:
     return bool(len(robot.spheres.get(link, ())) or robot.meshes.get(link))
 
@@ -391,3 +405,66 @@ def _parts(robot: Robot, link: str) -> tuple[Part, ...]:
 def _ball(vertices: ndarray) -> tuple[ndarray, float]:
     center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     return center, float(np.sqrt(((vertices - center) ** 2).sum(axis=1)).max())
+
+
+class MovingProver(Prover):
+    """Computes bounds for a robot among moving obstacles along straight lines through configurations at
+    times, or near them.
+
+    A stretch is free of an obstacle if the clearance of the link's spheres in its middle, in place and time,
+    exceeds the sum of the largest displacements of any point of the link and of the obstacle from there until
+    either end.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        moving: Sequence[MovingObstacle],
+        q: Float[ndarray, "rows dof"],
+        times: Float[ndarray, "rows"],
+        off: Float[ndarray, "rows1 dof"] | None = None,
+    ) -> None:
+        super().__init__(robot, Scene(), q, off)
+        self.times, self.moving = times, tuple(moving)
+        self._shapes = [Obstacles(Scene([one.shape])) for one in moving]
+
+    @cached_property
+    def claims(self) -> tuple[Claim, ...]:
+        """Each moving link against each obstacle."""
+        links = [link for link in self.links if self._moved[self._of[link]].any()]
+        return tuple(Claim(link, one.name) for link in links for one in self.moving)
+
+    def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
+        """Bounds of stretches by the spheres; planes are not used."""
+        middle = (stretches.start + stretches.stop) / 2
+        spans = self.spans(stretches.start, stretches.stop, middle)
+        postures = self.linkage.place(self.at(middle))
+        rows = np.arange(len(self.times))
+        begin, at, end = (np.interp(s, rows, self.times) for s in (stretches.start, middle, stretches.stop))
+        further = np.array([self._of[claim.link] for claim in self.claims])[stretches.claim]
+        number = {one.name: i for i, one in enumerate(self.moving)}
+        which = np.array([number[claim.against] for claim in self.claims])[stretches.claim]
+        obstacle = np.empty(len(which))
+
+        def distances(row: ndarray, at_row: ndarray, centers: ndarray) -> ndarray:
+            found = np.empty(len(row))
+            for i, one in enumerate(self.moving):
+                of_it = np.flatnonzero(which == i)
+                if one.max_speed is None:
+                    T = np.array([one.pose(time) for time in at[of_it]]).reshape(-1, 4, 4)
+                    obstacle[of_it] = one.top_speed * np.maximum(at - begin, end - at)[of_it]
+                else:
+                    T = np.broadcast_to(one.pose(0.0), (len(of_it), 4, 4))
+                    obstacle[of_it] = one.max_speed * np.maximum(end[of_it], 0.0)
+                place = np.empty(len(which), int)
+                place[of_it] = np.arange(len(of_it))
+                balls = np.flatnonzero(which[row] == i)
+                there = T[place[row[balls]]]
+                local = np.einsum("nji,nj->ni", there[:, :3, :3], centers[balls] - there[:, :3, 3])
+                stands = one.pose(float(one.track[0][0]))
+                found[balls] = self._shapes[i].distances(local @ stands[:3, :3].T + stands[:3, 3])[:, 0]
+            return found
+
+        posture, moved = np.arange(len(which)), self._moved[further]
+        clearance, went = self._ball_bounds(further, moved, posture, postures, spans, distances)
+        return Bounds(clearance, went + obstacle)

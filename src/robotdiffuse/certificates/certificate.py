@@ -2,9 +2,10 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -21,12 +22,6 @@ from robotdiffuse.problems.problem import Problem
 
 FILE_MARK, VERSION = "robotdiffuse certificate", 1
 RATE_ROWS = ("times", "velocities", "accelerations")
-FIELDS = {
-    *("is", "version", "robot", "robot_parts", "scene_parts", "motion_hash", "tolerances", "scene_clearance"),
-    *("self_clearance", "problem", "motion", "between", "proof", "request_parts", "moving", "constraints"),
-    *("looks", "torques", "jerks"),
-}
-"""Of a certificate file."""
 STRETCH_FIELDS = ("start", "stop", "by_planes", "clearance", "displacement")
 
 
@@ -48,7 +43,10 @@ class Certificate(MotionProof):
     def save(self, file: str | FilePath) -> None:
         """Write a .json file. Raises InputError for another ending or if the file cannot be written."""
         path = check_output(file, (".json",))
-        write_atomically(path, json.dumps(_record(self), allow_nan=False, separators=(",", ":")) + "\n")
+        record = {"is": FILE_MARK, "version": VERSION}
+        for name, field in FIELDS.items():
+            record[name] = field.write(getattr(self, field.attribute or name))
+        write_atomically(path, json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n")
 
 
 def load_certificate(file: str | FilePath) -> Certificate:
@@ -59,7 +57,16 @@ def load_certificate(file: str | FilePath) -> Certificate:
     try:
         if record.get("version") != VERSION:
             raise InputError(f"version is {shown(record.get('version'))}; this version reads {VERSION}")
-        return _certificate(record)
+        known = {"is", "version", *FIELDS}
+        unknown = sorted(record.keys() - known)
+        if unknown:
+            raise InputError(f"{unknown[0]} is unknown; the fields are {', '.join(sorted(known))}")
+        values = {
+            field.attribute or name: field.read(name, record[name])
+            for name, field in FIELDS.items()
+            if name in record or name in REQUIRED
+        }
+        return Certificate(**values)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -71,38 +78,14 @@ def is_certificate(record: object) -> bool:
     return isinstance(record, dict) and record.get("is") == FILE_MARK
 
 
-def _record(certificate: Certificate) -> dict[str, Any]:
-    motion, proof = certificate.motion, certificate.proof
-    timed = isinstance(motion, Trajectory)
-    return {
-        "is": FILE_MARK,
-        "version": VERSION,
-        "robot": certificate.robot,
-        "robot_parts": certificate.robot_parts,
-        "scene_parts": certificate.scene_parts,
-        "motion_hash": certificate.motion_hash,
-        "tolerances": asdict(certificate.tolerances),
-        "scene_clearance": certificate.scene_clearance,
-        "self_clearance": certificate.self_clearance,
-        "problem": certificate.problem,
-        "motion": {
-            "joint_names": list(motion.joint_names),
-            "positions": motion.positions.tolist(),
-            **({name: getattr(motion, name).tolist() for name in RATE_ROWS} if timed else {}),
-        },
-        "between": certificate.between.tolist(),
-        "proof": _proof_record(proof),
-        "request_parts": certificate.request_parts,
-        "moving": None if certificate.moving is None else _proof_record(certificate.moving),
-        "constraints": [list(one) for one in certificate.constraints],
-        "looks": certificate.torque_samples.tolist(),
-        "torques": [list(one) for one in certificate.torques],
-        "jerks": [list(one) for one in certificate.jerks],
-    }
+def _motion_record(motion: Path | Trajectory) -> dict[str, Any]:
+    arrays = ("positions", *(RATE_ROWS if isinstance(motion, Trajectory) else ()))
+    rows = {name: getattr(motion, name).tolist() for name in arrays}
+    return {"joint_names": list(motion.joint_names), **rows}
 
 
-def _proof_record(proof: StretchProof) -> list[dict[str, Any]]:
-    return [_claim_record(proof, k, claim) for k, claim in enumerate(proof.claims)]
+def _proof_record(proof: StretchProof | None) -> list[dict[str, Any]] | None:
+    return proof and [_claim_record(proof, k, claim) for k, claim in enumerate(proof.claims)]
 
 
 def _claim_record(proof: StretchProof, k: int, claim: Claim) -> dict[str, Any]:
@@ -124,45 +107,15 @@ def _claim_record(proof: StretchProof, k: int, claim: Claim) -> dict[str, Any]:
     }
 
 
-def _certificate(record: dict[str, Any]) -> Certificate:
-    unknown = sorted(record.keys() - FIELDS)
-    if unknown:
-        raise InputError(f"{unknown[0]} is unknown; the fields are {', '.join(sorted(FIELDS))}")
-    tolerances = record["tolerances"]
-    names = {f.name for f in fields(Tolerances)}
-    if not isinstance(tolerances, dict) or set(tolerances) != names:
-        raise InputError(f"tolerances must have the fields {', '.join(sorted(names))}")
-    problem = record.get("problem")
-    if problem is not None and not isinstance(problem, dict):
-        raise InputError("problem must be an object")
-    return Certificate(
-        str(record["robot"]),
-        _hashes("robot_parts", record["robot_parts"]),
-        _hashes("scene_parts", record["scene_parts"]),
-        str(record["motion_hash"]),
-        Tolerances(**{name: _number(name, value) for name, value in tolerances.items()}),
-        _motion(record["motion"]),
-        _vector("between", record["between"]),
-        _number("scene_clearance", record["scene_clearance"]),
-        _number("self_clearance", record["self_clearance"]),
-        _proof(record["proof"]),
-        problem,
-        _hashes("request_parts", record.get("request_parts", {})),
-        None if record.get("moving") is None else _proof(record["moving"]),
-        _named_bounds(record.get("constraints", [])),
-        _vector("looks", record.get("looks", [])),
-        _named_bounds(record.get("torques", [])),
-        _named_bounds(record.get("jerks", [])),
-    )
-
-
-def _motion(record: dict[str, Any]) -> Path | Trajectory:
+def _motion(_: str, record: dict[str, Any]) -> Path | Trajectory:
     arrays = {name: record[name] for name in ("positions", *RATE_ROWS) if name in record}
     names, checked = check_motion_arrays(record["joint_names"], arrays, "motion.")
     return Path(names, **checked) if len(checked) == 1 else Trajectory(names, **checked)
 
 
-def _proof(record: list[dict[str, Any]]) -> StretchProof:
+def _proof(_: str, record: list[dict[str, Any]] | None) -> StretchProof | None:
+    if record is None:
+        return None
     claims, columns, planes = [], {name: [np.zeros(0)] for name in ("claim", *STRETCH_FIELDS)}, []
     begin = 0
     for k, entry in enumerate(record):
@@ -191,7 +144,7 @@ def _proof(record: list[dict[str, Any]]) -> StretchProof:
     )
 
 
-def _named_bounds(rows: list[Any]) -> tuple[tuple[str, float], ...]:
+def _named_bounds(_: str, rows: list[Any]) -> tuple[tuple[str, float], ...]:
     return tuple((str(name), _number(str(name), most)) for name, most in rows)
 
 
@@ -212,3 +165,53 @@ def _number(name: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{name} is {shown(value)}; it must be a finite number")
     return float(value)
+
+
+def _tolerances(_: str, value: object) -> Tolerances:
+    names = {f.name for f in fields(Tolerances)}
+    if not isinstance(value, dict) or set(value) != names:
+        raise InputError(f"tolerances must have the fields {', '.join(sorted(names))}")
+    return Tolerances(**{name: _number(name, one) for name, one in value.items()})
+
+
+def _problem(_: str, value: object) -> dict[str, Any] | None:
+    if value is not None and not isinstance(value, dict):
+        raise InputError("problem must be an object")
+    return value
+
+
+def _text(_: str, value: object) -> str:
+    return str(value)
+
+
+class Field(NamedTuple):
+    """A field of a certificate file."""
+
+    read: Callable[[str, Any], Any]
+    write: Callable[[Any], Any] = lambda value: value
+    attribute: str = ""
+    """Of `Certificate`, where it has another name."""
+
+
+NUMBERS = Field(_vector, lambda array: array.tolist())
+FIELDS = {
+    "robot": Field(_text),
+    "robot_parts": Field(_hashes),
+    "scene_parts": Field(_hashes),
+    "motion_hash": Field(_text),
+    "tolerances": Field(_tolerances, asdict),
+    "scene_clearance": Field(_number),
+    "self_clearance": Field(_number),
+    "problem": Field(_problem),
+    "motion": Field(_motion, _motion_record),
+    "between": NUMBERS,
+    "proof": Field(_proof, _proof_record),
+    "request_parts": Field(_hashes),
+    "moving": Field(_proof, _proof_record),
+    "constraints": Field(_named_bounds),
+    "looks": NUMBERS._replace(attribute="torque_samples"),
+    "torques": Field(_named_bounds),
+    "jerks": Field(_named_bounds),
+}
+"""Fields of files, in their order, besides the mark and the version."""
+REQUIRED = {one.name for one in fields(MotionProof) if one.default is one.default_factory is MISSING}

@@ -11,16 +11,19 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.certificates.bounds import CLEARANCE_CAP, SCENE, Claim, Prover
-from robotdiffuse.certificates.content_hashes import (
+from robotdiffuse.certificates.bounds import CLEARANCE_CAP, SCENE, Claim, MovingProver, Prover
+from robotdiffuse.certificates.kinematics import places_of
+from robotdiffuse.certificates.proof import (
+    BOUND_TOLERANCE,
+    MotionProof,
+    StretchProof,
+    Tolerances,
     differences,
     motion_hash,
     request_parts,
     robot_parts,
     scene_parts,
 )
-from robotdiffuse.certificates.moving_obstacles import MovingProver
-from robotdiffuse.certificates.proof import BOUND_TOLERANCE, MotionProof, StretchProof, Tolerances
 from robotdiffuse.certificates.requirements import (
     configurations,
     deviations,
@@ -136,7 +139,7 @@ def _moving_proof_errors(problem: Problem, certificate: MotionProof) -> Iterator
     if proof is None:
         yield "proof: there is none among moving obstacles"
         return
-    times = np.sort(np.concatenate([motion.times, certificate.between]), kind="stable")
+    times = places_of(motion, certificate.between)
     q, off = configurations(motion, certificate.between), deviations(motion, certificate.between)
     prover = MovingProver(problem.robot, problem.moving, q, times, off)
     every, stated = np.ones(len(proof.stretches.claim), bool), {"scene": certificate.scene_clearance}

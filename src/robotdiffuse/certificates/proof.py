@@ -1,6 +1,10 @@
-"""The proof of a motion as values: what was proved, and the bounds that prove it."""
+"""The proof of a motion as values: what was proved, and the bounds that prove it; content hashes of robots,
+scenes and motions, part by part, so that the checker can name what differs."""
 
-from dataclasses import dataclass, field
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -8,7 +12,13 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.mesh import Triangulated
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import PointCloud, Shape
 
 BOUND_TOLERANCE = 1e-6
 """A recomputed bound may differ from the written one by this [m] or [rad], because files round."""
@@ -92,3 +102,96 @@ class MotionProof:
     jerks: tuple[tuple[str, float], ...] = ()
     """For each joint its name and its largest jerk, accelerations being linear between rows [rad/s³] or
     [m/s³]; empty for a path, and where accelerations jump at the ends."""
+
+
+HASH_DECIMALS = 9
+"""Decimals that are hashed: rotations from quaternions differ in the last bits between machines."""
+HASH_LENGTH = 16
+"""Hexadecimal digits of the hash of a part."""
+LIMITS = ("lower", "upper", "velocity", "acceleration")
+
+
+def robot_parts(robot: Robot) -> dict[str, str]:
+    """Hashes of everything in a robot that a proof depends on."""
+    parts = {
+        "planned joints": _hash([robot.base, *robot.joint_names]),
+        "allowed collisions": _hash(sorted(sorted(pair) for pair in robot.allowed_collisions)),
+    }
+    for joint in robot.joints:
+        numbers = [joint.T_parent_joint, joint.axis, *(getattr(joint, name) for name in LIMITS)]
+        held = robot.locked.get(joint.name)
+        names = [joint.name, joint.kind, joint.parent, joint.child, held is None]
+        parts[f"joint {joint.name}"] = _hash(names, *numbers, 0.0 if held is None else held)
+    for link, spheres in robot.spheres.items():
+        parts[f"spheres of {link}"] = _hash(link, spheres)
+    for link, meshes in robot.meshes.items():
+        arrays = [array for mesh in meshes for array in (mesh.vertices, mesh.faces)]
+        parts[f"meshes of {link}"] = _hash(link, *arrays)
+    return parts
+
+
+def scene_parts(scene: Scene) -> dict[str, str]:
+    """Hashes of the obstacles, by name, and of the contacts that are allowed."""
+    parts = {shape.name: _hash(shape.kind, *_numbers(shape)) for shape in scene.shapes}
+    for name, links in scene.allowed_contacts:
+        parts[f"links that may touch {name}"] = _hash(links if isinstance(links, str) else sorted(links))
+    return parts
+
+
+def request_parts(problem: Problem) -> dict[str, str]:
+    """Hashes of moving obstacles with their motions, of path constraints, and of the payload with all that
+    torques depend on: inertias, effort limits and the base's pose."""
+    parts = {}
+    if problem.payload is not None:
+        robot, carried = problem.robot, problem.payload
+        links = sorted(robot.inertias)
+        rows = [robot.inertias[link].values for link in links]
+        own, T_world_base = [carried.mass, *carried.com, *carried.moments], problem.T_world_base
+        stands = np.eye(4) if T_world_base is None else T_world_base
+        parts["payload"] = _hash([carried.link, *links], own, stands, robot.effort, rows)
+    for one in problem.moving:
+        ways = [np.zeros(0) if v is None else v for v in (one.velocity, one.times, one.poses, one.max_speed)]
+        parts[f"moving {one.name}"] = _hash(one.shape.kind, *_numbers(one.shape), *ways)
+    for i, one in enumerate(problem.constraints):
+        values = [getattr(one, f.name) for f in fields(one)]
+        texts = [one.kind, *(value for value in values if isinstance(value, str))]
+        rows = [np.zeros(0) if value is None else value for value in values if not isinstance(value, str)]
+        parts[f"constraints[{i}]"] = _hash(texts, *rows)
+    return parts
+
+
+def motion_hash(names: Iterable[str], *rows: np.ndarray | None) -> str:
+    """Hash of joint names and arrays, without any rounding."""
+    digest = hashlib.sha256(json.dumps(list(names)).encode())
+    for array in rows:
+        if array is not None:
+            digest.update(str(array.shape).encode() + np.ascontiguousarray(array, np.float64).tobytes())
+    return digest.hexdigest()
+
+
+def differences(what: str, certified: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
+    """A line for each part that is missing, added or changed since it was certified."""
+    lines = [f"{what}: {name} is missing" for name in certified if name not in here]
+    lines += [f"{what}: {name} was added" for name in here if name not in certified]
+    changed = (name for name in certified if name in here and certified[name] != here[name])
+    return lines + [f"{what}: {name} has changed" for name in changed]
+
+
+def _numbers(shape: Shape) -> list[object]:
+    if isinstance(shape, PointCloud):
+        return [shape.points, shape.point_radius]
+    if isinstance(shape, Triangulated):
+        mesh = shape.mesh
+        return [mesh.vertices, mesh.faces, mesh.xyz, mesh.wxyz]
+    names = [name for name in ("center", "radius", "size", "height", "wxyz") if hasattr(shape, name)]
+    if not names:
+        raise InputError(f"{shape.name}: a {type(shape).__name__} cannot be certified")
+    return [getattr(shape, name) for name in names]
+
+
+def _hash(names: object, *numbers: object) -> str:
+    digest = hashlib.sha256(json.dumps(names).encode())
+    for values in numbers:
+        rounded = np.round(np.asarray(values, np.float64), HASH_DECIMALS) + 0.0  # no negative zeros
+        digest.update(str(rounded.shape).encode() + rounded.tobytes())
+    return digest.hexdigest()[:HASH_LENGTH]

@@ -1,21 +1,446 @@
-"""The checker's own tests of all requirements but freedom from collision: limits, start, goal and rates."""
+"""The checker's own tests of all requirements but freedom from collision: limits, start, goal, rates, path
+constraints and torques.
 
-from collections.abc import Iterator
+Path constraints: between two configurations joints move by dq at constant rates. A frame's origin p then
+leaves the chord by at most an eighth of its second derivative, which is at most sum_jk |dq_j dq_k|
+L_max(j,k), where L_k bounds the distance of p from axis k all along. The distance to a convex body is a
+convex function, so it is bounded by its greater value at the two ends plus that deviation. An axis of the
+frame leaves its chord by at most (sum_j |dq_j|)² / 8, and the angle between two orientations grows no faster
+than the sum of their rotations.
+
+Torques are sampled at the rows of the motion and places between them. Between two samples, positions are
+cubics or straight lines, and velocities and accelerations their derivatives; at rows, accelerations may jump.
+A torque leaves its chord by at most an eighth of its greatest second derivative times the square of the time
+between. Torques are sums and products of vectors that rotate with the links, so the product rule bounds that
+derivative by bounds on the motion of links and joints.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.certificates.constraints import constraint_bounds, frame_speed_errors
-from robotdiffuse.certificates.cubics import Cubics, cubics_of
-from robotdiffuse.certificates.kinematics import Linkage
+from robotdiffuse.certificates.kinematics import (
+    Cubics,
+    Linkage,
+    Postures,
+    clock,
+    cross_matrix,
+    cubics_of,
+    places_of,
+)
 from robotdiffuse.certificates.proof import BOUND_TOLERANCE, MotionProof, Tolerances
-from robotdiffuse.certificates.torques import torque_bounds
-from robotdiffuse.core.errors import joined
+from robotdiffuse.core.errors import InputError, joined
 from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
+from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.inertias import Inertia
 from robotdiffuse.robots.robot import Robot
+
+MAX_HALVINGS, MAX_OPEN = 24, 100_000
+"""Halvings of a step at most, and stretches at a time, to show that a frame keeps its speed."""
+SAME_POSE = 1e-3
+"""Poses at several goals may differ by this for a Cartesian line to end there [m] and in entries of R."""
+
+
+class ConstraintBound(NamedTuple):
+    """Upper bounds of one quantity of a constraint."""
+
+    name: str
+    limit: float
+    """[m] or [rad]"""
+    bounds: Float[ndarray, "n"]
+    """From each configuration to the next."""
+
+
+class _Body(NamedTuple):
+    """A box whose half sizes may be 0 or infinite along some of its axes."""
+
+    center: ndarray
+    R: ndarray
+    half: ndarray
+
+    def distances(self, points: ndarray) -> ndarray:
+        """Signed distances of points [m], negative inside."""
+        beyond = np.abs((points - self.center) @ self.R) - self.half
+        return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+
+
+class _FrameMotion(NamedTuple):
+    """Motion of a frame from each of n + 1 configurations to the next."""
+
+    p: Float[ndarray, "n1 3"]
+    R: Float[ndarray, "n1 3 3"]
+    turn: Float[ndarray, "n"]
+    """Upper bound of its rotation [rad]."""
+    went: Float[ndarray, "n"]
+    """Upper bound of the path length of its origin [m]."""
+    sag: Float[ndarray, "n"]
+    """Upper bound of the origin's distance from the chord [m]."""
+    slack: Float[ndarray, "n"]
+    """Upper bound of the origin's displacement if every joint is off by 1 rad or 1 m [m]."""
+    joints: int
+    """Number of joints that move the frame."""
+
+
+def constraint_bounds(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[ConstraintBound]:
+    """Bounds along straight lines through configurations, and along all motions within `chord` of these lines
+    in each joint [rad] or [m]. Raises InputError for a Cartesian line if the goal is not a single pose."""
+    linkage = Linkage(problem.robot)
+    q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
+    frames = {constraint.frame for constraint in problem.constraints}
+    placed = linkage.place(q, *frames) if len(frames) == 1 else linkage.place(q)
+    found = []
+    for constraint in problem.constraints:
+        along = _frame_motion(linkage, placed, q, constraint.frame)
+        name = f"{constraint.kind} of {constraint.frame}"
+        if isinstance(constraint, AxisCone):
+            cosines = along.R @ constraint.axis @ constraint.direction
+            least = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
+            bounds = np.arccos(np.clip(least, -1.0, 1.0)) + chord * along.joints
+            found.append(ConstraintBound(name, constraint.angle, bounds))
+            continue
+        if isinstance(constraint, CartesianLine):
+            T_start, T_goal = _line_poses(problem, linkage, constraint)
+            body = _segment(T_start[:3, 3], T_goal[:3, 3])
+        else:
+            body = _body(constraint)
+        limit = 0.0 if isinstance(constraint, PositionBox) else constraint.tolerance
+        apart = body.distances(along.p)
+        bounds = np.maximum(apart[1:], apart[:-1]) + along.sag + chord * along.slack
+        found.append(ConstraintBound(name, limit, bounds))
+        if isinstance(constraint, CartesianLine) and constraint.angle is not None:
+            bounds = _angle_bounds(along, T_start, T_goal, chord)
+            found.append(ConstraintBound(f"{name}, its angle", constraint.angle, bounds))
+    return found
+
+
+def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
+    """A line for each frame that is not shown to keep its constraint's speed, but for a share `slack`, along
+    the cubics of the motion.
+
+    A velocity leaves its chord by at most an eighth of its second derivative times the square of the time.
+    The derivatives of a position by several joints are at most the lever of the last of them.
+    """
+    linkage, lines, cubics = Linkage(problem.robot), [], cubics_of(motion)
+    if cubics is None:
+        return lines
+    far = np.concatenate([motion.positions, cubics.turns])
+    jerks = np.abs(cubics.end - cubics.start) / cubics.steps
+    for one in problem.constraints:
+        if not isinstance(one, CartesianLine) or one.speed is None:
+            continue
+        joints, levers = np.flatnonzero(linkage.moved[linkage.links.index(one.frame)]), linkage.levers
+        speed, pull = np.cumsum(cubics.speeds[:, joints], axis=1), np.cumsum(cubics.pulls[:, joints], axis=1)
+        products = np.diff(3 * pull * speed + speed**3, axis=1, prepend=0.0)
+        bends = (jerks[:, joints] + products) @ levers(one.frame, far)
+        row, start, stop = np.arange(len(bends)), np.zeros(len(bends)), cubics.steps[:, 0]
+        allowed = one.speed * (1 + slack)
+        for _ in range(MAX_HALVINGS):
+            most = np.maximum(*(_frame_speeds(linkage, cubics, one.frame, row, at) for at in (start, stop)))
+            open_ = ~(most + bends[row] * (stop - start) ** 2 / 8 <= allowed)
+            if not open_.any() or not (most <= allowed).all() or open_.sum() > MAX_OPEN:
+                break
+            row, low, high = row[open_], start[open_], stop[open_]
+            start, stop = np.append(low, (low + high) / 2), np.append((low + high) / 2, high)
+            row = np.tile(row, 2)
+        if open_.any():
+            how = (
+                "is not shown to be slow enough"
+                if most.max() <= allowed
+                else f"moves at {most.max():.4g} m/s"
+            )
+            lines.append(f"motion: {one.frame} {how}; {one.speed:g} m/s is allowed")
+    return lines
+
+
+def _frame_speeds(
+    linkage: Linkage, cubics: Cubics, frame: str, row: ndarray, time: ndarray
+) -> Float[ndarray, "n"]:
+    q, v, _ = cubics.at(row, time)
+    joints, rates = linkage.rates(linkage.place(q, frame), frame)
+    return np.linalg.norm((rates * v[:, joints, None]).sum(axis=1), axis=1)
+
+
+def _frame_motion(linkage: Linkage, postures: Postures, q: ndarray, frame: str) -> _FrameMotion:
+    T, (joints, rates) = postures.T[:, linkage.links.index(frame)], linkage.rates(postures, frame)
+    step = np.abs(np.diff(q, axis=0))[:, joints]
+    lengths = np.linalg.norm(rates[:-1], axis=2)
+    went, sag = np.zeros(len(step)), np.zeros(len(step))
+    for j in reversed(range(len(joints))):
+        if not linkage.slides[joints[j]]:
+            lengths[:, j] += went  # later joints may have moved it away by so much
+        went = went + step[:, j] * lengths[:, j]
+        before = step[:, :j].sum(axis=1)
+        sag += lengths[:, j] * step[:, j] * (step[:, j] + 2 * before) / 8
+    turn = step[:, ~linkage.slides[joints]].sum(axis=1)
+    return _FrameMotion(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), len(joints))
+
+
+def _body(constraint: Constraint) -> _Body:
+    if isinstance(constraint, PositionBox):
+        T = constraint.T_base_box
+        assert T is not None  # the constructor sees to it
+        middle, half = (constraint.low + constraint.high) / 2, (constraint.high - constraint.low) / 2
+        return _Body(T[:3, :3] @ middle + T[:3, 3], T[:3, :3], half)
+    assert not isinstance(constraint, AxisCone | CartesianLine)
+    flat = isinstance(constraint, OnPlane)
+    along = constraint.normal if isinstance(constraint, OnPlane) else constraint.direction
+    half = np.array([np.inf, np.inf, 0.0] if flat else [0.0, 0.0, np.inf])
+    return _Body(constraint.point, _with_z(along), half)
+
+
+def _segment(start: ndarray, goal: ndarray) -> _Body:
+    length = float(np.linalg.norm(goal - start))
+    return _Body((start + goal) / 2, _with_z((goal - start) / length), np.array([0.0, 0.0, length / 2]))
+
+
+def _with_z(z: ndarray) -> Float[ndarray, "3 3"]:
+    """A rotation matrix with a given unit vector as its third column."""
+    x = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndarray, ndarray]:
+    """T_base_frame at start and goal."""
+    k = linkage.links.index(line.frame)
+    start, goal = linkage.place(problem.start[None]).T[0], problem.goal
+    if isinstance(goal, JointGoal):
+        ends = linkage.place(goal.positions).T[:, k]
+        if not (np.abs(ends - ends[0]) <= SAME_POSE).all():
+            raise InputError(f"cartesian_line of {line.frame}: the goals put it at different poses")
+        return start[k], ends[0]
+    for pose in poses_of(goal):
+        other = linkage.links.index(pose.frame)
+        if not pose.tolerant and (linkage.moved[k] == linkage.moved[other]).all():
+            return start[k], pose.T_base_frame @ np.linalg.inv(start[other]) @ start[k]
+    raise InputError(f"cartesian_line of {line.frame}: the goal does not determine one pose of it")
+
+
+def _angle_bounds(along: _FrameMotion, T_start: ndarray, T_goal: ndarray, chord: float) -> ndarray:
+    """Bounds of the angle between the frame's orientation and the one interpolated at its place on the
+    line."""
+    way = T_goal[:3, 3] - T_start[:3, 3]
+    length = float(np.linalg.norm(way))
+    turn = _rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
+    whole = float(np.linalg.norm(turn))
+    share = np.clip((along.p - T_start[:3, 3]) @ way / length**2, 0.0, 1.0)
+    axis = turn / whole if whole > 0 else np.array([0.0, 0.0, 1.0])
+    K = cross_matrix(axis)
+    angles = (share * whole)[:, None, None]
+    wanted = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
+    # from the norm of the difference of rotations, which is accurate near 0 too
+    chords = np.linalg.norm(along.R - wanted, axis=(1, 2))
+    off = 2 * np.arcsin(np.clip(chords / np.sqrt(8), 0.0, 1.0))
+    reach = whole / length
+    return (off[1:] + off[:-1] + along.turn + reach * along.went) / 2 + chord * (
+        along.joints + reach * along.slack
+    )
+
+
+def _rotation_vector(R: ndarray) -> ndarray:
+    angle = 2 * np.arcsin(np.clip(np.linalg.norm(R - np.eye(3)) / np.sqrt(8), 0.0, 1.0))
+    if angle < 1e-12:
+        return np.zeros(3)
+    axis = np.linalg.eigh(R + R.T)[1][:, -1]
+    skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return angle * axis * (-1.0 if skew @ axis < 0 else 1.0)
+
+
+GRAVITY = 9.81
+"""Along -z of the world [m/s²]."""
+MIN_MASS = 1e-9
+"""Smaller masses are ignored [kg]."""
+
+
+class Bound(NamedTuple):
+    """Upper bounds of the norm of vectors, or the size of numbers, and of their first two derivatives."""
+
+    size: ndarray
+    first: ndarray
+    second: ndarray
+
+    def __add__(self, other: "Bound") -> "Bound":  # type: ignore[override]
+        return Bound(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def __mul__(self, other: "Bound") -> "Bound":  # type: ignore[override]
+        second = self.second * other.size + 2 * self.first * other.first + self.size * other.second
+        return Bound(self.size * other.size, self.first * other.size + self.size * other.first, second)
+
+    def scaled(self, by: float) -> "Bound":
+        return Bound(*(by * part for part in self))
+
+
+class States(NamedTuple):
+    """The m stretches of a motion from each sample to the next: states at their starts and ends, and bounds
+    [m, dof] with derivatives by time (of paths, by the share of the way)."""
+
+    q: Float[ndarray, "2 m dof"]
+    v: Float[ndarray, "2 m dof"]
+    a: Float[ndarray, "2 m dof"]
+    durations: Float[ndarray, "m"]
+    """Of the stretches [s]; 1 for a path."""
+    places: Bound
+    """Of positions."""
+    speeds: Bound
+    """Of velocities; 0 for a path, whose configurations are at rest."""
+    pulls: Bound
+    """Of accelerations."""
+
+
+def torque_bounds(
+    problem: Problem, motion: Path | Trajectory, samples: Float[ndarray, "k"]
+) -> Float[ndarray, "m dof"]:
+    """Upper bounds of each joint's torque from each sample to the next [N m] or [N].
+
+    Samples are the rows and, between them, `samples`: times, or for a path rows plus shares of the way to the
+    next.
+    """
+    states = _states(motion, samples)
+    torques = [np.abs(inverse_dynamics(problem, *end)) for end in zip(*states[:3], strict=True)]
+    second_derivatives = _second_derivative_bounds(problem, states)
+    return np.maximum(*torques) + second_derivatives * states.durations[:, None] ** 2 / 8
+
+
+def _states(motion: Path | Trajectory, samples: Float[ndarray, "k"]) -> States:
+    cubics = cubics_of(motion)
+    if cubics is None:
+        return _static_states(configurations(motion, samples))
+    at = places_of(motion, samples)
+    row = cubics.rows(at[:-1])
+    ends = [cubics.at(row, time - cubics.times[row]) for time in (at[:-1], at[1:])]
+    q, v, a = (np.stack(both) for both in zip(*ends, strict=True))
+    speed, pull = cubics.speeds, cubics.pulls
+    jerk = np.abs(cubics.end - cubics.start) / cubics.steps
+    far = np.abs(cubics.positions) + speed * cubics.steps
+    places, speeds, pulls = (far, speed, pull), (speed, pull, jerk), (pull, jerk, 0 * jerk)
+    bounds = (Bound(*(part[row] for part in of)) for of in (places, speeds, pulls))
+    return States(q, v, a, np.diff(at), *bounds)
+
+
+def _static_states(q: Float[ndarray, "n dof"]) -> States:
+    q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
+    step = np.abs(np.diff(q, axis=0))
+    places = Bound(np.maximum(np.abs(q[1:]), np.abs(q[:-1])), step, 0 * step)
+    none = Bound(0 * step, 0 * step, 0 * step)
+    ends = np.stack([q[:-1], q[1:]])
+    return States(ends, 0 * ends, 0 * ends, np.ones(len(step)), places, none, none)
+
+
+def inverse_dynamics(
+    problem: Problem, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
+) -> Float[ndarray, "n dof"]:
+    """Torques [n, dof] by the Newton-Euler equations of each link, in the base frame [N m] or [N]."""
+    robot, linkage = problem.robot, Linkage(problem.robot)
+    postures, number = linkage.place(q), {joint.name: j for j, joint in enumerate(robot.planned_joints)}
+    T = {link: postures.T[:, k] for k, link in enumerate(linkage.links)}
+    up = np.eye(4)[2, :3] if problem.T_world_base is None else problem.T_world_base[2, :3]
+    still = np.zeros((len(q), 3))
+    turning = {robot.base: (still, still, still + GRAVITY * up)}
+    for joint in robot.joints:
+        w, dw, pull = turning[joint.parent]
+        arm = T[joint.child][:, :3, 3] - T[joint.parent][:, :3, 3]
+        pull = pull + np.cross(dw, arm) + np.cross(w, np.cross(w, arm))
+        j = number.get(joint.name)
+        if j is not None:
+            along, bent = v[:, j, None] * postures.axes[:, j], a[:, j, None] * postures.axes[:, j]
+            if linkage.slides[j]:
+                pull = pull + bent + 2 * np.cross(w, along)
+            else:
+                w, dw = w + along, dw + bent + np.cross(w, along)
+        turning[joint.child] = w, dw, pull
+    carried = _masses(problem)
+    force, moment = ({link: still for link in linkage.links} for _ in range(2))
+    torques = np.empty_like(q)
+    for joint in reversed(robot.joints):
+        link, (w, dw, pull) = joint.child, turning[joint.child]
+        for body in carried.get(link, ()):
+            R = T[link][:, :3, :3]
+            arm, inertia = R @ body.com, R @ body.moments @ R.transpose(0, 2, 1)
+            own = body.mass * (pull + np.cross(dw, arm) + np.cross(w, np.cross(w, arm)))
+            spin = np.einsum("nij,nj->ni", inertia, w)
+            force[link] = force[link] + own
+            turn = np.einsum("nij,nj->ni", inertia, dw) + np.cross(w, spin) + np.cross(arm, own)
+            moment[link] = moment[link] + turn
+        j = number.get(joint.name)
+        if j is not None:
+            of = force[link] if linkage.slides[j] else moment[link]
+            torques[:, j] = (postures.axes[:, j] * of).sum(axis=1)
+        arm = T[link][:, :3, 3] - T[joint.parent][:, :3, 3]
+        force[joint.parent] = force[joint.parent] + force[link]
+        moment[joint.parent] = moment[joint.parent] + moment[link] + np.cross(arm, force[link])
+    return torques
+
+
+def _second_derivative_bounds(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
+    """Upper bounds on the second derivatives of torques from each sample to the next: the same equations on
+    bounds."""
+    robot, linkage = problem.robot, Linkage(problem.robot)
+    number = {joint.name: j for j, joint in enumerate(robot.planned_joints)}
+    none = np.zeros(len(states.durations))
+    still = Bound(none, none, none)
+    turning = {robot.base: (still, still, still, Bound(none + GRAVITY, none, none))}
+    axes, arms = dict[str, Bound](), dict[str, Bound]()
+    for joint in robot.joints:
+        seen, w, dw, pull = turning[joint.parent]
+        held = joint.motion(robot.locked.get(joint.name, 0.0)) if joint.name not in number else np.eye(4)
+        reach = float(np.linalg.norm((joint.T_parent_joint @ held)[:3, 3]))
+        axis, arm = _rotating(1.0, seen), _rotating(reach, seen)
+        j = number.get(joint.name)
+        if j is None:
+            pull = pull + dw * arm + w * (w * arm)
+        else:
+            place, speed, bent = (Bound(*(part[:, j] for part in of)) for of in states[4:])
+            along, rate = speed * axis, Bound(place.first, place.second, none) * axis
+            if linkage.slides[j]:
+                arm = arm + place * axis
+                pull = pull + dw * arm + w * (w * arm) + bent * axis + (w * along).scaled(2.0)
+            else:
+                pull = pull + dw * arm + w * (w * arm)
+                seen, w, dw = seen + rate, w + along, dw + bent * axis + w * along
+        turning[joint.child], axes[joint.child], arms[joint.child] = (seen, w, dw, pull), axis, arm
+    carried = _masses(problem)
+    force, moment = ({link: still for link in linkage.links} for _ in range(2))
+    second_derivatives = np.empty((len(none), robot.dof))
+    for joint in reversed(robot.joints):
+        link, (seen, w, dw, pull) = joint.child, turning[joint.child]
+        for body in carried.get(link, ()):
+            arm, most = (
+                _rotating(float(np.linalg.norm(body.com)), seen),
+                float(np.linalg.eigvalsh(body.moments)[-1]),
+            )
+            inertia = Bound(none + most, 2 * most * seen.size, most * (2 * seen.first + 4 * seen.size**2))
+            own = (pull + dw * arm + w * (w * arm)).scaled(body.mass)
+            force[link] = force[link] + own
+            moment[link] = moment[link] + inertia * dw + w * (inertia * w) + arm * own
+        j = number.get(joint.name)
+        if j is not None:
+            second_derivatives[:, j] = (
+                axes[link] * (force[link] if linkage.slides[j] else moment[link])
+            ).second
+        force[joint.parent] = force[joint.parent] + force[link]
+        moment[joint.parent] = moment[joint.parent] + moment[link] + arms[link] * force[link]
+    return second_derivatives
+
+
+def _rotating(length: float, seen: Bound) -> Bound:
+    """Bounds of a vector of constant length that rotates with a link whose rotation is bounded by `seen`."""
+    return Bound(length + 0 * seen.size, length * seen.size, length * (seen.first + seen.size**2))
+
+
+def _masses(problem: Problem) -> dict[str, list[Inertia]]:
+    """The inertias of each link, with the payload's."""
+    payload, found = problem.payload, {link: [of] for link, of in problem.robot.inertias.items()}
+    assert payload is not None
+    if payload.mass > MIN_MASS:
+        link = payload.link or problem.robot.tip
+        found.setdefault(link, []).append(Inertia(payload.mass, payload.com, np.diag(payload.moments)))
+    return found
+
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
 """Where rows are closer than the first of these [s], mean accelerations are also tested over windows of at
@@ -45,10 +470,9 @@ def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> F
         return motion.positions
     cubics = cubics_of(motion)
     if cubics is None:
-        rows = np.arange(len(motion.positions))
-        places = np.sort(np.concatenate([rows, between]))
+        places, rows = places_of(motion, between), clock(motion)
         return np.column_stack([np.interp(places, rows, joint) for joint in motion.positions.T])
-    times = np.concatenate([motion.times, between])  # type: ignore[union-attr]
+    times = np.concatenate([clock(motion), between])
     q = np.concatenate([motion.positions, cubics.positions_at(between)])
     return q[np.argsort(times, kind="stable")]
 
@@ -57,9 +481,7 @@ def deviations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> Float
     """How far a motion leaves the straight line from each of its `configurations` to the next; None for a
     path, which does not."""
     cubics = cubics_of(motion)
-    if cubics is None:
-        return None
-    return cubics.deviations(np.sort(np.concatenate([motion.times, between])))  # type: ignore[union-attr]
+    return None if cubics is None else cubics.deviations(places_of(motion, between))
 
 
 def not_covered(problem: Problem, motion: Path | Trajectory) -> list[str]:
@@ -109,16 +531,15 @@ def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
     motion, robot = certificate.motion, problem.robot
     if tuple(motion.joint_names) != robot.joint_names:
         return [f"motion: its joints are {joined(motion.joint_names)}, not {joined(robot.joint_names)}"]
-    timed = isinstance(motion, Trajectory)
-    clock = motion.times if timed else np.arange(len(motion.positions), dtype=float)
-    if clock[0] != 0:
-        return [f"motion: its times begin at {clock[0]:g} s, not at 0"]
-    if not (np.diff(clock) > 0).all():
+    times = clock(motion)
+    if times[0] != 0:
+        return [f"motion: its times begin at {times[0]:g} s, not at 0"]
+    if not (np.diff(times) > 0).all():
         return ["motion: its times do not increase"]
     for name, places in (("between", certificate.between), ("looks", certificate.torque_samples)):
-        if not ((places > 0) & (places < clock[-1])).all() or len(np.unique(places)) < len(places):
+        if not ((places > 0) & (places < times[-1])).all() or len(np.unique(places)) < len(places):
             return [f"motion: the places of `{name}` do not lie between its rows"]
-    if timed and np.isin(certificate.between, clock).any():
+    if isinstance(motion, Trajectory) and np.isin(certificate.between, times).any():
         return ["motion: the times of `between` do not lie between its rows"]
     return []
 
@@ -184,21 +605,17 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
 def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Torque limits that are not shown to be kept with the payload, and torques that differ from the
     proof."""
-    motion, stated = certificate.motion, dict(certificate.torques)
+    motion, stated = certificate.motion, certificate.torques
     if problem.payload is None:
         if stated:
             yield "torques: the problem has no payload"
         return
-    if [name for name, _ in certificate.torques] != [*problem.robot.joint_names]:
+    if [name for name, _ in stated] != [*problem.robot.joint_names]:
         yield "torques: their joints are not those of the robot"
         return
     most = torque_bounds(problem, motion, certificate.torque_samples).max(axis=0)
     allowed = problem.robot.effort * (1 + certificate.tolerances.rate_slack)
-    for name, torque, limit in zip(stated, most, allowed, strict=True):
-        if not abs(torque - stated[name]) <= BOUND_TOLERANCE:
-            yield f"torques: the bound of {name} is {torque:.6f}, not {stated[name]:.6f}"
-        if not torque <= limit:
-            yield f"torques: {name} is not shown to keep its limit: {torque:.6f} of {limit:.6f}"
+    yield from _stated_errors("torques", stated, most, allowed)
 
 
 def _constraint_errors(
@@ -211,12 +628,19 @@ def _constraint_errors(
     if [one.name for one in shown] != [name for name, _ in certificate.constraints]:
         yield "constraints: they are not those of the problem"
         return
-    for one, (_, stated) in zip(shown, certificate.constraints, strict=True):
-        most = float(one.bounds.max())
-        if not abs(most - stated) <= BOUND_TOLERANCE:
-            yield f"constraints: the bound of {one.name} is {most:.6f}, not {stated:.6f}"
-        if not most <= one.limit:
-            yield f"constraints: {one.name} is not shown to be kept: {most:.6f} of {one.limit:.6f}"
+    most, limits = [float(one.bounds.max()) for one in shown], [one.limit for one in shown]
+    yield from _stated_errors("constraints", certificate.constraints, most, limits)
+
+
+def _stated_errors(
+    what: str, stated: Iterable[tuple[str, float]], most: Iterable[float], limits: Iterable[float]
+) -> Iterator[str]:
+    """Bounds that differ from the proof, and limits that they do not show to be kept."""
+    for (name, written), bound, limit in zip(stated, most, limits, strict=True):
+        if not abs(bound - written) <= BOUND_TOLERANCE:
+            yield f"{what}: the bound of {name} is {bound:.6f}, not {written:.6f}"
+        if not bound <= limit:
+            yield f"{what}: {name} is not shown to keep its limit: {bound:.6f} of {limit:.6f}"
 
 
 def _rate_errors(

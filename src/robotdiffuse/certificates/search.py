@@ -5,29 +5,173 @@ own bounds. Where spheres are too coarse, planes between the nearest points of c
 finds, prove it.
 """
 
-from dataclasses import replace
-from typing import NamedTuple
+# Coal's Python module has no type information.
+# pyright: reportAttributeAccessIssue=false
 
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import coal
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.certificates.bounds import CLEARANCE_CAP, SCENE, Plane, Prover, Stretches
+from robotdiffuse.certificates.bounds import (
+    CLEARANCE_CAP,
+    SCENE,
+    Claim,
+    MovingProver,
+    Part,
+    Plane,
+    Prover,
+    Stretches,
+    gaps,
+    placed,
+)
 from robotdiffuse.certificates.certificate import Certificate
 from robotdiffuse.certificates.checker import hash_of
-from robotdiffuse.certificates.constraints import constraint_bounds
-from robotdiffuse.certificates.content_hashes import request_parts, robot_parts, scene_parts
-from robotdiffuse.certificates.cubics import cubics_of
-from robotdiffuse.certificates.moving_obstacles import MovingProver
-from robotdiffuse.certificates.planes import PlaneFinder
-from robotdiffuse.certificates.proof import DECIMALS, StretchProof, Tolerances
-from robotdiffuse.certificates.requirements import configurations, cubic_jerks, deviations, not_covered
-from robotdiffuse.certificates.torques import torque_bounds
+from robotdiffuse.certificates.kinematics import cubics_of, places_of
+from robotdiffuse.certificates.obstacles import Rounded, Surface
+from robotdiffuse.certificates.proof import (
+    DECIMALS,
+    StretchProof,
+    Tolerances,
+    request_parts,
+    robot_parts,
+    scene_parts,
+)
+from robotdiffuse.certificates.requirements import (
+    configurations,
+    constraint_bounds,
+    cubic_jerks,
+    deviations,
+    not_covered,
+    torque_bounds,
+)
 from robotdiffuse.core.errors import InputError, check_type
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
+from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify
+
+MAX_PLANES = 64
+"""Planes between a part and a surface at most; concave surfaces need several."""
+NORMAL_DECIMALS = 10
+"""Decimals of normals in files, whose length must be 1 within 1e-9."""
+
+Normal = tuple[float, float, float]
+
+
+class _Body(NamedTuple):
+    geometry: coal.CollisionGeometry
+    T: Float[ndarray, "4 4"]
+    """Its pose in the frame of its link, or in the base frame."""
+
+
+class PlaneFinder:
+    """Finds separating planes for the stretches of a prover."""
+
+    def __init__(self, prover: Prover) -> None:
+        self.prover = prover
+        self._parts = {link: tuple(map(_hull, parts)) for link, parts in prover.parts.items()}
+        self._obstacles = tuple(
+            _rounded(body) if isinstance(body, Rounded) else None for body in prover.obstacles.bodies
+        )
+
+    def planes(self, todo: Stretches, rows: ndarray, needed: Float[ndarray, "rows"]) -> list[Plane]:
+        """Planes for the stretches of these rows; pairs of bodies with balls further apart than `needed` [m]
+        need none, and bodies that touch have none."""
+        prover = self.prover
+        middle = (todo.start[rows] + todo.stop[rows]) / 2
+        postures = prover.linkage.place(prover.at(middle))
+        return [
+            Plane(row, *plane)
+            for k, row in enumerate(rows.tolist())
+            for plane in self._of(prover.claims[todo.claim[row]], postures.T[k], float(needed[k]))
+        ]
+
+    def _of(self, claim: Claim, T: ndarray, needed: float) -> Iterator[tuple[int, int, Normal]]:
+        prover, links = self.prover, self.prover.linkage.links
+        T_base_link = T[links.index(claim.link)]
+        for p, part in enumerate(placed(prover.parts[claim.link], T_base_link)):
+            bodies = prover.others(claim, T, part)
+            apart = prover.balls_apart(part, bodies)
+            first = self._parts[claim.link][p]
+            first = first._replace(T=T_base_link @ first.T)
+            if claim.against == SCENE:
+                apart[prover.may_touch[links.index(claim.link)]] = np.inf
+            for o, body in enumerate(bodies):
+                if apart[o] >= needed:
+                    continue
+                if isinstance(body, Surface):
+                    yield from ((p, o, normal) for normal in _around(first, part, body, needed))
+                    continue
+                if claim.against == SCENE:
+                    second = self._obstacles[o]
+                else:
+                    second = self._parts[claim.against][o]
+                    second = second._replace(T=T[links.index(claim.against)] @ second.T)
+                assert second is not None
+                normal = _normal(first, second)
+                if normal is not None:
+                    yield p, o, normal
+
+
+def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterator[Normal]:
+    """Planes that together separate all near elements of a surface by `needed`, starting with the nearest
+    one."""
+    shown = np.full(len(surface.corners), -np.inf)
+    order = np.argsort(np.sqrt(((surface.corners - part.center) ** 2).sum(axis=-1)).min(axis=1))
+    asked = np.zeros(len(order), bool)
+    for _ in range(MAX_PLANES):
+        left = order[(shown[order] < needed) & ~asked[order]]
+        if not len(left):
+            return
+        element = int(left[0])
+        asked[element] = True
+        corners = surface.corners[element]
+        if len(corners) == 3:
+            second = _Body(coal_convex(corners, np.array([[0, 1, 2], [0, 2, 1]])), np.eye(4))
+        else:
+            second = _Body(coal.Sphere(surface.radius), transform(corners[0]))
+        normal = _normal(first, second)
+        if normal is None:
+            return
+        shown = np.maximum(shown, gaps(part, surface, np.array([normal]))[:, 0])
+        yield normal
+
+
+def _normal(first: _Body, second: _Body) -> Normal | None:
+    """Unit vector from the nearest point of the second body to that of the first; None if they touch."""
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    coal.distance(first.geometry, coal_pose(first.T), second.geometry, coal_pose(second.T), request, result)
+    between = np.asarray(result.getNearestPoint1()) - np.asarray(result.getNearestPoint2())
+    distance = float(np.linalg.norm(between))
+    if not result.min_distance > 0 or distance < 1e-9:
+        return None
+    x, y, z = np.round(between / distance, NORMAL_DECIMALS).tolist()
+    return x, y, z
+
+
+def _hull(part: Part) -> _Body:
+    if len(part.vertices) == 1:
+        return _Body(coal.Sphere(part.rounding), transform(part.vertices[0]))
+    return _Body(coal_convex(part.vertices, part.faces), np.eye(4))
+
+
+def _rounded(body: Rounded) -> _Body:
+    x, y, z = (2 * body.half).tolist()
+    if body.disc > 0:
+        geometry = coal.Cylinder(body.disc, z)
+    elif body.rounding > 0:
+        geometry = coal.Capsule(body.rounding, z) if z > 0 else coal.Sphere(body.rounding)
+    else:
+        geometry = coal.Box(x, y, z)
+    return _Body(geometry, transform(body.center, body.R))
+
 
 CLEARANCE_SHARE = 0.5
 """The proof shows this share of the clearances that the validator certifies; a larger one needs more
@@ -78,15 +222,32 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     clearances = [c for c in (report.scene_clearance, report.self_clearance) if c]
     reach = float(motion_radii(problem.robot).max(axis=0, initial=0.0).sum())
     chord = min(tolerances.chord, CHORD_SHARE * min(clearances, default=np.inf) / max(reach, 1e-3))
-    between, bounds = _prove_constraints(problem, motion, _between(motion, chord), tolerances.chord)
-    samples, torques = _prove_torques(problem, motion, tolerances.rate_slack)
+    between, bounds = _between(motion, chord), ()
+    samples, torques = np.zeros(0), ()
+    if problem.constraints:
+
+        def of_constraints(places: Float[ndarray, "k"]) -> tuple[Sequence[str], ndarray, Sequence[float]]:
+            shown = constraint_bounds(problem, configurations(motion, places), tolerances.chord)
+            names, limits, each = zip(*shown, strict=True)
+            return names, np.column_stack(each), limits
+
+        between, bounds = _refined(motion, between, of_constraints, "path constraints")
+    if problem.payload is not None:
+        allowed = problem.robot.effort * (1 + tolerances.rate_slack)
+        samples, torques = _refined(
+            motion,
+            samples,
+            lambda places: (problem.robot.joint_names, torque_bounds(problem, motion, places), allowed),
+            "torques",
+        )
     q, off = configurations(motion, between), deviations(motion, between)
     proof, left = _prove(Prover(problem.robot, problem.scene, q, off), least)
     moving = None
     if problem.moving and isinstance(motion, Trajectory):
-        times = np.sort(np.concatenate([motion.times, between]), kind="stable")
+        times = places_of(motion, between)
         moving, others = _prove(MovingProver(problem.robot, problem.moving, q, times, off), {"": 0.0})
         left[SCENE] = min(left[SCENE], *others.values())  # an obstacle may be called "scene"
+    jerks = cubic_jerks(problem.robot, motion)
     return Certificate(
         problem.robot.name,
         robot_parts(problem.robot),
@@ -104,58 +265,31 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         bounds,
         samples,
         torques,
-        _jerks(problem, motion),
+        () if jerks is None else tuple(zip(motion.joint_names, jerks.tolist(), strict=True)),
     )
 
 
-def _jerks(problem: Problem, motion: Path | Trajectory) -> tuple[tuple[str, float], ...]:
-    """See `MotionProof.jerks`."""
-    jerks = cubic_jerks(problem.robot, motion)
-    return () if jerks is None else tuple(zip(motion.joint_names, jerks.tolist(), strict=True))
-
-
-def _prove_constraints(
-    problem: Problem, motion: Path | Trajectory, between: Float[ndarray, "k"], chord: float
+def _refined(
+    motion: Path | Trajectory,
+    places: Float[ndarray, "k"],
+    bounds_of: Callable[[Float[ndarray, "k"]], tuple[Sequence[str], Float[ndarray, "n b"], Any]],
+    what: str,
 ) -> tuple[Float[ndarray, "m"], tuple[tuple[str, float], ...]]:
-    """Places between the rows (see `MotionProof.between`) from each of which to the next all path constraints
-    are proved, and upper bounds of the constraints' quantities."""
-    if not problem.constraints:
-        return between, ()
-    timed = isinstance(motion, Trajectory)
-    rows = motion.times if timed else np.arange(len(motion.positions), dtype=float)
-    for _ in range(MAX_HALVINGS):
-        shown = constraint_bounds(problem, configurations(motion, between), chord)
-        open_ = np.any([one.bounds > one.limit for one in shown], axis=0)
-        if not open_.any():
-            return between, tuple((one.name, float(one.bounds.max())) for one in shown)
-        at = np.sort(np.concatenate([rows, between]), kind="stable")
-        more = (at[:-1] + at[1:])[open_[: len(at) - 1]] / 2
-        between = np.sort(np.concatenate([between, more]))
-        if len(between) > MAX_STRETCHES:
-            break
-    raise InputError("no proof was found for the path constraints: the motion is too near to their limits")
+    """Places between the rows (see `MotionProof.between`) from each of which to the next some bounds are
+    within their limits, and the bounds by name.
 
-
-def _prove_torques(
-    problem: Problem, motion: Path | Trajectory, slack: float
-) -> tuple[Float[ndarray, "k"], tuple[tuple[str, float], ...]]:
-    """Places between the rows (see `MotionProof.between`) from each of which to the next all torques are
-    proved to be within their limits, and upper bounds of the torques."""
-    samples = np.zeros(0)
-    if problem.payload is None:
-        return samples, ()
-    timed = isinstance(motion, Trajectory)
-    rows = motion.times if timed else np.arange(len(motion.positions), dtype=float)
+    bounds_of: names, bounds from each place to the next, and limits.
+    """
     for _ in range(MAX_HALVINGS):
-        most = torque_bounds(problem, motion, samples)
-        open_ = (most > problem.robot.effort * (1 + slack)).any(axis=1)
+        names, bounds, limits = bounds_of(places)
+        open_ = (bounds > limits).any(axis=1)
         if not open_.any():
-            return samples, tuple(zip(problem.robot.joint_names, most.max(axis=0).tolist(), strict=True))
-        at = np.sort(np.concatenate([rows, samples]))
+            return places, tuple(zip(names, bounds.max(axis=0).tolist(), strict=True))
+        at = places_of(motion, places)
         if len(at) == 1 or len(at) > MAX_STRETCHES:
             break
-        samples = np.sort(np.concatenate([samples, ((at[:-1] + at[1:]) / 2)[open_]]))
-    raise InputError("no proof was found for the torques: the motion is too near to their limits")
+        places = np.sort(np.concatenate([places, ((at[:-1] + at[1:]) / 2)[open_]]))
+    raise InputError(f"no proof was found for the {what}: the motion is too near to their limits")
 
 
 def _record(problem: Problem) -> dict[str, object] | None:
@@ -318,4 +452,4 @@ def _down(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
 
 
 def _up(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
-    return np.ceil(values * 10.0**DECIMALS) / 10.0**DECIMALS
+    return -_down(-values)

@@ -202,7 +202,7 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 def described(robot: "Robot") -> str:
     """The robot's name, its source, and whether it is the bundled one."""
-    from robotdiffuse.certificates.content_hashes import differences, robot_parts
+    from robotdiffuse.certificates.proof import differences, robot_parts
     from robotdiffuse.core.errors import joined
     from robotdiffuse.robots import DATA, ROBOTS, load_robot
 
