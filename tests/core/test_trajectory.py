@@ -11,8 +11,8 @@ from robotdiffuse.interop import read_motion
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.validation.rates import RateTolerances, rate_violations
-from robotdiffuse.validation.validator import verify
+from robotdiffuse.validation.rates import rate_violations
+from robotdiffuse.validation.validator import VerifySettings, verify
 
 
 def cubic(steps: int = 7) -> Trajectory:
@@ -97,7 +97,7 @@ def test_resampled_times(rate):
 
 @pytest.mark.parametrize("rate", [125, 250, 500, 1000])
 def test_resampled_rates_still_keep_limits(rate):
-    tolerances = RateTolerances(slack=0.01, agreement=0.25, jump=1.5, resolution=1e-6)
+    tolerances = VerifySettings(rate_agreement=0.25)
     for motion in (smooth(), smooth(2), pulse()):
         assert rate_violations(box_arm(), motion, tolerances) == []
         assert rate_violations(box_arm(), motion.resample(rate), tolerances) == []
@@ -116,7 +116,7 @@ def test_short_motions_stay_valid_when_resampled(size, rate):
 
 
 def test_accelerations_of_0_are_not_those_of_a_motion():
-    tolerances = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
+    tolerances = VerifySettings()
     motion = smooth()
     still = replace(motion, accelerations=0 * motion.accelerations)
     assert [violation.kind for violation in rate_violations(box_arm(), still, tolerances)] == ["rates"]

@@ -23,12 +23,13 @@ from robotdiffuse.trajectories.timing_kernel import (
     rounded_line,
     slowdown,
 )
-from robotdiffuse.validation.rates import RateTolerances, rate_violations
+from robotdiffuse.validation.rates import rate_violations
+from robotdiffuse.validation.validator import VerifySettings
 
 VELOCITY = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
 ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
 NO_JERK_LIMIT = TimingSettings(jerk=np.inf, sample_time=1e-4)
-VALIDATOR = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
+VALIDATOR = VerifySettings()
 
 
 def arm(velocity: tuple[float, ...] = VELOCITY, acceleration: tuple[float, ...] = ACCELERATION) -> Robot:

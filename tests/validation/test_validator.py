@@ -24,15 +24,15 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.trajectories.speed_limits import TimingSettings
 from robotdiffuse.trajectories.timing import time_parameterize
-from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
+from robotdiffuse.validation.rates import rate_violations
 from robotdiffuse.validation.report import Report, Violation
-from robotdiffuse.validation.validator import VerifySettings, verifier, verify, verify_trajectory
-from robotdiffuse.validation.violations import violations
+from robotdiffuse.validation.validator import VerifySettings, verifier, verify, verify_trajectory, violations
 
 Z = np.array([0.0, 0.0, 1.0])
-RATES = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
+RATES = VerifySettings()
 
 
 def vector(*values: float) -> np.ndarray:
@@ -455,9 +455,9 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     chosen = rng.choice(len(place), len(place) // every + 1)
     rows = np.unique(np.concatenate([jumps, chosen, [len(place) - 1]]))
     accelerations = np.concatenate([fine, fine[-1:]])[rows]
-    place += rng.uniform(-1, 1, place.shape) * 0.99 * RATES.resolution
+    place += rng.uniform(-1, 1, place.shape) * 0.99 * RATES.limit_slack
     motion = Trajectory(robot.joint_names, rows * step, place[rows], speed[rows], accelerations)
-    wrong = {w.message for w in rate_violations(robot, motion, replace(RATES, agreement=2.0))}
+    wrong = {w.message for w in rate_violations(robot, motion, replace(RATES, rate_agreement=2.0))}
     assert not wrong
 
 
@@ -509,7 +509,7 @@ def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None
     ball = Sphere(1.1 * vector(np.cos(0.73), np.sin(0.73), 0), 0.02)
     found = refused(verify_trajectory(replace(problem, scene=Scene([ball])), out), "scene_collision")
     assert 1.0 < found.time < 1.5
-    times, positions = sample_cubics(out, 1e-3)
+    times, positions = Cubics(out).sampled(1e-3)[:2]
     assert np.isin(out.times, times).all()
     assert np.abs(positions[:, 0]).max() == pytest.approx(0.75, abs=1e-3)
 

@@ -84,7 +84,7 @@ def _validated(
         return True
     found = (report.violation,)
     if everything:
-        from robotdiffuse.validation.violations import violations
+        from robotdiffuse.validation.validator import violations
 
         found = violations(problem, motion) or found
     for violation in found:

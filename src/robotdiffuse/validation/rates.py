@@ -17,7 +17,6 @@ of these two rows alone.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +26,8 @@ from numpy import ndarray
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.cubics import Cubics
+from robotdiffuse.validation.report import Violation
+from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
 """Where rows are closer than the first of these [s], mean accelerations are tested over windows of at least
@@ -35,52 +36,23 @@ MIN_TIME = 1e-12
 """Shorter times are taken as this [s], so that rates over them are finite."""
 
 
-@dataclass(frozen=True)
-class RateTolerances:
-    """Tolerances of `rate_violations`."""
-
-    slack: float
-    """Share by which limits may be exceeded, and share of a velocity limit that counts as rest."""
-    agreement: float
-    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the
-    accelerations of the cubics before and after the row."""
-    jump: float
-    """A step faster than this times the velocity limit is a jump."""
-    resolution: float
-    """Accuracy of positions [rad] or [m]."""
-
-
-@dataclass(frozen=True)
-class RateViolation:
-    """The first violation of its kind along the trajectory."""
-
-    kind: str
-    """rest, jump, velocity, acceleration or rates."""
-    time: float
-    """[s]"""
-    joint: str
-    message: str
-    excess: float
-    """Amount beyond the allowed value, in the rate's unit."""
-
-
 def rate_violations(
     robot: Robot,
     trajectory: Trajectory,
-    tolerances: RateTolerances,
+    settings: VerifySettings = DEFAULT,
     start_velocity: Float[ndarray, "dof"] | None = None,
     cubics: Cubics | None = None,
-) -> list[RateViolation]:
+) -> list[Violation]:
     """The first violation of each kind in the rates of a trajectory, whose rows are finite and times
     increase; `cubics` are its cubics, if they are known.
 
     The motion must begin at `start_velocity` [dof], by default at rest, and end at rest. A limit of 0 means
     that the robot gives none: then the rates must only agree with each other.
     """
-    found: dict[str, RateViolation] = {}
+    found: dict[str, Violation] = {}
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
-        for check in _checks(robot, cubics or Cubics(trajectory), tolerances, begins):
+        for check in _checks(robot, cubics or Cubics(trajectory), settings, begins):
             right = check.off <= check.allowed
             if right.all():
                 continue
@@ -91,17 +63,8 @@ def rate_violations(
             if check.kind not in found or time < found[check.kind].time:
                 name, rate = robot.joint_names[j], abs(float(check.rates[i, j]))
                 message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
-                found[check.kind] = RateViolation(check.kind, time, name, message, float(beyond[i, j]))
+                found[check.kind] = Violation(check.kind, time, message, name, None, float(beyond[i, j]))
     return list(found.values())
-
-
-def sample_cubics(
-    trajectory: Trajectory, chord: float
-) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
-    """Times [m] and positions [m, dof] of a trajectory, with added rows on the cubics through its rows'
-    positions and velocities, such that straight lines between rows leave the cubics by at most `chord` [rad]
-    or [m]."""
-    return Cubics(trajectory).sampled(chord)[:2]
 
 
 class _Check(NamedTuple):
@@ -120,15 +83,15 @@ class _Check(NamedTuple):
 
 
 def _checks(
-    robot: Robot, cubics: Cubics, tolerances: RateTolerances, begins: Float[ndarray, "dof"]
+    robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Float[ndarray, "dof"]
 ) -> Iterator[_Check]:
     trajectory = cubics.trajectory
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
     step, mean, change = cubics.steps, cubics.extremes.mean, np.diff(v, axis=0) / cubics.steps
-    blur = 2 * tolerances.resolution / step
+    blur = 2 * settings.limit_slack / step
     """Uncertainty of the mean velocities, from the resolution of positions."""
-    share = 1 + tolerances.slack
-    nothing = tolerances.slack * _limits_or_peaks(robot.velocity, v, mean)
+    share = 1 + settings.rate_slack
+    nothing = settings.rate_slack * _limits_or_peaks(robot.velocity, v, mean)
 
     def limited(kind: str, what: str, rates: ndarray, limit: ndarray, allowed: ndarray) -> _Check:
         known = allowed if (limit > 0).all() else np.where(limit > 0, allowed, np.inf)
@@ -142,13 +105,16 @@ def _checks(
     yield _Check("rest", "velocity", v, at_ends, nothing, lambda *_: rule)
 
     most, onwards = robot.velocity, "mean velocity from here to the next row"
-    yield limited("jump", onwards, mean, most, tolerances.jump * most + blur)
+    yield limited("jump", onwards, mean, most, settings.jump * most + blur)
     # Velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step.
     onwards = "velocity by its positions from here to the next row"
     yield limited("velocity", onwards, cubics.extremes.velocity, most, share * most + 1.5 * blur)
     yield limited("velocity", "velocity", v, most, share * most)
 
-    around, length = _padded(2 * begins - mean[:1], mean, -mean[-1:]), _padded(step[:1], step, step[-1:])
+    around, length = (
+        _padded(2 * begins - mean[:1], mean, -mean[-1:]),
+        _padded(step[:1], step, step[-1:]),
+    )
     unsure = _padded(blur[:1], blur, blur[-1:])
     apart = (length[1:] + length[:-1]) / 2
     second, unsure = (around[1:] - around[:-1]) / apart, (unsure[1:] + unsure[:-1]) / apart
@@ -160,7 +126,7 @@ def _checks(
     yield limited("acceleration", "acceleration", a, most, share * most)
 
     # Rows may miss the peaks of the acceleration, but not by half.
-    own = np.maximum(_peak(a, second, change), tolerances.slack * robot.acceleration)
+    own = np.maximum(_peak(a, second, change), settings.rate_slack * robot.acceleration)
     strongest = np.where(most > 0, np.minimum(share * most, 2 * own), 2 * own)
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
@@ -181,7 +147,7 @@ def _checks(
         outside = np.maximum(low - a, a - high)
         if begins.any():
             outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
-        near = tolerances.agreement * np.where(most > 0, np.minimum(most, own), own)
+        near = settings.rate_agreement * np.where(most > 0, np.minimum(most, own), own)
         yield _Check(
             "rates",
             "acceleration",
@@ -193,7 +159,7 @@ def _checks(
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
         return
-    times, resolution = trajectory.times, tolerances.resolution
+    times, resolution = trajectory.times, settings.limit_slack
     onwards = "mean velocity from an earlier row to here"
     most = robot.velocity
     first, span = _worst_earlier_row(times, q, (times - times[0])[:, None] * share * most)
@@ -221,7 +187,7 @@ def _checks(
 
 def _cumulative(steps: Float[ndarray, "m dof"]) -> Float[ndarray, "n dof"]:
     """Sums of all steps before each row."""
-    return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
+    return _padded(np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0))
 
 
 def _worst_earlier_row(
@@ -239,7 +205,7 @@ def _worst_earlier_row(
         least = np.minimum.accumulate(room, axis=0)
         at = np.maximum.accumulate(np.where(room <= least, rows, 0), axis=0)
         # shifted by one row to exclude the row itself
-        least, at = np.concatenate([room[:1], least[:-1]]), np.concatenate([first[:1], at[:-1]])
+        least, at = _padded(room[:1], least[:-1]), _padded(first[:1], at[:-1])
         first = np.where(room - least > beyond, at, first)
         beyond = np.maximum(beyond, room - least)
     return first, np.maximum(times[:, None] - times[first], MIN_TIME)
@@ -260,7 +226,7 @@ def _second_differences(
     their uncertainty. Before the motion the arm moves at its start velocity, and afterwards it stands
     still."""
     times, q = trajectory.times, trajectory.positions
-    clock = np.concatenate([times[:1] - window, times, times[-1:] + window])
+    clock = _padded(times[:1] - window, times, times[-1:] + window)
     rows = _padded(q[:1] - window * begins, q, q[-1:])
     low = np.searchsorted(clock, times - window, side="right") - 1
     high = np.searchsorted(clock, times + window)

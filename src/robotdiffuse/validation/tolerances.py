@@ -189,13 +189,9 @@ def _near(
     return np.linalg.norm(apart, axis=1) <= room + blend
 
 
-def _within(values: ndarray, tolerance: ndarray, slack: float) -> bool:
-    return bool((np.abs(values) <= tolerance + slack).all())
-
-
 def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
     """Whether roll, pitch and yaw are within the tolerance, in either of their two representations."""
     roll, pitch, yaw = rpy_from_rotation(rotation)
     other = np.array([roll + np.pi, np.pi - pitch, yaw + np.pi])
     ways = np.array([roll, pitch, yaw]), (other + np.pi) % (2 * np.pi) - np.pi
-    return any(_within(way, tolerance, slack) for way in ways)
+    return any((np.abs(way) <= tolerance + slack).all() for way in ways)

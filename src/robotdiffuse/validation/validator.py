@@ -22,7 +22,7 @@ from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.trajectories.speed_limits import jerk_limits
-from robotdiffuse.validation.rates import RateTolerances, rate_violations
+from robotdiffuse.validation.rates import rate_violations
 from robotdiffuse.validation.report import Report, Violation
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, first_place_within, goal_error
 from robotdiffuse.validation.torques import (
@@ -45,16 +45,21 @@ CHORD_MARGIN = 0.9
 """Factor on the chords tried next, so that one trial suffices."""
 
 
+RATE_KINDS = ("rest", "rates", "velocity", "acceleration", "jump")
+CONTACT_KINDS = ("scene_collision", "self_collision")
+
+
 def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT) -> Report:
     """Validate a motion for a problem: a trajectory as `verify_trajectory` does; a path with respect to
     everything but moving obstacles, since it has no times.
 
     Raises InputError if the motion's joints are not those of the robot, or its shapes are wrong.
     """
-    if isinstance(motion, Trajectory):
-        return verify_trajectory(problem, motion, settings)
+    check_problem(problem)
+    check_type("settings", settings, VerifySettings, "VerifySettings")
     check_motion("motion", motion, (Path, Trajectory))
-    return _verifier(problem, settings).path(motion)
+    validator = verifier(problem, settings)
+    return validator.trajectory(motion) if isinstance(motion, Trajectory) else validator.path(motion)
 
 
 def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
@@ -64,7 +69,8 @@ def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: Verify
     accelerations must agree with its positions. It must begin at rest, or at the problem's start velocity,
     and end at rest. Raises InputError if its joints are not those of the robot, or its shapes are wrong.
     """
-    return _verifier(problem, settings).trajectory(trajectory)
+    check_motion("trajectory", trajectory, (Trajectory,))
+    return verify(problem, trajectory, settings)
 
 
 def check_motion(what: str, motion: object, kinds: tuple[type, ...]) -> None:
@@ -76,13 +82,6 @@ def check_motion(what: str, motion: object, kinds: tuple[type, ...]) -> None:
         values = getattr(motion, name)
         if not isinstance(values, ndarray) or values.dtype.kind not in "iuf":
             raise InputError(f"{what}.{name} is {shown(values)}; it must be a NumPy array of numbers")
-
-
-def _verifier(problem: object, settings: object) -> "Verifier":
-    """The Verifier of a problem; raises InputError if it is not a Problem."""
-    check_problem(problem)
-    check_type("settings", settings, VerifySettings, "VerifySettings")
-    return verifier(problem, settings)  # type: ignore[arg-type]
 
 
 class Verifier:
@@ -124,10 +123,7 @@ class Verifier:
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
         cubics, begins = Cubics(trajectory), self.problem.start_velocity
-        found = [
-            Violation(wrong.kind, wrong.time, wrong.message, wrong.joint, None, wrong.excess)
-            for wrong in rate_violations(self.robot, trajectory, self._rate_tolerances, begins, cubics)
-        ]
+        found = rate_violations(self.robot, trajectory, self.settings, begins, cubics)
         at_rest = None
         if self.problem.waypoints:
             at_rest = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
@@ -406,13 +402,6 @@ class Verifier:
         payload = self.problem.payload
         return None if payload is None else Dynamics(self.robot, payload, self.problem.T_world_base)
 
-    @property
-    def _rate_tolerances(self) -> RateTolerances:
-        settings = self.settings
-        return RateTolerances(
-            settings.rate_slack, settings.rate_agreement, settings.jump, settings.limit_slack
-        )
-
     @cached_property
     def _continuous(self) -> ContinuousCollision:
         settings = self.settings
@@ -460,3 +449,49 @@ def collision_violation(contact: Contact, time: float) -> Violation:
     kind = "scene_collision" if pair is None else "self_collision"
     message = describe_contact(link, other, contact.depth, pair is not None)
     return Violation(kind, time, message, link, other, contact.depth)
+
+
+def violations(
+    problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT
+) -> tuple[Violation, ...]:
+    """All violations of a motion in order; empty if it is valid.
+
+    They include every contact, at the place where it begins, joint limits once for each joint, and the first
+    of every other kind.
+    """
+    from robotdiffuse.collision.contacts import contacts  # which only this needs
+
+    timed = isinstance(motion, Trajectory)
+    report = verify(problem, motion, settings)
+    if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
+        return () if report.violation is None else (report.violation,)
+    still = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
+    found = [
+        w for w in report.found if w.kind != "limits" and not (w.kind in CONTACT_KINDS and w.other in still)
+    ]
+    q, clock = motion.positions, np.arange(len(motion.positions), dtype=float)
+    if timed:
+        rates = any(wrong.kind in RATE_KINDS for wrong in found)
+        clock, q = (motion.times, q) if rates else Cubics(motion).sampled(settings.chord)[:2]
+    for contact in contacts(problem.robot, problem.scene, q, settings.contact):
+        found.append(collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock))))
+    if timed:
+        times, turns = Cubics(motion).turns()
+        clock, q = np.concatenate([clock, times]), np.concatenate([q, turns])
+    found += _limit_violations(problem, q, clock, settings)
+    return tuple(sorted(found, key=lambda wrong: wrong.time))
+
+
+def _limit_violations(
+    problem: Problem, q: ndarray, clock: ndarray, settings: VerifySettings
+) -> list[Violation]:
+    robot, found = problem.robot, []
+    beyond = np.maximum(robot.lower - q, q - robot.upper)
+    beyond[:, robot.continuous] = 0.0
+    for j in np.flatnonzero((beyond > settings.limit_slack).any(axis=0)).tolist():
+        over = np.flatnonzero(beyond[:, j] > settings.limit_slack)
+        i, most = int(over[clock[over].argmin()]), float(beyond[:, j].max())
+        name, low, high = robot.joint_names[j], robot.lower[j], robot.upper[j]
+        message = f"{name} leaves its limits, {low:.6g} to {high:.6g}, by up to {most:.3g}"
+        found.append(Violation("limits", float(clock[i]), message, name, None, most))
+    return found
