@@ -14,7 +14,7 @@ from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.certificates.checker import Findings, check
 from robotdiffuse.certificates.proof import DECIMALS, MotionProof, StretchProof, Tolerances
 from robotdiffuse.core.bounds import MAX_RATE, numbers, one_line, within
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, reading, shown
 from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.types import Path, Trajectory, check_motion_arrays
@@ -54,7 +54,7 @@ def load_certificate(file: str | FilePath) -> Certificate:
     record = read_json(file)
     if not is_certificate(record):
         raise InputError(f"{file} is not a certificate; write one by `robotdiffuse verify --certificate`")
-    try:
+    with reading(file):
         if record.get("version") != VERSION:
             raise InputError(f"version is {shown(record.get('version'))}; this version reads {VERSION}")
         known = {"is", "version", *FIELDS}
@@ -67,10 +67,6 @@ def load_certificate(file: str | FilePath) -> Certificate:
             if name in record or name in REQUIRED
         }
         return Certificate(**values)
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from None
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise InputError(f"{file} is damaged: {type(error).__name__} {shown(str(error))}") from None
 
 
 def is_certificate(record: object) -> bool:

@@ -46,6 +46,18 @@ def located(where: object) -> Iterator[None]:
         raise InputError(f"{at}{error}") from None
 
 
+@contextmanager
+def reading(file: object) -> Iterator[None]:
+    """As `located`, while a file is read; of errors of other kinds, its damage is taken to be the cause."""
+    try:
+        with located(file):
+            yield
+    except InputError:
+        raise
+    except Exception as error:  # the readers of formats raise many kinds of errors for damaged files
+        raise InputError(f"{file} is damaged: {type(error).__name__}: {shortened(str(error))}") from None
+
+
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
     """Raises InputError unless the value is of one of these types; `wanted` says what it must be."""
     if not isinstance(value, kind):

@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, repeated, shortened, shown
+from robotdiffuse.core.errors import InputError, reading, repeated, shortened, shown
 
 MEGABYTE = 2**20
 MAX_FILE_SIZE = 256 * MEGABYTE
@@ -129,19 +129,18 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
     MAX_FILE_SIZE.
     """
     path = input_file(file)
-    try:
+    with reading(file):
         if path.suffix.lower() != ".npz":
             with path.open("rb") as stream:  # np.load would open an archive of this name
                 return {"": np.lib.format.read_array(stream, allow_pickle=False)}
         with zipfile.ZipFile(path) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size <= MAX_FILE_SIZE:
-            with np.load(path, allow_pickle=False) as arrays:
-                return {name: arrays[name] for name in arrays.files}
-    except Exception as error:  # NumPy, zipfile and zlib raise many kinds of errors for a damaged file
-        raise InputError(f"{file} is damaged: {shortened(str(error))}") from None
-    most = MAX_FILE_SIZE // MEGABYTE
-    raise InputError(f"{file} unpacks to {size // MEGABYTE} MB; at most {most} MB are read")
+            size, most = sum(member.file_size for member in archive.infolist()), MAX_FILE_SIZE
+        if size > most:
+            raise InputError(
+                f"{file} unpacks to {size // MEGABYTE} MB; at most {most // MEGABYTE} MB are read"
+            )
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
 
 
 def read_json(file: str | Path) -> Any:

@@ -5,10 +5,10 @@ import fcntl
 import json
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from robotdiffuse.core.errors import InputError, OutputError, shown
 from robotdiffuse.core.input_files import file_name
@@ -23,8 +23,12 @@ def write_error(file: Path, error: OSError) -> InputError:
     return kind(f"{file} cannot be written: {error.strerror or error}")
 
 
-def write_atomically(file: Path, content: str | bytes, make_folder: bool = False) -> None:
+def write_atomically(
+    file: Path, content: str | bytes | Callable[[BinaryIO], object], make_folder: bool = False
+) -> None:
     """Write a temporary file and rename it over `file`, so that no reader sees it half written.
+
+    content: text, bytes, or what writes them to a stream.
 
     An interruption or a full disk leaves the old file, if there was one. Raises InputError if the file cannot
     be written: OutputError if the disk is full.
@@ -34,7 +38,11 @@ def write_atomically(file: Path, content: str | bytes, make_folder: bool = False
         if make_folder:
             file.parent.mkdir(parents=True, exist_ok=True)
         try:
-            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+            with temporary.open("wb") as stream:
+                if callable(content):
+                    content(stream)
+                else:
+                    stream.write(content.encode() if isinstance(content, str) else content)
             temporary.replace(file)
         except BaseException:
             with suppress(OSError):

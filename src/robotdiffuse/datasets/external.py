@@ -5,7 +5,6 @@ that was reached 7, centres of two spheres 6, position of the target 3 [m]. The 
 first 20; that the last three are the target's position is our interpretation of the 23. float32.
 """
 
-import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path as FilePath
@@ -23,7 +22,7 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import numbers
 from robotdiffuse.core.errors import InputError, distinct, shortened, shown
 from robotdiffuse.core.input_files import input_file
-from robotdiffuse.core.output_files import lock_folder, write_error
+from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.datasets.rows import Row, resample, row_of
 from robotdiffuse.datasets.shards import (
@@ -236,15 +235,7 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
     x_train, y_train = np.concatenate(x), np.concatenate(y)
     if not len(x_train):
         raise InputError(f"{folder} has no scene of exactly two spheres, all that robot.npz can hold")
-    fresh = file.with_name(f".{file.name}.{os.getpid()}")
-    try:
-        with open(fresh, "wb") as stream:
-            np.savez(stream, x_train=x_train, y_train=y_train)
-        os.replace(fresh, file)
-    except OSError as error:
-        raise write_error(file, error) from None
-    finally:
-        fresh.unlink(missing_ok=True)
+    write_atomically(file, lambda stream: np.savez(stream, x_train=x_train, y_train=y_train))
     return len(x_train), total - len(x_train)
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Int, Int8
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, located, reading, shown
 from robotdiffuse.core.input_files import file_name, input_file, read_json
 from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.settings import Count, Natural, Settings
@@ -85,20 +85,7 @@ class Manifest(Settings):
 
     @classmethod
     def of(
-        cls,
-        robot: Robot,
-        source: str,
-        *,
-        waypoints: int,
-        families: dict[str, dict[str, Any]],
-        floors: Mapping[str, Box | None],
-        slots: int,
-        goals: int,
-        trajectories: int,
-        shard: int,
-        settings: dict[str, Any],
-        versions: dict[str, str],
-        timing: str = "arc",
+        cls, robot: Robot, source: str, *, floors: Mapping[str, Box | None], timing: str = "arc", **rest: Any
     ) -> "Manifest":
         """The manifest of data of a robot, which `source` names: the fields, with floors as boxes."""
         records = {
@@ -106,21 +93,14 @@ class Manifest(Settings):
             for name, floor in floors.items()
         }
         return cls(
-            source,
-            robot_fingerprint(robot),
-            robot.joint_names,
-            tuple(robot.lower.tolist()),
-            tuple(robot.upper.tolist()),
-            waypoints,
-            timing,
-            families,
-            records,
-            slots,
-            goals,
-            trajectories,
-            shard,
-            settings,
-            versions,
+            robot=source,
+            robot_fingerprint=robot_fingerprint(robot),
+            joint_names=robot.joint_names,
+            lower=tuple(robot.lower.tolist()),
+            upper=tuple(robot.upper.tolist()),
+            timing=timing,
+            floors=records,
+            **rest,
         )
 
     @property
@@ -153,18 +133,14 @@ def read_manifest(folder: str | FilePath) -> Manifest:
     file = file_name(folder, "folder") / MANIFEST
     if not os.path.lexists(file):
         raise InputError(f"no data set: there is no {file}; make one with: robotdiffuse data generate")
-    try:
+    with located(f"{file} is damaged"):
         data = read_json(file)
-    except InputError as error:
-        raise InputError(f"{file} is damaged: {error}") from None
     if not isinstance(data, dict) or "format" not in data:
         raise InputError(f"{file} is no manifest of a data set: it has no format")
     check_format(file, data.pop("format"))
-    try:
-        data.pop("dof")
+    data.pop("dof", None)
+    with located(f"{file} is damaged"):
         return Manifest.from_json(data, MANIFEST)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{file} is damaged: {error}") from None
 
 
 def check_format(file: FilePath, found: object) -> None:
@@ -359,13 +335,6 @@ def read_shard(folder: str | FilePath, index: int, names: tuple[str, ...] | None
     return Shard(index, str(attributes.get("fingerprint")), attributes["counts"], arrays)
 
 
-_DAMAGE_ERRORS = (
-    *(OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError),
-    *(OverflowError, MemoryError, RecursionError),
-)
-"""Exceptions of zarr and its codecs for damaged files."""
-
-
 def _open(path: FilePath) -> Any:
     zarr = _zarr()
     if not path.is_dir():
@@ -373,10 +342,8 @@ def _open(path: FilePath) -> Any:
     for file in path.rglob("*"):
         if not file.is_dir():
             input_file(file, largest=sys.maxsize)
-    try:
+    with reading(f"shard {path}"):
         return zarr.open_group(path, mode="r", zarr_format=3)
-    except _DAMAGE_ERRORS as error:
-        raise InputError(f"shard {path} is damaged: {_line(error)}") from None
 
 
 def _read_array(path: FilePath, group: Any, name: str) -> ndarray:
@@ -384,31 +351,25 @@ def _read_array(path: FilePath, group: Any, name: str) -> ndarray:
     where = f"shard {path}, array {name}"
     if not (path / name).is_dir():
         raise InputError(f"{where}: missing")
-    try:
+    with reading(where):
         array = group[name]
-        kind = (array.dtype.str, array.ndim)
+        found, wanted = (array.dtype.str, array.ndim), (dtype, 1 + len(row))
+        if found != wanted:
+            raise InputError(
+                f"{where} is {found[0]} with {found[1]} axes; it must be {dtype} with {wanted[1]}"
+            )
+        if not array.size:
+            return array[...]
         chunk = path / name / array.metadata.encode_chunk_key((0,) * array.ndim)
         # zarr reads missing chunks as zeros
-        complete = not array.size or (array.chunks == array.shape and chunk.is_file())
-    except _DAMAGE_ERRORS as error:
-        raise InputError(f"{where} is damaged: {_line(error)}") from None
-    if kind != (dtype, 1 + len(row)):
-        raise InputError(f"{where} is {kind[0]} with {kind[1]} axes; it must be {dtype} with {1 + len(row)}")
-    if not complete:
-        raise InputError(f"{where} is damaged: a chunk is missing")
-    try:
-        if name != "trajectories" or not array.size:
+        if array.chunks != array.shape or not chunk.is_file():
+            raise InputError(f"{where} is damaged: a chunk is missing")
+        if name != "trajectories":
             return array[...]
         size = chunk.stat().st_size
         if size != array.nbytes:
-            raise ValueError(f"its chunk has {size:,} bytes; it must have {array.nbytes:,}")
+            raise InputError(f"{where} is damaged: its chunk has {size:,} bytes, not {array.nbytes:,}")
         return np.memmap(chunk, dtype, "r", shape=array.shape)
-    except _DAMAGE_ERRORS as error:
-        raise InputError(f"{where} is damaged: {_line(error)}") from None
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> None:

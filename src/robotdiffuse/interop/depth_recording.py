@@ -19,12 +19,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation, Slerp
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, reading
 from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.interop.mcap_file import McapWriter, check_chunks, make_reader, messages_in, topics_in
-from robotdiffuse.interop.recorded_motion import reading
 from robotdiffuse.interop.ros_messages import JOINT_STATE, header_seconds, to_plain
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.robots.robot import Robot

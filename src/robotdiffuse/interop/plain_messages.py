@@ -8,12 +8,12 @@ from typing import Any
 
 import yaml
 
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, reading, shown
 from robotdiffuse.core.input_files import MAX_YAML_SIZE, parse_yaml, read_json, read_text
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import missing_package
-from robotdiffuse.interop.recorded_motion import RecordedMotion, checked_motion, reading
+from robotdiffuse.interop.recorded_motion import RecordedMotion, checked_motion
 from robotdiffuse.problems.problem import Problem
 
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"

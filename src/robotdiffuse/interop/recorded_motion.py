@@ -1,14 +1,12 @@
 """Motions read from files of other programs, and their conversion to motions of a robot."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, joined, shortened
+from robotdiffuse.core.errors import InputError, joined
 from robotdiffuse.core.types import Path, Trajectory, check_increasing, check_motion_arrays
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
@@ -21,19 +19,6 @@ LOCKED_TOLERANCE = 1e-4
 """Largest distance of a joint from the value that the problem locks it at [rad] or [m]."""
 MAX_NAMES = 6
 """Most joint names in a message."""
-
-
-@contextmanager
-def reading(file: object) -> Iterator[None]:
-    """Errors while a file is read become InputErrors that begin with its name; of errors of other kinds, the
-    file's damage is taken to be the cause."""
-    try:
-        yield
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(str(file)) else f"{file}: {text}") from None
-    except Exception as error:  # the readers of formats raise many kinds of errors for damaged files
-        raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
 
 
 @dataclass(frozen=True, eq=False)

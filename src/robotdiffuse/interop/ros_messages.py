@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, reading
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import missing_package
 from robotdiffuse.interop.plain_messages import JOINT_TRAJECTORY, motion_from_record
-from robotdiffuse.interop.recorded_motion import RecordedMotion, checked_motion, reading
+from robotdiffuse.interop.recorded_motion import RecordedMotion, checked_motion
 from robotdiffuse.problems.problem import Problem
 
 try:

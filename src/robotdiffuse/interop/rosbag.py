@@ -6,13 +6,13 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core.errors import InputError, OutputError, shown
+from robotdiffuse.core.errors import InputError, OutputError, reading, shown
 from robotdiffuse.core.input_files import input_file, read_yaml
 from robotdiffuse.core.output_files import write_error
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop.mcap_file import MAX_UNPACKED, check_chunks, make_reader
 from robotdiffuse.interop.plain_messages import joint_trajectory
-from robotdiffuse.interop.recorded_motion import RecordedMotion, reading
+from robotdiffuse.interop.recorded_motion import RecordedMotion
 from robotdiffuse.interop.ros_messages import (
     DISPLAY_TRAJECTORY,
     JOINT_TRAJECTORY,
