@@ -139,7 +139,7 @@ def read_manifest(folder: str | FilePath) -> Manifest:
         raise InputError(f"{file} is no manifest of a data set: it has no format")
     check_format(file, data.pop("format"))
     data.pop("dof", None)
-    with located(f"{file} is damaged"):
+    with reading(file), located(f"{file} is damaged"):
         return Manifest.from_json(data, MANIFEST)
 
 
