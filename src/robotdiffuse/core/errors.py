@@ -55,7 +55,7 @@ def reading(file: object) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # the readers of formats raise many kinds of errors for damaged files
-        raise InputError(f"{file} is damaged: {type(error).__name__}: {shortened(str(error))}") from None
+        raise InputError(f"{file} is damaged: {type(error).__name__}: {str(error)[:MAX_WORD]}") from None
 
 
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
