@@ -17,6 +17,14 @@ from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_DURATION, MAX_RATE, Val
 from robotdiffuse.core.errors import InputError, distinct, joined, repeated, shown
 from robotdiffuse.core.output_files import check_output, write_atomically
 
+Configuration = Float[ndarray, "dof"]
+"""Joint positions [rad], [m] for prismatic joints."""
+Configurations = Float[ndarray, "_ dof"]
+"""Configurations in rows, such as waypoints, samples and goals."""
+Points = Float[ndarray, "_ 3"]
+"""[m]"""
+Pose = Float[ndarray, "4 4"]
+"""A rigid transform."""
 ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
 REST = 1e-3

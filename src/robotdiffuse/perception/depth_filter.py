@@ -9,6 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.types import Pose
 from robotdiffuse.perception.depth_view import DepthView
 
 MIN_RETURNS = 4
@@ -100,7 +101,7 @@ def depth_spread(depth: Float32[ndarray, "h w"]) -> float:
 
 
 def grown_for_noise(
-    spheres: Float[ndarray, "n 4"], T_base_camera: Float[ndarray, "4 4"], spread: float
+    spheres: Float[ndarray, "n 4"], T_base_camera: Pose, spread: float
 ) -> Float[ndarray, "n 4"]:
     """The arm's spheres, in the base frame, enlarged by the noise of depth where they are."""
     ahead = (spheres[:, :3] - T_base_camera[:3, 3]) @ T_base_camera[:3, 2]

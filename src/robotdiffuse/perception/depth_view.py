@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32
 from numpy import ndarray
 from numpy.random import Generator
 from numpy.typing import ArrayLike
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.bounds import MAX_RATE, Value, numbers, rigid_transform, vector
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
+from robotdiffuse.core.types import Configuration, Points, Pose
 from robotdiffuse.scenes.shapes import PointCloud
 
 MIN_FOCAL_LENGTH = 1e-3
@@ -44,11 +45,11 @@ class DepthView(Value):
     intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy [pixels]; pixel centres have integer coordinates. A mapping of these names, and a camera
     matrix of 3 x 3, are taken too."""
-    T_base_camera: Float[ndarray, "4 4"]
+    T_base_camera: Pose
     """x to the right in the image, y down, z ahead: the optical frame of ROS and OpenCV."""
-    configuration: Float[ndarray, "dof"] | None = None
+    configuration: Configuration | None = None
     """Configuration of the arm when the image was taken; None: the problem's start."""
-    cloud: Float[ndarray, "n 3"] | None = None
+    cloud: Points | None = None
     """The original points [m] of an image that was made of a cloud; the image keeps only the nearest ones."""
     source: dict[str, str | float] | None = None
     """The image's entry in problem files: `depth`, a file name, and its `scale`, or `cloud`, a file name."""
@@ -85,7 +86,7 @@ class DepthView(Value):
             intrinsics: ArrayLike | Mapping[str, float],
             T_base_camera: ArrayLike,
             configuration: ArrayLike | None = None,
-            cloud: Float[ndarray, "n 3"] | None = None,
+            cloud: Points | None = None,
             source: dict[str, str | float] | None = None,
         ) -> None: ...
 
@@ -95,7 +96,7 @@ class DepthView(Value):
         returns = np.isfinite(self.depth) & (self.depth > 0)
         return bool(returns.mean() < MIN_RETURNS)
 
-    def points(self) -> Float[ndarray, "n 3"]:
+    def points(self) -> Points:
         """The points in the base frame [m]: those of the cloud, or one for each pixel with a return, row by
         row."""
         if self.cloud is not None:
@@ -106,7 +107,7 @@ class DepthView(Value):
         in_camera = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=1)
         return in_camera @ self.T_base_camera[:3, :3].T + self.T_base_camera[:3, 3]
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "DepthView":
+    def moved(self, T: Pose) -> "DepthView":
         """The view after the rigid motion T of camera and points."""
         cloud = None if self.cloud is None else self.cloud @ T[:3, :3].T + T[:3, 3]
         return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud)
@@ -114,9 +115,9 @@ class DepthView(Value):
     @classmethod
     def from_cloud(
         cls,
-        points: Float[ndarray, "n 3"],
-        T_base_camera: Float[ndarray, "4 4"],
-        configuration: Float[ndarray, "dof"] | None = None,
+        points: Points,
+        T_base_camera: Pose,
+        configuration: Configuration | None = None,
         source: dict[str, str | float] | None = None,
     ) -> "DepthView":
         """The depth image that a camera at `T_base_camera` has of a point cloud in the base frame [m].

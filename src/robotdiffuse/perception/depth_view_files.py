@@ -16,6 +16,7 @@ from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_arrays
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
+from robotdiffuse.core.types import Points
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
@@ -159,7 +160,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     return DepthView(image, values["intrinsics"], T_base_camera, configuration, source=source)
 
 
-def _rows(where: str, points: Any) -> Float[ndarray, "n 3"]:
+def _rows(where: str, points: Any) -> Points:
     array = numbers(points)
     if array is None or array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"{where}.cloud is {shown(points)}; it must be the name of a file or n x 3 numbers")

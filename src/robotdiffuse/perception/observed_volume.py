@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.types import Configuration
 from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.ray_caster import rectangle
@@ -368,7 +369,7 @@ class ObservedVolume:
         return ~(self.occupied | self.free)
 
 
-def observe(views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"]) -> ObservedVolume:
+def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> ObservedVolume:
     """The volume observed by all views: a voxel is occupied, or else free, if any view says so.
 
     A voxel is free in a view if none of the pixels that it may cover is nearer than its far side. start: the
@@ -396,7 +397,7 @@ def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
     return ObservedVolume(occupied, free, shadow & ~known, out, behind)
 
 
-def _observed(view: DepthView, robot: Robot, start: Float[ndarray, "dof"]) -> ObservedVolume:
+def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVolume:
     """The volume observed by one view."""
     q = start if view.configuration is None else view.configuration
     if len(q) != robot.dof:
@@ -412,7 +413,7 @@ def _observed(view: DepthView, robot: Robot, start: Float[ndarray, "dof"]) -> Ob
 def carve_view(
     view: DepthView,
     robot: Robot,
-    q: Float[ndarray, "dof"],
+    q: Configuration,
     arm_margin: float,
     grid: VoxelGrid,
 ) -> tuple[UInt8[ndarray, "nx ny nz"], Float32[ndarray, "nx ny nz"], Int32[ndarray, "nx ny nz"]]:

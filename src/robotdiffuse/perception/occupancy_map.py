@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, UInt8
+from jaxtyping import Int32, UInt8
 from numpy import ndarray
 from scipy.spatial import KDTree
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
+from robotdiffuse.core.types import Configuration, Points
 from robotdiffuse.perception.depth_filter import filtered
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import (
@@ -25,7 +26,7 @@ from robotdiffuse.perception.observed_volume import (
     observe,
 )
 from robotdiffuse.perception.seen_points import CELL, seen_points
-from robotdiffuse.perception.voxel_grid import MAP
+from robotdiffuse.perception.voxel_grid import MAP, Voxels
 from robotdiffuse.robots.robot import Robot
 
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -64,7 +65,7 @@ class OccupancyMap:
         self._seen_at = np.full(MAP.shape, -np.inf, np.float64)
         self._declared = np.zeros(MAP.shape, np.bool_)
         self._now = -np.inf
-        self._known: tuple[Bool[ndarray, "nx ny nz"], ...] | None = None
+        self._known: tuple[Voxels, ...] | None = None
 
     @locked
     def add(self, view: DepthView, stamp: float = 0.0) -> int:
@@ -83,7 +84,7 @@ class OccupancyMap:
         return self._update(state, counts, stamp)
 
     @locked
-    def add_points(self, points: Float[ndarray, "n 3"], stamp: float = 0.0) -> None:
+    def add_points(self, points: Points, stamp: float = 0.0) -> None:
         """Take occupied points in the base frame into account [m], such as those of a cloud without a camera
         or of `rd.PointCloud.from_file`. They say nothing about free space."""
         at = MAP.indices(np.asarray(points))
@@ -109,21 +110,21 @@ class OccupancyMap:
         return not self._evidence.any()
 
     @property
-    def occupied(self) -> Bool[ndarray, "nx ny nz"]:
+    def occupied(self) -> Voxels:
         return self._of_evidence[0]
 
     @property
-    def free(self) -> Bool[ndarray, "nx ny nz"]:
+    def free(self) -> Voxels:
         """Seen free, or declared so and not found occupied."""
         return self._of_evidence[1]
 
     @property
-    def unknown(self) -> Bool[ndarray, "nx ny nz"]:
+    def unknown(self) -> Voxels:
         return self._of_evidence[2]
 
     @property
     @locked
-    def _of_evidence(self) -> tuple[Bool[ndarray, "nx ny nz"], ...]:
+    def _of_evidence(self) -> tuple[Voxels, ...]:
         """Occupied, free and unknown voxels, computed once after each change; read-only."""
         if self._known is None:
             occupied, free = self._evidence > 0, self._evidence < 0
@@ -136,7 +137,7 @@ class OccupancyMap:
         return self._known
 
     @property
-    def _fresh(self) -> Bool[ndarray, "nx ny nz"]:
+    def _fresh(self) -> Voxels:
         assert self.settings.max_age is not None
         return self._seen_at >= self._now - self.settings.max_age
 
@@ -171,11 +172,11 @@ class _Kept:
         return observe([self.view], self._robot, self._configuration)
 
     @cached_property
-    def points(self) -> Float32[ndarray, "n 3"]:
+    def points(self) -> Points:
         return seen_points([self.view], self._robot, self._configuration)
 
     @property
-    def _configuration(self) -> Float[ndarray, "dof"]:
+    def _configuration(self) -> Configuration:
         assert self.view.configuration is not None
         return self.view.configuration
 
@@ -205,7 +206,7 @@ class ViewMemory:
         """What the kept views together tell of each voxel of 4 cm."""
         return merged([kept.volume for kept in self._kept])
 
-    def points(self, free: Bool[ndarray, "nx ny nz"]) -> Float[ndarray, "n 3"]:
+    def points(self, free: Voxels) -> Points:
         """The mean of the points that the kept views observed in each cell of a grid [m]; see `seen_points`.
 
         Stray points are left out: those in the free voxels of a map, since more views see through them, and
@@ -226,7 +227,7 @@ class ViewMemory:
         return points[~stray]
 
 
-def _cells(points: Float[ndarray, "n 3"]) -> ndarray:
+def _cells(points: Points) -> ndarray:
     """A number for the cell of each point."""
     at = np.floor(points / CELL).astype(np.int64)
     at -= at.min(axis=0, initial=0)

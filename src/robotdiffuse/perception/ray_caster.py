@@ -4,14 +4,15 @@ Rays are cast through the pixels that a shape may cover.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Float, Float32, Int64
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.transforms import transform
+from robotdiffuse.core.types import Configuration, Pose
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.voxel_grid import VoxelGrid
+from robotdiffuse.perception.voxel_grid import VoxelGrid, Voxels
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -186,9 +187,7 @@ MAX_RANGE = 4.0
 """Range of the cameras [m]."""
 
 
-def looking_at(
-    position: Float[ndarray, "3"], target: Float[ndarray, "3"], roll: float = 0.0
-) -> Float[ndarray, "4 4"]:
+def looking_at(position: Float[ndarray, "3"], target: Float[ndarray, "3"], roll: float = 0.0) -> Pose:
     """T_base_camera of a camera at `position` that looks at `target`, upright except for `roll` [rad].
 
     x is to the right in the image, y down, z forward. If the camera looks straight down, the top of the image
@@ -204,11 +203,11 @@ def looking_at(
 
 def ray_cast(
     scene: Scene,
-    T_base_camera: Float[ndarray, "4 4"],
+    T_base_camera: Pose,
     intrinsics: tuple[float, float, float, float],
     size: tuple[int, int],
     robot: Robot | None = None,
-    configuration: Float[ndarray, "dof"] | None = None,
+    configuration: Configuration | None = None,
 ) -> DepthView:
     """The depth image of a scene, and of the covering spheres of a robot if one is given.
 
@@ -230,7 +229,7 @@ def voxels_within(
     scene: Scene,
     grid: VoxelGrid,
     margin: float = 0.005,
-) -> Bool[ndarray, "nx ny nz"]:
+) -> Voxels:
     """Which voxels of a grid are occupied: their centre is in a shape, or at most `margin` [m] from it.
 
     With the default margin, walls of 1 cm have no holes in a grid with voxels of 2 cm. Raises

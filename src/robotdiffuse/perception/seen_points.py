@@ -4,13 +4,12 @@ of a grid, in a hash table."""
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Float32
-from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.collision.kernels.distance import scene_distance
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.types import Configuration, Configurations, Points
 from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -250,8 +249,8 @@ INITIAL_CELLS = 1 << 16
 
 
 def seen_points(
-    views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"], voxel: float = CELL
-) -> Float32[ndarray, "n 3"]:
+    views: Sequence[DepthView], robot: Robot, start: Configuration, voxel: float = CELL
+) -> Points:
     """The mean of the observed points in each cell of a grid, in the base frame [m].
 
     Flying pixels, points of the arm at its configuration in each view, and points far beyond its reach are
@@ -300,19 +299,19 @@ def seen_shapes(
     views: Sequence[DepthView],
     robot: Robot,
     known: Scene,
-    start: Float[ndarray, "dof"],
-    goals: Float[ndarray, "n dof"],
+    start: Configuration,
+    goals: Configurations,
 ) -> tuple[SeenPoints, ...]:
     """The points that views observed as obstacles; see `point_shapes`."""
     return point_shapes(seen_points(views, robot, start), robot, known, start, goals)
 
 
 def point_shapes(
-    points: Float[ndarray, "points 3"],
+    points: Points,
     robot: Robot,
     known: Scene,
-    start: Float[ndarray, "dof"],
-    goals: Float[ndarray, "n dof"],
+    start: Configuration,
+    goals: Configurations,
 ) -> tuple[SeenPoints, ...]:
     """Observed points as obstacles, without those of known shapes.
 

@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Configurations, Path, Points
 from robotdiffuse.perception.depth_view import AssumedPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume
 from robotdiffuse.perception.seen_points import near_scene, sphere_distances
@@ -33,7 +33,9 @@ from robotdiffuse.perception.voxel_grid import (
     FINE,
     SHAPE,
     VOXEL,
+    Probabilities,
     VoxelGrid,
+    Voxels,
     heaviest_part,
     summed,
     surface,
@@ -77,7 +79,7 @@ class Assumption(ABC):
 class Padded(Assumption):
     """Observed points, inflated."""
 
-    points: Float[ndarray, "points 3"]
+    points: Points
     padding: float
     """[m]"""
 
@@ -94,11 +96,11 @@ class Padded(Assumption):
 
 
 @dataclass(frozen=True, eq=False)
-class Voxels(Assumption):
+class OccupiedVoxels(Assumption):
     """Occupied voxels of the observed volume, coarse or fine."""
 
     name: str
-    occupied: Bool[ndarray, "nx ny nz"]
+    occupied: Voxels
     robot: Robot
     known_scene: Scene
     """What is known without views; voxels within it are left out."""
@@ -107,7 +109,7 @@ class Voxels(Assumption):
     def grid(self) -> VoxelGrid:
         return COARSE if self.occupied.shape == SHAPE else FINE
 
-    def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "nx ny nz"]:
+    def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Voxels:
         return self.occupied & self.grid.within(spheres, CARVING_MARGIN + self.grid.edge / 2)
 
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
@@ -120,9 +122,7 @@ class Voxels(Assumption):
         return AssumedPoints(points, edge / 2, name="unknown")
 
 
-def without_known(
-    centers: Float[ndarray, "n 3"], edge: float, robot: Robot, known_scene: Scene
-) -> Float[ndarray, "m 3"]:
+def without_known(centers: Points, edge: float, robot: Robot, known_scene: Scene) -> Points:
     """The centres of voxels with this edge, without those of voxels in the known scene [m]."""
     if not known_scene.shapes:
         return centers
@@ -130,26 +130,24 @@ def without_known(
     return centers[~near_scene(scene, centers.astype(np.float32), inside)]
 
 
-def padded_assumptions(points: Float[ndarray, "points 3"]) -> Iterator[Assumption]:
+def padded_assumptions(points: Points) -> Iterator[Assumption]:
     """Observed points, inflated: the largest padding first."""
     for padding in PADDINGS:
         yield Padded(voxel_thin(points, padding * THINNING_CELL), padding)
 
 
-def predicted_assumptions(
-    predicted: Float32[ndarray, "nx ny nz"], robot: Robot, known_scene: Scene
-) -> Iterator[Assumption]:
+def predicted_assumptions(predicted: Probabilities, robot: Robot, known_scene: Scene) -> Iterator[Assumption]:
     """Voxels that are occupied with a probability above a threshold: the lowest threshold first.
 
     predicted: the probability that each fine voxel is occupied.
     """
     for threshold in THRESHOLDS:
-        yield Voxels(f"predicted, p > {threshold:g}", predicted > threshold, robot, known_scene)
+        yield OccupiedVoxels(f"predicted, p > {threshold:g}", predicted > threshold, robot, known_scene)
 
 
 def occupied_assumption(volume: ObservedVolume, robot: Robot, known_scene: Scene) -> Assumption:
     """Every voxel that no view saw is occupied."""
-    return Voxels("unknown is occupied", volume.unknown, robot, known_scene)
+    return OccupiedVoxels("unknown is occupied", volume.unknown, robot, known_scene)
 
 
 TILE = 64
@@ -200,7 +198,7 @@ WORLDS = 256
 """Sampled worlds of a probability."""
 
 
-def free_share(probability: Float32[ndarray, "nx ny nz"], voxels: Bool[ndarray, "nx ny nz"]) -> float:
+def free_share(probability: Probabilities, voxels: Voxels) -> float:
     """The part of the sampled worlds in which all of these fine voxels are free.
 
     probability: that each fine voxel is occupied. The worlds are the same in every call.
@@ -238,9 +236,9 @@ class UnknownSpace:
     def __init__(
         self,
         robot: Robot,
-        occupied_by_arm: Float[ndarray, "n dof"],
-        unknown: Bool[ndarray, "nx ny nz"],
-        predicted: Float32[ndarray, "nx ny nz"] | None,
+        occupied_by_arm: Configurations,
+        unknown: Voxels,
+        predicted: Probabilities | None,
         margin: float = CARVING_MARGIN,
         grid: VoxelGrid = FINE,
     ) -> None:
@@ -264,8 +262,8 @@ class UnknownSpace:
 class CrossedSpace:
     """The unknown space that a motion passes through."""
 
-    voxels: Bool[ndarray, "nx ny nz"]
-    probability: Float32[ndarray, "nx ny nz"] | None
+    voxels: Voxels
+    probability: Probabilities | None
     """That each voxel is occupied."""
     grid: VoxelGrid = FINE
 

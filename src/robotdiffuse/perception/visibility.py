@@ -2,13 +2,14 @@
 that cover an arm's surface."""
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import Part, parts_of
 from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.collision.kernels.distance import frames_of, placed
 from robotdiffuse.core.kernels import kernel
+from robotdiffuse.core.types import Configuration, Points
 from robotdiffuse.perception.observed_volume import MAX_DEPTH, usable_depth
 from robotdiffuse.robots.robot import Robot, once_per_robot
 
@@ -175,7 +176,7 @@ BALL_RADIUS = BALL_CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
 """Radius of a ball around a cell that covers the samples in it, and what is near them [m]."""
 
 
-def surface_balls(robot: Robot, q: Float[ndarray, "dof"]) -> Float32[ndarray, "n 3"]:
+def surface_balls(robot: Robot, q: Configuration) -> Points:
     """The centres of balls of BALL_RADIUS that cover the surface of moving links and of what they hold, at a
     configuration, in the base frame [m]."""
     placed = [
@@ -186,7 +187,7 @@ def surface_balls(robot: Robot, q: Float[ndarray, "dof"]) -> Float32[ndarray, "n
 
 
 @once_per_robot
-def _balls_by_frame(robot: Robot) -> list[Float[ndarray, "n 3"]]:
+def _balls_by_frame(robot: Robot) -> list[Points]:
     """The balls' centres by frame, in its coordinates; none in that of the base."""
     parts = [part for of_link in parts_of(robot).values() for part in of_link]
     out = [np.zeros((0, 3)) for _ in range(robot.dof + 1)]
@@ -198,14 +199,14 @@ def _balls_by_frame(robot: Robot) -> list[Float[ndarray, "n 3"]]:
     return out
 
 
-def _samples(part: Part) -> Float[ndarray, "n 3"]:
+def _samples(part: Part) -> Points:
     """Points within SAMPLE_DISTANCE of each point of a part's surface."""
     if not len(part.faces):
         return _sphere(part.center, part.radius)
     return np.concatenate([_triangle(part.vertices[face]) for face in part.faces])
 
 
-def _triangle(corners: Float[ndarray, "3 3"]) -> Float[ndarray, "n 3"]:
+def _triangle(corners: Float[ndarray, "3 3"]) -> Points:
     longest = max(np.linalg.norm(corners[i] - corners[i - 1]) for i in range(3))
     count = int(np.ceil(longest / (SAMPLE_DISTANCE * 3**0.5))) + 1
     i, j = np.divmod(np.arange((count + 1) ** 2), count + 1)
@@ -213,7 +214,7 @@ def _triangle(corners: Float[ndarray, "3 3"]) -> Float[ndarray, "n 3"]:
     return weights @ corners
 
 
-def _sphere(center: Float[ndarray, "3"], radius: float) -> Float[ndarray, "n 3"]:
+def _sphere(center: Float[ndarray, "3"], radius: float) -> Points:
     """Points on a sphere, on a spiral."""
     count = max(int(4 * np.pi * (radius / SAMPLE_DISTANCE) ** 2), 1)
     z = 1 - (2 * np.arange(count) + 1) / count

@@ -10,10 +10,13 @@ from numpy import ndarray
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.kernels.distance import frames_of, placed
 from robotdiffuse.core.kernels import kernel
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Configuration, Path, Points
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
+Voxels = Bool[ndarray, "nx ny nz"]
+Probabilities = Float32[ndarray, "nx ny nz"]
+"""That each voxel is occupied."""
 VOXEL = 0.04
 """Edge length of a voxel [m]."""
 LOW = (-1.12, -1.12, -0.1)
@@ -48,11 +51,11 @@ class VoxelGrid:
         """The lower corner and the edge as compiled code takes them."""
         return np.array(self.low, np.float32), np.float32(self.edge)
 
-    def centers(self, at: Int[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+    def centers(self, at: Int[ndarray, "n 3"]) -> Points:
         """The centres of the voxels of these indices [m]."""
         return (at + 0.5) * self.edge + self.low
 
-    def indices(self, points: Float[ndarray, "n 3"]) -> Int[ndarray, "n 3"]:
+    def indices(self, points: Points) -> Int[ndarray, "n 3"]:
         """The indices of the voxels that points in the base frame lie in; they may be outside of the grid."""
         return np.floor((points - self.low) / self.edge).astype(np.int64)
 
@@ -60,20 +63,18 @@ class VoxelGrid:
         """Which of these indices are of voxels of the grid."""
         return np.asarray(((at >= 0) & (at < self.shape)).all(axis=1))
 
-    def filled(
-        self, robot: Robot, configurations: Iterable[Float[ndarray, "dof"]], margin: float = 0.0
-    ) -> Bool[ndarray, "nx ny nz"]:
+    def filled(self, robot: Robot, configurations: Iterable[Configuration], margin: float = 0.0) -> Voxels:
         """Voxels with their centres in the arm's covering spheres, inflated by `margin` [m], at any of these
         configurations."""
         return self.within(np.concatenate([placed_spheres(robot, q) for q in configurations]), margin)
 
-    def within(self, spheres: Float[ndarray, "n 4"], margin: float = 0.0) -> Bool[ndarray, "nx ny nz"]:
+    def within(self, spheres: Float[ndarray, "n 4"], margin: float = 0.0) -> Voxels:
         """Voxels with their centres in spheres, inflated by `margin` [m]."""
         out = np.zeros(self.shape, np.bool_)
         mark(spheres.astype(np.float32) + np.array([0, 0, 0, margin], np.float32), *self.frame, out)
         return out
 
-    def swept(self, robot: Robot, path: Path, margin: float = 0.0) -> Bool[ndarray, "nx ny nz"]:
+    def swept(self, robot: Robot, path: Path, margin: float = 0.0) -> Voxels:
         """Voxels with their centres in the arm's covering spheres, inflated by `margin` [m], anywhere on a
         path."""
         out = np.zeros(self.shape, np.bool_)
@@ -96,7 +97,7 @@ MAP = VoxelGrid(
 reaches."""
 
 
-def refined(voxels: Bool[ndarray, "mx my mz"]) -> Bool[ndarray, "nx ny nz"]:
+def refined(voxels: Bool[ndarray, "mx my mz"]) -> Voxels:
     """Coarse voxels of the observed volume as fine ones, of half the edge."""
     return voxels.repeat(2, 0).repeat(2, 1).repeat(2, 2)
 

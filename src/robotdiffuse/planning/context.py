@@ -15,7 +15,16 @@ from robotdiffuse.core.deadline import OutOfTimeError, check_cancelled, deadline
 from robotdiffuse.core.loading import loading_seconds
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural, OneOf, Settings
-from robotdiffuse.core.types import CONVERGED, OBJECTIVES, TIME, UNTIL, Path, Status, Trajectory
+from robotdiffuse.core.types import (
+    CONVERGED,
+    OBJECTIVES,
+    TIME,
+    UNTIL,
+    Configurations,
+    Path,
+    Status,
+    Trajectory,
+)
 from robotdiffuse.problems.problem import MAX_CLEARANCE, Problem, check_problem
 from robotdiffuse.problems.units import unit_notes
 from robotdiffuse.scenes.scene import contact_notes
@@ -128,7 +137,7 @@ class PlanningContext:
         """Add a note to the result."""
         self.notes = (*self.notes, text)
 
-    def keeps_constraints(self, q: Float[ndarray, "n dof"]) -> bool:
+    def keeps_constraints(self, q: Configurations) -> bool:
         """Whether the polyline through configurations, such as a rounded corner, keeps the path constraints
         as closely as planners do."""
         constraints = self.validator.constraints
@@ -221,7 +230,7 @@ class PlanningContext:
 
     def finish(
         self,
-        waypoints: Float[ndarray, "n dof"],
+        waypoints: Configurations,
         stage: str,
         reason: str = "",
         notes: tuple[str, ...] = (),
@@ -246,7 +255,7 @@ class PlanningContext:
 
     def _finished(
         self,
-        waypoints: Float[ndarray, "n dof"],
+        waypoints: Configurations,
         stage: str,
         reason: str,
         notes: tuple[str, ...],

@@ -26,8 +26,8 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative
-from robotdiffuse.core.types import Path
-from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
+from robotdiffuse.core.types import Configuration, Configurations, Path
+from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings, Trajectories
 from robotdiffuse.learning.motion_model import SamplingSettings
 from robotdiffuse.learning.weight_files import weights_for
 from robotdiffuse.planning import PATH_CONSTRAINTS
@@ -95,12 +95,12 @@ class ModelSampler(LearnedPlanner[SamplerSettings]):
         model: "MotionModel",
         checker: CollisionChecker,
         code: Float[ndarray, "code"] | None,
-        start: Float[ndarray, "dof"],
-        goals: Float[ndarray, "k dof"],
+        start: Configuration,
+        goals: Configurations,
         rng: np.random.Generator,
         clearances: "ClearanceFn | None" = None,
         constraints: PathConstraints | None = None,
-    ) -> Float[ndarray, "count waypoints dof"]:
+    ) -> Trajectories:
         """A batch of samples under guidance, divided among the nearest goals.
 
         code: the scene, as by `encode`; None: the condition is hidden, for weights that allow it.
@@ -144,9 +144,7 @@ def encode(
     return model.encode(sample_surface(checker.scene, count, rng, of_encoder.region), rng)
 
 
-def _projected(
-    constraints: PathConstraints, path: Float[ndarray, "waypoints dof"]
-) -> Float[ndarray, "waypoints dof"]:
+def _projected(constraints: PathConstraints, path: Configurations) -> Configurations:
     """The path with its inner waypoints projected onto the constraints; the path itself, for the validator to
     refuse, if the projection of one fails."""
     between = constraints.projected(path[1:-1], TOLERANCE_FRACTION)

@@ -37,7 +37,8 @@ from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural
-from robotdiffuse.learning.guidance import CollisionGuidance
+from robotdiffuse.core.types import Configuration, Configurations
+from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.diffusion import GuidedSamplingSettings, ModelSampler, encode
@@ -69,13 +70,13 @@ VARIANCE_EXPONENT = 3.5
 
 
 def smooth_noise(
-    start: Float[ndarray, "dof"],
-    goals: Float[ndarray, "k dof"],
+    start: Configuration,
+    goals: Configurations,
     count: int,
     waypoints: int,
     robot: Robot,
     rng: np.random.Generator,
-) -> Float[ndarray, "count waypoints dof"]:
+) -> Trajectories:
     """Straight lines from the start to the goals in turn, plus smooth noise; float32.
 
     All waypoints but the ends are clipped to the joint limits.
@@ -178,9 +179,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         scale = self.settings.guidance_scale
         return 1.0 if scale == 0.0 and not model.settings.null_condition else scale
 
-    def refine(
-        self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]
-    ) -> Float[ndarray, "count waypoints dof"]:
+    def refine(self, checker: CollisionChecker, q: Trajectories) -> Trajectories:
         """Trajectories after `refinement_steps` gradient steps on the guidance costs; float32."""
         return CollisionGuidance(checker, self.settings.guidance)(q, self.settings.refinement_steps)[0]
 
@@ -236,7 +235,7 @@ class _Batches:
             q = planner.refine(checker, q)
         self._take(q, "smooth_noise")
 
-    def _take(self, q: Float[ndarray, "count waypoints dof"], stage: str) -> bool:
+    def _take(self, q: Trajectories, stage: str) -> bool:
         """Offer the shortest free trajectories to the search; returns whether there were any."""
         space, most = self.search.space, self.planner.settings.max_simplified
         ordered = sorted(np.ascontiguousarray(q, np.float32), key=path_length)
@@ -288,7 +287,7 @@ class Candidates:
 
     source: str
     """"network", or "smooth_noise" for an arm without weights."""
-    positions: Float[ndarray, "count waypoints dof"]
+    positions: Trajectories
     clearances: Float[ndarray, "count"]
     """Smallest signed distance of the covering spheres to the obstacles along each trajectory, sampled [m],
     at most 1 m; negative where spheres touch, though the meshes within may not."""

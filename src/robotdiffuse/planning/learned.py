@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.settings import Settings
+from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.weight_files import check_weights
 from robotdiffuse.planning.planner import Planner
@@ -54,9 +53,7 @@ class LearnedPlanner(Planner[LearnedPlannerSettings]):
         self.network(robot)
 
 
-def nearest_goals(
-    start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], samples: int
-) -> Float[ndarray, "n dof"]:
+def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> Configurations:
     """The goals that a batch of `samples` samples is divided among: the nearest ones, nearest first."""
     order = np.argsort(np.linalg.norm(goals - start, axis=1))
     return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]

@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.deadline import check_time
+from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.problems.compiled_constraints import POSE_TOLERANCE, PathConstraints
 from robotdiffuse.problems.goals import PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
@@ -37,7 +37,7 @@ often; and the part of its distance by which this must bring it nearer."""
 EXACT = POSE_TOLERANCE, POSE_TOLERANCE
 """Tolerances of poses that give none [m], [rad]."""
 
-Accept = Callable[[Float[ndarray, "n dof"]], ndarray]
+Accept = Callable[[Configurations], ndarray]
 
 
 def pose_configurations(
@@ -48,7 +48,7 @@ def pose_configurations(
     count: int = GOAL_COUNT,
     rounds: int = MAX_ROUNDS,
     exact: tuple[float, float] = EXACT,
-) -> Float[ndarray, "k dof"]:
+) -> Configurations:
     """At most `count` configurations that bring links to their poses, or to poses within their tolerances,
     and keep the problem's path constraints; those nearest to the problem's start first.
 
@@ -93,7 +93,7 @@ def pose_configurations(
 
 def at_pose(
     problem: Problem, pose: PoseGoal, count: int, rng: np.random.Generator, exact: tuple[float, float]
-) -> Float[ndarray, "k dof"]:
+) -> Configurations:
     """At most `count` configurations for one pose from a round of seeds, of which the first is the start;
     without path constraints."""
     robot, start = problem.robot, problem.start
@@ -120,7 +120,7 @@ def _within(pose: PoseGoal, part: float) -> PoseGoal:
 
 def _combined(
     problem: Problem, poses: Sequence[PoseGoal], solutions: Sequence[ndarray], rng: np.random.Generator
-) -> Float[ndarray, "n dof"]:
+) -> Configurations:
     """Random combinations of configurations for each pose alone; joints that several poses move take the
     values of one of them."""
     seeds = np.tile(problem.start, (SEEDS if all(len(alone) for alone in solutions) else 0, 1))
@@ -131,9 +131,7 @@ def _combined(
     return seeds
 
 
-def _pulled(
-    together: PathConstraints, q: Float[ndarray, "n dof"], start: Float[ndarray, "dof"]
-) -> Float[ndarray, "n dof"]:
+def _pulled(together: PathConstraints, q: Configurations, start: Configuration) -> Configurations:
     """The configurations drawn towards the start, as far as the goal allows."""
     robot = together.robot
     nearest = q
@@ -148,11 +146,11 @@ def _pulled(
     return nearest
 
 
-def _accepted(q: Float[ndarray, "n dof"], accept: Accept | None) -> Float[ndarray, "k dof"]:
+def _accepted(q: Configurations, accept: Accept | None) -> Configurations:
     return q if accept is None or not len(q) else q[accept(q)]
 
 
-def _distinct(q: Float[ndarray, "n dof"]) -> Float[ndarray, "k dof"]:
+def _distinct(q: Configurations) -> Configurations:
     """The configurations without those close to one before them."""
     kept = q[:0]
     for row in q:

@@ -13,7 +13,7 @@ from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Status
+from robotdiffuse.core.types import Configuration, Configurations, Status
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, OneGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.units import arm_in_cloud_note
@@ -74,7 +74,7 @@ class StartGoal:
         self.goals = [goal for goal, lead in zip(ways, leads, strict=True) if lead is not None]
         self.goal_leads = [lead for lead in leads if lead is not None]
 
-    def rows(self) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
+    def rows(self) -> tuple[Configuration, Configurations]:
         """The start and the goals of a search, in float32."""
         assert self.start_lead is not None
         return self.start_lead.astype(np.float32), np.array(self.goal_leads, np.float32)
@@ -96,14 +96,14 @@ class StartGoal:
         states = np.concatenate([start[None], goals])
         return self._within(padded_space(self.checker, states, resolution, clearance), states)
 
-    def _within(self, space: Space, states: Float[ndarray, "k dof"]) -> Space:
+    def _within(self, space: Space, states: Configurations) -> Space:
         """The space with continuous joints limited to MAX_OVERTURN beyond the range of start and goals."""
         turning = self._robot.continuous
         lower = np.where(turning, np.maximum(space.lower, states.min(axis=0) - MAX_OVERTURN), space.lower)
         upper = np.where(turning, np.minimum(space.upper, states.max(axis=0) + MAX_OVERTURN), space.upper)
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
-    def complete(self, path: Float[ndarray, "n dof"], direct: bool = False) -> Float[ndarray, "m dof"]:
+    def complete(self, path: Configurations, direct: bool = False) -> Configurations:
         """The path of a search in float64, with the exact start and goal in place of its ends, or added to
         them; `direct`: always in place of them."""
         assert self.start_lead is not None
@@ -119,7 +119,7 @@ class StartGoal:
 
 
 def padded_space(
-    checker: CollisionChecker, states: Float[ndarray, "k dof"], resolution: float, clearance: float
+    checker: CollisionChecker, states: Configurations, resolution: float, clearance: float
 ) -> Space:
     """The space for motions that keep a clearance [m], except near a start or goal that is closer."""
     if clearance <= 0:
@@ -130,9 +130,7 @@ def padded_space(
     return search_space(checker, resolution, clearance, near)
 
 
-def falling_clearances(
-    most: float, checker: CollisionChecker, states: Float[ndarray, "k dof"]
-) -> list[float]:
+def falling_clearances(most: float, checker: CollisionChecker, states: Configurations) -> list[float]:
     """Clearances for a search to try, falling to zero in CLEARANCE_STEPS steps [m]; those of the start,
     states[0], and of the goal farthest from obstacles are two more."""
     has = checker.link_clearances(states).min(axis=1, initial=1.0)
@@ -142,9 +140,7 @@ def falling_clearances(
     )
 
 
-def images(
-    robot: Robot, start: Float[ndarray, "dof"], goal: Float[ndarray, "dof"]
-) -> list[Float[ndarray, "dof"]]:
+def images(robot: Robot, start: Configuration, goal: Configuration) -> list[Configuration]:
     """The goal with whole turns added to continuous joints: a search does not wrap them.
 
     First the image nearest to the start, then those with one continuous joint turned the other way: an
@@ -182,8 +178,8 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
 
 
 def retreat(
-    checker: CollisionChecker, q: Float[ndarray, "dof"], constraints: "PathConstraints | None" = None
-) -> Float[ndarray, "dof"] | None:
+    checker: CollisionChecker, q: Configuration, constraints: "PathConstraints | None" = None
+) -> Configuration | None:
     """A configuration nearby whose covering spheres are free, found down the gradient of the collision cost.
 
     For a start or goal whose exact meshes are free while the spheres around them are not. None if no free
@@ -202,7 +198,7 @@ def retreat(
     return None
 
 
-def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
+def closeness(checker: CollisionChecker, q: Configuration) -> str:
     """A message that says where the covering spheres penetrate deepest, for a configuration whose meshes are
     free."""
     clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
@@ -221,9 +217,7 @@ def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
     )
 
 
-def _usable_goals(
-    context: PlanningContext, checker: CollisionChecker
-) -> Float[ndarray, "k dof"] | PlanResult:
+def _usable_goals(context: PlanningContext, checker: CollisionChecker) -> Configurations | PlanResult:
     robot, scene, start = context.problem.robot, context.problem.scene, context.problem.start
     if not checker.free(start[None])[0]:
         collision = _explained(robot, scene, start)
@@ -249,14 +243,12 @@ def _usable_goals(
     return goals if len(held) == len(goals) else np.stack(held)
 
 
-def _too_heavy(context: PlanningContext, q: Float[ndarray, "dof"]) -> str | None:
+def _too_heavy(context: PlanningContext, q: Configuration) -> str | None:
     """A message that names the joint that cannot hold the problem's payload there; None if all can."""
     return None if context.validator.dynamics is None else context.validator.dynamics.overload_message(q)
 
 
-def _goals(
-    context: PlanningContext, goal: Goal, checker: CollisionChecker
-) -> Float[ndarray, "k dof"] | PlanResult:
+def _goals(context: PlanningContext, goal: Goal, checker: CollisionChecker) -> Configurations | PlanResult:
     """The free configurations of a goal, or of any of several goals; or the result that says why there are
     none."""
     if isinstance(goal, AnyGoal):
@@ -268,7 +260,7 @@ def _goals(
 
 def _any_goals(
     context: PlanningContext, goals: Sequence[OneGoal], checker: CollisionChecker
-) -> Float[ndarray, "k dof"] | PlanResult:
+) -> Configurations | PlanResult:
     """The free configurations of several goals, by one try for each; if none is free, by more for each."""
     until = GOAL_TIME_FRACTION * context.request.time_limit
     free = list[ndarray]()
@@ -295,7 +287,7 @@ def _any_goals(
     )
 
 
-def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecker) -> Float[ndarray, "k dof"]:
+def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecker) -> Configurations:
     """Free configurations of one of several goals, by little work."""
     if isinstance(goal, JointGoal):
         constraints = context.validator.constraints
@@ -309,7 +301,7 @@ def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecke
 
 def _free_goals(
     context: PlanningContext, goal: JointGoal, checker: CollisionChecker
-) -> Float[ndarray, "k dof"] | PlanResult:
+) -> Configurations | PlanResult:
     positions, constraints = goal.positions, context.validator.constraints
     if constraints is not None:
         kept = constraints.satisfied(positions)
@@ -333,19 +325,19 @@ def _free_goals(
 
 def _pose_goals(
     context: PlanningContext, goal: PoseGoal | PosesGoal, checker: CollisionChecker
-) -> Float[ndarray, "k dof"] | PlanResult:
+) -> Configurations | PlanResult:
     pose_configurations = _pose_configurations()
     problem, rng = context.problem, context.rng
     robot, scene, start = problem.robot, problem.scene, problem.start
     rejected = np.zeros((0, robot.dof))
 
-    def free(q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
+    def free(q: Configurations) -> Bool[ndarray, "n"]:
         nonlocal rejected
         free = checker.free(q)
         rejected = np.concatenate([rejected, q[~free]])
         return free
 
-    def distances(q: Float[ndarray, "n dof"]) -> Float[ndarray, "n"]:
+    def distances(q: Configurations) -> Float[ndarray, "n"]:
         return np.linalg.norm(q - start, axis=1)
 
     found = pose_configurations(problem, goal, rng, free)
@@ -403,14 +395,14 @@ def _pose_configurations() -> "Callable[..., Float[ndarray, 'k dof']]":
     return pose_configurations
 
 
-def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:
+def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Configurations:
     """The goals and their copies with whole turns: a pose does not say how often a continuous joint has
     turned."""
     robot, start = context.problem.robot, context.problem.start
     return np.concatenate([robot.equivalent_configurations(q, start) for q in goals])
 
 
-def _free_meshes(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"]) -> Float[ndarray, "k dof"]:
+def _free_meshes(robot: Robot, scene: Scene, q: Configurations) -> Configurations:
     """The configurations whose exact meshes are free."""
     with loading():
         from robotdiffuse.collision.exact_meshes import ExactCollision  # imports Coal, rarely needed
@@ -418,7 +410,7 @@ def _free_meshes(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"]) -> Floa
     return q[~ExactCollision(robot, scene).collides(q)]
 
 
-def _explained(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:
+def _explained(robot: Robot, scene: Scene, q: Configuration) -> str | None:
     """The message of `explain_collision`, imported here because it imports Coal."""
     with loading():
         from robotdiffuse.collision.exact_meshes import explain_collision

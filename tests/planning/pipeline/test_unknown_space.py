@@ -16,7 +16,14 @@ from robotdiffuse.core.types import FIRST, Status
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
-from robotdiffuse.perception.unknown_space import CARVING_MARGIN, PADDINGS, RATES, THRESHOLDS, Padded, Voxels
+from robotdiffuse.perception.unknown_space import (
+    CARVING_MARGIN,
+    PADDINGS,
+    RATES,
+    THRESHOLDS,
+    OccupiedVoxels,
+    Padded,
+)
 from robotdiffuse.perception.voxel_grid import (
     COARSE,
     FINE,
@@ -141,12 +148,12 @@ def test_assumptions_are_carved_free_at_the_ends() -> None:
     volume = observe([taken(DEEP)], PANDA, START)
     chain = [a for p in ("padded", "occupied") for a in assumptions_of(partial(p), volume, None)]
     assert [assumption.padding for assumption in chain if isinstance(assumption, Padded)] == list(PADDINGS)
-    for assumption in (*chain, Voxels("all", solid, PANDA, Scene())):
+    for assumption in (*chain, OccupiedVoxels("all", solid, PANDA, Scene())):
         cloud = assumption.obstacles(ends)
         away = np.linalg.norm(cloud.points[:, None] - ends[None, :, :3], axis=2) - ends[:, 3]
         assert len(cloud.points) and away.min() > cloud.point_radius
         assert assumption.touched(ends) > 0 or isinstance(assumption, Padded)
-    assert len(Voxels("all", solid, PANDA, Scene()).obstacles(ends[:1]).points) < 0.15 * solid.size
+    assert len(OccupiedVoxels("all", solid, PANDA, Scene()).obstacles(ends[:1]).points) < 0.15 * solid.size
 
 
 def test_later_assumptions_have_fewer_voxels() -> None:

@@ -85,7 +85,9 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Filled, Natural, NotNegative, Positive, Settings, Share
+from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.learning.diffusion import NoiseSchedule, reverse_process
+from robotdiffuse.learning.guidance import Trajectories
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
@@ -106,7 +108,7 @@ class Attempt(NamedTuple):
     """Number of segments in collision."""
     length: float
     """[rad]"""
-    path: Float[ndarray, "waypoints dof"]
+    path: Configurations
 
 
 @dataclass(frozen=True)
@@ -144,11 +146,11 @@ class GuidedPrior(LearnedPlanner[GuidedPriorSettings]):
         self,
         prior: MotionModel,
         checker: CollisionChecker,
-        starts: Float[ndarray, "count dof"],
-        goals: Float[ndarray, "count dof"],
+        starts: Configurations,
+        goals: Configurations,
         rng: np.random.Generator,
         stop: Callable[[], bool] = lambda: False,
-    ) -> Float[ndarray, "count waypoints dof"] | None:
+    ) -> Trajectories | None:
         """A batch of guided samples, float32; None if `stop` returns True before they are complete."""
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
@@ -192,15 +194,15 @@ class _StoppedError(Exception):
 
 def sample(
     prior: MotionModel,
-    starts: Float[ndarray, "count dof"],
-    goals: Float[ndarray, "count dof"],
+    starts: Configurations,
+    goals: Configurations,
     levels: Int[ndarray, "steps"],
     rng: np.random.Generator,
     guide: Guide,
     noise_scale: float = 1.0,
     quiet_steps: int = 0,
     stop: Callable[[], bool] = lambda: False,
-) -> Float[ndarray, "count waypoints dof"] | None:
+) -> Trajectories | None:
     """A trajectory from each start to its goal, float32, within the limits but for the ends themselves.
 
     levels, noise_scale: see `reverse_process`.
@@ -240,13 +242,13 @@ def falling(rising: Int[ndarray, "steps"], most: int) -> Int[ndarray, "steps"]:
     return np.minimum(apart, most - at[::-1])[::-1].copy()
 
 
-def _attempt(space: Space, path: Float[ndarray, "waypoints dof"]) -> Attempt:
+def _attempt(space: Space, path: Configurations) -> Attempt:
     return Attempt(int((~motions_free(space, path)).sum()), float(path_length(path)), path)
 
 
 def shared_out(
-    start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], samples: int
-) -> tuple[Float[ndarray, "samples dof"], Float[ndarray, "samples dof"]]:
+    start: Configuration, goals: Configurations, samples: int
+) -> tuple[Configurations, Configurations]:
     """The start and the goal of each sample: the nearest goals in turn."""
     nearest = nearest_goals(start, goals, samples)
     return np.repeat(start[None], samples, 0), nearest[np.arange(samples) % len(nearest)]
@@ -254,11 +256,11 @@ def shared_out(
 
 def collision_gradient(
     checker: CollisionChecker,
-    q: Float[ndarray, "count waypoints dof"],
+    q: Trajectories,
     margin: float,
     self_margin: float,
     between: int,
-) -> tuple[Float[ndarray, "count"], Float[ndarray, "count waypoints dof"]]:
+) -> tuple[Float[ndarray, "count"], Trajectories]:
     """Collision cost of trajectories [m] and its gradient by their waypoints [m/rad], of the ends too.
 
     The cost of a configuration is the root of the sum of h² over the covering spheres and pairs of links,
@@ -288,9 +290,7 @@ def collision_gradient(
     return costs, by_frame
 
 
-def limited(
-    moves: Float[ndarray, "count waypoints dof"], most: float
-) -> Float[ndarray, "count waypoints dof"]:
+def limited(moves: Trajectories, most: float) -> Trajectories:
     """Moves of waypoints, none longer than `most` [rad, joint-space L2]."""
     lengths = np.linalg.norm(moves, axis=2, keepdims=True)
     return moves * np.minimum(1.0, most / np.maximum(lengths, 1e-9)).astype(moves.dtype)
@@ -336,11 +336,11 @@ class MPD(GuidedPrior[MPDSettings]):
         self,
         prior: MotionModel,
         checker: CollisionChecker,
-        starts: Float[ndarray, "count dof"],
-        goals: Float[ndarray, "count dof"],
+        starts: Configurations,
+        goals: Configurations,
         rng: np.random.Generator,
         stop: Callable[[], bool] = lambda: False,
-    ) -> Float[ndarray, "count waypoints dof"] | None:
+    ) -> Trajectories | None:
         """See `GuidedPrior.draw`."""
         settings = self.settings
         guided = ceil(settings.guided_share * settings.sampling_steps)
@@ -353,9 +353,7 @@ class MPD(GuidedPrior[MPDSettings]):
             prior, starts, goals, levels, rng, guide, settings.noise_scale, settings.quiet_steps, stop
         )
 
-    def guided(
-        self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]
-    ) -> Float[ndarray, "count waypoints dof"]:
+    def guided(self, checker: CollisionChecker, q: Trajectories) -> Trajectories:
         """Trajectories after the gradient steps of one denoising step; their ends stay fixed."""
         settings, robot = self.settings, checker.robot
         gaussian = gaussian_process(q.shape[1])
@@ -403,17 +401,15 @@ class GaussianProcess:
     precision: Float[ndarray, "waypoints waypoints"]
     """P, of the positions of one joint."""
 
-    def costs(self, q: Float[ndarray, "count waypoints dof"]) -> Float[ndarray, "count"]:
+    def costs(self, q: Trajectories) -> Float[ndarray, "count"]:
         """The sum over the joints of q P q / 2 [rad²]."""
         return 0.5 * (q * self.gradient(q)).sum((1, 2))
 
-    def gradient(self, q: Float[ndarray, "count waypoints dof"]) -> Float[ndarray, "count waypoints dof"]:
+    def gradient(self, q: Trajectories) -> Trajectories:
         """P q."""
         return self.precision.astype(q.dtype) @ q
 
-    def step(
-        self, q: Float[ndarray, "count waypoints dof"], weight: float
-    ) -> Float[ndarray, "count waypoints dof"]:
+    def step(self, q: Trajectories, weight: float) -> Trajectories:
         """One implicit gradient step down weight q P q / 2 on all waypoints but the ends.
 
         It solves x = q - weight P x, the minimum of |x - q|² / 2 + weight x P x / 2 with fixed ends.
@@ -523,11 +519,11 @@ class EDMP(GuidedPrior[EDMPSettings]):
         self,
         prior: MotionModel,
         checker: CollisionChecker,
-        starts: Float[ndarray, "count dof"],
-        goals: Float[ndarray, "count dof"],
+        starts: Configurations,
+        goals: Configurations,
         rng: np.random.Generator,
         stop: Callable[[], bool] = lambda: False,
-    ) -> Float[ndarray, "count waypoints dof"] | None:
+    ) -> Trajectories | None:
         """See `GuidedPrior.draw`."""
         levels = quadratic_levels(prior.schedule, self.settings.sampling_steps)
 
@@ -536,9 +532,7 @@ class EDMP(GuidedPrior[EDMPSettings]):
 
         return sample(prior, starts, goals, levels, rng, guide, stop=stop)
 
-    def guided(
-        self, checker: CollisionChecker, q: Float[ndarray, "samples waypoints dof"], left: int
-    ) -> Float[ndarray, "samples waypoints dof"]:
+    def guided(self, checker: CollisionChecker, q: Trajectories, left: int) -> Trajectories:
         """The batch after a gradient step of every guide on its rows; the ends of trajectories stay fixed."""
         settings, moved = self.settings, q.copy()
         for share, guide in zip(settings.shares(), settings.guides, strict=True):

@@ -41,7 +41,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
-from robotdiffuse.core.types import Status
+from robotdiffuse.core.types import Configuration, Configurations, Status
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal
@@ -520,7 +520,7 @@ LatticePlannerSettings = TypeVar("LatticePlannerSettings", bound=LatticeSettings
 
 
 def make_lattice(
-    robot: Robot, start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], settings: LatticeSettings
+    robot: Robot, start: Configuration, goals: Configurations, settings: LatticeSettings
 ) -> tuple[Lattice, int]:
     """The lattice through the start, and the start's key. Raises InputError for one that is too large."""
     spacing, name = settings.spacing, settings.settings_name
@@ -550,7 +550,7 @@ def make_lattice(
     return lattice, int(below @ strides)
 
 
-def _steps(distance: Float[ndarray, "dof"], spacing: float) -> Int[ndarray, "dof"]:
+def _steps(distance: Configuration, spacing: float) -> Int[ndarray, "dof"]:
     return np.maximum(np.floor(distance / spacing - LIMIT_MARGIN), 0).astype(np.int64)
 
 
@@ -577,8 +577,8 @@ class _Search(Generic[LatticePlannerSettings]):
     def __init__(
         self,
         checker: CollisionChecker,
-        start: Float[ndarray, "dof"],
-        goals: Float[ndarray, "k dof"],
+        start: Configuration,
+        goals: Configurations,
         settings: LatticePlannerSettings,
         padding: float = 0.0,
     ) -> None:
@@ -595,7 +595,7 @@ class _Search(Generic[LatticePlannerSettings]):
     def _use(
         self,
         checker: CollisionChecker,
-        targets: Float[ndarray, "n dof"],
+        targets: Configurations,
         cell: int,
         inflation: float,
         ties: int,
@@ -619,7 +619,7 @@ class _Search(Generic[LatticePlannerSettings]):
             if outcome is not Outcome.GOING or stop():
                 return outcome
 
-    def path(self) -> Float[ndarray, "n dof"] | None:
+    def path(self) -> Configurations | None:
         """The start, the nodes at which the path found so far turns, and the goal; None if there is none."""
         nodes = [int(self._table.values[TARGET])]
         if self._table.rhs[nodes[0]] >= INFINITE:
@@ -651,7 +651,7 @@ class _Search(Generic[LatticePlannerSettings]):
     def _coordinates(self, keys: Int[ndarray, "n"]) -> Int[ndarray, "n dof"]:
         return keys[:, None] // self._lattice.strides % self._lattice.counts
 
-    def _configurations(self, at: Int[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+    def _configurations(self, at: Int[ndarray, "n dof"]) -> Configurations:
         robot, lattice = self.checker.robot, self._lattice
         return np.clip(lattice.origin + lattice.spacing * at, robot.lower, robot.upper)
 
@@ -694,7 +694,7 @@ class DStarLiteSearch(_Search[DStarLiteSettings]):
         self._use(checker, self._coordinates(start[None]).astype(np.float64), 0, 1.0, 1)
         update(self._search, distances, self._reaches)
 
-    def update(self, checker: CollisionChecker, start: Float[ndarray, "dof"] | None = None) -> None:
+    def update(self, checker: CollisionChecker, start: Configuration | None = None) -> None:
         """Take over a changed scene, and a new start at another node of the lattice; `run` then repairs the
         search.
 
@@ -730,7 +730,7 @@ class DStarLiteSearch(_Search[DStarLiteSettings]):
             distances[known] = clearances.min(axis=1, initial=np.inf) - margin
         return distances
 
-    def _move_start(self, start: Float[ndarray, "dof"]) -> None:
+    def _move_start(self, start: Configuration) -> None:
         lattice = self._lattice
         at = (np.asarray(start, np.float64) - lattice.origin) / lattice.spacing
         whole = np.round(at).astype(np.int64)

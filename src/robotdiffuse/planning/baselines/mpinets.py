@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -28,6 +28,7 @@ from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative, Positive
+from robotdiffuse.core.types import Configurations
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.planning.start_goal import StartGoal
@@ -147,7 +148,7 @@ class _Motion:
             self.waypoints.append(self.goal)
             self.arrived = True
 
-    def path(self, start_goal: StartGoal) -> Float[ndarray, "n dof"]:
+    def path(self, start_goal: StartGoal) -> Configurations:
         """Its waypoints, with the exact start, and the exact goal if it was reached."""
         if self.arrived:
             return start_goal.complete(np.stack(self.waypoints))

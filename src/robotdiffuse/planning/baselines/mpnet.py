@@ -24,7 +24,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -33,6 +33,7 @@ from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
+from robotdiffuse.core.types import Configuration, Configurations, Points
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.planning.search import rrt_kernel
@@ -104,7 +105,7 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
 
 @dataclass(frozen=True)
 class Attempt:
-    path: Float[ndarray, "n dof"]
+    path: Configurations
     """[rad]"""
     broken: float
     """Segments in collision; infinite if there is no path."""
@@ -162,8 +163,8 @@ class NeuralPlanning:
         return f"solved by {MPNet.name}: round {rounds}, after {self.replanned} neural replannings{how}"
 
     def between(
-        self, starts: Float[ndarray, "n dof"], goals: Float[ndarray, "n dof"], one_will_do: bool = False
-    ) -> list[Float[ndarray, "_ dof"]]:
+        self, starts: Configurations, goals: Configurations, one_will_do: bool = False
+    ) -> list[Configurations]:
         """Bidirectional neural planning of many motions at once.
 
         one_will_do: stop as soon as one of them is free.
@@ -186,7 +187,7 @@ class NeuralPlanning:
             near, far = far, near
         return [_joined(*rows) for rows in zip(forth, back, strict=True)]
 
-    def replan(self, paths: list[Float[ndarray, "_ dof"]]) -> list[Float[ndarray, "_ dof"]]:
+    def replan(self, paths: list[Configurations]) -> list[Configurations]:
         """The paths without their states in collision, with new states where the straight line is not
         free."""
         kept = [self.without_collisions(path) for path in paths]
@@ -205,7 +206,7 @@ class NeuralPlanning:
             for a, path in enumerate(kept)
         ]
 
-    def search(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+    def search(self, path: Configurations) -> Configurations:
         """The path without its states in collision, with paths of RRT-Connect where the straight line is not
         free; as far as time allows."""
         self.searched = True
@@ -215,7 +216,7 @@ class NeuralPlanning:
             pieces.append(b[None] if seen else self.searched_between(a, b)[1:])
         return np.concatenate(pieces)
 
-    def searched_between(self, a: Float[ndarray, "dof"], b: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+    def searched_between(self, a: Configuration, b: Configuration) -> Configurations:
         """A free path from a to b by RRT-Connect; the straight line if time runs out."""
         trees = rrt_kernel.make_trees(a, b[None], SEARCH_CAPACITY)
         while self.context.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
@@ -227,33 +228,29 @@ class NeuralPlanning:
                 return path
         return np.stack([a, b])
 
-    def without_collisions(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+    def without_collisions(self, path: Configurations) -> Configurations:
         """The path without its inner states in collision."""
         # a motion from a state to itself checks that state
         free = np.array([self.segments_free(np.stack([q, q]))[0] for q in path[1:-1]], bool)
         return np.concatenate([path[:1], path[1:-1][free], path[-1:]])
 
-    def contracted(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+    def contracted(self, path: Configurations) -> Configurations:
         """The path after lazy states contraction: without states that free straight lines can skip."""
         return shortcut(self.space, path, 0, self.state)
 
-    def segments_free(self, path: Float[ndarray, "n dof"]) -> Bool[ndarray, "segments"]:
+    def segments_free(self, path: Configurations) -> Bool[ndarray, "segments"]:
         return motions_free(self.space, path)
 
-    def next_states(
-        self, q: Float[ndarray, "n dof"], goal: Float[ndarray, "n dof"]
-    ) -> Float[ndarray, "n dof"]:
+    def next_states(self, q: Configurations, goal: Configurations) -> Configurations:
         """The states that Pnet proposes, with dropout."""
         return self.network.proposals(self.z, q, goal, self.generator)
 
 
-def _joined(forth: list[ndarray], back: list[ndarray]) -> Float[ndarray, "n dof"]:
+def _joined(forth: list[ndarray], back: list[ndarray]) -> Configurations:
     return np.stack([*forth, *back[::-1]])
 
 
-def scene_cloud(
-    network: "MPNetNetwork", checker: CollisionChecker, rng: np.random.Generator
-) -> Float32[ndarray, "points 3"]:
+def scene_cloud(network: "MPNetNetwork", checker: CollisionChecker, rng: np.random.Generator) -> Points:
     """A random cloud of the scene's obstacles [m]; zeros without obstacles."""
     cloud = np.zeros((network.settings.points, 3), np.float32)
     points = sample_surface(checker.scene, network.settings.points, rng, network.region)

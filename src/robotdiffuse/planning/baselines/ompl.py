@@ -26,8 +26,6 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.collision.kernels import lane_collision
 from robotdiffuse.collision.kernels.motions import Space, motions_free
@@ -35,7 +33,7 @@ from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Configuration, Configurations, Path
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.start_goal import StartGoal
@@ -359,7 +357,7 @@ class _Search:
         with self._watch.until_time_is_over() as condition:
             og.PathSimplifier(self._information, self._goals).simplify(self._solution(), condition)
 
-    def path(self) -> Float[ndarray, "n dof"]:
+    def path(self) -> Configurations:
         """Waypoints of the shortest path."""
         states: Any = self._solution().getStates()
         rows = np.array([state[0 : self._robot.dof] for state in states])
@@ -370,7 +368,7 @@ class _Search:
         assert isinstance(solution, og.PathGeometric)
         return solution
 
-    def _state(self, q: Float[ndarray, "dof"]) -> ob.RealVectorStateType:
+    def _state(self, q: Configuration) -> ob.RealVectorStateType:
         state = self._information.allocState()
         assert isinstance(state, ob.RealVectorStateType)
         # rounding to float32 may exceed a limit, which OMPL would refuse

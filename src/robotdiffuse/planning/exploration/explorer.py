@@ -19,8 +19,6 @@ from dataclasses import replace
 from itertools import islice
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
-from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
@@ -28,13 +26,13 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import FIRST, Path, Status, Trajectory
+from robotdiffuse.core.types import FIRST, Configurations, Path, Status, Trajectory
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import ObservedVolume
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.unknown_space import UnknownSpace, explored_confidence
-from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, surface
+from robotdiffuse.perception.voxel_grid import LAYERS_BELOW, MAP, Probabilities, Voxels, surface
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.exploration.looks import ReachableTree, best_looks, first_parts, swept_unseen
@@ -76,7 +74,7 @@ share of unknown voxels within reach that are."""
 
 def predicted_occupancy(
     robot: Robot, known: OccupancyMap, volume: Callable[[], ObservedVolume]
-) -> Float32[ndarray, "nx ny nz"] | None:
+) -> Probabilities | None:
     """The probability that each voxel is occupied, 0 where the map knows it to be free; None if the network
     does not cover the arm's reach. volume: gives what views observed."""
     from robotdiffuse.learning.completion import covers, predict
@@ -92,7 +90,7 @@ def planned_by_chance(
     planner: Planner,
     known: OccupancyMap,
     problem: Problem,
-    predicted: Float32[ndarray, "nx ny nz"] | None,
+    predicted: Probabilities | None,
     request: PlanRequest,
     to_goal: bool = True,
 ) -> PlanResult:
@@ -113,7 +111,7 @@ def with_confidence(
     known: OccupancyMap,
     problem: Problem,
     motion: PlanResult,
-    predicted: Float32[ndarray, "nx ny nz"] | None,
+    predicted: Probabilities | None,
     to_goal: bool = True,
 ) -> PlanResult:
     """The motion with the confidence that follows from the probability that it sweeps; None if the map holds
@@ -130,8 +128,8 @@ def with_confidence(
 def _unknown(
     known: OccupancyMap,
     problem: Problem,
-    ends: Float[ndarray, "n dof"],
-    predicted: Float32[ndarray, "nx ny nz"] | None,
+    ends: Configurations,
+    predicted: Probabilities | None,
 ) -> UnknownSpace:
     """What the map does not know, without the voxels that the arm fills at these configurations."""
     return UnknownSpace(problem.robot, ends, known.unknown, predicted, 0.0, MAP)
@@ -182,7 +180,7 @@ class Explorer:
         self._looks = 0
         self._looked_for = np.zeros(MAP.shape, np.bool_)
         """The voxels that looks were to show."""
-        self._way_in: Float[ndarray, "n dof"] | None = None
+        self._way_in: Configurations | None = None
         """Waypoints of the latest motion that was returned."""
         self._news: list[DepthView] = []
         """Views since the latest step."""
@@ -237,7 +235,7 @@ class Explorer:
         return replace(step, seen=problem.scene)
 
     @locked
-    def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
+    def wanted(self, path: Path) -> Voxels:
         """The voxels that looks are to show: unknown ones that a tentative motion sweeps, and those of the
         goal that must be seen."""
         return swept_unseen(self.map, path) | self._goal_seen.wanted(path)
@@ -299,7 +297,7 @@ class Explorer:
         self,
         problem: Problem,
         policy: str,
-        predicted: Float32[ndarray, "nx ny nz"] | None,
+        predicted: Probabilities | None,
         motion: PlanResult,
     ) -> Step:
         """A look at what a tentative motion sweeps unseen, or why there is none. `motion`: the one to the
@@ -345,8 +343,8 @@ class Explorer:
         self,
         problem: Problem,
         policy: str,
-        wanted: Bool[ndarray, "nx ny nz"],
-        predicted: Float32[ndarray, "nx ny nz"] | None,
+        wanted: Voxels,
+        predicted: Probabilities | None,
     ) -> PlanResult | None:
         """A motion by a policy to where a camera sees most of the wanted voxels; None if none was found."""
         allowed = problem.scene
@@ -377,21 +375,19 @@ class Explorer:
                 return found
         return None
 
-    def _within_seen_free(
-        self, problem: Problem, waypoints: Float[ndarray, "n dof"], name: str
-    ) -> PlanResult | None:
+    def _within_seen_free(self, problem: Problem, waypoints: Configurations, name: str) -> PlanResult | None:
         """The motion along waypoints, if the validator accepts it within space seen free; else None."""
         obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
         scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
         return self._along(replace(problem, scene=scene, goal=JointGoal(waypoints[-1:])), waypoints, name)
 
-    def _along(self, problem: Problem, waypoints: Float[ndarray, "n dof"], name: str) -> PlanResult | None:
+    def _along(self, problem: Problem, waypoints: Configurations, name: str) -> PlanResult | None:
         """The motion along waypoints, if the validator accepts it in the problem's scene; else None."""
         context = PlanningContext(self._planner.name, problem, PlanRequest(self.settings.time_limit))
         found = context.finish(waypoints, name, name)
         return None if found is None else replace(found, problem=problem)
 
-    def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Bool[ndarray, "nx ny nz"]]:
+    def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Voxels]:
         """A motion among what was seen, and what looks are to show of it: the least of several. Without any,
         the result that says why.
 
@@ -402,7 +398,7 @@ class Explorer:
         blocked = surface((self.map.occupied | in_vain) & ~ends)
         avoided = cover(self.map, self.scene, blocked, "occupied, or looked for in vain")
         avoiding = replace(as_seen, scene=as_seen.scene.with_shapes([*as_seen.scene.shapes, avoided]))
-        results = list[tuple[PlanResult, Bool[ndarray, "nx ny nz"]]]()
+        results = list[tuple[PlanResult, Voxels]]()
         for seed in range(self._seed, self._seed + TENTATIVE_MOTIONS):
             result = self._planned(avoiding, self._quick_limit, seed)
             if result.path is None and not any(one.solved for one, _ in results):
@@ -423,7 +419,7 @@ class Explorer:
         self,
         problem: Problem,
         policy: str,
-        predicted: Float32[ndarray, "nx ny nz"] | None,
+        predicted: Probabilities | None,
         limit: float,
         may_look: bool = False,
     ) -> PlanResult:
@@ -449,7 +445,7 @@ class Explorer:
     def _by_chance(
         self,
         problem: Problem,
-        predicted: Float32[ndarray, "nx ny nz"] | None,
+        predicted: Probabilities | None,
         limit: float,
         to_goal: bool = True,
     ) -> PlanResult:
@@ -461,7 +457,7 @@ class Explorer:
         compile_scene_for(self.robot, problem.scene)  # now, outside the time limit
         return self._planner.plan(problem, limit, self._seed if seed is None else seed, FIRST)
 
-    def _goals(self, problem: Problem) -> Float[ndarray, "n dof"] | PlanResult:
+    def _goals(self, problem: Problem) -> Configurations | PlanResult:
         """The goal configurations, or the result that says why there is none."""
         if isinstance(problem.goal, JointGoal):
             return problem.goal.positions
@@ -471,7 +467,7 @@ class Explorer:
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 
     @locked
-    def predicted(self) -> Float32[ndarray, "nx ny nz"] | None:
+    def predicted(self) -> Probabilities | None:
         """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
         network, and before the first view."""
         if not (len(self._views) and self.settings.predict):

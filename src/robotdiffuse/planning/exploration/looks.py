@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -15,12 +15,12 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Configuration, Configurations, Path, Pose
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.perception.visibility import seen_weights
-from robotdiffuse.perception.voxel_grid import FINE_VOXEL_SIZE, LOW, MAP, refined
+from robotdiffuse.perception.voxel_grid import FINE_VOXEL_SIZE, LOW, MAP, Probabilities, Voxels, refined
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, near_ends
 from robotdiffuse.planning.exploration.steps import ArmCamera
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
@@ -45,7 +45,7 @@ class ReachableTree:
     knows what is beyond such gaps before anything there is chosen as a goal.
     """
 
-    def __init__(self, robot: Robot, scene: Scene, start: Float[ndarray, "dof"]) -> None:
+    def __init__(self, robot: Robot, scene: Scene, start: Configuration) -> None:
         self._space = search_space(CollisionChecker(robot, scene), RESOLUTION)
         self._start = start
         self._trees = make_trees(start.astype(np.float32), np.zeros((0, robot.dof), np.float32), CAPACITY)
@@ -54,11 +54,11 @@ class ReachableTree:
         return int(self._trees.sizes[0])
 
     @property
-    def configurations(self) -> Float[ndarray, "n dof"]:
+    def configurations(self) -> Configurations:
         """The start, and what is reached from it."""
         return self._trees.nodes[0, : len(self)].astype(np.float64)
 
-    def grow(self, targets: Float[ndarray, "n dof"], longest: Float[ndarray, "n"]) -> None:
+    def grow(self, targets: Configurations, longest: Float[ndarray, "n"]) -> None:
         """Extend the tree from its nearest configuration towards each target, where that motion is free.
 
         longest: the longest extension towards each [rad, joint-space L2].
@@ -66,7 +66,7 @@ class ReachableTree:
         targets = np.clip(targets, self._space.lower, self._space.upper)
         extend(self._space, self._trees, targets.astype(np.float32), longest.astype(np.float32))
 
-    def way(self, number: int) -> Float[ndarray, "m dof"]:
+    def way(self, number: int) -> Configurations:
         """Waypoints from the start to one of the configurations."""
         nodes, parents, path = self._trees.nodes[0], self._trees.parents[0], [number]
         while parents[path[-1]] >= 0:
@@ -76,7 +76,7 @@ class ReachableTree:
         return way
 
 
-def first_parts(waypoints: Float[ndarray, "n dof"]) -> Iterator[Float[ndarray, "m dof"]]:
+def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
     """The first parts of a way, the shortest first, and all of it."""
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1))])
     for part in PARTS:
@@ -108,7 +108,7 @@ SIMILAR_LOOK = 0.2
 """A look that is nearer than this to one that did not show what is wanted counts less [rad]."""
 
 
-def swept_unseen(known: OccupancyMap, path: Path) -> Bool[ndarray, "nx ny nz"]:
+def swept_unseen(known: OccupancyMap, path: Path) -> Voxels:
     """The voxels that the map does not know and whose covering balls a path touches, without those near its
     ends, which count as free."""
     swept = MAP.swept(known.robot, path, COVER_RADIUS)
@@ -119,11 +119,11 @@ def best_looks(
     known: OccupancyMap,
     tree: ReachableTree,
     camera: ArmCamera,
-    wanted: Bool[ndarray, "nx ny nz"],
-    probability: Float32[ndarray, "nx ny nz"] | None,
+    wanted: Voxels,
+    probability: Probabilities | None,
     rng: np.random.Generator,
-    taken: Sequence[Float[ndarray, "dof"]] = (),
-) -> Iterator[Float[ndarray, "n dof"]]:
+    taken: Sequence[Configuration] = (),
+) -> Iterator[Configurations]:
     """Ways to configurations from which the camera sees wanted voxels, the best first: weighted by the
     prediction if there is one, against the way to get there.
 
@@ -146,7 +146,7 @@ def best_looks(
         at, weights = at[chosen], weights[chosen]
     start, (width, height) = tree.configurations[0], camera.size
 
-    def scored(q: Float[ndarray, "n dof"]) -> Float[ndarray, "n"]:
+    def scored(q: Configurations) -> Float[ndarray, "n"]:
         """The scores of configurations; 0 for those that see too little."""
         seen = (
             seen_weights(
@@ -200,12 +200,12 @@ MIN_PROBABILITY = 1e-3
 class NextView(Value):
     """A camera pose, and how much of the crossed unknown space it sees."""
 
-    T_base_camera: Float[ndarray, "4 4"]
+    T_base_camera: Pose
     seen: float
     """Expected part of the summed probability that a camera there sees, from 0 to 1."""
 
 
-def poses_around() -> list[Float[ndarray, "4 4"]]:
+def poses_around() -> list[Pose]:
     """Camera poses around the base, looking at the arm."""
     angles = 2 * np.pi * np.arange(POSES_PER_RING) / POSES_PER_RING
     ring = RING_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -213,9 +213,7 @@ def poses_around() -> list[Float[ndarray, "4 4"]]:
     return [looking_at(np.array(place), np.array(TARGET)) for place in places]
 
 
-def next_view(
-    problem: Problem, result: PlanResult, poses: Sequence[Float[ndarray, "4 4"]] | None = None
-) -> NextView:
+def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None = None) -> NextView:
     """The pose from which a camera like that of the first view sees most of the probability that the motion
     of a result sweeps.
 

@@ -11,20 +11,20 @@ what is taken on trust where the motion begins. What is inside of the surface ne
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import reach_ball
 from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Configuration, Configurations, Path, Points
 from robotdiffuse.perception.depth_filter import MARGIN_SPREADS, filtered
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView
 from robotdiffuse.perception.occupancy_map import OccupancyMap, ViewMemory
 from robotdiffuse.perception.seen_points import sphere_distances
 from robotdiffuse.perception.unknown_space import CARVING_MARGIN, without_known
 from robotdiffuse.perception.visibility import BALL_RADIUS, see_through, surface_balls, within_voxels
-from robotdiffuse.perception.voxel_grid import MAP, surface
+from robotdiffuse.perception.voxel_grid import MAP, Voxels, surface
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -40,7 +40,7 @@ WALL = 2.0
 
 
 def not_seen_free(
-    known: OccupancyMap, known_scene: Scene, ends: Sequence[Float[ndarray, "dof"]]
+    known: OccupancyMap, known_scene: Scene, ends: Sequence[Configuration]
 ) -> tuple[Shape, ...]:
     """Obstacles that cover all space that the map does not know to be free, apart from the known scene's.
 
@@ -52,12 +52,12 @@ def not_seen_free(
     return cover(known, known_scene, points, "not seen free"), *_walls()
 
 
-def near_ends(known: OccupancyMap, ends: Sequence[Float[ndarray, "dof"]]) -> Bool[ndarray, "nx ny nz"]:
+def near_ends(known: OccupancyMap, ends: Sequence[Configuration]) -> Voxels:
     """The voxels around the arm at these configurations that count as free."""
     return MAP.filled(known.robot, ends, CARVING_MARGIN + MAP.edge / 2)
 
 
-def hardly_seen(known: OccupancyMap, start: Float[ndarray, "dof"], goal: Float[ndarray, "dof"]) -> bool:
+def hardly_seen(known: OccupancyMap, start: Configuration, goal: Configuration) -> bool:
     """Whether so little was seen free around a goal that searches within space seen free are in vain."""
     filled = near_ends(known, (goal,)) & ~near_ends(known, (start,))
     return bool(known.free[filled].sum() < MIN_FREE_SHARE * filled.sum())
@@ -72,12 +72,12 @@ def cover(known: OccupancyMap, known_scene: Scene, voxels: Int[ndarray, "n 3"], 
     return AssumedPoints(points, COVER_RADIUS, name=name)
 
 
-def least_unknown(known: OccupancyMap, goals: Float[ndarray, "n dof"]) -> Float[ndarray, "dof"]:
+def least_unknown(known: OccupancyMap, goals: Configurations) -> Configuration:
     """The configuration at which the arm fills the fewest unknown voxels."""
     return min(goals, key=lambda q: int((known.unknown & MAP.filled(known.robot, [q])).sum()))
 
 
-def reaches_outside(robot: Robot, q: Float[ndarray, "dof"]) -> bool:
+def reaches_outside(robot: Robot, q: Configuration) -> bool:
     """Whether the arm reaches out of the map: centres of its covering spheres lie outside."""
     low, high = _ends_of_map()
     centers = placed_spheres(robot, q)[:, :3]
@@ -114,9 +114,9 @@ class GoalSeen:
         """views: kept ones, which count for new goals. required: False if goals need not be seen; nothing is
         missing then."""
         self._robot, self._known, self._views, self._required = robot, known, views, required
-        self._unseen: dict[tuple[float, ...], Float32[ndarray, "n 3"]] = {}
+        self._unseen: dict[tuple[float, ...], Points] = {}
         """Centres of the balls that no view has shown to be free, by configuration [m]."""
-        self.taken: list[Float[ndarray, "dof"]] = []
+        self.taken: list[Configuration] = []
         """Configurations of the views since the goal was set."""
 
     def forget(self) -> None:
@@ -130,14 +130,14 @@ class GoalSeen:
             self.taken.append(view.configuration)
             self._unseen = {q: self._not_shown(balls, [view]) for q, balls in self._unseen.items()}
 
-    def best(self, start: Float[ndarray, "dof"], goals: Float[ndarray, "n dof"]) -> Float[ndarray, "dof"]:
+    def best(self, start: Configuration, goals: Configurations) -> Configuration:
         """The goal of whose surface least is unseen."""
         found = min(goals, key=lambda q: len(self.unseen(start, q)))
         given = set(map(_key, goals))
         self._unseen = {q: balls for q, balls in self._unseen.items() if q in given}
         return found
 
-    def unseen(self, start: Float[ndarray, "dof"], q: Float[ndarray, "dof"]) -> Float32[ndarray, "n 3"]:
+    def unseen(self, start: Configuration, q: Configuration) -> Points:
         """The centres of the balls at a configuration that nothing has shown to be free [m]. start: where the
         arm is."""
         key = _key(q)
@@ -148,7 +148,7 @@ class GoalSeen:
         within_voxels(balls, np.float32(BALL_RADIUS), self._known.free, *MAP.frame, within)
         return balls[~within]
 
-    def wanted(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
+    def wanted(self, path: Path) -> Voxels:
         """The voxels that looks are to show of the surface where a path ends."""
         out = np.zeros(MAP.shape, np.bool_)
         if self._required:
@@ -167,9 +167,7 @@ class GoalSeen:
         share = unseen / len(surface_balls(self._robot, q))
         return f"{100 * share:.2g} % of the arm's surface at the goal was not seen"
 
-    def _not_shown(
-        self, balls: Float32[ndarray, "n 3"], views: Iterable[DepthView]
-    ) -> Float32[ndarray, "m 3"]:
+    def _not_shown(self, balls: Points, views: Iterable[DepthView]) -> Points:
         """The balls that no view shows to be free: none sees through them, and the arm was elsewhere."""
         for view in views:
             depth, spread = filtered(view)
@@ -188,11 +186,11 @@ class GoalSeen:
             balls = balls[~seen]
         return balls
 
-    def _distances(self, balls: Float32[ndarray, "n 3"], q: Float[ndarray, "dof"]) -> Float32[ndarray, "n"]:
+    def _distances(self, balls: Points, q: Configuration) -> Float32[ndarray, "n"]:
         """Signed distances of the balls' centres to the arm's covering spheres at a configuration [m]."""
         return sphere_distances(balls, placed_spheres(self._robot, q).astype(np.float32))
 
 
-def _key(q: Float[ndarray, "dof"]) -> tuple[float, ...]:
+def _key(q: Configuration) -> tuple[float, ...]:
     """The same for a goal and for the end of a motion there."""
     return tuple(np.round(q, KEY_DECIMALS).tolist())

@@ -6,19 +6,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
-from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import Configuration, Configurations, Pose, Trajectory
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.occupancy_map import Corners
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.seen_points import near_scene
+from robotdiffuse.perception.voxel_grid import Probabilities, Voxels
 from robotdiffuse.planning.exploration.explorer import DEFAULTS, NOTHING, Explorer
 from robotdiffuse.planning.exploration.steps import LOOK, ArmCamera, ExplorerSettings, Step
 from robotdiffuse.problems.problem import Problem
@@ -41,11 +40,11 @@ class RecordedView:
     view: DepthView
     camera: int | None
     """The number of the camera on the arm; None: another one."""
-    occupied: Bool[ndarray, "nx ny nz"]
-    free: Bool[ndarray, "nx ny nz"]
+    occupied: Voxels
+    free: Voxels
 
     @property
-    def unknown(self) -> Bool[ndarray, "nx ny nz"]:
+    def unknown(self) -> Voxels:
         return ~(self.occupied | self.free)
 
 
@@ -56,11 +55,11 @@ class RecordedAct:
     begins: float
     """[s]"""
     step: Step
-    configuration: Float[ndarray, "dof"]
+    configuration: Configuration
     """Of the arm before the step."""
-    predicted: Float32[ndarray, "nx ny nz"] | None
+    predicted: Probabilities | None
     """The probability that each voxel is occupied, when the step was chosen; None without the network."""
-    T_base_camera: Float[ndarray, "4 4"] | None
+    T_base_camera: Pose | None
     """Where the arm's first camera is at the end of a look; None for other steps."""
 
     @property
@@ -68,7 +67,7 @@ class RecordedAct:
         return None if self.step.motion is None else self.step.motion.trajectory
 
     @property
-    def waypoints(self) -> Float[ndarray, "n dof"]:
+    def waypoints(self) -> Configurations:
         """Of the motion; without one, the configuration."""
         return _waypoints(self.step, self.configuration)
 
@@ -137,7 +136,7 @@ class RecordedExplorer(Explorer):
         return None
 
 
-def _waypoints(step: Step, q: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+def _waypoints(step: Step, q: Configuration) -> Configurations:
     motion = step.motion
     return q[None] if motion is None or motion.path is None else motion.path.positions
 
@@ -171,7 +170,7 @@ class Event:
     """A step of the loop."""
 
     step: Step
-    configuration: Float[ndarray, "dof"]
+    configuration: Configuration
     """Of the arm after the step."""
     violation: str = ""
     """Why the validator refuses the motion in the true scene; "" if it accepts it, and without a motion."""
@@ -219,7 +218,7 @@ def simulated_explorer(
 def taken(
     problem: Problem,
     camera: ArmCamera,
-    q: Float[ndarray, "dof"],
+    q: Configuration,
     noise: DepthNoise | None,
     rng: np.random.Generator,
 ) -> DepthView:
@@ -279,7 +278,7 @@ def explore(
             return
 
 
-def _during(motion: PlanResult) -> Float[ndarray, "n dof"]:
+def _during(motion: PlanResult) -> Configurations:
     """The configurations of a motion in which images are taken, its end the last."""
     assert motion.path is not None
     end = motion.path.positions[-1:]
@@ -294,7 +293,7 @@ def _during(motion: PlanResult) -> Float[ndarray, "n dof"]:
 def _again(
     problem: Problem,
     beside: DepthView,
-    q: Float[ndarray, "dof"],
+    q: Configuration,
     noise: DepthNoise | None,
     rng: np.random.Generator,
 ) -> DepthView:

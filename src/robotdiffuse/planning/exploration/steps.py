@@ -3,14 +3,16 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
+from robotdiffuse.core.types import Configurations, Pose
 from robotdiffuse.perception.occupancy_map import MapSettings
+from robotdiffuse.perception.voxel_grid import Voxels
 from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -21,7 +23,7 @@ class ArmCamera(Value):
     """A depth camera on a link of the arm. Its body should be part of the robot, as a held object is."""
 
     link: str
-    T_link_camera: Float[ndarray, "4 4"]
+    T_link_camera: Pose
     """x to the right in the image, y down, z ahead."""
     intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy [pixels]."""
@@ -37,7 +39,7 @@ class ArmCamera(Value):
         object.__setattr__(self, "T_link_camera", pose)
         super().__post_init__()
 
-    def poses(self, robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 4 4"]:
+    def poses(self, robot: Robot, q: Configurations) -> Float[ndarray, "n 4 4"]:
         """T_base_camera at configurations."""
         return link_poses(robot, q, self.link) @ self.T_link_camera
 
@@ -98,6 +100,6 @@ class Step:
     """Stated probability that a motion by chance is free."""
     seen: Scene | None = None
     """The known scene and the points that the kept views saw; None where nothing was planned."""
-    wanted: Bool[ndarray, "nx ny nz"] | None = None
+    wanted: Voxels | None = None
     """What a look is to show: voxels of the map that are unknown and that a tentative motion to the goal
     sweeps. None for other steps."""

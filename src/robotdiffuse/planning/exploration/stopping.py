@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Path, Points, Trajectory
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.seen_points import seen_shapes
-from robotdiffuse.perception.voxel_grid import MAP
+from robotdiffuse.perception.voxel_grid import MAP, Voxels
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -58,7 +58,7 @@ def stop_before(
     robot: Robot,
     known: Scene,
     views: Sequence[DepthView],
-    free: Bool[ndarray, "nx ny nz"],
+    free: Voxels,
     motion: Trajectory,
     time: float,
 ) -> Stop | None:
@@ -86,7 +86,7 @@ def stop_before(
     return Stop(time, stop, violation.message, certified)
 
 
-def _within(points: Float[ndarray, "n 3"], free: Bool[ndarray, "nx ny nz"]) -> Bool[ndarray, "n"]:
+def _within(points: Points, free: Voxels) -> Bool[ndarray, "n"]:
     """Which points lie in free voxels with free voxels on all six sides."""
     at = MAP.indices(points)
     within = np.asarray(((at > 0) & (at < np.array(free.shape) - 1)).all(axis=1))

@@ -21,24 +21,22 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Float32
-from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import FIRST
+from robotdiffuse.core.types import FIRST, Configurations
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.unknown_space import (
     Assumption,
+    OccupiedVoxels,
     UnknownSpace,
-    Voxels,
     confidence,
     occupied_assumption,
     padded_assumptions,
     predicted_assumptions,
 )
-from robotdiffuse.perception.voxel_grid import refined
+from robotdiffuse.perception.voxel_grid import Probabilities, refined
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.pipeline import Solver, attempt
 from robotdiffuse.planning.start_goal import usable_start_goal
@@ -70,7 +68,7 @@ def plan_with_unknown_space(
     solver: Solver,
     problem: Problem,
     request: PlanRequest,
-    predicted: Float32[ndarray, "nx ny nz"] | None = None,
+    predicted: Probabilities | None = None,
     unknown: UnknownSpace | None = None,
 ) -> PlanResult:
     """A motion under the problem's policy for unknown space, within the time limit; see the head of this
@@ -162,7 +160,7 @@ def _with_notes(context: PlanningContext, result: PlanResult, *notes: str) -> Pl
 
 
 def assumptions_of(
-    problem: Problem, volume: ObservedVolume | None, predicted: Float32[ndarray, "nx ny nz"] | None
+    problem: Problem, volume: ObservedVolume | None, predicted: Probabilities | None
 ) -> Iterator[Assumption]:
     """The assumptions of the problem's policy, the most careful first.
 
@@ -182,7 +180,7 @@ def assumptions_of(
 
 
 def unknown_space_of(
-    problem: Problem, volume: ObservedVolume, predicted: Float32[ndarray, "nx ny nz"] | None
+    problem: Problem, volume: ObservedVolume, predicted: Probabilities | None
 ) -> UnknownSpace:
     """The space that no view of the problem saw, with its start and given goal configurations free."""
     goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
@@ -196,10 +194,10 @@ def predicted_obstacles(problem: Problem) -> AssumedPoints:
     volume = observe(problem.views, problem.robot, problem.start)
     arm = placed_spheres(problem.robot, problem.start).astype(np.float32)
     likely = predict(volume) > PICTURE_THRESHOLD
-    return Voxels("likely", likely, problem.robot, problem.known_scene).obstacles(arm)
+    return OccupiedVoxels("likely", likely, problem.robot, problem.known_scene).obstacles(arm)
 
 
-def _goals(context: PlanningContext, as_seen: Problem) -> Float[ndarray, "n dof"] | PlanResult:
+def _goals(context: PlanningContext, as_seen: Problem) -> Configurations | PlanResult:
     """The goal configurations, of a pose those that are free of what was seen; or the result without any."""
     if isinstance(as_seen.goal, JointGoal):
         return as_seen.goal.positions
@@ -207,7 +205,7 @@ def _goals(context: PlanningContext, as_seen: Problem) -> Float[ndarray, "n dof"
     return start_goal if isinstance(start_goal, PlanResult) else np.stack(start_goal.goals)
 
 
-def with_assumption(problem: Problem, assumption: Assumption, goals: Float[ndarray, "n dof"]) -> Problem:
+def with_assumption(problem: Problem, assumption: Assumption, goals: Configurations) -> Problem:
     """The problem in the scene as seen with an assumption's obstacles, and with those goals that need the
     least carving."""
     start, *at_goals = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))

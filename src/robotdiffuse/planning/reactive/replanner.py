@@ -34,7 +34,7 @@ from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, transform
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import Configuration, Configurations, Trajectory
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.reactive.timed_path import MIN_LENGTH, JerkFilter, SpeedProfile, TimedPath
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
@@ -123,23 +123,21 @@ class PredictedObstacles:
         first = self._collision.first_unproved_time(times, motion.positions, clearance)
         return None if first is None else first + self._since
 
-    def comes_to(
-        self, q: Float[ndarray, "n dof"], times: Float[ndarray, "n"], rest_time: float
-    ) -> float | None:
+    def comes_to(self, q: Configurations, times: Float[ndarray, "n"], rest_time: float) -> float | None:
         """When an obstacle first touches the arm on its way, or while it then rests for `rest_time` [s]; None
         if none."""
         times = np.append(times, times[-1] + rest_time) - self._since
         first = self._collision.first_unproved_time(times, np.concatenate([q, q[-1:]]), 0.0)
         return None if first is None else first + self._since
 
-    def comes(self, q: Float[ndarray, "dof"], time: float, rest_time: float) -> float | None:
+    def comes(self, q: Configuration, time: float, rest_time: float) -> float | None:
         """When an obstacle first touches the arm at rest [s]; None if none does."""
         return self.comes_to(q[None], np.array([time]), rest_time)
 
     def free(
         self,
         times: Float[ndarray, "n"],
-        q: Float[ndarray, "n dof"],
+        q: Configurations,
         begins: float,
         horizon: float,
         rest_time: float,
@@ -331,7 +329,7 @@ class Replanner:
             return bool(np.linalg.norm(self._goals - path.at(s), axis=1).min() < MIN_LENGTH)
         return bool(path.to_goal and path.then is None and s >= path.end)
 
-    def _first_path(self) -> tuple[TimedPath, Float[ndarray, "k dof"], Space]:
+    def _first_path(self) -> tuple[TimedPath, Configurations, Space]:
         """The first path, the goal configurations, and the space in which motions are checked."""
         context = PlanningContext("replanner", self._still, PlanRequest(SEARCH_TIME_LIMIT, self.seed))
         start_goal = usable_start_goal(context)
@@ -403,9 +401,7 @@ class Replanner:
         motion = path.coarse(path.onwards(s, speed), COARSE_SAMPLE_TIME)
         return predicted.free(*motion, begins, self.settings.horizon, self.settings.rest_time)
 
-    def _search(
-        self, predicted: PredictedObstacles, start: Float[ndarray, "dof"], time: float
-    ) -> TimedPath | None:
+    def _search(self, predicted: PredictedObstacles, start: Configuration, time: float) -> TimedPath | None:
         """A path from where the arm can rest to a goal, around the obstacles predicted for some time after
         that; or back to the present path, where that is free."""
         settings, self._searches = self.settings, self._searches + 1
@@ -436,9 +432,7 @@ class Replanner:
         end = int(np.abs(np.array(roots) - path[-1]).max(axis=1).argmin())
         return self._certified(np.concatenate([path, after[end]]), True)
 
-    def _evasion(
-        self, predicted: PredictedObstacles, rest: Float[ndarray, "dof"], time: float
-    ) -> TimedPath | None:
+    def _evasion(self, predicted: PredictedObstacles, rest: Configuration, time: float) -> TimedPath | None:
         """A straight path to where the next obstacle is predicted latest; None if that is here."""
         settings, robot = self.settings, self._robot
         directions = self._rng.normal(size=(settings.evasions, robot.dof))
@@ -461,7 +455,7 @@ class Replanner:
             return None
         return self._certified(np.stack([rest, best]), False)
 
-    def _certified(self, waypoints: Float[ndarray, "n dof"], to_goal: bool) -> TimedPath | None:
+    def _certified(self, waypoints: Configurations, to_goal: bool) -> TimedPath | None:
         """See `TimedPath.certified`."""
         limits = self._filter.acceleration, self._filter.displacement
         return TimedPath.certified(self._robot, self._validator, waypoints, to_goal, *limits)

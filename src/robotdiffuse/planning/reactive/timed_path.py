@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Configuration, Configurations, Path, Trajectory
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import braking_kernel
@@ -68,7 +68,7 @@ class TimedPath:
     """A polyline with rounded corners that passed the validator; the arm need not stop along it."""
 
     robot: Robot
-    acceleration: Float[ndarray, "dof"]
+    acceleration: Configuration
     """Acceleration limits of motions along it."""
     line: BlendedPolyline
     to_goal: bool
@@ -80,9 +80,9 @@ class TimedPath:
     def certified(
         robot: Robot,
         validator: Verifier,
-        waypoints: Float[ndarray, "n dof"],
+        waypoints: Configurations,
         to_goal: bool,
-        acceleration: Float[ndarray, "dof"],
+        acceleration: Configuration,
         displacement: float,
     ) -> "TimedPath | None":
         """The path through waypoints; None if the validator refuses it, or all waypoints are the same.
@@ -97,7 +97,7 @@ class TimedPath:
         def free(motion: Trajectory) -> bool:
             return validator.collision_free(Path(motion.joint_names, motion.positions))
 
-        def free_around(q: Float[ndarray, "n dof"]) -> bool:
+        def free_around(q: Configurations) -> bool:
             return distant.collision_free(Path(robot.joint_names, q))
 
         distant = verifier(validator.problem, replace(DEFAULT, contact=max(displacement, DEFAULT.contact)))
@@ -148,24 +148,22 @@ class TimedPath:
         """A value of s just before the last."""
         return self.line.length - 1e-9
 
-    def at(self, s: float) -> Float[ndarray, "dof"]:
+    def at(self, s: float) -> Configuration:
         """The configuration at s."""
         return self.line(np.array([s]), 0)[0]
 
-    def remaining(self, s: float) -> Float[ndarray, "n dof"]:
+    def remaining(self, s: float) -> Configurations:
         """Waypoints from s to the end, of the paths that follow too."""
         ahead = self.line.waypoints[self.line.knots > s + MIN_LENGTH]
         after = self.then.remaining(0.0)[1:] if self.then is not None else ahead[:0]
         return np.concatenate([self.at(s)[None], ahead, after])
 
-    def positions(self, motion: SpeedProfile, times: Float[ndarray, "n"]) -> Float[ndarray, "n dof"]:
+    def positions(self, motion: SpeedProfile, times: Float[ndarray, "n"]) -> Configurations:
         """Configurations at times after the beginning of a motion, which rests after its end [s]."""
         s, speeds = np.append(motion.s, motion.s[-1]), np.append(motion.speeds, 0.0)
         return sample_positions(self.line.arrays, s, speeds, times)
 
-    def coarse(
-        self, motion: SpeedProfile, step: float
-    ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:
+    def coarse(self, motion: SpeedProfile, step: float) -> tuple[Float[ndarray, "n"], Configurations]:
         """Times, `step` [s] apart, and configurations of a motion until it rests."""
         times = step * np.arange(int(np.ceil(motion.duration / step)) + 2)
         return times, self.positions(motion, times)
@@ -184,9 +182,7 @@ STILL = 1e-9
 class JerkFilter:
     """The jerk-limited motion that follows an acceleration-limited one."""
 
-    def __init__(
-        self, robot: Robot, jerk: Float[ndarray, "dof"], step: float, q: Float[ndarray, "dof"]
-    ) -> None:
+    def __init__(self, robot: Robot, jerk: Configuration, step: float, q: Configuration) -> None:
         """At rest at q; `step`: between two times of the grid [s]."""
         reach = float((motion_radii(robot) @ robot.acceleration).max())
         self.joint_names, self.step = robot.joint_names, step

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import random_state
@@ -26,7 +25,7 @@ from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
-from robotdiffuse.core.types import FIRST, LENGTH, TIME, TIME_LIMIT, Tree
+from robotdiffuse.core.types import FIRST, LENGTH, TIME, TIME_LIMIT, Configuration, Configurations, Tree
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import DEFAULT_CLEARANCE, TOLERANCE_FRACTION, PlanningContext
 from robotdiffuse.planning.planner import Planner
@@ -144,7 +143,7 @@ class AnytimeSearch:
         self.name = name
         self.bounded = bounded
         self.start, self.goals = start_goal.rows()
-        self.best: Float[ndarray, "n dof"] | None = None
+        self.best: Configurations | None = None
         """The shortest path so far, free at the resolution of the search."""
         self.length = np.float32(np.inf)
         self.stage = ""
@@ -246,7 +245,7 @@ class AnytimeSearch:
         or there were fewer than `patience` iterations."""
         return still_improves(self._lengths, self.work, float(self.length), gain, patience)
 
-    def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
+    def offer(self, path: Configurations, stage: str) -> bool:
         """Simplify a path from the start to a goal, free in `space`, and keep it if it is the shortest so
         far; returns whether it was."""
         path = for_kernels(path, np.float32)
@@ -262,7 +261,7 @@ class AnytimeSearch:
             self.motions.offer(self.space, path, stage)
         return bool(length < self.length) and self._take(path, float(length), stage)
 
-    def _take(self, path: Float[ndarray, "n dof"], length: float, stage: str) -> bool:
+    def _take(self, path: Configurations, length: float, stage: str) -> bool:
         """Make a path the best one."""
         self.best, self.length, self.stage = path, np.float32(length), stage
         self.history.append((path, stage))
@@ -271,12 +270,12 @@ class AnytimeSearch:
         self._improved(length)
         return True
 
-    def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
+    def keeps_clearance(self, q: Configurations) -> bool:
         """Whether the polyline through configurations keeps the clearance of the search."""
         rows = np.ascontiguousarray(q if len(q) > 1 else np.repeat(q, 2, axis=0), np.float32)
         return bool(motions_free(self.space, rows).all())
 
-    def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
+    def refuse(self, accepted: Configurations | None) -> None:
         """Halve the resolution after the validator refused the best path, and go back to the last accepted
         one."""
         self.settings = replace(self.settings, resolution=finer_resolution(self.settings.resolution))
@@ -307,7 +306,7 @@ class AnytimeSearch:
                 self.found += 1
                 return
 
-    def _line(self, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+    def _line(self, goal: Configuration) -> Configurations:
         """The edge from the start to a goal; without rows if there is none."""
         path = np.stack([self.start, goal])
         return path if motions_free(self.space, path).all() else path[:0]
@@ -374,11 +373,11 @@ class ConstrainedSearch(AnytimeSearch):
         line."""
         return self._near_straight(STRAIGHT_EXCESS)
 
-    def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
+    def keeps_clearance(self, q: Configurations) -> bool:
         """Whether the polyline through configurations keeps the clearance and the constraints."""
         return self.context.keeps_constraints(q) and super().keeps_clearance(q)
 
-    def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
+    def offer(self, path: Configurations, stage: str) -> bool:
         """See `AnytimeSearch`; the path also keeps the constraints, and the one of the least cost is kept."""
         path = self._code.simplify(
             self.space, self.limits, path, self.settings.smoothings, SHORTCUTS, self._state
@@ -389,17 +388,17 @@ class ConstrainedSearch(AnytimeSearch):
         self.cost = cost
         return self._take(path, float(path_length(path)), self.name)
 
-    def _cost_of(self, path: Float[ndarray, "n dof"]) -> float:
+    def _cost_of(self, path: Configurations) -> float:
         if self.context.request.objective == LENGTH:
             return float(path_length(path))
         return estimated_duration(path, self.context.timing.corner_deviation, self._speed_limits)
 
-    def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
+    def refuse(self, accepted: Configurations | None) -> None:
         """See `AnytimeSearch`."""
         super().refuse(accepted)
         self.cost = np.inf if accepted is None else self._cost_of(accepted)
 
-    def _line(self, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+    def _line(self, goal: Configuration) -> Configurations:
         return self._code.line(self.space, self.limits, self.start, goal)
 
 

@@ -36,6 +36,7 @@ from robotdiffuse.collision.kernels.motions import distance, motion_free, motion
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings
+from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
 from robotdiffuse.planning.search import rrt_kernel
@@ -73,7 +74,7 @@ class Goals(NamedTuple):
     """[k] failed searches for this goal alone."""
 
 
-def make_goals(start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"]) -> Goals:
+def make_goals(start: Configuration, goals: Configurations) -> Goals:
     """Goals that are not reached yet, for a tree from a start."""
     at = goals.astype(np.float32)
     count = len(at)
@@ -282,8 +283,8 @@ class SharedTreeSearch:
     def __init__(
         self,
         checker: CollisionChecker,
-        start: Float[ndarray, "dof"],
-        goals: Float[ndarray, "k dof"],
+        start: Configuration,
+        goals: Configurations,
         settings: SharedTreeSettings,
         state: ndarray,
     ) -> None:
@@ -318,7 +319,7 @@ class SharedTreeSearch:
         """The goal that the best path leads to; -1 if there is no path."""
         return int(self.goal_costs.argmin()) if (self.targets.node >= 0).any() else -1
 
-    def path(self, goal: int | None = None) -> Float[ndarray, "n dof"] | None:
+    def path(self, goal: int | None = None) -> Configurations | None:
         """Waypoints of the best path, or of the best one to a goal; None if there is none."""
         g = self.best_goal if goal is None else goal
         path = rrt_kernel.branch(self.tree, 0, self.targets.node[g] if g >= 0 else -1)
@@ -383,7 +384,7 @@ class SharedTreeSearch:
         elif len(targets) == 1:
             self.targets.failures[targets] += 1
 
-    def _graft(self, path: Float[ndarray, "n dof"], g: int) -> None:
+    def _graft(self, path: Configurations, g: int) -> None:
         graft(self.tree, self.targets, shortcut(self._space, path, SHORTCUTS, self._state), g)
 
 

@@ -16,6 +16,7 @@ from robotdiffuse.collision.kernels.lane_collision import make_workspace
 from robotdiffuse.collision.kernels.motions import Space, motion_free
 from robotdiffuse.collision.kernels.simd import W
 from robotdiffuse.core.kernels import inner_kernel, kernel
+from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.speed_limits import TimingSettings, scaled_limits
 from robotdiffuse.trajectories.straight_line import straight_line_time
@@ -176,16 +177,14 @@ def still_improves(
     return bool(half[-1] - now >= gain * half[-1])
 
 
-def estimated_duration(
-    path: Float[ndarray, "n dof"], deviation: float, limits: tuple[Float[ndarray, "dof"], ...]
-) -> float:
+def estimated_duration(path: Configurations, deviation: float, limits: tuple[Configuration, ...]) -> float:
     """The estimated time of a motion along a path whose corners it leaves by at most `deviation`, with these
     limits of velocity and acceleration [s]."""
     path = with_corner(path)
     return float(estimated_time(rounded_line(path, np.full(len(path) - 2, deviation)), *limits))
 
 
-def with_corner(path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+def with_corner(path: Configurations) -> Configurations:
     """The path in float64; of a single segment with its middle as a waypoint."""
     path = path.astype(np.float64)
     return np.insert(path, 1, path.mean(axis=0), axis=0) if len(path) == 2 else path
@@ -195,7 +194,7 @@ def with_corner(path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
 class Candidate:
     """A polyline with rounded corners."""
 
-    path: Float[ndarray, "n dof"]
+    path: Configurations
     deviations: Float[ndarray, "corners"]
     """How far the motion may leave each inner waypoint [rad, joint-space L2]."""
     time: float
@@ -216,8 +215,8 @@ class TimeOptimization:
         self,
         robot: Robot,
         settings: TimingSettings,
-        start: Float[ndarray, "dof"],
-        goals: Float[ndarray, "k dof"],
+        start: Configuration,
+        goals: Configurations,
         seed: int,
         longest: float = np.inf,
     ) -> None:
@@ -257,7 +256,7 @@ class TimeOptimization:
         """The candidates, ordered by the exact time of the fastest motion without limits of jerk."""
         return sorted(self.candidates, key=self._least_time)
 
-    def offer(self, space: Space, path: Float[ndarray, "n dof"], stage: str) -> None:
+    def offer(self, space: Space, path: Configurations, stage: str) -> None:
         """Make a path whose polyline is free in `space` a candidate, if it is among the fastest."""
         path = with_corner(path)
         deviations = free_deviations(space, path, self._deviation)
