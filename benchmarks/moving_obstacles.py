@@ -191,7 +191,6 @@ def main() -> None:
     robot, planner = rd.load_robot("panda"), rd.load_planner("rrt_connect")
     methods = {
         "the loop": looped(rd.ReplannerSettings()),
-        "searching from scratch": looped(rd.ReplannerSettings(from_scratch=True)),
         "played blindly": played,
     }
     compiling = problem_of(robot, scene(robot, 3, 10**6))

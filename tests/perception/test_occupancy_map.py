@@ -8,7 +8,7 @@ import pytest
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 from robotdiffuse.perception.observed_volume import FREE, OUT, carve_view
-from robotdiffuse.perception.occupancy_map import MapSettings, OccupancyMap
+from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
 from robotdiffuse.perception.voxel_grid import MAP
 from robotdiffuse.robots import load_robot
@@ -83,7 +83,7 @@ def test_what_went_away_becomes_free_and_old_evidence_is_forgotten() -> None:
     for _ in range(3):
         known.add(view_from(2.8, scene=Scene([FLOOR])))
     assert known.free[middle]
-    ageing = OccupancyMap(PANDA, MapSettings(max_age=1.0))
+    ageing = OccupancyMap(PANDA, max_age=1.0)
     ageing.add(view_from(2.8), stamp=10.0)
     assert ageing.occupied[middle]
     ageing.add(view_from(-1.4, scene=Scene([FLOOR])), stamp=12.0)

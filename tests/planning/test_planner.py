@@ -2,16 +2,19 @@
 
 import inspect
 import re
+import traceback
 from dataclasses import fields
 
 import numpy as np
 import pytest
 
+import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS, SEARCH, load_planner, plan
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
+from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -83,13 +86,11 @@ def test_weights_are_for_learned_planners_alone(name: str) -> None:
 
 
 def test_plan_takes_the_fields_of_a_request() -> None:
-    """`Planner.plan` and `rd.plan` name the arguments for help(); names and defaults are those of
-    PlanRequest."""
+    """`rd.plan` names the arguments for help(); names and defaults are those of PlanRequest."""
     request = [(field.name, field.default) for field in fields(PlanRequest)]
-    for function in (plan, Planner.plan):
-        arguments = list(inspect.signature(function).parameters.values())
-        arguments = [argument for argument in arguments if argument.name not in OTHER_ARGUMENTS]
-        assert [(argument.name, argument.default) for argument in arguments] == request
+    arguments = list(inspect.signature(plan).parameters.values())
+    arguments = [argument for argument in arguments if argument.name not in OTHER_ARGUMENTS]
+    assert [(argument.name, argument.default) for argument in arguments] == request
 
 
 def test_plan_with_a_planner_and_settings_by_name() -> None:
@@ -119,10 +120,23 @@ def test_help_names_every_argument_of_plan() -> None:
 
 def test_warming_up_loads_what_a_plan_needs_by_default() -> None:
     # it ended at first paths, and the first plan then compiled the search for the fastest motion (10 s)
-    defaults = [
-        inspect.signature(call).parameters["until"].default for call in (Planner.warm_up, Planner.plan)
-    ]
-    assert defaults[0] == defaults[1]
+    assert inspect.signature(Planner.warm_up).parameters["until"].default == PlanRequest().until
     problem = Problem(load_robot("panda"), Scene([]), START, GOAL)
     rows = [len(result.path.positions) for result in load_planner("aorrtc").warm_up(problem) if result.path]
     assert rows[0] == 2 and max(rows) > 2, "balls in the way make corners"
+
+
+def test_at_most_nine_functions_lead_to_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """docs/architecture.md lists them."""
+    depths, search = set[int](), rrt_kernel.search
+
+    def measured(*arguments: object) -> object:
+        frames = [frame for frame, _ in traceback.walk_stack(None)]
+        depths.add(sum(frame.f_globals["__name__"].startswith("robotdiffuse.") for frame in frames))
+        return search(*arguments)
+
+    monkeypatch.setattr(rrt_kernel, "search", measured)
+    wall = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8])])
+    side = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+    assert rd.plan(rd.Problem(rd.load_robot("panda"), wall, side, side * [-1, 1, 1, 1, 1, 1, 1])).solved
+    assert depths and max(depths) <= 9

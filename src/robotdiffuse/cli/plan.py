@@ -229,7 +229,7 @@ def load_and_plan(
 ) -> "PlanResult":
     """Load a planner and plan, with a spinner that names what is compiled.
 
-    picture: whether a picture follows. `request` holds arguments of `Planner.plan`.
+    picture: whether a picture follows. `request` holds arguments of `rd.plan`.
     """
     from robotdiffuse.cli.compile_ahead import compiling_ahead
     from robotdiffuse.core.processes import exit_on_interrupt

@@ -2,7 +2,6 @@
 ViewMemory: the views that showed most, with what each of them shows, computed once.
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -12,11 +11,11 @@ from scipy.spatial import KDTree
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.locked import locked
-from robotdiffuse.core.settings import NotNegative, Positive, Settings
 from robotdiffuse.core.types import Configuration, Points
 from robotdiffuse.perception.depth_filter import filtered
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import (
+    ARM_MARGIN,
     FREE,
     HIDDEN,
     ObservedVolume,
@@ -33,19 +32,11 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Low and high corner of a box [m]."""
 
 
-@dataclass(frozen=True)
-class MapSettings(Settings, name="map"):
-    hit: Positive = 3.0
-    """Added to a voxel's evidence by a view with points in it."""
-    miss: Positive = 2.0
-    """Taken from it by a view that sees through all of it."""
-    largest: Positive = 8.0
-    """Evidence stays within this, so that a voxel can change."""
-    arm_margin: NotNegative = 0.015
-    """Points within this distance of the arm's covering spheres are points of the arm [m]; more with noise.
-    At least the error of camera calibration."""
-    max_age: Positive | None = None
-    """Evidence older than this is forgotten [s]; None: never."""
+HIT, MISS = np.float32(3.0), np.float32(2.0)
+"""Added to a voxel's evidence by a view with points in it, and taken from it by a view that sees through all
+of it."""
+MOST_EVIDENCE = np.float32(8.0)
+"""Evidence stays within this, so that a voxel can change."""
 
 
 class OccupancyMap:
@@ -58,8 +49,9 @@ class OccupancyMap:
     The voxels are those of `MAP`.
     """
 
-    def __init__(self, robot: Robot, settings: MapSettings = MapSettings()) -> None:
-        self.robot, self.settings = robot, settings
+    def __init__(self, robot: Robot, max_age: float | None = None) -> None:
+        """max_age: evidence older than this is forgotten [s]; None: never."""
+        self.robot, self.max_age = robot, max_age
         self._evidence = np.zeros(MAP.shape, np.float32)
         """Above 0 occupied, below free, 0 unknown."""
         self._seen_at = np.full(MAP.shape, -np.inf, np.float64)
@@ -80,7 +72,7 @@ class OccupancyMap:
                 f"view.configuration is {shown(q)}; a map needs the {self.robot.dof} joint positions of"
                 f" {self.robot.name} when the view was taken"
             )
-        state, _, counts = carve_view(view, self.robot, q, self.settings.arm_margin, MAP)
+        state, _, counts = carve_view(view, self.robot, q, ARM_MARGIN, MAP)
         return self._update(state, counts, stamp)
 
     @locked
@@ -128,7 +120,7 @@ class OccupancyMap:
         """Occupied, free and unknown voxels, computed once after each change; read-only."""
         if self._known is None:
             occupied, free = self._evidence > 0, self._evidence < 0
-            if self.settings.max_age is not None:
+            if self.max_age is not None:
                 occupied, free = occupied & self._fresh, free & self._fresh
             free |= self._declared & ~occupied
             self._known = occupied, free, ~(free | occupied)
@@ -138,8 +130,8 @@ class OccupancyMap:
 
     @property
     def _fresh(self) -> Voxels:
-        assert self.settings.max_age is not None
-        return self._seen_at >= self._now - self.settings.max_age
+        assert self.max_age is not None
+        return self._seen_at >= self._now - self.max_age
 
     def _update(
         self, state: UInt8[ndarray, "nx ny nz"], counts: Int32[ndarray, "nx ny nz"], stamp: float
@@ -148,14 +140,14 @@ class OccupancyMap:
         known of before."""
         self._now = max(self._now, stamp)
         self._known = None
-        settings = self.settings
-        if settings.max_age is not None:
+        if self.max_age is not None:
             self._evidence[~self._fresh] = 0.0
             self._seen_at[(counts > 0) | (state == FREE)] = stamp
-        weights = np.array([settings.hit, settings.miss, settings.largest], np.float32)
-        return add_evidence(state, counts, self._evidence, *weights)
+        return add_evidence(state, counts, self._evidence, HIT, MISS, MOST_EVIDENCE)
 
 
+MAX_VIEWS = 12
+"""Views that are kept."""
 ALONE_DISTANCE = 0.02
 """With noise, a point of one view with no other point within this distance is stray [m]. Of surfaces at 1 m,
 99 of 100 points have three or more there."""
@@ -184,7 +176,7 @@ class _Kept:
 class ViewMemory:
     """Keeps a number of views: a new one takes the place of the kept one that showed least."""
 
-    def __init__(self, robot: Robot, most: int) -> None:
+    def __init__(self, robot: Robot, most: int = MAX_VIEWS) -> None:
         self._robot, self._most = robot, most
         self._kept = list[_Kept]()
 

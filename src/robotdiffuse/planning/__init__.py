@@ -169,17 +169,6 @@ def planners_that_support(what: str) -> list[str]:
 _planners: dict[tuple[str, str], "Planner"] = {}
 
 
-def _loaded(name: str, settings: Settings | None) -> "Planner":
-    """The planner of a name and settings, loaded once; the oldest goes when there are too many."""
-    key = name, repr(settings)
-    planner = _planners.get(key)
-    if planner is None:
-        while len(_planners) >= MAX_LOADED:
-            _planners.pop(next(iter(tuple(_planners))), None)
-        planner = _planners[key] = load_planner(name, settings)
-    return planner
-
-
 def plan(
     problem: "Problem",
     time_limit: float = 1.0,
@@ -199,21 +188,24 @@ def plan(
     problem: a `rd.Problem`; `rd.load_problem` reads one from a file.
     time_limit: wall time for the call, without what is loaded once (code, weights, a robot's arrays) [s].
     seed: seed of all random numbers, at least 0. The same seed gives the same path, unless time runs out.
-    until: "first" returns the first verified motion, "converged" searches on until more time hardly shortens
-        the path, "time_limit" until time runs out.
-    clearance: distance to obstacles that is kept wherever start, goal and passages allow it, up to 0.5 m [m];
-        None: the problem's, or 1 cm.
+    until: "first" returns the first verified motion, "converged" searches on until more time hardly improves
+        it, "time_limit" until time runs out; planners that cannot improve a path return their first.
+    clearance: distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal and
+        passages allow it, up to 0.5 m [m]; where they do not, it is smaller, and a note says so. None: the
+        problem's, or 1 cm. The other planners have their own settings and refuse a clearance.
     velocity_scaling, acceleration_scaling: parts of the robot's limits that the timed motion uses, from 0.001
         to 1.
-    jerk: largest jerk of any joint [rad/s³]; None: the robot's limits, infinite: no limit.
-    objective: what searches minimize: "length" of the path, or "time", the motion's duration.
+    jerk: largest jerk of any joint of the timed motion [rad/s³], at least 0.01. None: the robot's jerk
+        limits, or 10 / s times the acceleration limit of joints without one; infinite: no limit.
+    objective: what aorrtc, rrt_connect and robotdiffuse minimize in calls that improve a path: "time", the
+        motion's duration, or "length" of the path in joint space.
     planner: a name that `robotdiffuse planner list` lists. A planner is loaded once for its settings.
     settings: of the planner: a table of those that differ from the defaults, such as {"range": 0.5}, or its
         dataclass.
 
     Raises InputError, one line, for arguments of the wrong type or out of bounds, unknown planners and
-    settings, and requests that the planner does not support. `planning.planner.Planner.plan` says more on the
-    arguments.
+    settings, and requests that the planner does not support. `planning.planner.Planner.plan` says what
+    problems may ask for.
     """
     if settings is not None and not isinstance(settings, Settings | Mapping):
         raise InputError(
@@ -222,5 +214,10 @@ def plan(
     PLANNERS.entry(planner)  # unknown names first
     if isinstance(settings, Mapping):
         settings = _default_settings(planner).replaced(settings)
+    loaded = _planners.get(key := (planner, repr(settings)))
+    if loaded is None:
+        while len(_planners) >= MAX_LOADED:  # the oldest goes
+            _planners.pop(next(iter(tuple(_planners))), None)
+        loaded = _planners[key] = load_planner(planner, settings)
     limits = velocity_scaling, acceleration_scaling, jerk
-    return _loaded(planner, settings).plan(problem, time_limit, seed, until, clearance, *limits, objective)
+    return loaded.plan(problem, time_limit, seed, until, clearance, *limits, objective)

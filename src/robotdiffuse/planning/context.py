@@ -58,8 +58,7 @@ EXPECTED_VALIDATION_TIME = 0.003
 
 @dataclass(frozen=True)
 class PlanRequest(Settings):
-    """What a call of a planner asks for besides its problem: the arguments of `Planner.plan`, which documents
-    them."""
+    """What a call of a planner asks for besides its problem; `rd.plan` documents the fields."""
 
     time_limit: Annotated[float, Bound(above=0.0, most=1e9)] = 1.0
     seed: Natural = 0

@@ -36,7 +36,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Bound, Count, Natural
+from robotdiffuse.core.settings import Bound, Count
 from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.learning.guidance import CollisionGuidance, Trajectories
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
@@ -103,6 +103,10 @@ BATCH_SECONDS = 0.1
 """Expected time of a batch or its refinement before any was measured [s]: the first of a process is slow."""
 BATCH_TIME_FACTOR = 2.0
 """A batch is begun if this many times the expected time is left: scenes differ."""
+REFINEMENT_STEPS = 40
+"""Gradient steps on batches that still collide."""
+MAX_SIMPLIFIED = 6
+"""Largest number of free trajectories of a batch that are simplified, the shortest ones."""
 
 
 @dataclass(frozen=True)
@@ -114,10 +118,6 @@ class RobotDiffuseSettings(GuidedSamplingSettings, name="robotdiffuse"):
     """Scale of classifier-free guidance. At 0 the condition is hidden, and the scene's code is not computed:
     with it paths are as long, see benchmarks/results/network_inputs.txt. Weights that cannot do without their
     condition are then sampled with 1."""
-    refinement_steps: Natural = 40
-    """Gradient steps on batches that still collide."""
-    max_simplified: Count = 6
-    """Largest number of free trajectories of a batch that are simplified, the shortest ones."""
     network_share: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
     """Part of the work that goes to batches, of the network or of smooth noise; a batch counts as BATCH_WORK
     iterations of search."""
@@ -180,8 +180,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         return 1.0 if scale == 0.0 and not model.settings.null_condition else scale
 
     def refine(self, checker: CollisionChecker, q: Trajectories) -> Trajectories:
-        """Trajectories after `refinement_steps` gradient steps on the guidance costs; float32."""
-        return CollisionGuidance(checker, self.settings.guidance)(q, self.settings.refinement_steps)[0]
+        """Trajectories after REFINEMENT_STEPS gradient steps on the guidance costs; float32."""
+        return CollisionGuidance(checker, self.settings.guidance)(q, REFINEMENT_STEPS)[0]
 
 
 class _Batches:
@@ -237,9 +237,9 @@ class _Batches:
 
     def _take(self, q: Trajectories, stage: str) -> bool:
         """Offer the shortest free trajectories to the search; returns whether there were any."""
-        space, most = self.search.space, self.planner.settings.max_simplified
+        space = self.search.space
         ordered = sorted(np.ascontiguousarray(q, np.float32), key=path_length)
-        paths = list(islice((path for path in ordered if motions_free(space, path).all()), most))
+        paths = list(islice((path for path in ordered if motions_free(space, path).all()), MAX_SIMPLIFIED))
         for path in paths:
             if self.context.remaining > 0 or self.search.best is None:
                 self.search.offer(path, stage)

@@ -45,7 +45,7 @@ def plan_many(
     cluster: "ray": the Ray cluster that RAY_ADDRESS names, or one started here, in place of processes;
         problems of a lost node are planned again on another.
     progress: called after each problem, in whatever order they end, with the numbers done and in all.
-    request: arguments of `Planner.plan`, the same for all problems: time_limit, seed, until, ...
+    request: arguments of `rd.plan`, the same for all problems: time_limit, seed, until, ...
 
     A problem that raises an error, or kills its process, has a result with status ERROR; the others continue.
     On a cluster, a problem that kills its process ends the call.

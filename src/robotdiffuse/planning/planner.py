@@ -3,14 +3,14 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.loading import compile_note
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import CONVERGED, TIME
+from robotdiffuse.core.types import CONVERGED
 from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, planners_that_support
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.pipeline import Solver, attempt
@@ -42,38 +42,12 @@ class Planner(ABC, Generic[PlannerSettings]):
     def __init__(self, settings: PlannerSettings | None = None) -> None:
         self.settings = self.settings_class() if settings is None else settings
 
-    def plan(
-        self,
-        problem: Problem,
-        time_limit: float = 1.0,
-        seed: int = 0,
-        until: str = CONVERGED,
-        clearance: float | None = None,
-        velocity_scaling: float = 1.0,
-        acceleration_scaling: float = 1.0,
-        jerk: float | None = None,
-        objective: str = TIME,
-    ) -> PlanResult:
-        """Plan a motion within `time_limit` [s] of wall time.
+    def plan(self, problem: Problem, *values: Any, **request: Any) -> PlanResult:
+        """Plan a motion. The arguments after the problem are the fields of `PlanRequest`, by name or in their
+        order; `rd.plan` documents them.
 
         The same seed gives the same path, as long as time does not run out. A result with status SOLVED holds
         a path and a trajectory that passed `verify`; any other status comes with a reason.
-
-        time_limit: wall time for the call, without what is loaded once (code, weights, a robot's arrays) [s].
-        seed: seed of all random numbers, at least 0.
-        until: "first" returns the first verified motion, "converged" searches on until more time hardly
-            improves it, "time_limit" until time runs out; planners that cannot improve a path return
-            their first.
-        clearance: distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
-            and passages allow it [m]; where they do not, the distance is smaller, and a note says so. None:
-            the problem's, or 1 cm. The other planners have their own settings and refuse a clearance.
-        velocity_scaling, acceleration_scaling: parts of the robot's limits that the timed motion uses, from
-            0.001 to 1.
-        jerk: largest jerk of any joint of the timed motion [rad/s³], at least 0.01. None: the robot's jerk
-            limits, or 10 / s times the acceleration limit of joints without one; infinite: no limit.
-        objective: what aorrtc, rrt_connect and robotdiffuse minimize in calls that improve a path: "time",
-            the motion's duration, or "length" of the path in joint space; ignored by planners that return
-            their first path.
 
         Problems may also have, for every planner:
 
@@ -91,10 +65,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         not support, and where `prepare` does.
         """
         check_problem(problem)
-        request = PlanRequest(
-            time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk, objective
-        )
-        result, note = self._plan(problem, request), compile_note()
+        result, note = self._plan(problem, PlanRequest(*values, **request)), compile_note()
         if result.path is not None:
             reached = goal_index(problem.robot, problem.goal, result.path.positions[-1])
             result = replace(result, goal_index=reached)

@@ -162,7 +162,7 @@ def test_later_assumptions_have_fewer_voxels() -> None:
     occupied = [
         assumption.occupied
         for assumption in assumptions_of(partial("predicted"), volume, p)
-        if isinstance(assumption, Voxels)
+        if isinstance(assumption, OccupiedVoxels)
     ]
     assert len(occupied) == len(THRESHOLDS)
     assert all((b <= a).all() and b.sum() < a.sum() for a, b in pairwise(occupied))

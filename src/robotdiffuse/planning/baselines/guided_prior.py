@@ -296,6 +296,20 @@ def limited(moves: Trajectories, most: float) -> Trajectories:
     return moves * np.minimum(1.0, most / np.maximum(lengths, 1e-9)).astype(moves.dtype)
 
 
+QUIET_STEPS = 5
+"""Number of final steps without noise."""
+GUIDE_STEPS = 5
+"""Gradient steps at each guided denoising step."""
+NOISE_SCALE = 0.5
+"""Factor on the standard deviation of the noise of a denoising step."""
+LIMIT_MARGIN = 0.02
+"""Joints nearer to their limits than this are moved away from them [rad]."""
+COLLISION_WEIGHT = 0.1
+"""Weight of the collision cost [rad²/m]: a waypoint that is too close moves by about this times 0.5
+m/rad."""
+PRIOR_WEIGHT = 2.0
+"""Weight of the Gaussian process cost, with waypoints one unit of time apart and a power spectrum of 1
+rad²."""
 EXPONENTIAL_BETAS = (1e-4, 1.0)
 """Variances that the first and the last step of MPD's exponential schedule add."""
 
@@ -304,24 +318,10 @@ EXPONENTIAL_BETAS = (1e-4, 1.0)
 class MPDSettings(PriorSettings, name="mpd"):
     """Settings of MPD. The noise levels are spaced as in MPD's exponential schedule."""
 
-    quiet_steps: Natural = 5
-    """Number of final steps without noise."""
     guided_share: Share = 0.25
     """Part of the denoising steps that are guided, the last ones; the quiet steps always are."""
-    guide_steps: Count = 5
-    """Gradient steps at each guided denoising step."""
-    noise_scale: NotNegative = 0.5
-    """Factor on the standard deviation of the noise of a denoising step."""
     margin: NotNegative = 0.04
     """Spheres nearer to obstacles than this have a collision cost [m]."""
-    limit_margin: NotNegative = 0.02
-    """Joints nearer to their limits than this are moved away from them [rad]."""
-    collision_weight: NotNegative = 0.1
-    """Weight of the collision cost [rad²/m]: a waypoint that is too close moves by about this times 0.5
-    m/rad."""
-    prior_weight: NotNegative = 2.0
-    """Weight of the Gaussian process cost, with waypoints one unit of time apart and a power spectrum of 1
-    rad²."""
     between: Natural = 1
     """Places between two waypoints at which the collision cost is evaluated."""
 
@@ -349,23 +349,21 @@ class MPD(GuidedPrior[MPDSettings]):
             return self.guided(checker, q) if left < guided else q
 
         levels = exponential_levels(prior.schedule, settings.sampling_steps)
-        return sample(
-            prior, starts, goals, levels, rng, guide, settings.noise_scale, settings.quiet_steps, stop
-        )
+        return sample(prior, starts, goals, levels, rng, guide, NOISE_SCALE, QUIET_STEPS, stop)
 
     def guided(self, checker: CollisionChecker, q: Trajectories) -> Trajectories:
         """Trajectories after the gradient steps of one denoising step; their ends stay fixed."""
         settings, robot = self.settings, checker.robot
         gaussian = gaussian_process(q.shape[1])
-        for _ in range(settings.guide_steps):
+        for _ in range(GUIDE_STEPS):
             _, gradient = collision_gradient(
                 checker, q, settings.margin, settings.self_margin, settings.between
             )
-            near = np.minimum(settings.limit_margin, (robot.upper - robot.lower) / 2)
+            near = np.minimum(LIMIT_MARGIN, (robot.upper - robot.lower) / 2)
             inside = np.clip(q, robot.lower + near, robot.upper - near)
-            moves = limited(-settings.collision_weight * gradient, settings.push) + (inside - q)
+            moves = limited(-COLLISION_WEIGHT * gradient, settings.push) + (inside - q)
             moves[:, [0, -1]] = 0.0
-            q = gaussian.step((q + moves).astype(np.float32), settings.prior_weight)
+            q = gaussian.step((q + moves).astype(np.float32), PRIOR_WEIGHT)
         return q
 
 

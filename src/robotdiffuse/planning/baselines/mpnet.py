@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 SEARCH_ITERATIONS = 500
 """Iterations of RRT-Connect between two readings of the clock, in hybrid replanning."""
 SEARCH_CAPACITY = 20_000
+SEARCH_RANGE = np.float32(1.0)
+"""Longest extension of a tree of RRT-Connect, in hybrid replanning [rad, joint-space L2]."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,6 @@ class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
     """N_r, how often colliding parts are replanned before the attempts are given up."""
     hybrid: bool = False
     """Whether RRT-Connect repairs what the network leaves in collision."""
-    hybrid_range: Positive = 1.0
-    """Longest extension of a tree of RRT-Connect [rad, joint-space L2]."""
     resolution: Positive = 0.03
     """No point of the arm moves further than this between two checks of a motion [m]; the validator's
     certificate covers the rest. It is halved after a path that the validator refuses."""
@@ -220,9 +220,8 @@ class NeuralPlanning:
         """A free path from a to b by RRT-Connect; the straight line if time runs out."""
         trees = rrt_kernel.make_trees(a, b[None], SEARCH_CAPACITY)
         while self.context.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
-            longest = np.float32(self.settings.hybrid_range)
             path = rrt_kernel.search(
-                self.space, None, trees, rrt_kernel.INFINITE, longest, SEARCH_ITERATIONS, self.state
+                self.space, None, trees, rrt_kernel.INFINITE, SEARCH_RANGE, SEARCH_ITERATIONS, self.state
             )
             if len(path):
                 return path

@@ -169,12 +169,12 @@ class Explorer:
         """
         check_type("settings", settings, ExplorerSettings, "ExplorerSettings")
         self.robot, self.cameras, self.scene, self.settings = robot, tuple(cameras), scene, settings
-        self.map = OccupancyMap(robot, settings.map)
+        self.map = OccupancyMap(robot, settings.max_age)
         if free_zone is not None:
             self.map.declare_free(free_zone)
         self._planner = load_planner("robotdiffuse")
         self._rng, self._seed = np.random.default_rng(seed), seed
-        self._views = ViewMemory(robot, settings.max_views)
+        self._views = ViewMemory(robot)
         self._goal_seen = GoalSeen(robot, self.map, self._views, settings.see_goal)
         self._goal: Goal | None = None
         self._looks = 0

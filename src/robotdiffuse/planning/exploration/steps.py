@@ -1,6 +1,6 @@
 """Cameras and settings of an Explorer, and the steps that it asks for."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from jaxtyping import Float
@@ -11,7 +11,6 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Positive, Settings
 from robotdiffuse.core.types import Configurations, Pose
-from robotdiffuse.perception.occupancy_map import MapSettings
 from robotdiffuse.perception.voxel_grid import Voxels
 from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.robots.robot import Robot
@@ -63,16 +62,14 @@ class ExplorerSettings(Settings, name="explorer"):
     """Most looks on the way to a goal."""
     look_attempts: Count = 4
     """Looks to which a motion is searched for in a step, the most useful first."""
-    max_views: Count = 12
-    """This many views, those that showed most, give seen points and the prediction; the map holds what all
-    views showed."""
     predict: bool = True
     """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
     reach."""
     see_goal: bool = False
     """Whether all of the arm's surface at the goal must have been seen free before it goes there; for policy
     strict. It takes more looks, and fails where something is nearer to the goal than about 1 cm."""
-    map: MapSettings = field(default_factory=MapSettings)
+    max_age: Positive | None = None
+    """What was seen longer ago than this is forgotten [s]; None: never."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -32,7 +32,7 @@ from robotdiffuse.core.bounds import numbers, rigid_transform, within
 from robotdiffuse.core.errors import InputError, check_type, distinct, shown, unknown_name
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
+from robotdiffuse.core.settings import Bound, NotNegative, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, transform
 from robotdiffuse.core.types import Configuration, Configurations, Trajectory
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
@@ -139,13 +139,11 @@ class PredictedObstacles:
         times: Float[ndarray, "n"],
         q: Configurations,
         begins: float,
-        horizon: float,
-        rest_time: float,
     ) -> bool:
-        """Whether no obstacle touches the arm on its way for `horizon` [s], or until it has rested at the end
-        for `rest_time` [s]."""
-        soon = max(int(np.searchsorted(times, horizon)), 1)
-        rest_time = rest_time if soon == len(times) else 0.0
+        """Whether no obstacle touches the arm on its way for HORIZON, or until it has rested at the end for
+        REST_TIME."""
+        soon = max(int(np.searchsorted(times, HORIZON)), 1)
+        rest_time = REST_TIME if soon == len(times) else 0.0
         return self.comes_to(q[:soon], times[:soon] + begins, rest_time + 1e-3) is None
 
 
@@ -162,6 +160,19 @@ PREDICTION_DELAYS = 0.3, 0.0, 0.8
 """A search takes the obstacles where they are predicted this long after the arm rests, in turn [s]."""
 EVASION_OVERHEAD = 0.2
 """Time that an evasion takes beyond its length at full speed [s]."""
+HORIZON = 2.5
+"""How far ahead the obstacles are predicted [s]."""
+REST_TIME = 1.0
+"""Where the arm stops, no obstacle is predicted to come for this long [s]."""
+SAFETY_MARGIN = 0.2
+"""Predictions keep the distance to obstacles that these can go at their maximum speed in this time [s], where
+possible: nearer to one, hardly any motion can be certified to stop in time."""
+ITERATIONS = 600
+"""Most iterations of a search for a path; there is at most one search per step."""
+EVASIONS = 24
+"""Random directions that are tried for an evasion, when the arm rests where an obstacle is predicted."""
+EVASION_RADIUS = 0.8
+"""Length of evasions [rad, joint-space L2]."""
 AT_REST = SpeedProfile(np.zeros(2), np.zeros(2))
 
 
@@ -171,20 +182,6 @@ class ReplannerSettings(Settings, name="replanner"):
     """Time between two steps [s]; the motion of a step begins one period after its observation."""
     clearance: NotNegative = 0.005
     """Distance of the covering spheres to every place that the obstacles can reach [m]."""
-    horizon: Positive = 2.5
-    """How far ahead the obstacles are predicted [s]."""
-    rest_time: Positive = 1.0
-    """Where the arm stops, no obstacle is predicted to come for this long [s]."""
-    safety_margin: NotNegative = 0.2
-    """Predictions keep the distance to obstacles that these can go at their maximum speed in this time [s],
-    where
-    possible: nearer to one, hardly any motion can be certified to stop in time."""
-    iterations: Count = 600
-    """Most iterations of a search for a path; there is at most one search per step."""
-    evasions: Count = 24
-    """Random directions that are tried for an evasion, when the arm rests where an obstacle is predicted."""
-    evasion_radius: Positive = 0.8
-    """Length of evasions [rad, joint-space L2]."""
     sample_time: Annotated[float, Bound(least=1e-3, most=0.1)] = 0.005
     """Time between the rows of the motion that a step returns [s]. Filtering for the jerk limits delays
     motions by at least four of these."""
@@ -192,9 +189,6 @@ class ReplannerSettings(Settings, name="replanner"):
     """Jerk limit of every joint [rad/s³] or [m/s³]; None: the limits that the robot states, and none for
     joints without one: unlike in plans, the default of 10 / s times the acceleration limit does not hold,
     with which stops take 1.7 times as long."""
-    from_scratch: bool = False
-    """Whether each step searches for a whole new path, even if the old one is free: the control of the
-    benchmark."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,7 +357,7 @@ class Replanner:
         here = self._path.at(float(self._motion.s[0]))
         predicted = PredictedObstacles(self._robot, moving, self._now)
         for share in MARGIN_FRACTIONS:
-            wide = predicted.wider(share * self.settings.safety_margin * speeds)
+            wide = predicted.wider(share * SAFETY_MARGIN * speeds)
             if wide.comes(here, self._now, self.settings.period) is None:
                 return wide
         return predicted
@@ -371,26 +365,17 @@ class Replanner:
     def _choose_path(self, predicted: PredictedObstacles) -> bool:
         """Search for another path if an obstacle is predicted on the present one; returns whether none is
         predicted on the path that the arm is on."""
-        settings = self.settings
         rest_time, rest = self._rest_time, self._path.at(float(self._motion.s[-1]))
         ahead = self._path if self._next is None else self._next
         clear = self._path_clear(predicted, ahead, self._next is None)
         moving = not self._rests or self._motion.duration > 0
         leaves = self._left and self._next is None
-        done = clear and (ahead.to_goal or moving) and not leaves
-        if done and not settings.from_scratch:
+        if clear and (ahead.to_goal or moving) and not leaves:
             return clear
         found = self._search(predicted, rest, rest_time)
-        if done:
-            return clear
-        if found is not None and predicted.free(
-            *found.coarse(found.onwards(0.0, 0.0), COARSE_SAMPLE_TIME),
-            rest_time,
-            settings.horizon,
-            settings.rest_time,
-        ):
+        if found is not None and self._path_clear(predicted, found, False):
             self._next = found
-        elif not moving and predicted.comes(rest, rest_time, settings.rest_time) is not None:
+        elif not moving and predicted.comes(rest, rest_time, REST_TIME) is not None:
             self._next = self._evasion(predicted, rest, rest_time) or self._next
         return clear
 
@@ -399,18 +384,18 @@ class Replanner:
         s, speed = (float(self._motion.s[0]), float(self._motion.speeds[0])) if under_way else (0.0, 0.0)
         begins = self._since if under_way else self._rest_time
         motion = path.coarse(path.onwards(s, speed), COARSE_SAMPLE_TIME)
-        return predicted.free(*motion, begins, self.settings.horizon, self.settings.rest_time)
+        return predicted.free(*motion, begins)
 
     def _search(self, predicted: PredictedObstacles, start: Configuration, time: float) -> TimedPath | None:
         """A path from where the arm can rest to a goal, around the obstacles predicted for some time after
         that; or back to the present path, where that is free."""
-        settings, self._searches = self.settings, self._searches + 1
+        self._searches += 1
         later = time + PREDICTION_DELAYS[self._searches % len(PREDICTION_DELAYS)]
         still = self._still.scene
         scene = still.with_shapes([*still.shapes, *predicted.shapes(later)])
         checker = CollisionChecker(self._robot, scene)
         roots, after = list(self._goals), [np.zeros((0, self._robot.dof))] * len(self._goals)
-        if self._path.to_goal and not (settings.from_scratch or self._left):
+        if self._path.to_goal and not self._left:
             old = self._path.remaining(float(self._motion.s[-1]))
             free = motions_free(search_space(checker, COARSE_RESOLUTION), old.astype(np.float32))
             first = len(free) - int(np.argmin(free[::-1])) if not free.all() else 1
@@ -420,13 +405,13 @@ class Replanner:
         if not usable[0] or not usable[1:].any():
             return None
         chosen = np.array([root for root, free in zip(roots, usable[1:], strict=True) if free])
-        clearance = min(float(predicted.margin.min()) + settings.clearance, MAX_CLEARANCE)
+        clearance = min(float(predicted.margin.min()) + self.settings.clearance, MAX_CLEARANCE)
         request = PlanRequest(SEARCH_TIME_LIMIT, self.seed + self._searches, clearance=clearance)
         context = PlanningContext("replanner", self._still, request)
         search = AnytimeSearch.of(
             context, StartGoal(checker, start, chosen), SearchSettings(), "replanner", bounded=False
         )
-        if not search.first(work=settings.iterations) or search.best is None:
+        if not search.first(work=ITERATIONS) or search.best is None:
             return None
         path = search.start_goal.complete(search.best)
         end = int(np.abs(np.array(roots) - path[-1]).max(axis=1).argmin())
@@ -434,16 +419,14 @@ class Replanner:
 
     def _evasion(self, predicted: PredictedObstacles, rest: Configuration, time: float) -> TimedPath | None:
         """A straight path to where the next obstacle is predicted latest; None if that is here."""
-        settings, robot = self.settings, self._robot
-        directions = self._rng.normal(size=(settings.evasions, robot.dof))
-        directions *= settings.evasion_radius / np.linalg.norm(directions, axis=1, keepdims=True)
+        robot = self._robot
+        directions = self._rng.normal(size=(EVASIONS, robot.dof))
+        directions *= EVASION_RADIUS / np.linalg.norm(directions, axis=1, keepdims=True)
         ends = np.clip(rest + directions, robot.lower, robot.upper)
-        best, best_time = None, predicted.comes(rest, time, settings.horizon) or np.inf
+        best, best_time = None, predicted.comes(rest, time, HORIZON) or np.inf
         for end in ends:
             lasts = float((np.abs(end - rest) / robot.velocity).max()) + EVASION_OVERHEAD
-            comes = predicted.comes_to(
-                np.stack([rest, end]), np.array([time, time + lasts]), settings.horizon
-            )
+            comes = predicted.comes_to(np.stack([rest, end]), np.array([time, time + lasts]), HORIZON)
             if comes is not None and comes <= best_time:
                 continue
             if not motions_free(self._space, np.stack([rest, end]).astype(np.float32)).all():
@@ -479,7 +462,7 @@ class Replanner:
             extended = path.on_then_rest(s, speed, periods * settings.period)
             motion = self._filter.follow(path, extended)
             rests = self._since + motion.duration
-            left_alone = clear or predicted.comes(motion.positions[-1], rests, settings.rest_time) is None
+            left_alone = clear or predicted.comes(motion.positions[-1], rests, REST_TIME) is None
             certified = grown.near(motion, self._since, settings.clearance) is None
             if certified and (left_alone or not path.to_goal):
                 self._motion = extended

@@ -79,7 +79,8 @@ END_MARGIN = 1e-6
 """Under path constraints, tolerances are widened to the values at the start and the goals, plus this
 margin."""
 PATHS_TO_FIND = 2
-"""Under path constraints, with until "converged": number of paths to find; the best is returned."""
+"""Of RRT-Connect, and under path constraints, with until "converged": number of paths to find; the best is
+returned."""
 STRAIGHT_EXCESS = 0.02
 """Under path constraints, a path is the shortest if it exceeds the straight line by no more than this
 part."""
@@ -613,8 +614,6 @@ class AORRTCSettings(SearchSettings, name="aorrtc"):
 
 @dataclass(frozen=True)
 class RRTConnectSettings(SearchSettings, name="rrt_connect"):
-    searches: Count = 2
-    """With until "converged": number of paths to find; the shortest is returned."""
     optimize_time: NotNegative = 0.0
     """With until "converged": time for restarts after the first path [s]."""
 
@@ -657,7 +656,7 @@ class RRTConnect(Planner[RRTConnectSettings]):
 
         def improves() -> bool:
             restarts_end = context.first_path_at + settings.optimize_time
-            return search.found < settings.searches or context.elapsed < restarts_end
+            return search.found < PATHS_TO_FIND or context.elapsed < restarts_end
 
         return anytime(context, search, improves, lambda: search.improve(search.clock_interval))
 
