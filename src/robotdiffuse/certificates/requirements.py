@@ -15,8 +15,8 @@ between. Torques are sums and products of vectors that rotate with the links, so
 derivative by bounds on the motion of links and joints.
 """
 
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -38,7 +38,7 @@ from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constrain
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.inertias import Inertia
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Joint, Robot
 
 MAX_HALVINGS, MAX_OPEN = 24, 100_000
 """Halvings of a step at most, and stretches at a time, to show that a frame keeps its speed."""
@@ -331,100 +331,121 @@ def _static_states(q: Float[ndarray, "n dof"]) -> States:
     return States(ends, 0 * ends, 0 * ends, np.ones(len(step)), places, none, none)
 
 
+class Vectors(NamedTuple):
+    """Vectors whose product is the cross product, as `Bound` is for their bounds."""
+
+    xyz: Float[ndarray, "n 3"]
+
+    def __add__(self, other: "Vectors") -> "Vectors":  # type: ignore[override]
+        return Vectors(self.xyz + other.xyz)
+
+    def __mul__(self, other: "Vectors") -> "Vectors":  # type: ignore[override]
+        return Vectors(np.cross(self.xyz, other.xyz))
+
+    def scaled(self, by: float) -> "Vectors":
+        return Vectors(by * self.xyz)
+
+
 def inverse_dynamics(
     problem: Problem, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
 ) -> Float[ndarray, "n dof"]:
     """Torques [n, dof] by the Newton-Euler equations of each link, in the base frame [N m] or [N]."""
-    robot, linkage = problem.robot, Linkage(problem.robot)
-    postures, number = linkage.place(q), {joint.name: j for j, joint in enumerate(robot.planned_joints)}
+    linkage = Linkage(problem.robot)
+    postures = linkage.place(q)
     T = {link: postures.T[:, k] for k, link in enumerate(linkage.links)}
     up = np.eye(4)[2, :3] if problem.T_world_base is None else problem.T_world_base[2, :3]
     still = np.zeros((len(q), 3))
-    turning = {robot.base: (still, still, still + GRAVITY * up)}
+
+    def of_joint(joint: Joint, j: int | None, seen: None) -> tuple[Any, ...]:
+        arm = Vectors(T[joint.child][:, :3, 3] - T[joint.parent][:, :3, 3])
+        if j is None:
+            return arm, None, None, None, seen
+        axis = postures.axes[:, j]
+        return arm, Vectors(axis), Vectors(v[:, j, None] * axis), Vectors(a[:, j, None] * axis), seen
+
+    def of_body(body: Inertia, link: str, _: None) -> tuple[Vectors, Callable[[Vectors], Vectors]]:
+        R = T[link][:, :3, :3]
+        inertia = R @ body.moments @ R.transpose(0, 2, 1)
+        return Vectors(R @ body.com), lambda w: Vectors(np.einsum("nij,nj->ni", inertia, w.xyz))
+
+    at_base = None, Vectors(still), Vectors(still), Vectors(still + GRAVITY * up)
+    loads = _newton_euler(problem, at_base, of_joint, of_body)
+    return np.stack([(axis.xyz * load.xyz).sum(axis=1) for axis, load in loads], axis=1)
+
+
+def _newton_euler(
+    problem: Problem,
+    at_base: tuple[Any, Any, Any, Any],
+    of_joint: Callable[[Joint, int | None, Any], tuple[Any, ...]],
+    of_body: Callable[[Inertia, str, Any], tuple[Any, Callable[[Any], Any]]],
+) -> list[tuple[Any, Any]]:
+    """The axis of each planned joint, and the force or moment along it: of `Vectors`, or bounds of them.
+
+    at_base: what `of_joint` and `of_body` need of a link, angular velocity and acceleration, and acceleration
+        of the origin against gravity, of the base; its angular velocity is 0.
+    of_joint: by the joint, its number and what is needed of the parent: the arm from the parent's origin to
+        the child's; None, or the axis, and the joint's velocity and acceleration along it; and what is needed
+        of the child.
+    of_body: the arm to a body's centre of mass, and the product with its inertia.
+    """
+    robot, number = problem.robot, {joint.name: j for j, joint in enumerate(problem.robot.planned_joints)}
+    slides, turning = Linkage(robot).slides, {robot.base: at_base}
+    arms, axes = dict[str, Any](), dict[str, Any]()
     for joint in robot.joints:
-        w, dw, pull = turning[joint.parent]
-        arm = T[joint.child][:, :3, 3] - T[joint.parent][:, :3, 3]
-        pull = pull + np.cross(dw, arm) + np.cross(w, np.cross(w, arm))
-        j = number.get(joint.name)
-        if j is not None:
-            along, bent = v[:, j, None] * postures.axes[:, j], a[:, j, None] * postures.axes[:, j]
-            if linkage.slides[j]:
-                pull = pull + bent + 2 * np.cross(w, along)
-            else:
-                w, dw = w + along, dw + bent + np.cross(w, along)
-        turning[joint.child] = w, dw, pull
+        j, link = number.get(joint.name), joint.child
+        needed, w, dw, pull = turning[joint.parent]
+        arms[link], axes[link], along, bent, needed = of_joint(joint, j, needed)
+        pull = pull + dw * arms[link] + w * (w * arms[link])
+        if j is not None and slides[j]:
+            pull = pull + bent + (w * along).scaled(2.0)
+        elif j is not None:
+            w, dw = w + along, dw + bent + w * along
+        turning[link] = needed, w, dw, pull
     carried = _masses(problem)
-    force, moment = ({link: still for link in linkage.links} for _ in range(2))
-    torques = np.empty_like(q)
+    force, moment = ({link: at_base[1] for link in turning} for _ in range(2))
+    loads = dict[int, tuple[Any, Any]]()
     for joint in reversed(robot.joints):
-        link, (w, dw, pull) = joint.child, turning[joint.child]
+        j, link = number.get(joint.name), joint.child
+        needed, w, dw, pull = turning[link]
         for body in carried.get(link, ()):
-            R = T[link][:, :3, :3]
-            arm, inertia = R @ body.com, R @ body.moments @ R.transpose(0, 2, 1)
-            own = body.mass * (pull + np.cross(dw, arm) + np.cross(w, np.cross(w, arm)))
-            spin = np.einsum("nij,nj->ni", inertia, w)
+            arm, inertia = of_body(body, link, needed)
+            own = (pull + dw * arm + w * (w * arm)).scaled(body.mass)
             force[link] = force[link] + own
-            turn = np.einsum("nij,nj->ni", inertia, dw) + np.cross(w, spin) + np.cross(arm, own)
-            moment[link] = moment[link] + turn
-        j = number.get(joint.name)
+            moment[link] = moment[link] + inertia(dw) + w * inertia(w) + arm * own
         if j is not None:
-            of = force[link] if linkage.slides[j] else moment[link]
-            torques[:, j] = (postures.axes[:, j] * of).sum(axis=1)
-        arm = T[link][:, :3, 3] - T[joint.parent][:, :3, 3]
+            loads[j] = axes[link], force[link] if slides[j] else moment[link]
         force[joint.parent] = force[joint.parent] + force[link]
-        moment[joint.parent] = moment[joint.parent] + moment[link] + np.cross(arm, force[link])
-    return torques
+        moment[joint.parent] = moment[joint.parent] + moment[link] + arms[link] * force[link]
+    return [loads[j] for j in range(len(number))]
 
 
 def _second_derivative_bounds(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
     """Upper bounds on the second derivatives of torques from each sample to the next: the same equations on
-    bounds."""
-    robot, linkage = problem.robot, Linkage(problem.robot)
-    number = {joint.name: j for j, joint in enumerate(robot.planned_joints)}
-    none = np.zeros(len(states.durations))
-    still = Bound(none, none, none)
-    turning = {robot.base: (still, still, still, Bound(none + GRAVITY, none, none))}
-    axes, arms = dict[str, Bound](), dict[str, Bound]()
-    for joint in robot.joints:
-        seen, w, dw, pull = turning[joint.parent]
-        held = joint.motion(robot.locked.get(joint.name, 0.0)) if joint.name not in number else np.eye(4)
-        reach = float(np.linalg.norm((joint.T_parent_joint @ held)[:3, 3]))
-        axis, arm = _rotating(1.0, seen), _rotating(reach, seen)
-        j = number.get(joint.name)
+    bounds. Of a link, bounds of its rotation are needed."""
+    robot, none = problem.robot, np.zeros(len(states.durations))
+    still, slides = Bound(none, none, none), Linkage(robot).slides
+
+    def of_joint(joint: Joint, j: int | None, seen: Bound) -> tuple[Any, ...]:
+        held = joint.motion(robot.locked.get(joint.name, 0.0)) if j is None else np.eye(4)
+        arm = _rotating(float(np.linalg.norm((joint.T_parent_joint @ held)[:3, 3])), seen)
         if j is None:
-            pull = pull + dw * arm + w * (w * arm)
+            return arm, None, None, None, seen
+        axis = _rotating(1.0, seen)
+        place, speed, bent = (Bound(*(part[:, j] for part in of)) for of in states[4:])
+        if slides[j]:
+            arm = arm + place * axis
         else:
-            place, speed, bent = (Bound(*(part[:, j] for part in of)) for of in states[4:])
-            along, rate = speed * axis, Bound(place.first, place.second, none) * axis
-            if linkage.slides[j]:
-                arm = arm + place * axis
-                pull = pull + dw * arm + w * (w * arm) + bent * axis + (w * along).scaled(2.0)
-            else:
-                pull = pull + dw * arm + w * (w * arm)
-                seen, w, dw = seen + rate, w + along, dw + bent * axis + w * along
-        turning[joint.child], axes[joint.child], arms[joint.child] = (seen, w, dw, pull), axis, arm
-    carried = _masses(problem)
-    force, moment = ({link: still for link in linkage.links} for _ in range(2))
-    second_derivatives = np.empty((len(none), robot.dof))
-    for joint in reversed(robot.joints):
-        link, (seen, w, dw, pull) = joint.child, turning[joint.child]
-        for body in carried.get(link, ()):
-            arm, most = (
-                _rotating(float(np.linalg.norm(body.com)), seen),
-                float(np.linalg.eigvalsh(body.moments)[-1]),
-            )
-            inertia = Bound(none + most, 2 * most * seen.size, most * (2 * seen.first + 4 * seen.size**2))
-            own = (pull + dw * arm + w * (w * arm)).scaled(body.mass)
-            force[link] = force[link] + own
-            moment[link] = moment[link] + inertia * dw + w * (inertia * w) + arm * own
-        j = number.get(joint.name)
-        if j is not None:
-            second_derivatives[:, j] = (
-                axes[link] * (force[link] if linkage.slides[j] else moment[link])
-            ).second
-        force[joint.parent] = force[joint.parent] + force[link]
-        moment[joint.parent] = moment[joint.parent] + moment[link] + arms[link] * force[link]
-    return second_derivatives
+            seen = seen + Bound(place.first, place.second, none) * axis
+        return arm, axis, speed * axis, bent * axis, seen
+
+    def of_body(body: Inertia, _: str, seen: Bound) -> tuple[Bound, Callable[[Bound], Bound]]:
+        most = float(np.linalg.eigvalsh(body.moments)[-1])
+        inertia = Bound(none + most, 2 * most * seen.size, most * (2 * seen.first + 4 * seen.size**2))
+        return _rotating(float(np.linalg.norm(body.com)), seen), lambda w: inertia * w
+
+    at_base = still, still, still, Bound(none + GRAVITY, none, none)
+    loads = _newton_euler(problem, at_base, of_joint, of_body)
+    return np.stack([(axis * load).second for axis, load in loads], axis=1)
 
 
 def _rotating(length: float, seen: Bound) -> Bound:
