@@ -19,8 +19,13 @@ from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import READERS, TRAJECTORY_ENDINGS, WRITERS, read_motion, rosbag, write_motion
-from robotdiffuse.interop.plain_messages import joint_trajectory, motion_from_record
-from robotdiffuse.interop.recorded_motion import checked_motion, motion_of_robot, problem_of_motion
+from robotdiffuse.interop.recorded_motion import (
+    checked_motion,
+    joint_trajectory,
+    motion_from_record,
+    motion_of_robot,
+    problem_of_motion,
+)
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify_trajectory
@@ -486,7 +491,7 @@ def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: 
         "rosbags": "import robotdiffuse.interop.rosbag",
         "mcap": "import robotdiffuse.interop.mcap_file",
         "rerun": "import robotdiffuse.interop.rerun_file",
-        "roslibpy": "from robotdiffuse.interop.plain_messages import publish; publish(None, '')",
+        "roslibpy": "from robotdiffuse.interop.recorded_motion import publish; publish(None, '')",
     }
     code = (
         f"import sys; sys.modules[{module!r}] = None\n"
@@ -520,7 +525,7 @@ def test_motions_are_published_to_a_rosbridge(
     """Subscribers had no time to match the publisher, which sent and ended at once."""
     import time
 
-    from robotdiffuse.interop import plain_messages as module
+    from robotdiffuse.interop import recorded_motion as module
 
     _, trajectory = planned
     waited: list[str] = []
@@ -544,7 +549,7 @@ def test_motions_are_published_to_a_rosbridge(
 
 
 def test_no_rosbridge_is_one_line(planned: tuple[Problem, Trajectory]) -> None:
-    from robotdiffuse.interop.plain_messages import publish
+    from robotdiffuse.interop.recorded_motion import publish
 
     with pytest.raises(InputError, match=r"no rosbridge answers at 127\.0\.0\.1:1 within 1 s"):
         publish(planned[1], "127.0.0.1", 1, timeout=1.0)

@@ -97,7 +97,7 @@ def address(text: str) -> tuple[str, int]:
 
 
 def run_publish(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.interop.plain_messages import publish
+    from robotdiffuse.interop.recorded_motion import publish
 
     host, port = arguments.to
     _, trajectory = validated_motion(arguments.result)

@@ -38,7 +38,7 @@ from robotdiffuse.datasets.shards import (
     write_shard,
 )
 from robotdiffuse.problems.families import load_family
-from robotdiffuse.problems.problem_fields import LIMIT_SLACK
+from robotdiffuse.problems.problem import LIMIT_SLACK
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot

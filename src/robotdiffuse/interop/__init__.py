@@ -21,7 +21,7 @@ WRITERS = Registry(
         ".mcap": Entry("robotdiffuse.interop.mcap_file:write", "a Foxglove scene, and ROS 2 messages"),
         ".rosbag2": Entry("robotdiffuse.interop.rosbag:write", "a ROS 2 bag (a folder)"),
         ".rrd": Entry("robotdiffuse.interop.rerun_file:write", "a Rerun recording"),
-        ".yaml": Entry("robotdiffuse.interop.plain_messages:write_yaml", "a ROS 2 JointTrajectory"),
+        ".yaml": Entry("robotdiffuse.interop.recorded_motion:write_yaml", "a ROS 2 JointTrajectory"),
     },
 )
 """Functions of problem, trajectory and file, by the ending of the file."""
@@ -29,13 +29,15 @@ READERS = Registry(
     "motion format",
     {
         ".json": Entry(
-            "robotdiffuse.interop.plain_messages:read_json_file", "results, trajectories, ROS messages"
+            "robotdiffuse.interop.recorded_motion:read_json_file", "results, trajectories, ROS messages"
         ),
-        ".csv": Entry("robotdiffuse.interop.plain_messages:read_csv", "a column for time and for each joint"),
+        ".csv": Entry(
+            "robotdiffuse.interop.recorded_motion:read_csv", "a column for time and for each joint"
+        ),
         ".yaml": Entry(
-            "robotdiffuse.interop.plain_messages:read_yaml", "ROS JointTrajectory, MoveIt RobotTrajectory"
+            "robotdiffuse.interop.recorded_motion:read_yaml", "ROS JointTrajectory, MoveIt RobotTrajectory"
         ),
-        ".yml": Entry("robotdiffuse.interop.plain_messages:read_yaml", "the same"),
+        ".yml": Entry("robotdiffuse.interop.recorded_motion:read_yaml", "the same"),
         ".mcap": Entry("robotdiffuse.interop.mcap_file:read", "ROS 2 messages"),
         ".rosbag2": Entry("robotdiffuse.interop.rosbag:read", "a ROS 2 bag (a folder)"),
     },

@@ -24,8 +24,7 @@ from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.drawables import Color, Drawable, Surface, drawables, link_surfaces
 from robotdiffuse.interop import missing_package
-from robotdiffuse.interop.plain_messages import joint_trajectory
-from robotdiffuse.interop.recorded_motion import RecordedMotion
+from robotdiffuse.interop.recorded_motion import RecordedMotion, joint_trajectory
 from robotdiffuse.interop.ros_messages import (
     DISPLAY_TRAJECTORY,
     JOINT_STATE,

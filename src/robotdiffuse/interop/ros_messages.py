@@ -10,8 +10,12 @@ import numpy as np
 from robotdiffuse.core.errors import InputError, reading
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import missing_package
-from robotdiffuse.interop.plain_messages import JOINT_TRAJECTORY, motion_from_record
-from robotdiffuse.interop.recorded_motion import RecordedMotion, checked_motion
+from robotdiffuse.interop.recorded_motion import (
+    JOINT_TRAJECTORY,
+    RecordedMotion,
+    checked_motion,
+    motion_from_record,
+)
 from robotdiffuse.problems.problem import Problem
 
 try:

@@ -11,8 +11,7 @@ from robotdiffuse.core.input_files import input_file, read_yaml
 from robotdiffuse.core.output_files import write_error
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop.mcap_file import MAX_UNPACKED, check_chunks, make_reader
-from robotdiffuse.interop.plain_messages import joint_trajectory
-from robotdiffuse.interop.recorded_motion import RecordedMotion
+from robotdiffuse.interop.recorded_motion import RecordedMotion, joint_trajectory
 from robotdiffuse.interop.ros_messages import (
     DISPLAY_TRAJECTORY,
     JOINT_TRAJECTORY,

@@ -321,8 +321,7 @@ def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     from robotdiffuse.core.types import Trajectory
     from robotdiffuse.interop import read_motion, write_motion
-    from robotdiffuse.interop.plain_messages import joint_trajectory
-    from robotdiffuse.interop.recorded_motion import motion_of_robot
+    from robotdiffuse.interop.recorded_motion import joint_trajectory, motion_of_robot
     from robotdiffuse.problems.files import problem_from_record
     from robotdiffuse.validation.validator import Verifier
 

@@ -14,7 +14,7 @@ from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.pipeline.moving_obstacles import GRID_STEP, WAITED, earliest
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.trajectories.speed_limits import TimingSettings
-from robotdiffuse.trajectories.stops import StopGraph
+from robotdiffuse.trajectories.timing import StopGraph
 from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")

@@ -29,8 +29,7 @@ from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.pipeline import Solver, attempt
 from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.trajectories.stops import MIN_DISTANCE, SPEED_FACTORS, StopGraph
-from robotdiffuse.trajectories.timing import time_parameterize
+from robotdiffuse.trajectories.timing import MIN_DISTANCE, SPEED_FACTORS, StopGraph, time_parameterize
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verifier
 
