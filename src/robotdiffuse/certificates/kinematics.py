@@ -216,10 +216,6 @@ class Cubics(NamedTuple):
         """The cubic at each time; at a row, the one that begins there."""
         return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
 
-    def positions_at(self, times: Float[ndarray, "n"]) -> Float[ndarray, "n dof"]:
-        rows = self.rows(times)
-        return self.at(rows, times - self.times[rows])[0]
-
     @property
     def pulls(self) -> Float[ndarray, "m dof"]:
         """The greatest absolute acceleration of each."""

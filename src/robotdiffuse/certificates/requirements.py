@@ -494,7 +494,8 @@ def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> F
         places, rows = places_of(motion, between), clock(motion)
         return np.column_stack([np.interp(places, rows, joint) for joint in motion.positions.T])
     times = np.concatenate([clock(motion), between])
-    q = np.concatenate([motion.positions, cubics.positions_at(between)])
+    rows = cubics.rows(between)
+    q = np.concatenate([motion.positions, cubics.at(rows, between - cubics.times[rows])[0]])
     return q[np.argsort(times, kind="stable")]
 
 

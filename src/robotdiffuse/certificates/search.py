@@ -349,7 +349,9 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
         if tools is not None and close.any():
             rows = np.flatnonzero(close)
             planes = tools.planes(todo, rows, displacement[rows] + target[rows])
-            again = prover.bounds(todo.some(rows), np.ones(len(rows), bool), _renumbered(planes, rows))
+            number = {row: k for k, row in enumerate(rows.tolist())}
+            own = [plane._replace(stretch=number[plane.stretch]) for plane in planes]
+            again = prover.bounds(todo.some(rows), np.ones(len(rows), bool), own)
             better, less = _down(again.clearance), _up(again.displacement)
             by_planes[rows] = better - less > clearance[rows] - displacement[rows]
             chosen = by_planes[rows]
@@ -373,11 +375,6 @@ def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
                 f"no proof exists: {claim.link} and {claim.against} are apart only by their exact surfaces, "
                 f"and proofs use the convex parts around them, which touch"
             )
-
-
-def _renumbered(planes: list[Plane], rows: ndarray) -> list[Plane]:
-    number = {row: k for k, row in enumerate(rows.tolist())}
-    return [plane._replace(stretch=number[plane.stretch]) for plane in planes]
 
 
 def _proved_part(

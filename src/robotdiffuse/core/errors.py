@@ -58,6 +58,11 @@ def reading(file: object) -> Iterator[None]:
         raise InputError(f"{file} is damaged: {type(error).__name__}: {str(error)[:MAX_WORD]}") from None
 
 
+def missing_package(package: str, extra: str) -> InputError:
+    """An InputError for an extra that is not installed."""
+    return InputError(f'this needs {package}, not installed: pip install "robotdiffuse[{extra}]"')
+
+
 def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
     """Raises InputError unless the value is of one of these types; `wanted` says what it must be."""
     if not isinstance(value, kind):

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Int, Int8
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, located, reading, shown
+from robotdiffuse.core.errors import InputError, located, missing_package, reading, shown
 from robotdiffuse.core.input_files import file_name, input_file, read_json
 from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.settings import Count, Natural, Settings
@@ -243,9 +243,7 @@ def _zarr() -> ModuleType:
     try:
         import zarr
     except ImportError:
-        raise InputError(
-            'data sets need zarr, which is not installed: pip install "robotdiffuse[data]"'
-        ) from None
+        raise missing_package("zarr", "data") from None
     return zarr
 
 

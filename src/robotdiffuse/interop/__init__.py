@@ -86,8 +86,3 @@ def read_motion(file: str | Path, topic: str | None = None) -> "RecordedMotion":
         raise InputError(f"{path} is part of a ROS 2 bag; give the folder that contains it")
     read: Callable[..., RecordedMotion] = READERS.load(ending)
     return read(path, topic)
-
-
-def missing_package(package: str, extra: str) -> InputError:
-    """An InputError for an extra that is not installed."""
-    return InputError(f'this needs {package}, not installed: pip install "robotdiffuse[{extra}]"')

@@ -17,13 +17,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, reading
+from robotdiffuse.core.errors import InputError, missing_package, reading
 from robotdiffuse.core.input_files import MEGABYTE, input_file, parse_json
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.drawables import Color, Drawable, Surface, drawables, link_surfaces
-from robotdiffuse.interop import missing_package
 from robotdiffuse.interop.recorded_motion import RecordedMotion, joint_trajectory
 from robotdiffuse.interop.ros_messages import (
     DISPLAY_TRAJECTORY,

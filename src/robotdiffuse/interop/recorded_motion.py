@@ -15,11 +15,10 @@ import yaml
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError, joined, reading, shown
+from robotdiffuse.core.errors import InputError, joined, missing_package, reading, shown
 from robotdiffuse.core.input_files import MAX_YAML_SIZE, parse_yaml, read_json, read_text
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import Path, Trajectory, check_increasing, check_motion_arrays
-from robotdiffuse.interop import missing_package
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.errors import missing_package
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces
-from robotdiffuse.interop import missing_package
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_poses
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere

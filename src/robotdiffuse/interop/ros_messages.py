@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from robotdiffuse.core.errors import InputError, reading
+from robotdiffuse.core.errors import InputError, missing_package, reading
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.interop import missing_package
 from robotdiffuse.interop.recorded_motion import (
     JOINT_TRAJECTORY,
     RecordedMotion,

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core.errors import InputError, OutputError, reading, shown
+from robotdiffuse.core.errors import InputError, OutputError, missing_package, reading, shown
 from robotdiffuse.core.input_files import input_file, read_yaml
 from robotdiffuse.core.output_files import write_error
 from robotdiffuse.core.types import Trajectory
@@ -27,8 +27,6 @@ try:
     from rosbags.highlevel import AnyReader
     from rosbags.rosbag2 import Writer
 except ImportError:
-    from robotdiffuse.interop import missing_package
-
     raise missing_package("rosbags", "ros") from None
 
 VERSION = 9

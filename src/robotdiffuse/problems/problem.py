@@ -89,16 +89,16 @@ def blend_radii(value: object, count: int) -> tuple[float, ...]:
     given = blends is not None and blends.size > 0
     if given and not count:
         raise InputError(f"blend is {shown(value)}; there are no waypoints")
-    if blends is None or (given and blends.shape != (count,)) or not _is_blend(blends).all():
+    if (
+        blends is None
+        or (given and blends.shape != (count,))
+        or not ((blends == 0) | ((blends >= MIN_BLEND) & (blends <= MAX_BLEND))).all()
+    ):
         raise InputError(
             f"blend is {shown(value)}; it must be one number for all {count} waypoints, or one for each: 0 "
             f"to stop there, or from {MIN_BLEND:g} to {MAX_BLEND:g}"
         )
     return tuple(blends.tolist()) if given else (0.0,) * count
-
-
-def _is_blend(blends: ndarray) -> ndarray:
-    return (blends == 0) | ((blends >= MIN_BLEND) & (blends <= MAX_BLEND))
 
 
 def _check_planned_joint_moves(robot: Robot, field: str, frame: str) -> None:
@@ -353,8 +353,12 @@ class Problem(Value):
         checked["blend"] = blend_radii(self.blend, len(checked["waypoints"]))
         _check_combinations(checked)
         if checked["views"]:
-            start, goal = checked["start"], checked["goal"]
-            checked["scene"] = _scene_with_views(self.robot, self.known_scene, checked["views"], start, goal)
+            from robotdiffuse.perception.seen_points import seen_shapes  # compiled code
+
+            goal, known = checked["goal"], self.known_scene
+            goals = goal.positions if isinstance(goal, JointGoal) else checked["start"][None]
+            seen = seen_shapes(checked["views"], self.robot, known, checked["start"], goals)
+            checked["scene"] = known.with_shapes([*known.shapes, *seen])
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         super().__post_init__()
@@ -507,13 +511,3 @@ def moved(value: Any, T: Float[ndarray, "4 4"]) -> Any:
     if isinstance(value, list | tuple):
         return [moved(one, T) for one in value]
     return value.moved(T) if hasattr(value, "moved") else value
-
-
-def _scene_with_views(
-    robot: Robot, known: Scene, views: tuple[DepthView, ...], start: Float[ndarray, "dof"], goal: Goal
-) -> Scene:
-    """The known scene and the points that the views observed."""
-    from robotdiffuse.perception.seen_points import seen_shapes  # compiled code, which only views need
-
-    goals = goal.positions if isinstance(goal, JointGoal) else start[None]
-    return known.with_shapes([*known.shapes, *seen_shapes(views, robot, known, start, goals)])

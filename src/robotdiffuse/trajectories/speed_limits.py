@@ -244,15 +244,6 @@ def _duration(grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"]) -> float:
     return float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
 
 
-def can_begin(robot: Robot, line: BlendedPolyline, settings: TimingSettings, start_speed: float) -> bool:
-    """Whether a motion along the line with this start speed keeps the limits and can stop at the end."""
-    try:
-        time_line(robot, line, settings, start_speed)
-    except TooFastError:
-        return False
-    return True
-
-
 def symmetric_bounds(
     acceleration: Float[ndarray, "dof"], rows: int
 ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
@@ -349,19 +340,12 @@ def _extra_slowdown(
         speeds = extra.frame_speeds.speeds(q, v)
         slower = max(slower, float((speeds / extra.frame_speeds.limits).max(initial=0.0)))
     if extra.dynamics is not None:
-        slower = max(slower, _torque_slowdown(extra.dynamics, q, v, a))
+        # all torque but gravity's grows with the square of the speed
+        gravity, limits = extra.dynamics.holding_torques(q), extra.dynamics.limits
+        own = extra.dynamics.torques(q, v, a) - gravity
+        room = np.maximum(limits - np.sign(own) * gravity, MIN_TORQUE_SHARE * limits)
+        slower = max(slower, float(np.sqrt((np.abs(own) / room).max(initial=1.0))))
     return slower
-
-
-def _torque_slowdown(
-    dynamics: Dynamics, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
-) -> float:
-    """How many times slower a motion must be, at least 1, for its torques to keep their limits: all torque
-    but gravity's grows with the square of the speed."""
-    gravity = dynamics.holding_torques(q)
-    own = dynamics.torques(q, v, a) - gravity
-    room = np.maximum(dynamics.limits - np.sign(own) * gravity, MIN_TORQUE_SHARE * dynamics.limits)
-    return float(np.sqrt((np.abs(own) / room).max(initial=1.0)))
 
 
 def scaled_limits(robot: Robot, settings: TimingSettings) -> tuple[ndarray, ndarray]:

@@ -3,7 +3,7 @@ timed motions between them, forwards and back, for timings that wait or retreat.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from robotdiffuse.trajectories.speed_limits import (
     ExtraLimits,
     Rows,
     TimingSettings,
-    can_begin,
+    TooFastError,
     time_line,
 )
 from robotdiffuse.trajectories.timing_kernel import evaluate, rounded_line
@@ -131,9 +131,12 @@ def _round_and_time(
     `time_parameterize`."""
     deviations = _shrunk(waypoints, deviations, keeps, MIN_DEVIATION)
     while start_speed and deviations[:1].any():
-        if _can_begin(robot, waypoints, deviations, settings, start_speed):
+        stop = np.append(np.flatnonzero(deviations == 0), len(deviations))[0]
+        try:  # whether a motion with this start speed can pass the corners up to its first stop
+            _time_segments(robot, path, waypoints[: stop + 2], deviations[:stop], settings, start_speed)
             break
-        deviations[:1] = _smaller(deviations[:1])
+        except TooFastError:
+            deviations[:1] = _smaller(deviations[:1])
     slower = settings
     for attempt in range(MAX_TIMINGS):
         trajectory = _time_segments(robot, path, waypoints, deviations, slower, start_speed, extra)
@@ -174,7 +177,8 @@ def _shrunk(
         doubtful = np.flatnonzero((deviations > 0) & (widths > accepted * (1 + 1e-9)))
         if not len(doubtful):
             return deviations
-        corners = _corner_configurations(line, doubtful)
+        along = line[1][1 + doubtful, None] + widths[doubtful, None] * CORNER_PLACES
+        corners = evaluate(line, along.ravel(), 0).reshape(len(doubtful), CORNER_SAMPLES, -1)
         smaller = np.maximum(_smaller(deviations), np.minimum(deviations, least))
         for i, corner in zip(doubtful.tolist(), corners, strict=True):
             if accepts(corner):
@@ -214,28 +218,6 @@ def _resting_trajectory(path: Path, settings: TimingSettings) -> Trajectory:
     return Trajectory(path.joint_names, np.array([0.0, settings.sample_time]), positions, still, still)
 
 
-def _corner_configurations(
-    line: tuple[ndarray, ndarray, ndarray, ndarray], corners: Int[ndarray, "k"]
-) -> Float[ndarray, "k m dof"]:
-    """Configurations along these rounded corners of a line, as `rounded_line` returns it."""
-    along = line[1][1 + corners, None] + line[3][corners, None] * CORNER_PLACES
-    return evaluate(line, along.ravel(), 0).reshape(len(corners), CORNER_SAMPLES, -1)
-
-
-def _can_begin(
-    robot: Robot,
-    waypoints: Float[ndarray, "n dof"],
-    deviations: Float[ndarray, "corners"],
-    settings: TimingSettings,
-    start_speed: float,
-) -> bool:
-    """Whether a motion with this start speed can pass the corners up to its first stop."""
-    stop = np.append(np.flatnonzero(deviations == 0), len(deviations))[0]
-    waypoints, deviations = waypoints[: stop + 2], deviations[:stop]
-    line = BlendedPolyline(waypoints, half_widths(waypoints, deviations))
-    return can_begin(robot, line, settings, start_speed)
-
-
 def _time_segments(
     robot: Robot,
     path: Path,
@@ -252,15 +234,17 @@ def _time_segments(
         part = waypoints[a : b + 1]
         line = BlendedPolyline(part, half_widths(part, deviations[a : b - 1]))
         pieces.append(time_line(robot, line, settings, 0.0 if pieces else start_speed, extra))
-    start, rows = 0.0, []
-    for k, (times, positions, velocities, accelerations) in enumerate(pieces):
-        first = 0 if k == 0 else 1
-        rows.append((start + times[first:], positions[first:], velocities[first:], accelerations[first:]))
+    return Trajectory(path.joint_names, *_joined(pieces))
+
+
+def _joined(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
+    """Motions one after the other, each of which begins with the last row of the one before."""
+    start, parts = 0.0, []
+    for times, *more in pieces:
+        first = min(len(parts), 1)
+        parts.append((start + times[first:], *(column[first:] for column in more)))
         start += times[-1]
-    times, positions, velocities, accelerations = (
-        np.concatenate(column) for column in zip(*rows, strict=True)
-    )
-    return Trajectory(path.joint_names, times, positions, velocities, accelerations)
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
 PATH_PARTS = 8
@@ -310,9 +294,11 @@ class StopGraph:
         self.line = BlendedPolyline(waypoints, half_widths(waypoints, rounded))
         self.stops = self._find_stops(rounded)
         """Their values of s along the path, in order."""
-        self.motions = [
-            motion for pair in self._pairs(rounded) for motion in self._between(robot, settings, *pair)
-        ]
+        sharp = self.line.knots[1:-1][rounded == 0]
+        self.motions: list[Motion] = []
+        for (i, low), (j, high) in combinations(enumerate(self.stops), 2):
+            if not ((low < sharp) & (sharp < high)).any():  # else it would pass a stop
+                self.motions += self._between(robot, settings, i, j)
 
     def _find_stops(self, deviations: Float[ndarray, "corners"]) -> Float[ndarray, "k"]:
         """Values of s of all stops: none within a rounded corner, and every corner that is not rounded."""
@@ -326,13 +312,6 @@ class StopGraph:
             if min(abs(s - other) for other in found) > MIN_DISTANCE:
                 found.append(float(s))
         return np.sort(np.array(found))
-
-    def _pairs(self, deviations: Float[ndarray, "corners"]) -> list[tuple[int, int]]:
-        """Pairs of stops with no required stop, or sharp corner, between them."""
-        sharp = self.line.knots[1:-1][deviations == 0]
-        s = self.stops
-        pairs = [(i, j) for i in range(len(s)) for j in range(i + 1, len(s))]
-        return [(i, j) for i, j in pairs if not ((s[i] < sharp) & (sharp < s[j])).any()]
 
     def _between(self, robot: Robot, settings: TimingSettings, i: int, j: int) -> list[Motion]:
         """The motions from stop i to stop j and back, at each speed factor."""
@@ -380,13 +359,11 @@ class StopGraph:
         """Motions one after the other; an integer in `way` is a wait of one time step."""
         q = self.line(self.stops[:1], 0)
         a = way[0].rows[3][:1] if way and not isinstance(way[0], int) else 0 * q
-        rows = [(np.zeros(1), q, 0 * q, a)]
+        pieces = [(np.zeros(1), q, 0 * q, a)]
         for part in way:
             if isinstance(part, int):
-                q = rows[-1][1][-1:]
-                times, q, v, a = np.array([self.step]), q, 0 * q, 0 * q
+                q = np.repeat(pieces[-1][1][-1:], 2, axis=0)
+                pieces.append((np.array([0.0, self.step]), q, 0 * q, 0 * q))
             else:
-                times, q, v, a = (column[1:] for column in part.rows)
-            rows.append((rows[-1][0][-1] + times, q, v, a))
-        times, *more = (np.concatenate(column) for column in zip(*rows, strict=True))
-        return Trajectory(self.joint_names, times, *more)
+                pieces.append(part.rows)
+        return Trajectory(self.joint_names, *_joined(pieces))

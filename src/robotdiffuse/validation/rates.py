@@ -91,7 +91,7 @@ def _checks(
     blur = 2 * settings.limit_slack / step
     """Uncertainty of the mean velocities, from the resolution of positions."""
     share = 1 + settings.rate_slack
-    nothing = settings.rate_slack * _limits_or_peaks(robot.velocity, v, mean)
+    nothing = settings.rate_slack * np.where(robot.velocity > 0, robot.velocity, _peak(v, mean))
 
     def limited(kind: str, what: str, rates: ndarray, limit: ndarray, allowed: ndarray) -> _Check:
         known = allowed if (limit > 0).all() else np.where(limit > 0, allowed, np.inf)
@@ -239,11 +239,6 @@ def _second_differences(
 
 def _padded(*rows: ndarray) -> ndarray:
     return np.concatenate(rows)
-
-
-def _limits_or_peaks(limit: Float[ndarray, "dof"], *rates: ndarray) -> Float[ndarray, "dof"]:
-    """The limits, or the greatest rate of a joint without a limit."""
-    return np.where(limit > 0, limit, _peak(*rates))
 
 
 def _peak(*rates: ndarray) -> Float[ndarray, "dof"]:
