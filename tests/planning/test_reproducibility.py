@@ -5,7 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.validation.report import Report, Violation
+from robotdiffuse.validation.validator import Verifier
 
 SOURCE = Path(__file__).parents[2] / "src" / "robotdiffuse"
 SHELF = SOURCE / "examples" / "shelf.yaml"
@@ -49,3 +55,37 @@ def test_the_same_seed_gives_the_same_motion() -> None:
     assert len(here) == 2 * len(PLANNERS)
     assert here[::2] == here[1::2], "twice in one process"
     assert here == there, "in another process with other threads"
+
+
+@pytest.mark.parametrize("planner", ["aorrtc", "rrt_connect"])
+def test_the_first_call_and_later_ones_give_the_same_path_although_paths_are_refused(
+    planner: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time of validations in earlier calls decided when later calls validated, and a refused path changes
+    what the search does next."""
+    accepted = Verifier.path
+    refusals = list[float]()
+
+    def refuses_some(verifier: Verifier, path: rd.Path) -> Report:
+        report = accepted(verifier, path)
+        if int(path.length * 1e9) % 3:
+            return report
+        refusals.append(path.length)
+        return Report(False, Violation("scene_collision", 0.0, "refused by the test"), None, None)
+
+    problem = rd.load_problem(SHELF)
+
+    def call() -> PlanResult:
+        return rd.plan(problem, 60.0, seed=1, planner=planner)
+
+    monkeypatch.setattr(Verifier, "path", refuses_some)
+    first = call()
+    refused = len(refusals)
+    assert refused > 0
+    for seed in range(2, 6):
+        rd.plan(problem, 60.0, seed=seed, planner=planner, until="first")
+    refusals.clear()
+    later = call()
+    assert len(refusals) == refused
+    assert first.path is not None and later.path is not None
+    assert np.array_equal(first.path.positions, later.path.positions)
