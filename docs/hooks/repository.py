@@ -18,7 +18,7 @@ ROOT_PAGES = {
     "CONVENTIONS.md": "conventions.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
-    "benchmarks/README.md": "benchmarks/README.md",
+    "benchmarks/README.md": "benchmarks/reports.md",
 }
 LINK = re.compile(r"\]\(([^)#\s]+)((?:#[^)]*)?)\)")
 
