@@ -524,8 +524,12 @@ def make_lattice(
 ) -> tuple[Lattice, int]:
     """The lattice through the start, and the start's key. Raises InputError for one that is too large."""
     spacing, name = settings.spacing, settings.settings_name
-    below = _steps(start.astype(float) - robot.lower.astype(float), spacing)
-    counts = below + _steps(robot.upper.astype(float) - start.astype(float), spacing) + 1
+    start, most = start.astype(float), min(settings.joints_per_move, robot.dof)
+    below, above = (
+        np.maximum(np.floor(distance / spacing - LIMIT_MARGIN), 0).astype(np.int64)
+        for distance in (start - robot.lower, robot.upper - start)
+    )
+    counts = below + above + 1
     if (total := np.prod(counts.astype(float))) >= MAX_NODE_KEYS:
         raise InputError(
             f"{name}.spacing is {spacing:g}; on {robot.name} that makes {total:.0e} nodes, which must be "
@@ -533,25 +537,20 @@ def make_lattice(
             f"{spacing * (total / MAX_NODE_KEYS) ** (1 / robot.dof) * 1.1:.2g} does it"
         )
     edges = np.cumsum([comb(robot.dof, k) * 2**k for k in range(1, robot.dof + 1)])
-    if (count := edges[min(settings.joints_per_move, robot.dof) - 1]) > MAX_MOVES:
+    if (count := edges[most - 1]) > MAX_MOVES:
         raise InputError(
             f"{name}.joints_per_move is {settings.joints_per_move}; on {robot.name} that makes {count} edges "
             f"of a node; it must be at most {np.searchsorted(edges, MAX_MOVES, side='right')}"
         )
     strides = np.concatenate([[1], np.cumprod(counts[:-1])]).astype(np.int64)
-    origin = start.astype(float) - spacing * below
-    half = lattice_moves(robot.dof, settings.joints_per_move)
+    origin = start - spacing * below
+    half = lattice_moves(robot.dof, most)
     moves = np.concatenate([half, -half])
     costs = np.ceil(UNITS * np.sqrt(np.abs(moves).sum(axis=1))).astype(np.int64)
-    slope = 1 / sqrt(min(settings.joints_per_move, robot.dof))
     goals_at = (goals.astype(float) - origin) / spacing
     goals = np.ascontiguousarray(goals, np.float32)
-    lattice = Lattice(origin, float(spacing), counts, strides, moves, costs, slope, goals, goals_at)
+    lattice = Lattice(origin, float(spacing), counts, strides, moves, costs, 1 / sqrt(most), goals, goals_at)
     return lattice, int(below @ strides)
-
-
-def _steps(distance: Configuration, spacing: float) -> Int[ndarray, "dof"]:
-    return np.maximum(np.floor(distance / spacing - LIMIT_MARGIN), 0).astype(np.int64)
 
 
 def lattice_moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
@@ -567,12 +566,8 @@ def lattice_moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
     return np.array(moves)
 
 
-class _Search(Generic[LatticePlannerSettings]):
-    """The lattice, the nodes in memory, the search and the path along it."""
-
-    checker: CollisionChecker
-    _table: Table
-    _search: Search
+class AStarSearch(Generic[LatticePlannerSettings]):
+    """Weighted A* from the start, which must be free, to the nearest goal; the base of D* Lite."""
 
     def __init__(
         self,
@@ -590,7 +585,11 @@ class _Search(Generic[LatticePlannerSettings]):
 
     def _begin(self, checker: CollisionChecker, start_key: int) -> None:
         """Make the table, and queue the nodes of the source."""
-        raise NotImplementedError
+        self._table = make_table(len(self.goals), self.settings.max_nodes, 0)
+        [start] = add_nodes(self._table, np.array([start_key]))
+        self._table.rhs[start], self._table.state[start] = 0, FREE
+        put(self._table, start, 0, 0)
+        self._use(checker, self._lattice.goals_at, 1, getattr(self.settings, "inflation", 1.0), -1)
 
     def _use(
         self,
@@ -656,18 +655,7 @@ class _Search(Generic[LatticePlannerSettings]):
         return np.clip(lattice.origin + lattice.spacing * at, robot.lower, robot.upper)
 
 
-class AStarSearch(_Search[AStarSettings]):
-    """Weighted A* from the start, which must be free, to the nearest goal."""
-
-    def _begin(self, checker: CollisionChecker, start_key: int) -> None:
-        self._table = make_table(len(self.goals), self.settings.max_nodes, 0)
-        [start] = add_nodes(self._table, np.array([start_key]))
-        self._table.rhs[start], self._table.state[start] = 0, FREE
-        put(self._table, start, 0, 0)
-        self._use(checker, self._lattice.goals_at, 1, self.settings.inflation, -1)
-
-
-class DStarLiteSearch(_Search[DStarLiteSettings]):
+class DStarLiteSearch(AStarSearch[DStarLiteSettings]):
     """D* Lite from the goals, which can be repaired when obstacles or the arm have moved. Needs memory for
     the 2^dof nodes around each goal."""
 
@@ -750,7 +738,7 @@ class DStarLiteSearch(_Search[DStarLiteSettings]):
 class _LatticePlanner(Planner[LatticePlannerSettings]):
     """Base of both planners. The path depends on the seed only through the configurations of a goal pose."""
 
-    search: Callable[..., AStarSearch | DStarLiteSearch]
+    search: Callable[..., AStarSearch]
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -760,10 +748,18 @@ class _LatticePlanner(Planner[LatticePlannerSettings]):
             outcome = search.run(lambda: context.remaining <= 0)
             path = search.path() if outcome is Outcome.FOUND else None
             if path is None:
+                after = f"after {search.expansions} expansions"
+                spacing = f"{settings.settings_name}.spacing (now {settings.spacing:g} rad)"
+                reasons = {
+                    Outcome.FULL: f"memory is full: {search.nodes} nodes {after}; take a coarser {spacing} "
+                    f"or a larger {settings.settings_name}.max_nodes",
+                    Outcome.EXHAUSTED: f"there is no path on the lattice; a finer {spacing} may have one",
+                    Outcome.GOING: f"time ran out {after}; a coarser {spacing} searches faster",
+                }
                 status = Status.TIMEOUT if outcome is Outcome.GOING else Status.NO_PATH
-                return context.fail(status, _reason(outcome, settings, search))
-            done = f"solved by {context.planner_name}: {search.expansions} expansions"
-            result = context.finish(start_goal.complete(path), context.planner_name, reason=done)
+                return context.fail(status, reasons[outcome])
+            done = f"solved by {self.name}: {search.expansions} expansions"
+            result = context.finish(start_goal.complete(path), self.name, reason=done)
             if result is not None:
                 return result
             if settings.resolution <= FINEST_RESOLUTION:
@@ -783,15 +779,3 @@ class DStarLite(_LatticePlanner[DStarLiteSettings]):
     """D* Lite on a lattice, for one problem; `DStarLiteSearch` can be repaired after changes."""
 
     name, settings_class, search = "d_star_lite", DStarLiteSettings, DStarLiteSearch
-
-
-def _reason(outcome: Outcome, settings: LatticeSettings, search: AStarSearch | DStarLiteSearch) -> str:
-    spacing = f"{settings.settings_name}.spacing (now {settings.spacing:g} rad)"
-    if outcome is Outcome.FULL:
-        return (
-            f"memory is full: {search.nodes} nodes after {search.expansions} expansions; take a coarser "
-            f"{spacing} or a larger {settings.settings_name}.max_nodes"
-        )
-    if outcome is Outcome.EXHAUSTED:
-        return f"there is no path on the lattice; a finer {spacing} may have one"
-    return f"time ran out after {search.expansions} expansions; a coarser {spacing} searches faster"
