@@ -17,7 +17,7 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration
 from robotdiffuse.perception.depth_filter import filtered, grown_for_noise
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.ray_caster import rectangle
+from robotdiffuse.perception.ray_caster import in_camera, rectangle
 from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
@@ -234,15 +234,14 @@ def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missi
     px = low[0] + (np.float32(first[0]) + middle) * voxel - T[0, 3]
     py = low[1] + (np.float32(first[1]) + middle) * voxel - T[1, 3]
     pz = low[2] + (np.float32(first[2]) + middle) * voxel - T[2, 3]
-    z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
+    x, y, z = in_camera(T, px, py, pz)
     ez = _HALF * voxel * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
     near, far = z - np.float32(BLOCK) * ez, z + np.float32(BLOCK) * ez
     if far <= ez:
         return OUT
     if near <= voxel:
         return -1
-    x = (T[0, 0] * px + T[1, 0] * py + T[2, 0] * pz) / z
-    y = (T[0, 1] * px + T[1, 1] * py + T[2, 1] * pz) / z
+    x, y = x / z, y / z
     du, dv = _ZERO, _ZERO
     for c in range(3):
         du += abs(T[c, 0] - x * T[c, 2])
@@ -284,12 +283,11 @@ def _carve_block(
             py = low[1] + (np.float32(j) + _HALF) * voxel - T[1, 3]
             for k in range(first[2], end[2]):
                 pz = low[2] + (np.float32(k) + _HALF) * voxel - T[2, 3]
-                z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
+                x, y, z = in_camera(T, px, py, pz)
                 behind[i, j, k] = _ZERO
                 state[i, j, k] = OUT
                 if z <= ez:
                     continue
-                x, y = T[0, 0] * px + T[1, 0] * py + T[2, 0] * pz, T[0, 1] * px + T[1, 1] * py + T[2, 1] * pz
                 x, y = x / z, y / z
                 u, v = fx * x + cx, fy * y + cy
                 column, row = int(np.floor(u + _HALF)), int(np.floor(v + _HALF))

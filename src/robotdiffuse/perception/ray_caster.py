@@ -24,6 +24,16 @@ _NEAR = np.float32(0.02)
 _MISS = np.float32(1e9)
 
 
+@kernel(inline="always")
+def in_camera(T, x, y, z):
+    """A vector in the frame of the base, in the camera's."""
+    return (
+        T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
+        T[0, 1] * x + T[1, 1] * y + T[2, 1] * z,
+        T[0, 2] * x + T[1, 2] * y + T[2, 2] * z,
+    )
+
+
 @kernel()
 def rectangle(x, y, z, r, intrinsics, h, w):
     """First and last row, first and last column of the pixels that a sphere in the camera's frame may
@@ -103,9 +113,7 @@ def render_depth(kinds, rows, intrinsics, T, depth):
     for s in range(len(kinds)):
         row = rows[s]
         px, py, pz = row[0] - T[0, 3], row[1] - T[1, 3], row[2] - T[2, 3]
-        x = T[0, 0] * px + T[1, 0] * py + T[2, 0] * pz
-        y = T[0, 1] * px + T[1, 1] * py + T[2, 1] * pz
-        z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
+        x, y, z = in_camera(T, px, py, pz)
         v0, v1, u0, u1 = rectangle(x, y, z, row[15], intrinsics, h, w)
         if v1 < v0 or u1 < u0:
             continue

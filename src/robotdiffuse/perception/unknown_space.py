@@ -13,7 +13,7 @@ each free with a probability of 0.999, free with one of 0.37.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -24,7 +24,7 @@ from numpy import ndarray
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.loading import loading
-from robotdiffuse.core.types import Configurations, Path, Points
+from robotdiffuse.core.types import Configuration, Path, Points
 from robotdiffuse.perception.depth_view import AssumedPoints
 from robotdiffuse.perception.observed_volume import ObservedVolume
 from robotdiffuse.perception.seen_points import near_scene, sphere_distances
@@ -236,7 +236,7 @@ class UnknownSpace:
     def __init__(
         self,
         robot: Robot,
-        occupied_by_arm: Configurations,
+        occupied_by_arm: Iterable[Configuration],
         unknown: Voxels,
         predicted: Probabilities | None,
         margin: float = CARVING_MARGIN,

@@ -11,6 +11,7 @@ from robotdiffuse.collision.kernels.distance import frames_of, placed
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration, Points
 from robotdiffuse.perception.observed_volume import MAX_DEPTH, usable_depth
+from robotdiffuse.perception.ray_caster import in_camera
 from robotdiffuse.robots.robot import Robot, once_per_robot
 
 OCCLUSION_START = np.float32(2.0)
@@ -43,11 +44,11 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
         for n in range(len(voxels)):
             x, y, z = voxels[n, 0] + half, voxels[n, 1] + half, voxels[n, 2] + half
             dx, dy, dz = ox - x, oy - y, oz - z
-            ahead = -(T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz)
+            x_away, y_away, z_away = in_camera(T, dx, dy, dz)
+            ahead = -z_away
             if ahead <= one or ahead * edge > reach:
                 continue
-            u = -fx * (T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz) / ahead + cx
-            v = -fy * (T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz) / ahead + cy
+            u, v = -fx * x_away / ahead + cx, -fy * y_away / ahead + cy
             if not (-half <= u < size[1] - half and -half <= v < size[0] - half):
                 continue
             if arm[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < ahead * edge:
@@ -84,9 +85,7 @@ def _arm_ahead(robot, q, T, intrinsics, margin, depth):
             x, y, z = placed(frames[robot.frame[g]], sphere[0], sphere[1], sphere[2])
             x, y, z, r = x - T[0, 3], y - T[1, 3], z - T[2, 3], sphere[3] + margin
             square = x * x + y * y + z * z - r * r
-            u = T[0, 0] * x + T[1, 0] * y + T[2, 0] * z
-            v = T[0, 1] * x + T[1, 1] * y + T[2, 1] * z
-            w = T[0, 2] * x + T[1, 2] * y + T[2, 2] * z
+            u, v, w = in_camera(T, x, y, z)
             if square <= 0 or w <= -r:
                 continue
             for i in range(len(depth)):
@@ -120,11 +119,10 @@ def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
         if seen[n]:
             continue
         dx, dy, dz = balls[n, 0] - T[0, 3], balls[n, 1] - T[1, 3], balls[n, 2] - T[2, 3]
-        z = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
+        x, y, z = in_camera(T, dx, dy, dz)
         near, far = z - radius, z + radius
         if near <= _ZERO:
             continue
-        x, y = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz, T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
         u0 = np.floor(fx * (x - radius) / (near if x < radius else far) + cx) - border
         u1 = np.ceil(fx * (x + radius) / (near if x > -radius else far) + cx) + border
         v0 = np.floor(fy * (y - radius) / (near if y < radius else far) + cy) - border

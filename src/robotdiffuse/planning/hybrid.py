@@ -141,12 +141,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         if context.problem.constraints:
             return plan_constrained(context, start_goal, settings.search)
         search = AnytimeSearch.of(context, start_goal, settings.search, AORRTC.name)
-        model, fallback = self.model(robot), None
-        if model is not None:
-            batches = _NetworkBatches(self, context, start_goal, search, model)
-            fallback = batches.offer
-        else:
-            batches = _Batches(self, context, start_goal, search)
+        model = self.model(robot)
+        batches = _Batches(self, context, start_goal, search, model)
 
         def improve() -> None:
             if batches.due:
@@ -159,7 +155,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             search,
             lambda: search.improves(settings.search.gain, settings.search.patience),
             improve,
-            fallback,
+            None if model is None else batches.offer,
         )
         if model is not None or result.stage == "straight_line":
             return result
@@ -183,14 +179,29 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         """Trajectories after REFINEMENT_STEPS gradient steps on the guidance costs; float32."""
         return CollisionGuidance(checker, self.settings.guidance)(q, REFINEMENT_STEPS)[0]
 
+    def noise(
+        self, checker: CollisionChecker, start: Configuration, goals: Configurations, rng: np.random.Generator
+    ) -> Trajectories:
+        """Smooth noise about the lines to the nearest goals, refined."""
+        count = self.settings.samples
+        goals = nearest_goals(start, goals, count)
+        return self.refine(checker, smooth_noise(start, goals, count, WAYPOINTS, checker.robot, rng))
+
 
 class _Batches:
-    """Batches of smooth noise in the anytime loop of a call, drawn once it has a path."""
+    """Batches in the anytime loop of a call: of the network, refined where none is free; or, without one, of
+    smooth noise, drawn once the search has a path."""
 
     def __init__(
-        self, planner: RobotDiffuse, context: PlanningContext, start_goal: StartGoal, search: AnytimeSearch
+        self,
+        planner: RobotDiffuse,
+        context: PlanningContext,
+        start_goal: StartGoal,
+        search: AnytimeSearch,
+        model: "MotionModel | None",
     ) -> None:
         self.planner, self.context, self.start_goal, self.search = planner, context, start_goal, search
+        self.model = model
         self._spent = 0
         self._seconds = {"batch": BATCH_SECONDS, "refinement": BATCH_SECONDS}
         """Expected times [s]: that of the last one, or more if those before it took longer."""
@@ -199,21 +210,34 @@ class _Batches:
     def due(self) -> bool:
         """Whether the batches had less than their part of the work, and there is time for another one."""
         batches, share = self._spent + BATCH_WORK, self.planner.settings.network_share
-        return batches <= share * (self.search.work + batches) and self._can()
+        return batches <= share * (self.search.work + batches) and self._time_for("batch")
 
     @property
     def drawn(self) -> bool:
         """Whether there was a batch."""
         return self._spent > 0
 
+    @cached_property
+    def _code(self) -> Float[ndarray, "code"] | None:
+        assert self.model is not None
+        return self.planner.code(self.model, self.start_goal.checker, self.context.rng)
+
     def offer(self) -> None:
         """Draw a batch and offer its shortest free trajectories to the search, if there is time."""
-        if self._can():
-            self._draw()
-
-    def _can(self) -> bool:
-        """Whether there is time for a batch."""
-        return self._time_for("batch")
+        if not self._time_for("batch"):
+            return
+        planner, model, checker = self.planner, self.model, self.start_goal.checker
+        ends, rng = self.start_goal.rows(), self.context.rng
+        with self._timed("batch"):
+            if model is None:
+                q = planner.noise(checker, *ends, rng)
+            else:
+                q = planner.draw(model, checker, self._code, *ends, rng)
+        taken = self._take(q, "smooth_noise" if model is None else "network")
+        if model is not None and not taken and self._time_for("refinement"):
+            with self._timed("refinement"):
+                q = planner.refine(checker, q)
+            self._take(q, "refinement")
 
     def _time_for(self, part: str) -> bool:
         return self.context.remaining > BATCH_TIME_FACTOR * self._seconds[part]
@@ -226,15 +250,6 @@ class _Batches:
         took, self._spent = self.context.elapsed - began, self._spent + BATCH_WORK
         self._seconds[part] = max(took, 0.5 * (self._seconds[part] + took))
 
-    def _draw(self) -> None:
-        planner, checker, count = self.planner, self.start_goal.checker, self.planner.settings.samples
-        start, goals = self.start_goal.rows()
-        goals = nearest_goals(start, goals, count)
-        with self._timed("batch"):
-            q = smooth_noise(start, goals, count, WAYPOINTS, checker.robot, self.context.rng)
-            q = planner.refine(checker, q)
-        self._take(q, "smooth_noise")
-
     def _take(self, q: Trajectories, stage: str) -> bool:
         """Offer the shortest free trajectories to the search; returns whether there were any."""
         space = self.search.space
@@ -244,35 +259,6 @@ class _Batches:
             if self.context.remaining > 0 or self.search.best is None:
                 self.search.offer(path, stage)
         return bool(paths)
-
-
-class _NetworkBatches(_Batches):
-    """Batches of the network, refined where none is free."""
-
-    def __init__(
-        self,
-        planner: RobotDiffuse,
-        context: PlanningContext,
-        start_goal: StartGoal,
-        search: AnytimeSearch,
-        model: "MotionModel",
-    ) -> None:
-        super().__init__(planner, context, start_goal, search)
-        self._model = model
-
-    @cached_property
-    def _code(self) -> Float[ndarray, "code"] | None:
-        return self.planner.code(self._model, self.start_goal.checker, self.context.rng)
-
-    def _draw(self) -> None:
-        planner, checker, context = self.planner, self.start_goal.checker, self.context
-        start, goals = self.start_goal.rows()
-        with self._timed("batch"):
-            sampled = planner.draw(self._model, checker, self._code, start, goals, context.rng)
-        if not self._take(sampled, "network") and self._time_for("refinement"):
-            with self._timed("refinement"):
-                refined = planner.refine(checker, sampled)
-            self._take(refined, "refinement")
 
 
 TIME_LIMIT = 1.0
@@ -304,20 +290,18 @@ def draw_candidates(problem: Problem, seed: int = 0) -> Candidates:
     start_goal = usable_start_goal(context)
     if isinstance(start_goal, PlanResult):
         raise InputError(f"nothing can be drawn: {start_goal.reason}")
-    start, goals = start_goal.rows()
+    checker = start_goal.checker
     if model is None:
-        goals = nearest_goals(start, goals, planner.settings.samples)
-        q = smooth_noise(start, goals, planner.settings.samples, WAYPOINTS, problem.robot, context.rng)
-        q = planner.refine(start_goal.checker, q)
+        q = planner.noise(checker, *start_goal.rows(), context.rng)
     else:
-        code = planner.code(model, start_goal.checker, context.rng)
-        q = planner.draw(model, start_goal.checker, code, start, goals, context.rng)
+        code = planner.code(model, checker, context.rng)
+        q = planner.draw(model, checker, code, *start_goal.rows(), context.rng)
     count, waypoints, dof = q.shape
     at = np.linspace(0, waypoints - 1, PLACES_PER_SEGMENT * (waypoints - 1) + 1)
     low = np.minimum(at.astype(int), waypoints - 2)
     share = (at - low)[:, None]
     dense = (1 - share) * q[:, low] + share * q[:, low + 1]
-    distances = start_goal.checker.link_clearances(dense.reshape(-1, dof)).reshape(count, -1)
+    distances = checker.link_clearances(dense.reshape(-1, dof)).reshape(count, -1)
     source = "smooth_noise" if model is None else "network"
     return Candidates(
         source, np.asarray(q, np.float64), distances.min(axis=1, initial=1.0).astype(np.float64)

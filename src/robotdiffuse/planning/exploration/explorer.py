@@ -14,7 +14,7 @@ Looks are chosen by what a tentative motion, planned among what was seen alone, 
 own motion is subject to the same policy; by chance, too, a strict one comes first.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import islice
 
@@ -26,9 +26,8 @@ from robotdiffuse.core.bounds import vector
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.locked import locked
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import FIRST, Configurations, Path, Status, Trajectory
+from robotdiffuse.core.types import FIRST, Configuration, Configurations, Path, Status, Trajectory
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.observed_volume import ObservedVolume
 from robotdiffuse.perception.occupancy_map import Corners, OccupancyMap, ViewMemory
 from robotdiffuse.perception.seen_points import point_shapes
 from robotdiffuse.perception.unknown_space import UnknownSpace, explored_confidence
@@ -59,7 +58,6 @@ from robotdiffuse.planning.exploration.steps import (
 )
 from robotdiffuse.planning.exploration.stopping import Stop, stop_before
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
-from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.goals import Goal
 from robotdiffuse.problems.problem import PADDED, PREDICTED, JointGoal, Problem
@@ -70,71 +68,6 @@ from robotdiffuse.validation.tolerances import VerifySettings, goal_error
 PROBABILITY_BELOW = np.float32(0.1)
 """That a voxel below the volume that the network predicts is occupied, where the map does not know it: the
 share of unknown voxels within reach that are."""
-
-
-def predicted_occupancy(
-    robot: Robot, known: OccupancyMap, volume: Callable[[], ObservedVolume]
-) -> Probabilities | None:
-    """The probability that each voxel is occupied, 0 where the map knows it to be free; None if the network
-    does not cover the arm's reach. volume: gives what views observed."""
-    from robotdiffuse.learning.completion import covers, predict
-
-    if not covers(robot):
-        return None
-    below = ((0, 0), (0, 0), (LAYERS_BELOW, 0))
-    probability = np.pad(predict(volume()), below, constant_values=PROBABILITY_BELOW)
-    return np.where(known.free, np.float32(0), probability)
-
-
-def planned_by_chance(
-    planner: Planner,
-    known: OccupancyMap,
-    problem: Problem,
-    predicted: Probabilities | None,
-    request: PlanRequest,
-    to_goal: bool = True,
-) -> PlanResult:
-    """A motion among what was seen and predicted, with its confidence; see `with_confidence`.
-
-    predicted: the probability that each voxel of the map is occupied; None without the network.
-    to_goal: whether the problem's goal is the Explorer's, not where a look ends.
-    """
-    asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
-    goals = problem.goal.positions if to_goal and isinstance(problem.goal, JointGoal) else ()
-    unknown = _unknown(known, problem, np.stack([problem.start, *goals]), predicted)
-    above = None if predicted is None else predicted[:, :, LAYERS_BELOW:]
-    result = plan_with_unknown_space(planner, asked, request, above, unknown)
-    return replace(with_confidence(known, problem, result, predicted, to_goal), problem=asked)
-
-
-def with_confidence(
-    known: OccupancyMap,
-    problem: Problem,
-    motion: PlanResult,
-    predicted: Probabilities | None,
-    to_goal: bool = True,
-) -> PlanResult:
-    """The motion with the confidence that follows from the probability that it sweeps; None if the map holds
-    no measurement. The arm is taken to be
-    free where a motion begins, and at the goal, but not where a look ends."""
-    if motion.path is None or predicted is None:
-        return motion
-    ends = motion.path.positions[[0, -1] if to_goal else [0]]
-    swept = _unknown(known, problem, ends, predicted).crossed(motion.path).risk
-    stated = None if swept is None or known.is_blind else explored_confidence(swept)
-    return replace(motion, swept_probability=swept, confidence=stated)
-
-
-def _unknown(
-    known: OccupancyMap,
-    problem: Problem,
-    ends: Configurations,
-    predicted: Probabilities | None,
-) -> UnknownSpace:
-    """What the map does not know, without the voxels that the arm fills at these configurations."""
-    return UnknownSpace(problem.robot, ends, known.unknown, predicted, 0.0, MAP)
-
-
 NOTHING, DEFAULTS = Scene(()), ExplorerSettings()
 QUICK_FRACTION = 0.2
 """Part of the time limit for a search that a look, or another search, may follow. Within space seen free it
@@ -319,7 +252,7 @@ class Explorer:
             return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
         kept, under = None, policy
         if policy == CHANCE and predicted is not None:
-            kept = with_confidence(self.map, problem, tentative, predicted)
+            kept = self._with_confidence(tentative, predicted)
         elif not wanted.any():
             kept, under = self._within_seen_free(problem, tentative.path.positions, "as seen"), STRICT
         if kept is not None and self._may_go(kept, under):
@@ -347,18 +280,15 @@ class Explorer:
         predicted: Probabilities | None,
     ) -> PlanResult | None:
         """A motion by a policy to where a camera sees most of the wanted voxels; None if none was found."""
-        allowed = problem.scene
-        if policy == STRICT:
-            obstacles = not_seen_free(self.map, self.scene, (problem.start,))
-            allowed = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-        tree = ReachableTree(self.robot, allowed, problem.start)
+        allowed = self._seen_free(problem) if policy == STRICT else problem
+        tree = ReachableTree(self.robot, allowed.scene, problem.start)
         for camera in self.cameras:
             ways = best_looks(self.map, tree, camera, wanted, predicted, self._rng, self._goal_seen.taken)
             for waypoints in islice(ways, self.settings.look_attempts):
-                look = replace(problem, goal=JointGoal(waypoints[-1:]))
                 if policy == STRICT:
-                    way = self._along(replace(look, scene=allowed), waypoints, "look")
+                    way = self._along(allowed, waypoints, "look")
                 else:
+                    look = replace(problem, goal=JointGoal(waypoints[-1:]))
                     way = self._by_chance(look, predicted, self.settings.time_limit, to_goal=False)
                 if way is not None and self._good(way, policy):
                     return way
@@ -377,15 +307,21 @@ class Explorer:
 
     def _within_seen_free(self, problem: Problem, waypoints: Configurations, name: str) -> PlanResult | None:
         """The motion along waypoints, if the validator accepts it within space seen free; else None."""
-        obstacles = not_seen_free(self.map, self.scene, (problem.start, waypoints[-1]))
-        scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-        return self._along(replace(problem, scene=scene, goal=JointGoal(waypoints[-1:])), waypoints, name)
+        return self._along(self._seen_free(problem, waypoints[-1]), waypoints, name)
+
+    def _seen_free(self, problem: Problem, *goals: Configuration) -> Problem:
+        """The problem with obstacles that cover all space not seen free, but near the start and the goals."""
+        obstacles = not_seen_free(self.map, self.scene, (problem.start, *goals))
+        return replace(problem, scene=problem.scene.with_shapes([*problem.scene.shapes, *obstacles]))
 
     def _along(self, problem: Problem, waypoints: Configurations, name: str) -> PlanResult | None:
         """The motion along waypoints, if the validator accepts it in the problem's scene; else None."""
-        context = PlanningContext(self._planner.name, problem, PlanRequest(self.settings.time_limit))
-        found = context.finish(waypoints, name, name)
+        problem = replace(problem, goal=JointGoal(waypoints[-1:]))
+        found = self._context(problem, self.settings.time_limit).finish(waypoints, name, name)
         return None if found is None else replace(found, problem=problem)
+
+    def _context(self, problem: Problem, limit: float, seed: int = 0) -> PlanningContext:
+        return PlanningContext(self._planner.name, problem, PlanRequest(limit, seed, FIRST))
 
     def _least_unseen(self, as_seen: Problem) -> tuple[PlanResult, Voxels]:
         """A motion among what was seen, and what looks are to show of it: the least of several. Without any,
@@ -432,25 +368,45 @@ class Explorer:
             return goals
         goal = least_unknown(self.map, goals)
         if may_look and hardly_seen(self.map, problem.start, goal):
-            context = PlanningContext(self._planner.name, problem, PlanRequest(limit))
-            return context.fail(Status.NO_PATH, "too little of the space around the goal was seen free")
-        obstacles = not_seen_free(self.map, self.scene, (problem.start, goal))
-        scene = problem.scene.with_shapes([*problem.scene.shapes, *obstacles])
-        result = self._planned(replace(problem, scene=scene, goal=JointGoal(goal[None])), limit)
+            why = "too little of the space around the goal was seen free"
+            return self._context(problem, limit).fail(Status.NO_PATH, why)
+        result = self._planned(replace(self._seen_free(problem, goal), goal=JointGoal(goal[None])), limit)
         if result.solved:
             return result
         why = "" if result.status is Status.TIMEOUT else f": {result.reason}"
         return replace(result, reason=f"no motion through space seen free alone was found{why}")
 
     def _by_chance(
-        self,
-        problem: Problem,
-        predicted: Probabilities | None,
-        limit: float,
-        to_goal: bool = True,
+        self, problem: Problem, predicted: Probabilities | None, limit: float, to_goal: bool = True
     ) -> PlanResult:
+        """A motion among what was seen and predicted, with its confidence.
+
+        to_goal: whether the problem's goal is the Explorer's, not where a look ends.
+        """
+        asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
+        goals = problem.goal.positions if to_goal and isinstance(problem.goal, JointGoal) else ()
+        unknown = self._unknown((problem.start, *goals), predicted)
+        above = None if predicted is None else predicted[:, :, LAYERS_BELOW:]
         request = PlanRequest(limit, self._seed, FIRST)
-        return planned_by_chance(self._planner, self.map, problem, predicted, request, to_goal)
+        result = plan_with_unknown_space(self._planner, asked, request, above, unknown)
+        return replace(self._with_confidence(result, predicted, to_goal), problem=asked)
+
+    def _with_confidence(
+        self, motion: PlanResult, predicted: Probabilities | None, to_goal: bool = True
+    ) -> PlanResult:
+        """The motion with the confidence that follows from the probability that it sweeps; None if the map
+        holds no measurement. The arm is taken to be free where a motion begins, and at the goal, but not
+        where a look ends."""
+        if motion.path is None or predicted is None:
+            return motion
+        ends = motion.path.positions[[0, -1] if to_goal else [0]]
+        swept = self._unknown(ends, predicted).crossed(motion.path).risk
+        stated = None if swept is None or self.map.is_blind else explored_confidence(swept)
+        return replace(motion, swept_probability=swept, confidence=stated)
+
+    def _unknown(self, ends: Iterable[Configuration], predicted: Probabilities | None) -> UnknownSpace:
+        """What the map does not know, without the voxels that the arm fills at these configurations."""
+        return UnknownSpace(self.robot, ends, self.map.unknown, predicted, 0.0, MAP)
 
     def _planned(self, problem: Problem, limit: float, seed: int | None = None) -> PlanResult:
         """A first motion in the problem's scene as it is, found within a time limit [s]."""
@@ -462,14 +418,19 @@ class Explorer:
         if isinstance(problem.goal, JointGoal):
             return problem.goal.positions
         seed = 0 if self.settings.see_goal else self._seed  # looks are made for the same ones again
-        request = PlanRequest(self.settings.time_limit, seed, FIRST)
-        usable = usable_start_goal(PlanningContext(self._planner.name, problem, request))
+        usable = usable_start_goal(self._context(problem, self.settings.time_limit, seed))
         return usable if isinstance(usable, PlanResult) else np.stack(usable.goals)
 
     @locked
     def predicted(self) -> Probabilities | None:
         """The probability that each voxel is occupied, 0 where the map knows it to be free; None without the
-        network, and before the first view."""
+        network, where it does not cover the arm's reach, and before the first view."""
         if not (len(self._views) and self.settings.predict):
             return None
-        return predicted_occupancy(self.robot, self.map, self._views.volume)
+        from robotdiffuse.learning.completion import covers, predict
+
+        if not covers(self.robot):
+            return None
+        below = ((0, 0), (0, 0), (LAYERS_BELOW, 0))
+        probability = np.pad(predict(self._views.volume()), below, constant_values=PROBABILITY_BELOW)
+        return np.where(self.map.free, np.float32(0), probability)

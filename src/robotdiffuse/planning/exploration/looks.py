@@ -20,7 +20,7 @@ from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.occupancy_map import OccupancyMap
 from robotdiffuse.perception.ray_caster import looking_at
 from robotdiffuse.perception.visibility import seen_weights
-from robotdiffuse.perception.voxel_grid import FINE_VOXEL_SIZE, LOW, MAP, Probabilities, Voxels, refined
+from robotdiffuse.perception.voxel_grid import FINE, MAP, Probabilities, Voxels, refined
 from robotdiffuse.planning.exploration.seen_free import COVER_RADIUS, near_ends
 from robotdiffuse.planning.exploration.steps import ArmCamera
 from robotdiffuse.planning.pipeline.unknown_space import policy_for, unknown_space_of
@@ -264,8 +264,7 @@ def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None
         at,
         weights,
         filled,
-        np.array(LOW, np.float32),
-        np.float32(FINE_VOXEL_SIZE),
+        *FINE.frame,
     )
     best = int(seen.argmax())
     return NextView(candidates[best], float(seen[best] / weights.sum()))

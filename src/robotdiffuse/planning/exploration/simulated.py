@@ -2,8 +2,9 @@
 Explorer that keeps what it saw, knew and did, for pictures, replays and recordings of it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,11 +15,10 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Configuration, Configurations, Pose, Trajectory
 from robotdiffuse.perception.depth_view import DepthNoise, DepthView
-from robotdiffuse.perception.occupancy_map import Corners
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import Probabilities, Voxels
-from robotdiffuse.planning.exploration.explorer import DEFAULTS, NOTHING, Explorer
+from robotdiffuse.planning.exploration.explorer import Explorer
 from robotdiffuse.planning.exploration.steps import LOOK, ArmCamera, ExplorerSettings, Step
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
@@ -83,17 +83,9 @@ class RecordedExplorer(Explorer):
     A view counts as taken where the motion comes nearest to its configuration.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        cameras: Sequence[ArmCamera] = (),
-        scene: Scene = NOTHING,
-        free_zone: Corners | None = None,
-        settings: ExplorerSettings = DEFAULTS,
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, *values: Any, **named: Any) -> None:
         """See `Explorer`."""
-        super().__init__(robot, cameras, scene, free_zone, settings, seed)
+        super().__init__(*values, **named)
         self.views: list[RecordedView] = []
         self.acts: list[RecordedAct] = []
 
@@ -272,7 +264,10 @@ def explore(
                 explorer.observe(taken(problem, camera, at, noise, rng))
         q = path.positions[-1]
         if beside is not None:
-            explorer.observe(_again(problem, beside, q, noise, rng))
+            height, width = beside.depth.shape
+            T, size = beside.T_base_camera, (width, height)
+            view = ray_cast(problem.scene, T, beside.intrinsics, size, problem.robot, q)
+            explorer.observe(measured(view, np.inf, noise, rng))
         yield Event(step, q, "" if found is None else found.message)
         if found is not None:
             return
@@ -288,17 +283,3 @@ def _during(motion: PlanResult) -> Configurations:
     count = int(np.clip(duration / IMAGE_PERIOD, 1, MAX_IMAGES))
     times = duration * np.arange(1, count) / count
     return np.concatenate([motion.trajectory.at(times).positions, end]) if count > 1 else end
-
-
-def _again(
-    problem: Problem,
-    beside: DepthView,
-    q: Configuration,
-    noise: DepthNoise | None,
-    rng: np.random.Generator,
-) -> DepthView:
-    """Another image of a camera that stands."""
-    height, width = beside.depth.shape
-    T, size = beside.T_base_camera, (width, height)
-    view = ray_cast(problem.scene, T, beside.intrinsics, size, problem.robot, q)
-    return measured(view, np.inf, noise, rng)

@@ -184,7 +184,7 @@ def unknown_space_of(
 ) -> UnknownSpace:
     """The space that no view of the problem saw, with its start and given goal configurations free."""
     goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
-    return UnknownSpace(problem.robot, np.stack([problem.start, *goals]), refined(volume.unknown), predicted)
+    return UnknownSpace(problem.robot, (problem.start, *goals), refined(volume.unknown), predicted)
 
 
 def predicted_obstacles(problem: Problem) -> AssumedPoints:
