@@ -16,7 +16,6 @@ network runs without guidance.
 """
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -32,7 +31,7 @@ from robotdiffuse.learning.motion_model import SamplingSettings
 from robotdiffuse.learning.weight_files import weights_for
 from robotdiffuse.planning import PATH_CONSTRAINTS
 from robotdiffuse.planning.context import TOLERANCE_FRACTION, PlanningContext
-from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
+from robotdiffuse.planning.learned import ExportedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.robots.robot import Robot
@@ -64,7 +63,7 @@ class DiffusionSettings(GuidedSamplingSettings, name="diffusion"):
 SamplerSettings = TypeVar("SamplerSettings", bound=GuidedSamplingSettings)
 
 
-class ModelSampler(LearnedPlanner[SamplerSettings]):
+class ModelSampler(ExportedPlanner[SamplerSettings]):
     """Base of the planners that use the diffusion model: loads it, and draws batches by the settings."""
 
     network_name = "model"
@@ -74,17 +73,8 @@ class ModelSampler(LearnedPlanner[SamplerSettings]):
 
         Raises InputError if the settings name weights of another robot, or ones that cannot be read.
         """
-        weights = self.settings.weights or weights_for(self.network_name, robot)
-        return None if weights is None else self._exported(weights, robot)
-
-    def network(self, robot: Robot) -> "MotionModel":
-        """See `LearnedPlanner`."""
-        return self._exported(self.settings.weights, robot)
-
-    def _exported(self, weights: str | FilePath | None, robot: Robot) -> "MotionModel":
-        from robotdiffuse.learning.exported_model import exported_model  # imports ONNX Runtime
-
-        return exported_model(self.network_name, weights, robot)
+        known = self.settings.weights or weights_for(self.network_name, robot)
+        return self.network(robot) if known else None
 
     def guidance_scale(self, model: "MotionModel") -> float:
         """Scale of classifier-free guidance for a model."""

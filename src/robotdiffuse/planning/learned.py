@@ -4,13 +4,17 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
 
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.weight_files import check_weights
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 
 SAMPLES_PER_GOAL = 4
 """Smallest number of samples for each goal of a batch."""
@@ -53,7 +57,28 @@ class LearnedPlanner(Planner[LearnedPlannerSettings]):
         self.network(robot)
 
 
+class ExportedPlanner(LearnedPlanner[LearnedPlannerSettings]):
+    """A planner with a diffusion model, which needs no PyTorch."""
+
+    def network(self, robot: Robot) -> Any:
+        """See `LearnedPlanner`; a `MotionModel`."""
+        from robotdiffuse.learning.exported_model import exported_model  # imports ONNX Runtime
+
+        return exported_model(self.network_name, self.settings.weights, robot)
+
+
 def nearest_goals(start: Configuration, goals: Configurations, samples: int) -> Configurations:
     """The goals that a batch of `samples` samples is divided among: the nearest ones, nearest first."""
     order = np.argsort(np.linalg.norm(goals - start, axis=1))
     return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]
+
+
+def scene_clouds(
+    checker: CollisionChecker, region: VisibleRegion, points: int, count: int, rng: np.random.Generator
+) -> Float32[ndarray, "count points 3"]:
+    """Random clouds of the scene's obstacles [m]; zeros if nothing is in the region."""
+    clouds = np.zeros((count, points, 3), np.float32)
+    for cloud in clouds:
+        found = sample_surface(checker.scene, points, rng, region)
+        cloud[: len(found)] = found
+    return clouds

@@ -21,8 +21,9 @@ from robotdiffuse.learning.mpnet import (
 )
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_cloud
+from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
+from robotdiffuse.planning.learned import scene_clouds
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -148,7 +149,7 @@ def test_the_order_of_the_points_does_not_matter_and_no_points_are_zeros() -> No
     steps = (near[:, 1:] - near[:, :-1]).norm(dim=-1).mean()
     assert steps < 0.7 * (cloud[:, 1:] - cloud[:, :-1]).norm(dim=-1).mean(), "neighbours are near each other"
     assert not sorted_along_curve(torch.zeros(1, 40, 3), net.region).any()
-    empty = scene_cloud(net, CollisionChecker(PANDA, Scene([])), rng)
+    empty = scene_clouds(CollisionChecker(PANDA, Scene([])), net.region, net.settings.points, 1, rng)[0]
     torch.testing.assert_close(net.code_of(empty), net.encode(torch.zeros(1, 40, 3))[0])
 
 

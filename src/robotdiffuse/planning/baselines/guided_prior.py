@@ -73,14 +73,14 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise, product
 from math import ceil
-from typing import Annotated, NamedTuple, TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.motions import Space, motions_free, path_length
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
@@ -90,25 +90,14 @@ from robotdiffuse.learning.diffusion import NoiseSchedule, reverse_process
 from robotdiffuse.learning.guidance import Trajectories
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
+from robotdiffuse.planning.learned import ExportedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.robots.robot import Robot
 
 SAMPLE_RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of a sample [m]."""
 Guide = Callable[[ndarray, int], ndarray]
 """Maps the mean of a denoising step [count, waypoints, dof] [rad], and the number of steps to come (0 at the
 last one and in the steps without noise after it), to the mean after gradient steps on the guide's costs."""
-
-
-class Attempt(NamedTuple):
-    """A sample that collides."""
-
-    segments: int
-    """Number of segments in collision."""
-    length: float
-    """[rad]"""
-    path: Configurations
 
 
 @dataclass(frozen=True)
@@ -126,7 +115,7 @@ class PriorSettings(LearnedSettings):
 GuidedPriorSettings = TypeVar("GuidedPriorSettings", bound=PriorSettings)
 
 
-class GuidedPrior(LearnedPlanner[GuidedPriorSettings]):
+class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
     """A planner that samples batches from the prior under guidance.
 
     The free samples of a batch are validated, the shortest first. If none passes, the next batch is drawn
@@ -134,12 +123,6 @@ class GuidedPrior(LearnedPlanner[GuidedPriorSettings]):
     """
 
     network_name = "trajectory_prior"
-
-    def network(self, robot: Robot) -> MotionModel:
-        """See `LearnedPlanner`."""
-        from robotdiffuse.learning.exported_model import exported_model  # imports ONNX Runtime
-
-        return exported_model(self.network_name, self.settings.weights, robot)
 
     @abstractmethod
     def draw(
@@ -158,7 +141,8 @@ class GuidedPrior(LearnedPlanner[GuidedPriorSettings]):
         prior, samples = self.network(context.problem.robot), self.settings.samples
         start, goals = shared_out(*start_goal.rows(), samples)
         space = search_space(start_goal.checker, SAMPLE_RESOLUTION)
-        closest: Attempt | None = None
+        closest: tuple[int, float, ndarray] | None = None
+        """Of the samples that collide: segments in collision, length [rad] and waypoints."""
         batches = 0
         while context.remaining > 0:
             drawn = self.draw(
@@ -167,18 +151,21 @@ class GuidedPrior(LearnedPlanner[GuidedPriorSettings]):
             if drawn is None:
                 break
             batches += 1
-            attempts = [_attempt(space, path) for path in np.ascontiguousarray(drawn, np.float32)]
+            attempts = [
+                (int((~motions_free(space, path)).sum()), float(path_length(path)), path)
+                for path in np.ascontiguousarray(drawn, np.float32)
+            ]
             for attempt in sorted(attempts, key=lambda attempt: attempt[:2]):
-                if attempt.segments:
+                if attempt[0]:
                     if closest is None or attempt[:2] < closest[:2]:
                         closest = attempt
                     break
-                result = context.finish(start_goal.complete(attempt.path), self.name)
+                result = context.finish(start_goal.complete(attempt[2]), self.name)
                 if result is not None:
                     return result
         if closest is not None:
             # so that the result says what is wrong with it; by the exact meshes it may even be free
-            result = context.finish(start_goal.complete(closest.path), self.name)
+            result = context.finish(start_goal.complete(closest[2]), self.name)
             if result is not None:
                 return result
         return context.unsolved(
@@ -240,10 +227,6 @@ def falling(rising: Int[ndarray, "steps"], most: int) -> Int[ndarray, "steps"]:
     at = np.arange(len(rising))
     apart = np.maximum.accumulate(rising - at) + at
     return np.minimum(apart, most - at[::-1])[::-1].copy()
-
-
-def _attempt(space: Space, path: Configurations) -> Attempt:
-    return Attempt(int((~motions_free(space, path)).sum()), float(path_length(path)), path)
 
 
 def shared_out(
@@ -354,7 +337,6 @@ class MPD(GuidedPrior[MPDSettings]):
     def guided(self, checker: CollisionChecker, q: Trajectories) -> Trajectories:
         """Trajectories after the gradient steps of one denoising step; their ends stay fixed."""
         settings, robot = self.settings, checker.robot
-        gaussian = gaussian_process(q.shape[1])
         for _ in range(GUIDE_STEPS):
             _, gradient = collision_gradient(
                 checker, q, settings.margin, settings.self_margin, settings.between
@@ -363,7 +345,7 @@ class MPD(GuidedPrior[MPDSettings]):
             inside = np.clip(q, robot.lower + near, robot.upper - near)
             moves = limited(-COLLISION_WEIGHT * gradient, settings.push) + (inside - q)
             moves[:, [0, -1]] = 0.0
-            q = gaussian.step((q + moves).astype(np.float32), PRIOR_WEIGHT)
+            q = implicit_step((q + moves).astype(np.float32), PRIOR_WEIGHT)
         return q
 
 
@@ -381,46 +363,16 @@ def exponential_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "ste
     return falling(np.append(nearest, schedule.steps), schedule.steps)
 
 
-@dataclass(frozen=True, eq=False)
-class GaussianProcess:
-    """The prior of constant velocity over trajectories (M. Mukadam et al., IJRR 2018, section 3).
+def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
+    """The precision of the states of one joint, (position, velocity) of each waypoint in turn, under the
+    prior of constant velocity over trajectories (M. Mukadam et al., IJRR 2018, section 3).
 
-    Its states (position, velocity) follow white noise on acceleration: between waypoints one unit of time
-    apart,
+    The states follow white noise on acceleration: between waypoints one unit of time apart,
 
         state' = F state + noise,  F = [[1, 1], [0, 1]],  covariance Q = [[1/3, 1/2], [1/2, 1]],
 
-    for every joint alike, so the precision of all states is block tri-diagonal. Samples of the prior have no
-    velocities; integrated out, they leave the precision of the positions, which is that Schur complement.
-    The cost q P q / 2 is the least integral of squared accelerations through the waypoints over 2, so that of
-    natural cubic splines; straight lines cost nothing.
+    for every joint alike, so the precision is block tri-diagonal.
     """
-
-    precision: Float[ndarray, "waypoints waypoints"]
-    """P, of the positions of one joint."""
-
-    def costs(self, q: Trajectories) -> Float[ndarray, "count"]:
-        """The sum over the joints of q P q / 2 [rad²]."""
-        return 0.5 * (q * self.gradient(q)).sum((1, 2))
-
-    def gradient(self, q: Trajectories) -> Trajectories:
-        """P q."""
-        return self.precision.astype(q.dtype) @ q
-
-    def step(self, q: Trajectories, weight: float) -> Trajectories:
-        """One implicit gradient step down weight q P q / 2 on all waypoints but the ends.
-
-        It solves x = q - weight P x, the minimum of |x - q|² / 2 + weight x P x / 2 with fixed ends.
-        """
-        inner, ends = _implicit(q.shape[1], weight)
-        moved = q.copy()
-        moved[:, 1:-1] = inner.astype(q.dtype) @ q[:, 1:-1] + ends.astype(q.dtype) @ q[:, [0, -1]]
-        return moved
-
-
-def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
-    """The precision of the states of one joint, (position, velocity) of each waypoint in turn: block
-    tri-diagonal."""
     transition = np.array([[1.0, 1.0], [0.0, 1.0]])
     inverse = np.linalg.inv(np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]))
     precision = np.zeros((2 * waypoints, 2 * waypoints))
@@ -430,23 +382,33 @@ def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
     return precision
 
 
-@cache
-def gaussian_process(waypoints: int) -> GaussianProcess:
-    """The prior over this number of waypoints."""
+def position_precision(waypoints: int) -> Float[ndarray, "waypoints waypoints"]:
+    """P, the precision of the positions of one joint, with the velocities integrated out: a Schur complement.
+
+    The cost q P q / 2 is the least integral of squared accelerations through the waypoints over 2, so that of
+    natural cubic splines; straight lines cost nothing.
+    """
     every = state_precision(waypoints)
     position, velocity = slice(0, None, 2), slice(1, None, 2)
     mixed = every[position, velocity]
-    return GaussianProcess(
-        every[position, position] - mixed @ np.linalg.solve(every[velocity, velocity], mixed.T)
-    )
+    return every[position, position] - mixed @ np.linalg.solve(every[velocity, velocity], mixed.T)
+
+
+def implicit_step(q: Trajectories, weight: float) -> Trajectories:
+    """One implicit gradient step down weight q P q / 2 on all waypoints but the ends.
+
+    It solves x = q - weight P x, the minimum of |x - q|² / 2 + weight x P x / 2 with fixed ends.
+    """
+    inner, ends = _implicit(q.shape[1], weight)
+    moved = q.copy()
+    moved[:, 1:-1] = inner.astype(q.dtype) @ q[:, 1:-1] + ends.astype(q.dtype) @ q[:, [0, -1]]
+    return moved
 
 
 @cache
-def _implicit(
-    waypoints: int, weight: float
-) -> tuple[Float[ndarray, "inner inner"], Float[ndarray, "inner 2"]]:
-    """The matrices that `GaussianProcess.step` multiplies the inner waypoints and the ends with."""
-    precision = gaussian_process(waypoints).precision
+def _implicit(waypoints: int, weight: float) -> tuple[ndarray, ndarray]:
+    """The matrices that `implicit_step` multiplies the inner waypoints and the ends with."""
+    precision = position_precision(waypoints)
     inverse = np.linalg.inv(np.eye(waypoints - 2) + weight * precision[1:-1, 1:-1])
     return inverse, -weight * inverse @ precision[1:-1][:, [0, -1]]
 

@@ -23,16 +23,14 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative, Positive
 from robotdiffuse.core.types import Configurations
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
+from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, scene_clouds
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.scenes.surface_points import sample_surface
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.mpinets import MPiNetsNetwork
@@ -104,7 +102,8 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         start, goals = start_goal.rows()
         order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")
         goal = goals[order[np.arange(tried, tried + count) % len(order)]]
-        clouds = scene_clouds(network, start_goal.checker, count, rng)
+        cloud = network.settings.region, network.settings.scene_points
+        clouds = scene_clouds(start_goal.checker, *cloud, count, rng)
         roll_outs = network.roll_outs(clouds, np.repeat(start[None], count, 0), goal)
         motions = [_Motion(start, end) for end in goal]
         for step in range(settings.steps + 1):
@@ -155,16 +154,3 @@ class _Motion:
         return np.concatenate(
             [start_goal.start[None], np.stack(self.waypoints[1:] or self.waypoints).astype(np.float64)]
         )
-
-
-def scene_clouds(
-    network: "MPiNetsNetwork", checker: CollisionChecker, count: int, rng: np.random.Generator
-) -> Float32[ndarray, "count points 3"]:
-    """Random clouds of the scene in the size of the network's inputs [m]; zeros if nothing is in reach."""
-    points, region = network.settings.scene_points, network.settings.region
-    clouds = np.zeros((count, points, 3), np.float32)
-    for cloud in clouds:
-        found = sample_surface(checker.scene, points, rng, region)
-        if len(found):
-            cloud[:] = found
-    return clouds

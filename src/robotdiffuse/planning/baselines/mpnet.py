@@ -21,24 +21,22 @@ divided evenly among the attempts.
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
-from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
-from robotdiffuse.core.types import Configuration, Configurations, Points
+from robotdiffuse.core.types import Configuration, Configurations
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
+from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, scene_clouds
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.start_goal import StartGoal
-from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.trajectories.simplification import shortcut
 
 if TYPE_CHECKING:
@@ -76,12 +74,8 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        network, settings, best, rounds = (
-            self.network(context.problem.robot),
-            self.settings,
-            Attempt.none(),
-            0,
-        )
+        network, settings = self.network(context.problem.robot), self.settings
+        best, rounds = Attempt(np.inf, np.inf, np.zeros((0, 0))), 0
         while rounds == 0 or context.remaining > 0:
             one = NeuralPlanning(context, start_goal, network, settings, context.rng)
             found = one.best()
@@ -103,16 +97,13 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
         )
 
 
-@dataclass(frozen=True)
-class Attempt:
-    path: Configurations
-    """[rad]"""
+class Attempt(NamedTuple):
     broken: float
     """Segments in collision; infinite if there is no path."""
-
-    @classmethod
-    def none(cls) -> "Attempt":
-        return cls(np.zeros((0, 0), np.float32), np.inf)
+    length: float
+    """[rad]"""
+    path: Configurations
+    """[rad]"""
 
 
 class NeuralPlanning:
@@ -135,7 +126,8 @@ class NeuralPlanning:
         start, goals = start_goal.rows()
         self.starts = np.tile(start, (settings.attempts, 1))
         self.goals = goals[(np.arange(settings.attempts) + rng.integers(len(goals))) % len(goals)]
-        self.z = network.code_of(scene_cloud(network, start_goal.checker, rng))
+        [cloud] = scene_clouds(start_goal.checker, network.region, network.settings.points, 1, rng)
+        self.z = network.code_of(cloud)
         self.replanned = 0
         """How often colliding parts were replanned."""
         self.searched = False
@@ -155,8 +147,11 @@ class NeuralPlanning:
             least = int(np.argmin([(~f).sum() for f in free]))
             paths = [self.contracted(self.search(paths[least]))]
             free = [self.segments_free(paths[0])]
-        attempts = [Attempt(path, float((~f).sum())) for path, f in zip(paths, free, strict=True)]
-        return min(attempts, key=lambda a: (a.broken, float(path_length(a.path))))
+        attempts = [
+            Attempt(float((~f).sum()), float(path_length(path)), path)
+            for path, f in zip(paths, free, strict=True)
+        ]
+        return min(attempts, key=lambda attempt: attempt[:2])
 
     def reason(self, rounds: int) -> str:
         how = " and RRT-Connect" if self.searched else ""
@@ -247,11 +242,3 @@ class NeuralPlanning:
 
 def _joined(forth: list[ndarray], back: list[ndarray]) -> Configurations:
     return np.stack([*forth, *back[::-1]])
-
-
-def scene_cloud(network: "MPNetNetwork", checker: CollisionChecker, rng: np.random.Generator) -> Points:
-    """A random cloud of the scene's obstacles [m]; zeros without obstacles."""
-    cloud = np.zeros((network.settings.points, 3), np.float32)
-    points = sample_surface(checker.scene, network.settings.points, rng, network.region)
-    cloud[: len(points)] = points
-    return cloud
