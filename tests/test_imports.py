@@ -14,7 +14,17 @@ SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 MODULES = sorted(SOURCE.rglob("*.py"))
 
 ORDER = (
-    *("core", "robots", "scenes", "collision", "perception", "drawables", "problems", "trajectories"),
+    *(
+        "core",
+        "processes",
+        "robots",
+        "scenes",
+        "collision",
+        "perception",
+        "drawables",
+        "problems",
+        "trajectories",
+    ),
     "validation",
     *("certificates", "interop", "datasets", "learning", "planning", "generation", "simulation"),
     *("evaluation", "visualization", "server", "cli"),
@@ -39,7 +49,7 @@ EXTRAS = {
     "pybullet_data": {"simulation"},
     "ompl": {"planning"},
     "OpenEXR": {"perception"},
-    "ray": {"core"},
+    "ray": {"processes"},
     "zarr": {"datasets"},
     "torch": {"datasets", "learning"},
     "onnx": {"learning"},

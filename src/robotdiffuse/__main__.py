@@ -13,7 +13,7 @@ def main() -> int:
     """Run `cli.main`; Ctrl-C during its import also ends the program with one line."""
     gc.set_threshold(GC_THRESHOLD)
     try:
-        from robotdiffuse.core.processes import exit_on_interrupt
+        from robotdiffuse.core.interrupts import exit_on_interrupt
 
         with exit_on_interrupt():
             from robotdiffuse import cli
@@ -25,10 +25,9 @@ def main() -> int:
 
 def run() -> NoReturn:
     """Run `main` and exit the process with its status."""
-    status = main()
-    from robotdiffuse.core.processes import exit_process
+    from robotdiffuse.core.interrupts import exit_fast
 
-    exit_process(status)
+    exit_fast(main)
 
 
 if __name__ == "__main__":

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.processes import SingleWorker, on_this_machine
 from robotdiffuse.core.registry import AddedEntries, Entry, Registry, added_entries, adopt_entries
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.rop import Rop
+from robotdiffuse.processes.workers import Worker, on_this_machine
 
 FAMILY = """from robotdiffuse.problems.families.rop import Rop
 ONE = Rop(obstacles=(1, 1))
@@ -34,7 +34,7 @@ def test_added_entries_are_those_that_the_package_lacks(one: Rop, monkeypatch: p
 
 def test_worker_processes_have_added_entries(one: Rop) -> None:
     assert list(on_this_machine(load_family, [("one",)], 1)) == [(0, one)]
-    worker = SingleWorker(adopt_entries, (AddedEntries({}, ()),))
+    worker = Worker(adopt_entries, (AddedEntries({}, ()),))
     assert worker.call(load_family, "one") == one
     worker.close()
 

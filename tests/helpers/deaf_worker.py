@@ -4,11 +4,7 @@ import ctypes
 import os
 import sys
 
-from robotdiffuse.core.processes import SingleWorker
-
-
-def nothing() -> None:
-    pass
+from robotdiffuse.processes.workers import Workers
 
 
 def hold(seconds: int) -> None:
@@ -16,8 +12,8 @@ def hold(seconds: int) -> None:
 
 
 if __name__ == "__main__":
-    worker = SingleWorker(nothing, ())
-    print(worker.call(os.getpid), flush=True)
-    worker.submit(hold, int(sys.argv[1]))
+    workers = Workers(1)
+    print(workers.submit(os.getpid).result(), flush=True)
+    workers.submit(hold, int(sys.argv[1]))
     print("begun", flush=True)
     sys.stdin.read()

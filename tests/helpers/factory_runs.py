@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.core.processes import Results
+from robotdiffuse.processes.workers import Results
 
 HEARS_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
 """Where a shell starts the tests in the background, they and their children would ignore it."""

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from helpers.box_arm import box_arm
 from helpers.toy_task import ToyTask
-from robotdiffuse.core.processes import exit_process
+from robotdiffuse.core.interrupts import exit_fast
 from robotdiffuse.learning.checkpoint import write_tensors
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
@@ -81,5 +81,9 @@ if __name__ == "__main__":
     arm = box_arm()
     training.load_robot = lambda name: arm
     given = PlannerTraining.from_json(json.loads(Path(values).read_text()), "settings")
-    {"slow": slow, "two": two}[kind](given, Path(folder))
-    exit_process(0)
+
+    def run() -> int:
+        {"slow": slow, "two": two}[kind](given, Path(folder))
+        return 0
+
+    exit_fast(run)

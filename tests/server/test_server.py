@@ -271,10 +271,8 @@ def test_a_request_beyond_its_time_limit_is_stopped(server: httpx.Client) -> Non
         until(lambda: gauge(server, "workers_busy") == 1 or late.done())
         assert server.get("/health", timeout=PROMPT).status_code == 200
     assert late.result().status_code == 503
-    assert re.fullmatch(
-        r"the request was stopped after \d+\.\d s, 5 s beyond its time limit, and its worker replaced",
-        error(late.result()),
-    )
+    stopped = "the request was stopped 5 s beyond its time limit, and its worker replaced"
+    assert error(late.result()) == stopped
     assert server.post("/plan", json=asked(3)).json()["status"] == "solved"
     assert gauge(server, "workers_lost_total") == lost + 1
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from robotdiffuse.cli.arguments import add_import_option, command, count, option, options, positive
 from robotdiffuse.cli.console import progress
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.processes.ray_cluster import CLUSTERS
 
 if TYPE_CHECKING:
     from robotdiffuse.evaluation import report

@@ -232,7 +232,7 @@ def load_and_plan(
     picture: whether a picture follows. `request` holds arguments of `rd.plan`.
     """
     from robotdiffuse.cli.compile_ahead import compiling_ahead
-    from robotdiffuse.core.processes import exit_on_interrupt
+    from robotdiffuse.core.interrupts import exit_on_interrupt
     from robotdiffuse.planning import load_planner
 
     spinner = Spinner(f"planning with {planner}")

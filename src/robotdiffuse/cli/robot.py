@@ -126,7 +126,7 @@ def run_add(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from robotdiffuse.core.processes import exit_on_interrupt
+    from robotdiffuse.core.interrupts import exit_on_interrupt
 
     console = Console(stderr=True)
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)

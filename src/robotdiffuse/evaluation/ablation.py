@@ -16,7 +16,6 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
-from robotdiffuse.core.processes import Workers
 from robotdiffuse.core.settings import Count, OneOf, Settings
 from robotdiffuse.core.tables import Column, Table
 from robotdiffuse.datasets.shards import read_manifest
@@ -42,6 +41,7 @@ from robotdiffuse.planning.hybrid import RobotDiffuse
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.held_out import Case
+from robotdiffuse.processes.workers import Workers
 from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"

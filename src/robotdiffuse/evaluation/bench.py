@@ -14,7 +14,6 @@ from typing import Annotated, Any
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import JsonLines, lock_folder
-from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.core.settings import Count, Filled, OneOf, Positive, Settings
 from robotdiffuse.evaluation.planner_processes import PlannerSpec, on_cluster, on_this_machine
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
@@ -31,6 +30,7 @@ from robotdiffuse.evaluation.runs import (
 )
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.held_out import Case
+from robotdiffuse.processes.ray_cluster import CLUSTERS
 
 PACKAGES = ("numpy", "numba", "onnxruntime", "ompl")
 """Packages whose versions are kept with the results."""

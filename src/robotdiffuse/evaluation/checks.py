@@ -17,7 +17,6 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError, distinct
-from robotdiffuse.core.processes import Workers, in_order
 from robotdiffuse.core.tables import Column, Table
 from robotdiffuse.core.types import Path
 from robotdiffuse.datasets.rows import path_of, problem_of, scenes_of
@@ -32,6 +31,7 @@ from robotdiffuse.datasets.shards import (
 )
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.runs import Record, read_records
+from robotdiffuse.processes.workers import Workers, in_order
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

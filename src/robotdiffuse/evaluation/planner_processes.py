@@ -6,11 +6,9 @@ Warming up (compiled code, imports) is not timed.
 
 import os
 import resource
-import signal
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
@@ -18,8 +16,6 @@ from typing import Any
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import is_file
-from robotdiffuse.core.processes import NotStartedError, SingleWorker
-from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.evaluation.methods import measure_of, planner_calls
 from robotdiffuse.evaluation.runs import (
@@ -37,6 +33,8 @@ from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record, problem_record
+from robotdiffuse.processes.ray_cluster import CLUSTERS
+from robotdiffuse.processes.workers import EndedError, NotStartedError, OverrunError, Worker
 from robotdiffuse.robots.robot import Robot
 
 CALL_ARGUMENTS = [field.name for field in fields(PlanRequest) if field.name not in ("time_limit", "seed")]
@@ -131,16 +129,16 @@ class PlannerProcess:
     def __init__(self, spec: PlannerSpec, log: FilePath) -> None:
         """`log`: the process's output is appended to this file."""
         self._log = log
-        self._worker = SingleWorker(_prepare, (spec, str(log)))
+        self._worker = Worker(_prepare, (spec, str(log)))
 
     def warm(self, run: Run) -> None:
         """Warm up for a run's robot. If the process dies of that, `plan` will report it. Raises InputError if
         the program cannot start processes."""
         try:
-            self._worker.call(os.getpid)
+            self._worker.start()
         except NotStartedError as error:
             raise InputError(str(error)) from None
-        except BrokenProcessPool:
+        except EndedError:
             return
         self._ask(START_TIMEOUT, _warm_up, problem_record(run.problem))
 
@@ -162,19 +160,18 @@ class PlannerProcess:
 
     def close(self) -> None:
         """Kill the process, even if another thread waits for it."""
-        self._worker.close(signal.SIGKILL)
+        self._worker.close(0.0)
 
     def _ask(self, timeout: float, call: Callable[..., Fields | None], *arguments: Any) -> Fields | None:
         """The answer of a call in the process, or the record of a process that gave none."""
         try:
-            return self._worker.submit(call, *arguments).result(timeout)
-        except TimeoutError:
-            self._worker.terminate(signal.SIGKILL)
+            return self._worker.call(call, *arguments, timeout=timeout)
+        except OverrunError:
             reason = f"no answer {timeout:g} s after the call; the process was killed"
             return {"status": OVERRAN, "reason": reason, "time": timeout}
-        except BrokenProcessPool:
+        except EndedError as error:
             lines = self._log.read_text(errors="replace").strip().splitlines() if self._log.exists() else []
-            reason = ": ".join([f"the planner's process ended {self._worker.ending}", *lines[-1:]])
+            reason = ": ".join([f"the planner's process ended {error}", *lines[-1:]])
             return {"status": CRASHED, "reason": reason[:300], "time": 0.0}
 
 

@@ -22,9 +22,8 @@ from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.interrupts import delay_interrupts
 from robotdiffuse.core.output_files import lock_folder
-from robotdiffuse.core.processes import delay_interrupts, on_this_machine
-from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
 from robotdiffuse.core.types import Path
@@ -43,6 +42,8 @@ from robotdiffuse.planning.search.shared_tree import SharedTreeSearch, SharedTre
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import POSE, POSITION, Family, SampledProblem
 from robotdiffuse.problems.families.scaled import family_for
+from robotdiffuse.processes.ray_cluster import CLUSTERS
+from robotdiffuse.processes.workers import on_this_machine
 from robotdiffuse.robots import load_robot, names_a_file
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot

@@ -1,18 +1,14 @@
 """Planning for many problems at once, over processes of this machine or a Ray cluster."""
 
 import os
-import queue
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import as_completed
 from contextlib import closing
 from dataclasses import fields, replace
 from numbers import Integral
 from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.processes import NotStartedError, Results, SingleWorker, check_not_importing, in_order
-from robotdiffuse.core.ray_cluster import CLUSTERS
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Status
@@ -20,6 +16,15 @@ from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import Problem, check_problem
+from robotdiffuse.processes.ray_cluster import CLUSTERS
+from robotdiffuse.processes.workers import (
+    EndedError,
+    NotStartedError,
+    Results,
+    Workers,
+    check_not_importing,
+    in_order,
+)
 from robotdiffuse.robots.robot import Robot
 
 PlannerArguments = tuple[str, Settings | Mapping[str, object] | None, str | None]
@@ -96,43 +101,25 @@ def _planned(
     robots = list(dict.fromkeys(problem.robot for problem in problems))
     number = {robot: i for i, robot in enumerate(robots)}
     bare = [replace(robot) for robot in robots]
-    pool = [SingleWorker(_prepare, (loaded, bare, request)) for _ in range(workers)]
-    idle: queue.SimpleQueue[SingleWorker] = queue.SimpleQueue()
-    for worker in pool:
-        idle.put(worker)
-
-    not_started: list[NotStartedError] = []
-
-    def one(problem: Problem) -> PlanResult:
-        if not_started:  # nor would the next process
-            return _error(loaded[0], problem, str(not_started[0]), request)
-        values = {
-            field.name: getattr(problem, field.name) for field in fields(problem) if field.name != "robot"
-        }
-        worker = idle.get()
-        try:
-            return replace(worker.call(_plan, number[problem.robot], values), problem=problem)
-        except NotStartedError as error:
-            not_started.append(error)
-            return _error(loaded[0], problem, str(error), request)
-        except BrokenProcessPool:
-            return _error(
-                loaded[0], problem, "the process of the planner died while planning this problem", request
-            )
-        except Exception as error:
-            return _error(loaded[0], problem, f"{type(error).__name__}: {error}", request)
-        finally:
-            idle.put(worker)
-
-    threads = ThreadPoolExecutor(max(workers, 1))
-    try:
-        number_of = {threads.submit(one, problem): i for i, problem in enumerate(problems)}
-        for future in as_completed(number_of):
-            yield number_of[future], future.result()
-    finally:
-        for worker in pool:
-            worker.close()
-        threads.shutdown(cancel_futures=True)
+    with Workers(workers, _prepare, (loaded, bare, request)) as pool:
+        calls = {}
+        for i, problem in enumerate(problems):
+            values = {
+                field.name: getattr(problem, field.name) for field in fields(problem) if field.name != "robot"
+            }
+            calls[pool.submit(_plan, number[problem.robot], values)] = i
+        for call in as_completed(calls):
+            problem = problems[calls[call]]
+            error = call.exception()
+            if error is None:
+                yield calls[call], replace(call.result(), problem=problem)
+                continue
+            reason = f"{type(error).__name__}: {error}"
+            if isinstance(error, EndedError):
+                reason = "the process of the planner died while planning this problem"
+            if isinstance(error, NotStartedError):
+                reason = str(error)
+            yield calls[call], _error(loaded[0], problem, reason, request)
 
 
 def _planned_on_cluster(

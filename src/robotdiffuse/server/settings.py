@@ -12,8 +12,6 @@ COMPILE_TIMEOUT, WARM_UP_TIMEOUT = 300.0, 60.0
 GRACE_TIME = 5.0
 """Time that a call may take beyond its time limit, for reading the request, validation and timing, until its
 worker is killed [s]."""
-CANCEL_TIMEOUT = 1.0
-"""Time for a worker to leave a cancelled call, until the worker is killed [s]."""
 READ_TIMEOUT = 10.0
 """Time for a client to send a request, from its first byte [s]."""
 WRITE_TIMEOUT = 60.0

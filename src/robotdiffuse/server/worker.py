@@ -7,9 +7,6 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
-from ctypes import Structure, c_double, c_int64
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -28,6 +25,7 @@ from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.processes.workers import allow, cancelled, renew
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
@@ -46,6 +44,7 @@ from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import Verifier
 
 PLAN, VERIFY = "plan", "verify"
+TOO_LARGE = 413
 
 
 class Answer(NamedTuple):
@@ -56,18 +55,10 @@ class Answer(NamedTuple):
     body: bytes
     status: str
     """Status of the result; for verify, valid or invalid; "" for an error."""
-    memory: int = 0
-    """Memory of the worker process [bytes]."""
-
-
-class Shared(Structure):
-    """Memory that a worker shares with the server."""
-
-    _fields_ = [("cancelled", c_int64), ("due", c_double)]
-    cancelled: int
-    """Number of the call to cancel."""
-    due: float
-    """Monotonic time at which the worker is killed if its call is still running [s]."""
+    seconds: float = 0.0
+    """Time that the worker took [s]."""
+    renewed: bool = False
+    """Whether the worker is replaced because it holds too much memory."""
 
 
 class Cancelled(BaseException):
@@ -81,27 +72,27 @@ class _State:
     robots: dict[str, Robot]
     """Robots that requests may name."""
     settings: ServeSettings
-    shared: Shared
 
 
 _state: _State | None = None
 _warm: set[tuple[str, str]] = set()
 
 
-def prepare(robots: dict[str, Robot], settings: ServeSettings, shared: Shared) -> None:
-    """Set up a new worker process."""
-    accept(robots, settings, shared)
+def prepare(robots: dict[str, Robot], settings: ServeSettings) -> bool:
+    """Set up a new worker process. Returns whether it compiled code: then another one that loads the code
+    from the cache takes its place, so that all workers give the same numbers, bit for bit."""
+    accept(robots, settings)
     most = settings.max_worker_memory
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
-    signal.signal(
-        signal.SIGTERM, signal.SIG_IGN
-    )  # service managers signal all processes; the server ends its workers itself
+    # service managers signal all processes; the server ends its workers itself
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    return warm_up()
 
 
-def accept(robots: dict[str, Robot], settings: ServeSettings, shared: Shared) -> None:
+def accept(robots: dict[str, Robot], settings: ServeSettings) -> None:
     """Accept requests from now on; see `_State`."""
     global _state
-    _state = _State(robots, settings, shared)
+    _state = _State(robots, settings)
 
 
 def warm_up() -> bool:
@@ -117,35 +108,39 @@ def warm_up() -> bool:
     return loading.compile_seconds() > 0
 
 
-def respond(number: int, endpoint: str, body: bytes) -> Answer:
-    """The answer to a request. Raises Cancelled if the server cancels the call by its number."""
+def respond(endpoint: str, body: bytes) -> Answer:
+    """The answer to a request. Raises Cancelled if the server cancels the call."""
     state = _state
     assert state is not None
+    began = time.monotonic()
+    loading.on_first_compilation = lambda: allow(COMPILE_TIMEOUT)
+    answer, renewed = _answer_of(state, endpoint, body), False
+    if answer.code == TOO_LARGE or _memory() > state.settings.max_worker_memory / 2:
+        renew()
+        renewed = True
+    return answer._replace(seconds=time.monotonic() - began, renewed=renewed)
 
-    def raise_if_cancelled() -> None:
-        if state.shared.cancelled == number:
-            raise Cancelled
 
-    def compiling() -> None:
-        state.shared.due = time.monotonic() + COMPILE_TIMEOUT
-
-    loading.on_first_compilation = compiling
+def _answer_of(state: _State, endpoint: str, body: bytes) -> Answer:
     try:
-        with cancel_check(raise_if_cancelled):
-            raise_if_cancelled()  # it may have been cancelled before it began
-            answer = (answer_plan if endpoint == PLAN else answer_verify)(state, body)
-        return answer._replace(memory=_memory())
+        with cancel_check(_raise_if_cancelled):
+            check_cancelled()  # it may have been cancelled before it began
+            return (answer_plan if endpoint == PLAN else answer_verify)(state, body)
     except InputError as error:
         return failed(400, str(error))
     except Cancelled:
         raise
     except MemoryError:
-        most = state.settings.max_worker_memory
-        message = f"the request needs more memory than a worker may use, {most / MEGABYTE:.0f} MB"
-        return failed(413, message)._replace(memory=most)
+        most = f"{state.settings.max_worker_memory / MEGABYTE:.0f} MB"
+        return failed(TOO_LARGE, f"the request needs more memory than a worker may use, {most}")
     except BaseException as error:  # a SystemExit of a planner would end the server's event loop
         traceback.print_exc(file=sys.stderr)
         return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
+
+
+def _raise_if_cancelled() -> None:
+    if cancelled():
+        raise Cancelled
 
 
 def _memory() -> int:
@@ -195,14 +190,17 @@ def answer_plan(state: _State, body: bytes) -> Answer:
     rate = requested.get("rate")
     if rate is not None:
         check_sample_rate(rate)
-    state.shared.due = began + request.time_limit + GRACE_TIME
+    limit = request.time_limit + GRACE_TIME
+    allow(began + limit - time.monotonic())
     problem = _problem(state, requested["problem"])
     if request.seed > MAX_SEED:
         raise InputError(f"seed is {shown(request.seed)}; it must be at most {MAX_SEED}")
     planner = _planner(requested.get("planner", DEFAULT_PLANNER))
-    with _more_time(state, WARM_UP_TIMEOUT):
-        planner.prepare(problem.robot)
-        _warm_up_once(planner, problem, requested["problem"]["robot"])
+    reading = time.monotonic() - began
+    allow(WARM_UP_TIMEOUT)
+    planner.prepare(problem.robot)
+    _warm_up_once(planner, problem, requested["problem"]["robot"])
+    allow(limit - reading)
     result: PlanResult = planner.plan(problem, **given)
     record = result.record()
     if rate is not None and result.trajectory is not None:
@@ -226,15 +224,6 @@ def _resampled(problem: Problem, trajectory: Trajectory, rate: float) -> Traject
     if violation is not None:
         raise InputError(f"rate is {rate:g} Hz; the motion with these rows is not valid: {violation.message}")
     return rows
-
-
-@contextmanager
-def _more_time(state: _State, seconds: float) -> Iterator[None]:
-    """The block may take `seconds` [s], which do not count as time of the call."""
-    left = state.shared.due - time.monotonic()
-    state.shared.due = time.monotonic() + seconds
-    yield
-    state.shared.due = time.monotonic() + left
 
 
 def _planner(name: object) -> Planner:

@@ -17,7 +17,6 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.processes import SingleWorker
 from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
 from robotdiffuse.learning.checkpoint import load_completion, save_network
 from robotdiffuse.learning.completion import (
@@ -35,6 +34,7 @@ from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSetting
 from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, on_cpu, train
 from robotdiffuse.perception.voxel_grid import VOXEL
 from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.processes.workers import Workers
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
@@ -59,13 +59,13 @@ class SamplePrefetcher:
         self._families = tuple(families)
         self._robot = robot
         self._batch = batch
-        self._workers = deque(SingleWorker(_give_way, ()) for _ in range(workers))
+        self._count, self._workers = workers, Workers(workers, _give_way)
         self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
 
     def next(self, rng: np.random.Generator) -> Samples:
         """The batch of samples with the seeds that `rng` draws."""
         seeds = self._seeds(rng)
-        if not self._workers:
+        if not self._count:
             return draw_samples(self._families, self._robot, seeds)
         if not self._pending or self._pending[0][0] != seeds:
             self._pending.clear()
@@ -73,21 +73,19 @@ class SamplePrefetcher:
         following = copy.deepcopy(rng)
         for _ in range(len(self._pending) - 1):
             self._seeds(following)
-        while len(self._pending) <= BATCHES_AHEAD * len(self._workers):
+        while len(self._pending) <= BATCHES_AHEAD * self._count:
             self._submit(self._seeds(following))
         return self._pending.popleft()[1].result()
 
     def close(self) -> None:
         """Stop the workers."""
-        for worker in self._workers:
-            worker.close()
+        self._workers.close()
 
     def _seeds(self, rng: np.random.Generator) -> tuple[int, ...]:
         return tuple(rng.integers(SEED_LIMIT, size=self._batch).tolist())
 
     def _submit(self, seeds: tuple[int, ...]) -> None:
-        self._workers.rotate()
-        job = self._workers[0].submit(draw_samples, self._families, self._robot, seeds)
+        job = self._workers.submit(draw_samples, self._families, self._robot, seeds)
         self._pending.append((seeds, job))
 
 

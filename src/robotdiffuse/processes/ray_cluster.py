@@ -9,8 +9,8 @@ from typing import Any
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.processes import RERUN_HINT, Results
 from robotdiffuse.core.registry import AddedEntries, added_entries, adopt_entries
+from robotdiffuse.processes.workers import RERUN_HINT, Results
 
 CONNECT_TIMEOUT = 5.0
 """Time for a Ray cluster to answer [s]; Ray itself would try for minutes."""

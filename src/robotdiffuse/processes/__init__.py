@@ -1,0 +1,1 @@
+"""Calls in other processes: workers on this machine, and a Ray cluster."""

@@ -1,0 +1,502 @@
+"""Worker processes on this machine: each runs one call at a time, and is killed if the call takes too long.
+
+Only the process that the user started handles Ctrl-C; it ends its workers. Workers also exit when their
+parent dies, even if it is killed.
+"""
+
+import atexit
+import fcntl
+import multiprocessing
+import os
+import pickle
+import queue
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager, suppress
+from math import inf
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+from weakref import WeakSet
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.registry import added_entries, adopt_entries
+
+Results = Generator[tuple[int, Any], None, None]
+"""Results in order of completion, each with the index of its call. Close the generator to stop the calls."""
+TERMINATE_TIMEOUT = 5.0
+"""Time from asking a process to end until it is killed [s]."""
+PREPARE_TIMEOUT = 600.0
+"""Time for a process to prepare, until it is killed [s]."""
+CANCEL_TIMEOUT = 1.0
+"""Time for a worker to leave a cancelled call, until it is killed [s]."""
+CHECK_INTERVAL = 0.05
+"""Time between two looks at whether a call takes too long or is cancelled [s]."""
+RESTART_DELAY = 1.0
+"""Time between two attempts to start a worker that is kept ready [s]."""
+RERUN_HINT = "run the same command again"
+GUARD = 'if __name__ == "__main__":'
+# fresh interpreters: forked ones could inherit locks of running threads
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+class EndedError(Exception):
+    """A worker process ended; the message says how."""
+
+
+class NotStartedError(EndedError):
+    """A worker process ended before its first call; the message says what to change."""
+
+
+class OverrunError(EndedError):
+    """A worker process was killed because its call took too long."""
+
+
+def check_not_importing() -> None:
+    """End this process if it is a worker that still imports the main script, and the script starts workers on
+    import because it lacks GUARD. The process that the user started reports it."""
+    if sys.modules["__main__"] is not sys.modules.get("__mp_main__", sys.modules["__main__"]):
+        sys.exit(1)
+
+
+def _check_script() -> None:
+    """Raise NotStartedError if the main script is not a file that worker processes can import."""
+    main = sys.modules["__main__"]
+    script = getattr(main, "__file__", None)
+    if main.__spec__ is None and script is not None and not Path(script).is_file():
+        raise NotStartedError(
+            "worker processes cannot import a script from standard input; save it to a file, and put what it "
+            f"does below the line: {GUARD}"
+        )
+
+
+def _not_started() -> NotStartedError:
+    """The error for a process that ended before its first call."""
+    script = getattr(sys.modules["__main__"], "__file__", None)
+    if script is None:
+        return NotStartedError("a worker process was killed as it started")
+    return NotStartedError(
+        f"a worker process could not import the main script {script}, or was killed as it started; put what "
+        f"the script does below the line: {GUARD}"
+    )
+
+
+def _nothing() -> None:
+    """The preparation of a worker that needs none."""
+
+
+class Worker:
+    """A process that runs one call at a time. It starts with the first call, and again after it ended."""
+
+    busy = False
+    """Whether `Workers` runs a call in it."""
+
+    def __init__(self, prepare: Callable[..., object] = _nothing, arguments: tuple = ()) -> None:
+        """`prepare(*arguments)` runs once in each new process. If it returns True, the process is replaced
+        once, for example by one that loads what the first has compiled."""
+        self._prepare, self._arguments = prepare, arguments
+        self._running: tuple[BaseProcess, Connection] | None = None
+        self._number = 0
+        """Of the last call in the process."""
+        self._closed = False
+        self.ready = False
+        """Whether the process is prepared."""
+
+    def start(self) -> None:
+        """Start and prepare the process unless it runs.
+
+        Raises NotStartedError if it cannot start, EndedError if it ends while it prepares or is closed.
+        """
+        if self._closed:
+            raise EndedError("closed")
+        if self._running is None and self._start() is True:
+            self.end(0.0)
+            self._start()
+
+    def _start(self) -> object:
+        _check_script()
+        connection, theirs = _SPAWN.Pipe()
+        process = _SPAWN.Process(target=_main, args=(theirs,))
+        with block_interrupts_in_children():
+            process.start()
+        theirs.close()
+        self._running, self._number = (process, connection), 0
+        _started.add(self)
+        if self._closed:  # meanwhile, by another thread
+            self.end(0.0)
+        try:
+            connection.recv()  # writing before would block forever if the process ends
+        except (EOFError, OSError):
+            self.end(0.0)
+            raise EndedError("closed") if self._closed else _not_started() from None
+        result = self._ask(pickle.dumps((added_entries(), self._prepare, self._arguments)), PREPARE_TIMEOUT)
+        self.ready = True
+        return result
+
+    def call(
+        self,
+        call: Callable[..., Any],
+        *arguments: Any,
+        timeout: float = inf,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Any:
+        """The result of `call(*arguments)` in the process; its exceptions are raised here.
+
+        timeout: the process is killed if the call takes longer [s], unless it calls `allow`.
+        stop: whether the call is cancelled; then it must end soon, see `cancelled`.
+
+        Raises EndedError if the process ends or is closed, OverrunError after the timeout, and
+        NotStartedError if it could not start.
+        """
+        given = pickle.dumps((call, arguments))
+        self.start()
+        return self._ask(given, timeout, stop)
+
+    def _ask(self, given: bytes, timeout: float, stop: Callable[[], bool] = lambda: False) -> Any:
+        if self._running is None:
+            raise EndedError("closed")
+        process, connection = self._running
+        due, told = time.monotonic() + timeout, False
+        self._number += 1
+        try:
+            connection.send((self._number, given))
+            while True:
+                left = due - time.monotonic()
+                if left <= 0:
+                    self.end(0.0)
+                    raise OverrunError("because its call took too long")
+                if not told and stop():
+                    told, due = True, min(due, time.monotonic() + CANCEL_TIMEOUT)
+                    connection.send((self._number, None))
+                if connection.poll(min(left, CHECK_INTERVAL)):
+                    answer, renew = connection.recv()
+                    if not isinstance(answer, float):
+                        break
+                    due = time.monotonic() + answer
+        except (EOFError, OSError):
+            process.join(TERMINATE_TIMEOUT)
+            self.end(0.0)
+            code = process.exitcode or 0
+            how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
+            raise EndedError("closed" if self._closed else how) from None
+        if renew:
+            self.end(0.0)
+        result, error = pickle.loads(answer)
+        if error is not None:
+            raise error
+        return result
+
+    def end(self, patience: float = TERMINATE_TIMEOUT) -> None:
+        """End the process, even during a call; the next call starts a new one. patience: time from SIGTERM to
+        SIGKILL [s]."""
+        end_workers([self], patience)
+
+    def close(self, patience: float = TERMINATE_TIMEOUT) -> None:
+        """End the process; later calls raise EndedError."""
+        self._closed = True
+        self.end(patience)
+
+
+_started: "WeakSet[Worker]" = WeakSet()
+"""Workers whose processes may run."""
+
+
+def end_workers(workers: Iterable[Worker], patience: float) -> None:
+    """End the processes of workers together; see `Worker.end`."""
+    processes = []
+    for worker in workers:
+        running, worker._running, worker.ready = worker._running, None, False
+        processes += [] if running is None else [running[0]]
+    for process in processes:
+        if patience > 0:
+            process.terminate()
+    until = time.monotonic() + patience
+    for process in processes:
+        process.join(max(until - time.monotonic(), 0.0))
+        process.kill()
+        process.join()
+
+
+@atexit.register
+def _end_all() -> None:
+    end_workers(list(_started), 0.0)
+
+
+class Call(Future):
+    """The result of a call that waits for a worker, or runs in one."""
+
+    def __init__(self, call: Callable[..., Any], arguments: tuple, timeout: float) -> None:
+        super().__init__()
+        self._call, self._arguments, self._timeout = call, arguments, timeout
+        self._stop = False
+
+    def cancel(self) -> bool:
+        """Cancel it, also if it runs: then its worker leaves it, or is killed. Returns whether it has not
+        begun."""
+        self._stop = True
+        return super().cancel()
+
+    def run(self, worker: Worker) -> None:
+        """Run it in a worker."""
+        if not self.set_running_or_notify_cancel():
+            return
+        worker.busy = True
+        try:
+            result = worker.call(self._call, *self._arguments, timeout=self._timeout, stop=lambda: self._stop)
+        except BaseException as error:
+            worker.busy = False
+            self.set_exception(error)
+        else:
+            worker.busy = False
+            self.set_result(result)
+
+
+class Workers:
+    """Worker processes that take calls from one queue, in order; they end at the end of the `with` block."""
+
+    def __init__(
+        self,
+        count: int,
+        prepare: Callable[..., object] = _nothing,
+        arguments: tuple = (),
+        patience: float = TERMINATE_TIMEOUT,
+        keep_ready: bool = False,
+    ) -> None:
+        """count: processes; 0: `each` runs the calls in this process. prepare, arguments: see `Worker`.
+        patience: time from SIGTERM to SIGKILL [s]. keep_ready: start processes before calls need them."""
+        if count:
+            check_not_importing()
+        self.workers = [Worker(prepare, arguments) for _ in range(count)]
+        self._patience, self._keep_ready = patience, keep_ready
+        self._calls: queue.SimpleQueue[Call | None] = queue.SimpleQueue()
+        self._threads: list[threading.Thread] = []
+        self._closed = False
+        self._not_started: NotStartedError | None = None
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def start(self) -> None:
+        """Start to take calls. With `keep_ready`, returns when the first process is prepared, and raises what
+        prevents that; the others follow."""
+        if self._keep_ready:
+            self.workers[0].start()
+        self._threads = [
+            threading.Thread(target=self._take_calls, args=(worker,), daemon=True) for worker in self.workers
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _take_calls(self, worker: Worker) -> None:
+        while not self._closed:
+            try:
+                if self._keep_ready:
+                    worker.start()
+            except Exception as error:
+                if not self._closed:
+                    print(f"a worker could not be started: {error}", file=sys.stderr)
+                    time.sleep(RESTART_DELAY)
+                continue
+            call = self._calls.get()
+            if call is None:
+                return
+            if self._not_started is not None:  # nor would the next process
+                _fail(call, self._not_started)
+                continue
+            call.run(worker)
+            error = None if call.cancelled() else call.exception()
+            if isinstance(error, NotStartedError):
+                self._not_started = error
+
+    def submit(self, call: Callable[..., Any], *arguments: Any, timeout: float = inf) -> Call:
+        """The future of `call(*arguments)` in the next idle process; its exceptions are those of
+        `Worker.call`."""
+        submitted = Call(call, arguments, timeout)
+        if not self._threads:
+            self.start()
+        self._calls.put(submitted)
+        return submitted
+
+    def drop(self, error: Exception) -> None:
+        """Let all waiting calls raise `error`."""
+        with suppress(queue.Empty):
+            while True:
+                call = self._calls.get_nowait()
+                if call is not None:
+                    _fail(call, error)
+
+    def close(self) -> None:
+        """End the processes, even during calls; all calls raise EndedError."""
+        self._closed = True
+        self.drop(EndedError("closed"))
+        for worker in self.workers:
+            worker._closed = True
+        for _ in self._threads:
+            self._calls.put(None)
+        end_workers(self.workers, self._patience)
+
+    def each(self, call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
+        """Results of `call(*arguments)` for each of `calls`.
+
+        At most one call more than there are processes is running or queued. Raises InputError if a process is
+        killed from outside, e.g. when memory runs out.
+        """
+        left, running = list(enumerate(calls))[::-1], {}
+        while left and not self.workers:
+            number, arguments = left.pop()
+            yield number, call(*arguments)
+        try:
+            while left or running:
+                while left and len(running) < len(self.workers) + 1:
+                    number, arguments = left.pop()
+                    running[self.submit(call, *arguments)] = number
+                for job in wait(running, return_when=FIRST_COMPLETED).done:
+                    yield running.pop(job), job.result()
+        except NotStartedError as error:
+            raise InputError(str(error)) from None
+        except EndedError:
+            raise InputError(f"a worker process was killed; {RERUN_HINT}") from None
+
+
+def _fail(call: Call, error: Exception) -> None:
+    if call.set_running_or_notify_cancel():
+        call.set_exception(error)
+
+
+def on_this_machine(call: Callable[..., Any], calls: Sequence[tuple], workers: int) -> Results:
+    """`Workers.each` with processes for these calls only."""
+    with Workers(min(workers, len(calls))) as pool:
+        yield from pool.each(call, calls)
+
+
+def in_order(results: Results) -> Iterator[Any]:
+    """The results in the order of the calls."""
+    early: dict[int, Any] = {}
+    following = 0
+    for number, result in results:
+        early[number] = result
+        while following in early:
+            yield early.pop(following)
+            following += 1
+
+
+@contextmanager
+def block_interrupts_in_children() -> Iterator[None]:
+    """Processes started within the block never receive SIGINT, because they inherit the signal mask.
+
+    Only the parent handles Ctrl-C then, even while the children are still importing.
+    """
+    resource_tracker.ensure_running()  # else the first process starts it and unblocks the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+# In the process
+
+
+class _Process:
+    """A worker process, as seen from within."""
+
+    def __init__(self, connection: Connection) -> None:
+        self.connection, self.sending = connection, threading.Lock()
+        self.calls: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
+        self.running = self.cancelled = 0
+        """Numbers of the running call and of the last one that was cancelled."""
+        self.renew = False
+
+    def send(self, answer: bytes | float) -> None:
+        with self.sending:
+            self.connection.send((answer, self.renew))
+
+    def receive(self) -> None:
+        """Receive calls and cancellations; exit when the parent dies, even if it is killed."""
+        with suppress(EOFError, OSError):
+            while True:
+                number, given = self.connection.recv()
+                if given is None:
+                    self.cancelled = number
+                else:
+                    self.calls.put((number, given))
+        os._exit(1)
+
+    def run(self) -> None:
+        while True:
+            self.running, given = self.calls.get()
+            try:
+                call, arguments = pickle.loads(given)
+                answer = pickle.dumps((call(*arguments), None))
+            except BaseException as error:
+                answer = _failure(error)
+            self.send(answer)
+
+
+_this: _Process | None = None
+
+
+def _main(connection: Connection) -> None:
+    global _this
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    _exit_by_signal_with_parent()
+    _this = _Process(connection)
+    threading.Thread(target=_this.receive, daemon=True).start()
+    _this.send(0.0)
+    try:
+        _, given = _this.calls.get()
+        entries, prepare, arguments = pickle.loads(given)
+        adopt_entries(entries)
+        _this.send(pickle.dumps((prepare(*arguments), None)))
+    except BaseException:  # it could not run any call
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(1)
+    _this.run()
+
+
+def _failure(error: BaseException) -> bytes:
+    error.add_note("in a worker process:\n" + "".join(traceback.format_exception(error)))
+    try:
+        return pickle.dumps((None, error))
+    except Exception:
+        return pickle.dumps((None, RuntimeError(f"{type(error).__name__}: {error}")))
+
+
+def _exit_by_signal_with_parent() -> None:
+    """Let Linux send SIGIO, which ends this process, when the pipe from its parent closes.
+
+    `_Process.receive` alone is not enough: it waits while compiled code or imports hold the interpreter.
+    """
+    parent = multiprocessing.parent_process()
+    with suppress(OSError, AttributeError):  # other systems have only the thread
+        pipe = parent.sentinel if parent is not None else -1
+        fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())
+        fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)
+
+
+def cancelled() -> bool:
+    """Whether the call that this worker process runs is cancelled."""
+    return _this is not None and _this.cancelled == _this.running
+
+
+def allow(seconds: float) -> None:
+    """Let the call that this worker process runs take `seconds` from now on [s]."""
+    if _this is not None:
+        _this.send(float(seconds))
+
+
+def renew() -> None:
+    """End this worker process after the call that it runs."""
+    if _this is not None:
+        _this.renew = True

@@ -1,0 +1,194 @@
+"""Worker processes are replaced when they die, and do not outlive their parent."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from helpers import waiting
+from robotdiffuse.processes.workers import EndedError, OverrunError, Worker, Workers, allow, cancelled, renew
+
+ROOT = Path(__file__).parents[2]
+HELD = 60
+"""Longer than a worker may outlive its parent [s]."""
+
+
+def nothing() -> None:
+    pass
+
+
+def test_a_single_worker_is_replaced_when_it_dies_or_is_ended() -> None:
+    worker = Worker()
+    try:
+        first = worker.call(os.getpid)
+        with pytest.raises(EndedError):
+            worker.call(os.kill, first, signal.SIGKILL)
+        second = worker.call(os.getpid)
+        worker.end(0.0)
+        third = worker.call(os.getpid)
+        assert len({first, second, third, os.getpid()}) == 4
+        with ThreadPoolExecutor(1) as threads:
+            sent = threads.submit(worker.call, time.sleep, HELD)
+            os.kill(third, signal.SIGTERM)
+            with pytest.raises(EndedError, match="by SIGTERM"):
+                sent.result(HELD)
+    finally:
+        worker.close()
+    with pytest.raises(EndedError, match="closed"):
+        worker.call(os.getpid)
+
+
+def wait_until_cancelled() -> None:
+    while not cancelled():
+        time.sleep(0.01)
+
+
+def sleep_allowed(first: float, allowed: float, then: float) -> str:
+    time.sleep(first)
+    allow(allowed)
+    time.sleep(then)
+    return "done"
+
+
+def renewed() -> int:
+    renew()
+    return os.getpid()
+
+
+def no_answer() -> object:
+    return lambda: None
+
+
+class OddError(Exception):
+    def __init__(self, one: int, two: int) -> None:
+        super().__init__(f"{one} and {two}")
+
+
+def odd() -> None:
+    raise OddError(1, 2)
+
+
+def test_a_call_that_takes_too_long_is_killed_unless_it_is_allowed_more_time() -> None:
+    worker = Worker()
+    try:
+        first = worker.call(os.getpid)
+        assert worker.call(sleep_allowed, 0.0, float(HELD), 0.3, timeout=0.2) == "done"
+        assert worker.call(os.getpid) == first
+        with pytest.raises(OverrunError):
+            worker.call(sleep_allowed, 0.0, 0.1, float(HELD), timeout=float(HELD))
+        assert worker.call(os.getpid) != first
+    finally:
+        worker.close(0.0)
+
+
+def test_errors_of_calls_keep_the_process() -> None:
+    worker = Worker()
+    try:
+        first = worker.call(os.getpid)
+        with pytest.raises(ZeroDivisionError) as raised:
+            worker.call(divmod, 1, 0)
+        assert "in a worker process" in raised.value.__notes__[0]
+        with pytest.raises(Exception, match="pickle"):
+            worker.call(no_answer)
+        with pytest.raises(Exception, match="pickle"):
+            worker.call(print, lambda: None)
+        with pytest.raises(TypeError):
+            worker.call(odd)
+        with pytest.raises(SystemExit):
+            worker.call(sys.exit, "no licence")
+        assert worker.call(os.getpid) == first
+        assert worker.call(renewed) == first
+        assert worker.call(os.getpid) != first
+    finally:
+        worker.close(0.0)
+
+
+def test_running_and_waiting_calls_are_cancelled() -> None:
+    with Workers(1) as workers:
+        first = workers.submit(os.getpid).result(HELD)
+        running, waiting = workers.submit(wait_until_cancelled), workers.submit(os.getpid)
+        time.sleep(0.2)
+        assert waiting.cancel() and not running.cancel()
+        assert running.result(HELD) is None
+        assert workers.submit(os.getpid).result(HELD) == first
+        deaf = workers.submit(time.sleep, float(HELD))
+        time.sleep(0.2)
+        deaf.cancel()
+        with pytest.raises(OverrunError):
+            deaf.result(HELD)
+        last = workers.submit(time.sleep, float(HELD)), workers.submit(os.getpid)
+        time.sleep(0.2)
+    for call in last:
+        with pytest.raises(EndedError, match="closed"):
+            call.result(HELD)
+
+
+def fail_without(file: str) -> bool:
+    """Whether this made the file; a second call has to fail."""
+    new = not os.path.exists(file)
+    Path(file).write_text("")
+    return new
+
+
+def test_ready_workers_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker that has compiled code is replaced once, as one that lacks memory to start is."""
+    with Workers(1, fail_without, (str(tmp_path / "file"),), keep_ready=True) as workers:
+        workers.start()
+        [worker] = workers.workers
+        assert worker.ready
+        first = workers.submit(os.getpid).result(HELD)
+        with pytest.raises(EndedError, match="by SIGKILL"):
+            workers.submit(os.kill, first, signal.SIGKILL).result(HELD)
+        waiting.until(lambda: worker.ready, HELD)
+        assert workers.submit(os.getpid).result(HELD) != first
+
+
+@pytest.mark.skipif(not hasattr(os, "O_ASYNC"), reason="needs a signal on a closed pipe")
+def test_a_worker_in_compiled_code_does_not_outlive_a_killed_parent() -> None:
+    paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
+    with subprocess.Popen(
+        [sys.executable, "-m", "helpers.deaf_worker", str(HELD)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": paths},
+    ) as parent:
+        assert parent.stdout is not None
+        worker = Path("/proc", parent.stdout.readline().strip())
+        assert parent.stdout.readline() == "begun\n" and worker.exists()
+        time.sleep(0.5)  # for the call to begin
+        parent.kill()
+        until = time.monotonic() + HELD / 4
+        while worker.exists():
+            assert time.monotonic() < until, "it lives as long as its call"
+            time.sleep(0.02)
+
+
+CHECKS = """
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.processes.workers import on_this_machine
+try:
+    print(sorted(on_this_machine(abs, [(-1,), (-2,)], 2)))
+except InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("by", ["file", "stdin", "text"])
+def test_shared_calls_of_a_script_that_processes_cannot_import_say_what_to_do(
+    by: str, tmp_path: Path
+) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(CHECKS)
+    arguments = {"file": [str(script)], "stdin": ["-"], "text": ["-c", CHECKS]}[by]
+    command = [sys.executable, *arguments]
+    ended = subprocess.run(command, input=CHECKS, capture_output=True, text=True, timeout=500, check=True)
+    if by == "text":
+        assert ended.stdout == "[(0, 1), (1, 2)]\n"
+    else:
+        assert ended.stdout.endswith('below the line: if __name__ == "__main__":\n')
