@@ -3,7 +3,7 @@
 import numpy as np
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
+from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 
 
 def least_clearance(checker: CollisionChecker, q: np.ndarray) -> np.ndarray:

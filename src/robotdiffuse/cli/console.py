@@ -111,7 +111,7 @@ def clearances(motion: "PlanResult | Report | Certificate", asked: float | None 
 
 def _certified(clearance: float) -> str:
     """A certified lower bound [m]; the validator measures no distance beyond CLEARANCE_CAP."""
-    from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
+    from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 
     capped = clearance > CLEARANCE_CAP - CAP_TOLERANCE
     return f"> {CLEARANCE_CAP:g} m" if capped else f"at least {1e3 * clearance + 0.0:.1f} mm"

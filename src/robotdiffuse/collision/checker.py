@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
-from robotdiffuse.collision.kernels import clearance_gradients, distance, lane_clearance, lane_collision
+from robotdiffuse.collision.kernels import collision_cost, lane_clearance, lane_collision
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
@@ -60,7 +60,7 @@ class CollisionChecker:
         The violation is the root of the sum of h² over the covering spheres, with the hinge h = max(0, margin
         - D) on their signed distances D to the scene; it is 0 where no link is within the margin [m].
         """
-        links, gradients = clearance_gradients.clearances_and_gradients(
+        links, gradients = collision_cost.clearances_and_gradients(
             self.robot_arrays,
             self.scene_arrays,
             self._rows(q),
@@ -71,7 +71,7 @@ class CollisionChecker:
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
         """Distance between the links of each checked pair [m], at most 1 m."""
-        return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), distance.CLEARANCE_CAP)
+        return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), collision_cost.CLEARANCE_CAP)
 
     def cost_gradients(
         self, q: Float[ndarray, "n dof"], margin: float, self_margin: float = 0.01
@@ -80,7 +80,7 @@ class CollisionChecker:
 
         `margin` and `self_margin` [m]: distances to obstacles and between links below which there is a cost.
         """
-        return lane_clearance.cost_gradients(
+        return collision_cost.cost_gradients(
             self.robot_arrays,
             self.scene_arrays,
             self._rows(q),

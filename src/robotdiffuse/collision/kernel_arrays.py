@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy import ndarray
 
+from robotdiffuse.collision.convex_geometry import Solid, solids_of
 from robotdiffuse.collision.kernels.simd import W, by_sixteen
 from robotdiffuse.collision.point_cloud_grid import (
     NO_SPHERES,
@@ -22,12 +23,13 @@ from robotdiffuse.collision.point_cloud_grid import (
 )
 from robotdiffuse.collision.sphere_pair_tables import build_pair_tables, no_tables
 from robotdiffuse.core.deadline import check_time
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.link_pair_tables import LinkPairTable
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import PointCloud
 
 FLOAT32_ROUNDING = 4e-7
 """Obstacles grow by this share of their coordinates, which is more than float32 rounding."""
@@ -72,20 +74,12 @@ class RobotArrays(NamedTuple):
 
 
 class SceneArrays(NamedTuple):
-    """Obstacles by type. Rows of oriented shapes: centre, world-to-shape rotation (row-major), three
-    dimensions. Surfaces that links may touch are spheres among the solids."""
+    """Obstacles: solids, and points in a grid."""
 
-    spheres: ndarray
-    """[n, 4] centre, radius."""
-    boxes: ndarray
-    """[n, 15] ..., half edges."""
-    cylinders: ndarray
-    """[n, 15] ..., radius, half height, 0."""
-    capsules: ndarray
-    """[n, 15] ..., radius, half height, 0."""
     solids: ndarray
-    """[n, 17] all of these in one format: centre, rotation, half edges, rounding radius, and 1 for a
-    cylinder, else 0. The first two half edges of a cylinder are its radius."""
+    """[n, 17] Minkowski sums of a box, a disc about its z axis and a ball: centre, world-to-shape rotation
+    (row-major), half edges, radius of the ball, and 1 for a cylinder, else 0. The first two half edges of a
+    cylinder are its radius. Surfaces that links may touch are balls among the solids."""
     solid_boxes: ndarray
     """[rows, 6 * 16] axis-aligned boxes around the solids in rows of sixteen: low x of all, then low y, low
     z, high x, high y and high z."""
@@ -259,38 +253,23 @@ def compile_scene(
     Points well beyond that are left out. `radius` is that of the robot's largest sphere [m]; `groups` are its
     links with spheres, for allowed contacts.
     """
-    spheres, boxes, cylinders, capsules, points = [], [], [], [], []
     touched = {name for name, _ in scene.allowed_contacts}
-    for shape in scene.shapes:
-        match shape:
-            case Sphere():
-                spheres.append((shape.name, np.array([[*shape.center, shape.radius]])))
-            case Box():
-                boxes.append(shape)
-            case Cylinder():
-                cylinders.append(shape)
-            case Capsule():
-                capsules.append(shape)
-            case PointCloud() | Triangulated():
-                if shape.name in touched:
-                    spheres.append((shape.name, join_to_few(_cover(shape, reach))))
-                else:
-                    points.append(shape)
-    balls = np.concatenate([NO_SPHERES, *(rows for _, rows in spheres)])
-    edges = np.array([shape.size for shape in boxes]).reshape(-1, 3)
-    names = [name for name, rows in spheres for _ in rows]
-    names += [shape.name for shape in (*boxes, *cylinders, *capsules)]
-    by_type = (
-        _grown(balls, slice(3, 4)).astype(np.float32),
-        _oriented(boxes, edges / 2, (0, 1, 2), reach),
-        _round(cylinders, reach),
-        _round(capsules, reach),
-    )
+    solids, points = list[Solid](), list[PointCloud | Triangulated]()
+    for solid in solids_of(scene):
+        shape = solid.shape
+        if not isinstance(shape, PointCloud | Triangulated):
+            solids.append(solid)
+        elif shape.name in touched:
+            for ball in join_to_few(_cover(shape, reach)):
+                solids.append(Solid(shape, transform(ball[:3]), np.zeros(3), 0.0, ball[3], False))
+        else:
+            points.append(shape)
+    rows = _rows(solids, reach)
     return SceneArrays(
-        *by_type,
-        *_solids(*by_type),
+        rows,
+        _boxes_around(rows),
         *_grid_around(tuple(points), reach, radius),
-        _may_touch(scene, groups, names),
+        _may_touch(scene, groups, [solid.shape.name for solid in solids]),
     )
 
 
@@ -302,25 +281,34 @@ def _may_touch(scene: Scene, groups: tuple[str, ...], names: list[str]) -> ndarr
     return np.array([allowed[name] for name in names], np.bool_).reshape(len(names), len(groups)).T.copy()
 
 
-def _solids(
-    spheres: ndarray, boxes: ndarray, cylinders: ndarray, capsules: ndarray
-) -> tuple[ndarray, ndarray]:
-    """`SceneArrays.solids` and `SceneArrays.solid_boxes`."""
-    rows = np.zeros((len(spheres) + len(boxes) + len(cylinders) + len(capsules), 17), np.float32)
-    a, b, c = np.cumsum([len(spheres), len(boxes), len(cylinders)]).tolist()
-    rows[:a, :3], rows[:a, 3:12:4], rows[:a, 15] = spheres[:, :3], 1, spheres[:, 3]
-    rows[a:b, :15] = boxes
-    rows[b:c, :13], rows[b:c, 13], rows[b:c, 14], rows[b:c, 16] = (
-        cylinders[:, :13],
-        cylinders[:, 12],
-        cylinders[:, 13],
-        1,
-    )
-    rows[c:, :12], rows[c:, 15], rows[c:, 14] = capsules[:, :12], capsules[:, 12], capsules[:, 13]
+def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
+    """`SceneArrays.solids`, cropped along straight edges to what the robot can come near, and then grown by
+    what rounding to float32 may take away.
+
+    Cropping does not change the distance to points within reach, and keeps the precision of a floor of 1 km
+    in float32.
+    """
+    T = np.array([solid.T_base_box for solid in solids]).reshape(-1, 4, 4)
+    sizes = np.array([[*solid.half, solid.disc, solid.rounding] for solid in solids]).reshape(-1, 5)
+    R, half, far = T[:, :3, :3], sizes[:, :3], 2 * reach + 1
+    base = -np.einsum("nij,ni->nj", R, T[:, :3, 3])
+    low, high = np.maximum(-half, base - far), np.minimum(half, base + far)
+    kept = low < high
+    half[kept] = ((high - low) / 2)[kept]
+    centre = T[:, :3, 3] + np.einsum("nij,nj->ni", R, np.where(kept, (low + high) / 2, 0.0))
+    grown = FLOAT32_ROUNDING * (np.abs(centre).max(axis=1) + sizes.max(axis=1))
+    sizes += grown[:, None] * (sizes > 0)
+    half[:, :2] += sizes[:, 3:4]
+    turned = R.transpose(0, 2, 1).reshape(-1, 9)
+    return np.concatenate([centre, turned, half, sizes[:, 4:], sizes[:, 3:4] > 0], axis=1).astype(np.float32)
+
+
+def _boxes_around(rows: ndarray) -> ndarray:
+    """`SceneArrays.solid_boxes`."""
     middle, rotation, half = rows[:, :3], np.abs(rows[:, 3:12].reshape(-1, 3, 3)), rows[:, 12:15]
     extent = np.einsum("nij,ni->nj", rotation, half) + rows[:, 15:16]
     extent += BOX_SLACK * (1 + np.abs(middle) + extent)
-    return rows, by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), EMPTY_BOX)
+    return by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), EMPTY_BOX)
 
 
 def _cover(shape: PointCloud | Triangulated, reach: float) -> ndarray:
@@ -342,46 +330,3 @@ def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, ra
     cloud = np.concatenate(clouds) if clouds else NO_SPHERES
     check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS_PER_POINT * len(cloud))
     return build_grid(cloud, radius)
-
-
-def _round(shapes: Sequence[Cylinder | Capsule], reach: float) -> ndarray:
-    """`SceneArrays.cylinders` or `SceneArrays.capsules`."""
-    half = np.array([[shape.radius, shape.radius, shape.height / 2] for shape in shapes]).reshape(-1, 3)
-    return np.ascontiguousarray(_oriented(shapes, half, (2,), reach)[:, [*range(13), 14, 11]])
-
-
-def _oriented(
-    shapes: Sequence[Box | Cylinder | Capsule], half: ndarray, axes: tuple[int, ...], reach: float
-) -> ndarray:
-    """Centre, world-to-shape rotation and half extents, cropped along some axes to what the robot can come
-    near.
-
-    Cropping does not change the distance to points within reach, and keeps the precision of a floor of 1 km
-    in float32.
-    """
-    if not shapes:
-        return np.zeros((0, 15), np.float32)
-    origin = np.array([shape.center for shape in shapes])
-    R_base_shape = np.array([shape.rotation for shape in shapes])
-    R_shape_base = R_base_shape.transpose(0, 2, 1)
-    middle, far = (-R_shape_base @ origin[:, :, None])[:, :, 0], 2 * reach + 1
-    centre = np.zeros_like(origin)
-    for axis in axes:
-        low, high = (
-            np.maximum(-half[:, axis], middle[:, axis] - far),
-            np.minimum(half[:, axis], middle[:, axis] + far),
-        )
-        kept = low < high
-        centre[kept, axis] = ((low + high) / 2)[kept]
-        half[kept, axis] = ((high - low) / 2)[kept]
-    centre = (R_base_shape @ centre[:, :, None])[:, :, 0] + origin
-    rows = np.concatenate([centre, R_shape_base.reshape(-1, 9), half], axis=1)
-    return _grown(rows, slice(12, 15)).astype(np.float32)
-
-
-def _grown(rows: ndarray, sizes: slice) -> ndarray:
-    """The rows with sizes increased by what rounding to float32 may take away."""
-    rows[:, sizes] += (
-        FLOAT32_ROUNDING * (np.abs(rows[:, :3]).max(axis=1) + np.abs(rows[:, sizes]).max(axis=1))[:, None]
-    )
-    return rows

@@ -5,7 +5,7 @@ piece of the motion is free for a link if a lower bound of its clearance along t
 otherwise the piece is split. The bound is computed from the clearance in the piece's middle, the velocity
 there towards what is near, and a bound on the curvature of the motion (`kernels/motion_certificate.py`).
 Between two links only the joints between them count, because motion is seen from the nearer one. Clearances
-are those of the covering spheres, for many configurations at once (`kernels/swept_spheres.py`). Where the
+are those of the covering spheres, for many configurations at once (`kernels/lane_clearance.py`). Where the
 spheres are too coarse, separating planes between the convex meshes give the bound
 (`kernels/convex_bounds.py`). Coal computes distances to surfaces and point clouds, and decides whether bodies
 touch.

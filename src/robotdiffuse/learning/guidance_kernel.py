@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
-from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
+from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP, cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace, pair_clearances_into
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
-from robotdiffuse.collision.kernels.distance import scene_distance
+from robotdiffuse.collision.kernels.collision_cost import scene_distance
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration, Configurations, Points

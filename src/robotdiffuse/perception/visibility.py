@@ -7,7 +7,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import Part, parts_of
 from robotdiffuse.collision.exact_meshes import forward_frames
-from robotdiffuse.collision.kernels.distance import frames_of, placed
+from robotdiffuse.collision.kernels.collision_cost import frames_of, placed
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration, Points
 from robotdiffuse.perception.observed_volume import MAX_DEPTH, usable_depth

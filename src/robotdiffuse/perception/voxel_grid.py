@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.collision.kernels.distance import frames_of, placed
+from robotdiffuse.collision.kernels.collision_cost import frames_of, placed
 from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration, Path, Points
 from robotdiffuse.robots.kinematics import placed_spheres

@@ -16,8 +16,8 @@ from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.convex_geometry import checks_of, hulls_of, solid_arrays
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernels import convex_bounds, motion_certificate, motion_pieces
+from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace
 from robotdiffuse.collision.kernels.motion_pieces import Motion, Pieces
-from robotdiffuse.collision.kernels.swept_spheres import make_swept_spheres
 from robotdiffuse.collision.motions import ContinuousCollision
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -108,7 +108,7 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
         validator.checks,
         whole,
         best,
-        make_swept_spheres(validator.arm.spheres, validator.scene_arrays),
+        make_clearance_workspace(validator.arm.spheres, len(validator.scene_arrays.solids)),
     )
     places = np.linspace(0, motion.travel[-1], 41)
     dense = motion_pieces.configurations(motion, places)

@@ -1,6 +1,7 @@
-"""The compiled collision cost of a configuration and its gradient, which guidance and refinement descend.
+"""Compiled signed distances of points to obstacles with gradients, the collision cost of a configuration, and
+its gradient, which guidance and refinement descend. The yes-or-no check is in `lane_collision.py`.
 
-The computation goes from coarse to fine: first the obstacles whose boxes are within reach of the bounding
+The cost is computed from coarse to fine: first the obstacles whose boxes are within reach of the bounding
 sphere of 16 of a link's spheres, then their distances to these 16 at once, then, one by one, the spheres
 within the margin. The gradients of a link's spheres add up to a force and a moment (a wrench), which act on
 the joints before the link.
@@ -11,31 +12,103 @@ from typing import NamedTuple
 import numpy as np
 
 from robotdiffuse.collision.kernels.compiled import parent_of
-from robotdiffuse.collision.kernels.distance import frames_of, placed, solid_distance
+from robotdiffuse.collision.kernels.lane_clearance import (
+    clearances_into,
+    make_clearance_workspace,
+    pair_clearances,
+    to_solid,
+)
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
-from robotdiffuse.collision.kernels.simd import W, absolute, first_lane, lane, load, maximum, minimum, sqrt
-from robotdiffuse.core.kernels import allocation_free, inner_kernel
+from robotdiffuse.collision.kernels.simd import W, first_lane, lane, load, maximum, minimum
+from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
+CLEARANCE_CAP = np.float32(1.0)
+"""Clearances beyond this [m] are reported as this."""
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _TINY = np.float32(1e-9)
 
 
-@allocation_free(forceinline=True)
-def _signed_distances(x, y, z, solid):
-    """Signed distances of points in 16 lanes to an obstacle."""
+@allocation_free(fastmath=True)
+def frames_of(robot, q, frames):
+    """Writes frames[dof + 1, 12] (rotation row-major, translation) at q; frame 0 is the base."""
+    frames[0, :] = _ZERO
+    frames[0, 0] = frames[0, 4] = frames[0, 8] = _ONE
+    for j in range(len(q)):
+        parent, child, offset = frames[parent_of(robot.parents, j)], frames[j + 1], robot.offsets[j]
+        c, s, slide = np.cos(q[j]), np.sin(q[j]), _ZERO
+        if robot.offsets[j, 12] > _ZERO:
+            c, s, slide = _ONE, _ZERO, q[j]
+        for k in range(3):
+            r0, r1, r2 = parent[3 * k], parent[3 * k + 1], parent[3 * k + 2]
+            x = r0 * offset[0] + r1 * offset[3] + r2 * offset[6]
+            y = r0 * offset[1] + r1 * offset[4] + r2 * offset[7]
+            z = r0 * offset[2] + r1 * offset[5] + r2 * offset[8]
+            child[3 * k] = x * c + y * s
+            child[3 * k + 1] = y * c - x * s
+            child[3 * k + 2] = z
+            child[9 + k] = r0 * offset[9] + r1 * offset[10] + r2 * offset[11] + parent[9 + k] + z * slide
+
+
+@allocation_free(fastmath=True)
+def placed(frame, x, y, z):
+    """Position of a point of a frame in the base frame."""
+    return (
+        frame[0] * x + frame[1] * y + frame[2] * z + frame[9],
+        frame[3] * x + frame[4] * y + frame[5] * z + frame[10],
+        frame[6] * x + frame[7] * y + frame[8] * z + frame[11],
+    )
+
+
+@allocation_free(fastmath=True)
+def solid_distance(solid, x, y, z):
+    """Signed distance of a point to a row of `SceneArrays.solids`, and its gradient."""
     dx, dy, dz = x - solid[0], y - solid[1], z - solid[2]
     u = dx * solid[3] + dy * solid[4] + dz * solid[5]
     v = dx * solid[6] + dy * solid[7] + dz * solid[8]
-    w = absolute(dx * solid[9] + dy * solid[10] + dz * solid[11]) - solid[14]
+    w = dx * solid[9] + dy * solid[10] + dz * solid[11]
+    a, b, c = abs(u) - solid[12], abs(v) - solid[13], abs(w) - solid[14]
+    # outward directions along the first two axes; a cylinder has a single radial one
+    ou, ov, pu, pv = np.copysign(_ONE, u), _ZERO, _ZERO, np.copysign(_ONE, v)
     if solid[16] > _ZERO:
-        u = sqrt(u * u + v * v) - solid[12]
-        inside = minimum(maximum(u, w), _ZERO)
-        v = u * _ZERO
+        r = np.sqrt(u * u + v * v) + _TINY
+        a, b, ou, ov = r - solid[12], -solid[12], u / r, v / r
+    if a <= _ZERO and b <= _ZERO and c <= _ZERO:
+        d, na, nb, nc = max(a, b, c), _ZERO, _ZERO, _ZERO
+        if a >= b and a >= c:
+            na = _ONE
+        elif b >= c:
+            nb = _ONE
+        else:
+            nc = _ONE
     else:
-        u, v = absolute(u) - solid[12], absolute(v) - solid[13]
-        inside = minimum(maximum(maximum(u, v), w), _ZERO)
-    u, v, w = maximum(u, _ZERO), maximum(v, _ZERO), maximum(w, _ZERO)
-    return sqrt(u * u + v * v + w * w) + inside - solid[15]
+        a, b, c = max(a, _ZERO), max(b, _ZERO), max(c, _ZERO)
+        d = np.sqrt(a * a + b * b + c * c) + _TINY
+        na, nb, nc = a / d, b / d, c / d
+    u, v, w = na * ou + nb * pu, na * ov + nb * pv, np.copysign(nc, w)
+    return (
+        d - solid[15],
+        solid[3] * u + solid[6] * v + solid[9] * w,
+        solid[4] * u + solid[7] * v + solid[10] * w,
+        solid[5] * u + solid[8] * v + solid[11] * w,
+    )
+
+
+@allocation_free(inline="always")
+def scene_distance(scene, x, y, z, limit):
+    """Signed distance of a point to the nearest obstacle, at most `limit`, and its gradient.
+
+    Distances to point clouds may be too large by a few millimetres.
+    """
+    best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
+    for k in range(len(scene.solids)):
+        d, nx, ny, nz = solid_distance(scene.solids[k], x, y, z)
+        if d < best:
+            best, bx, by, bz = d, nx, ny, nz
+    if len(scene.points):
+        d, nx, ny, nz = near_point(scene, x, y, z, best)
+        if d < best:
+            best, bx, by, bz = d, nx, ny, nz
+    return best, bx, by, bz
 
 
 @allocation_free(forceinline=True)
@@ -96,7 +169,7 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
     y = a * frame[3] + b * frame[4] + c * frame[5] + frame[10]
     z = a * frame[6] + b * frame[7] + c * frame[8] + frame[11]
     within = load(robot.rows, row, 3) + margin
-    best, pushed = within, 0
+    best, pushed, zero = within, 0, x * _ZERO
     for part in range(len(around)):
         close = _close(around, part, u, v, w, reach)
         while close:
@@ -104,7 +177,7 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
             close &= close - 1
             if len(scene.may_touch) and scene.may_touch[g, k]:
                 continue
-            d = _signed_distances(x, y, z, scene.solids[k])
+            d, _ = to_solid(x, y, z, zero, zero, zero, scene.solids[k])
             nearer = d < best
             best = minimum(best, d)
             pushed |= nearer
@@ -199,3 +272,46 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
         _pull(robot, frames, ia, wrench, grad)
         _pull(robot, frames, ib, other, grad)
     return cost
+
+
+@kernel(nogil=True)
+def cost_gradients(robot, scene, q, margin, self_margin):
+    """Collision costs [n] of the rows of q[n, dof] and their gradients [n, dof]; see `cost_gradient_at`."""
+    costs, grads = np.empty(len(q), np.float32), np.zeros(q.shape, np.float32)
+    scratch = make_cost_workspace(q.shape[1])
+    pairs = pair_clearances(robot, q, self_margin)
+    for i in range(len(q)):
+        costs[i] = cost_gradient_at(robot, scene, q[i], pairs[i], margin, self_margin, scratch, grads[i])
+    return costs, grads
+
+
+@inner_kernel()
+def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearances, gradients):
+    """Writes clearances[n, groups] of the moving groups and gradients[n, dof] for the rows of q[n, dof].
+
+    The gradients are those of sqrt(2 cost), with the cost of `cost_gradient_at` towards the scene alone: the
+    root of the sum of h^2 over the spheres with h = max(0, S - D), S being the margin and D the signed
+    distance. Because of the root, gradients have the size of a sphere's distance from the joint axes, from
+    the edge of the margin to deep inside an obstacle. Gradients of the cost itself vary by a factor of a
+    thousand.
+    """
+    clearances_into(robot, scene, q, limit, work, clearances)
+    scratch = make_cost_workspace(q.shape[1])
+    pairs = np.zeros(len(robot.pairs), np.float32)  # with a self margin of 0 they cost nothing
+    gradients[:] = np.float32(0.0)
+    for i in range(len(q)):
+        if clearances[i].min() < margin:
+            cost = cost_gradient_at(robot, scene, q[i], pairs, margin, np.float32(0.0), scratch, gradients[i])
+            if cost > np.float32(0.0):
+                gradients[i] /= np.sqrt(np.float32(2.0) * cost)
+
+
+@kernel(nogil=True)
+def clearances_and_gradients(robot, scene, q, limit, margin):
+    """Clearances [n, moving groups] to the scene, at most `limit`, and gradients [n, dof]; see
+    `clearances_and_gradients_into`."""
+    moving = len(robot.frame) - np.searchsorted(robot.frame, 1)
+    clearances, gradients = np.empty((len(q), moving), np.float32), np.empty(q.shape, np.float32)
+    work = make_clearance_workspace(robot, len(scene.solids))
+    clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearances, gradients)
+    return clearances, gradients

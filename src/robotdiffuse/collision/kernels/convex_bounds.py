@@ -3,8 +3,8 @@
 A plane that separates two convex bodies proves that they do not touch, whatever algorithm found it. The
 algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane in the middle of a motion, starting
 from the one that was found last. The bound follows from the plane alone: the distance that remains between
-all vertices of one body and the other body while they move by t v + r (see `swept_spheres.py`), t in [-1, 1].
-All computations are in float64.
+all vertices of one body and the other body while they move by t v + r (see `lane_clearance.py`), t in
+[-1, 1]. All computations are in float64.
 """
 
 from typing import NamedTuple
@@ -63,7 +63,7 @@ class Posture(NamedTuple):
     frames: np.ndarray
     """[dof + 1, 3, 4]"""
     twists: np.ndarray
-    """[dof + 1, 6] as in `swept_spheres.py`."""
+    """[dof + 1, 6] as in `lane_clearance.py`."""
     planes: np.ndarray
     """[parts, solids + parts, 3] normals of the planes that were found last, towards the first part;
     initially zero."""

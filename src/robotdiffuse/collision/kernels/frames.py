@@ -38,3 +38,16 @@ def point_to_box(x, y, z, rotation, middle, half, disc):
         outside += max(d, 0.0) ** 2
         deepest = max(deepest, d)
     return np.sqrt(outside) + min(deepest, 0.0)
+
+
+@inner_kernel()
+def write_rotation(w, x, y, z, out):
+    """Writes the matrix of a unit quaternion."""
+    for r, row in enumerate(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
+    ):
+        out[r, 0], out[r, 1], out[r, 2] = row

@@ -1,268 +1,166 @@
-"""Compiled clearances of links to the scene and to each other, 16 configurations at once; see
-`lane_collision.py`."""
+"""Compiled clearances of covering spheres to the scene and to each other, of 16 configurations or short
+motions at once; see `lane_collision.py`.
+
+A motion is given by its middle and the joint motion dq from there to either end. A sphere's centre moves by t
+v + r from the middle to the place t in [-1, 1]: v is the Jacobian times dq, and |r| is at most a remainder
+that `motion_certificate.py` computes for the whole link. Distance to a convex obstacle is a convex function
+along t v and thus nowhere below its tangent: with the distance d and the direction n to the obstacle's
+nearest point in the middle, the sphere stays at least d - |n . v| - |r| away. A configuration is a motion
+with v = 0.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
-from robotdiffuse.collision.kernels.lane_collision import W, lanes_that_may_touch, place, place_frames
+from robotdiffuse.collision.kernels.compiled import parent_of
+from robotdiffuse.collision.kernels.lane_collision import (
+    W,
+    lanes_that_may_touch,
+    place,
+    place_frames,
+    take_block,
+)
 from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, points_distance, points_lower_bound
-from robotdiffuse.collision.kernels.simd import load, reduce_min
+from robotdiffuse.collision.kernels.simd import (
+    absolute,
+    copysign,
+    lane,
+    load,
+    maximum,
+    minimum,
+    reduce_min,
+    sqrt,
+    store,
+)
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
-_ZERO, _FAR = np.float32(0.0), np.float32(1e9)
-
-
-@allocation_free(fastmath=True)
-def _to_spheres(at, s, obstacles, near, n, mark, out):
-    """Signed distances of a point in 16 lanes to obstacles.
-
-    With `mark`, writes them to row n + k of `out` for every obstacle k. Else lowers `out[0]` to the distances
-    to the obstacles with near[n + k].
-    """
-    for k in range(len(obstacles)):
-        if not (mark or near[n + k]):
-            continue
-        x, y, z, radius = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2], obstacles[k, 3]
-        row = n + k if mark else 0
-        for i in range(W):
-            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
-            d = np.sqrt(dx * dx + dy * dy + dz * dz) - radius
-            out[row, i] = d if mark else min(out[row, i], d)
-
-
-@allocation_free(fastmath=True)
-def _to_boxes(at, s, obstacles, near, n, mark, out):
-    """The same for boxes."""
-    for k in range(len(obstacles)):
-        if not (mark or near[n + k]):
-            continue
-        x, y, z = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2]
-        a00, a01, a02 = obstacles[k, 3], obstacles[k, 4], obstacles[k, 5]
-        a10, a11, a12 = obstacles[k, 6], obstacles[k, 7], obstacles[k, 8]
-        a20, a21, a22 = obstacles[k, 9], obstacles[k, 10], obstacles[k, 11]
-        hx, hy, hz = obstacles[k, 12], obstacles[k, 13], obstacles[k, 14]
-        row = n + k if mark else 0
-        for i in range(W):
-            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
-            u = abs(a00 * dx + a01 * dy + a02 * dz) - hx
-            v = abs(a10 * dx + a11 * dy + a12 * dz) - hy
-            w = abs(a20 * dx + a21 * dy + a22 * dz) - hz
-            inside = min(max(max(u, v), w), _ZERO)
-            u, v, w = max(u, _ZERO), max(v, _ZERO), max(w, _ZERO)
-            d = np.sqrt(u * u + v * v + w * w) + inside
-            out[row, i] = d if mark else min(out[row, i], d)
-
-
-@allocation_free(fastmath=True)
-def _to_round(at, s, obstacles, flat_ends, near, n, mark, out):
-    """The same for cylinders (`flat_ends`) or capsules."""
-    for k in range(len(obstacles)):
-        if not (mark or near[n + k]):
-            continue
-        x, y, z = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2]
-        a00, a01, a02 = obstacles[k, 3], obstacles[k, 4], obstacles[k, 5]
-        a10, a11, a12 = obstacles[k, 6], obstacles[k, 7], obstacles[k, 8]
-        a20, a21, a22 = obstacles[k, 9], obstacles[k, 10], obstacles[k, 11]
-        wide, half = obstacles[k, 12], obstacles[k, 13]
-        row = n + k if mark else 0
-        for i in range(W):
-            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
-            u = a00 * dx + a01 * dy + a02 * dz
-            v = a10 * dx + a11 * dy + a12 * dz
-            w = abs(a20 * dx + a21 * dy + a22 * dz) - half
-            if flat_ends:
-                r = np.sqrt(u * u + v * v) - wide
-                inside = min(max(r, w), _ZERO)
-                r, w = max(r, _ZERO), max(w, _ZERO)
-                d = np.sqrt(r * r + w * w) + inside
-            else:
-                w = max(w, _ZERO)
-                d = np.sqrt(u * u + v * v + w * w) - wide
-            out[row, i] = d if mark else min(out[row, i], d)
-
-
-@allocation_free()
-def _bound_points(at, s, scene, radius, row, out):
-    """Writes lower bounds of the distances of a sphere's centre to the points to a row of `out`."""
-    for i in range(W):
-        d = points_lower_bound(scene, at[s, i], at[s, W + i], at[s, 2 * W + i])
-        out[row, i] = min(d, POINT_RANGE + radius)
-
-
-@allocation_free()
-def _to_points(at, s, scene, radius, out):
-    """Lowers `out[0]` to the distances of a sphere's centre to the points."""
-    for i in range(W):
-        limit = min(out[0, i], POINT_RANGE + radius)
-        out[0, i] = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit)
-
-
-@allocation_free()
-def _pass_over_allowed(may_touch, g, out):
-    """Moves the solids that a group may touch out of its way, in the distances of its bounding sphere."""
-    for k in range(may_touch.shape[1]):
-        if may_touch[g, k]:
-            for i in range(W):
-                out[k, i] = _FAR
-
-
-@allocation_free(inline="always")
-def to_scene(at, s, scene, radius, near, mark, out):
-    """Distances to all obstacles; see `_to_spheres`. With `mark`, s is a group and `at` holds the centres of
-    all bounding spheres."""
-    n = 0
-    _to_spheres(at, s, scene.spheres, near, n, mark, out)
-    n += len(scene.spheres)
-    _to_boxes(at, s, scene.boxes, near, n, mark, out)
-    n += len(scene.boxes)
-    _to_round(at, s, scene.cylinders, True, near, n, mark, out)
-    n += len(scene.cylinders)
-    _to_round(at, s, scene.capsules, False, near, n, mark, out)
-    n += len(scene.capsules)
-    if mark and len(scene.may_touch):
-        _pass_over_allowed(scene.may_touch, s, out)
-    if len(scene.points):
-        if mark:
-            _bound_points(at, s, scene, radius, n, out)
-        elif near[n]:
-            _to_points(at, s, scene, radius, out)
-
-
-@allocation_free(fastmath=True)
-def _nearer(a, s, b, t, radii, best):
-    """Number of lanes in which the distance of sphere s of a and t of b is below best[0]."""
-    total = 0
-    for i in range(W):
-        dx, dy, dz = a[s, i] - b[t, i], a[s, W + i] - b[t, W + i], a[s, 2 * W + i] - b[t, 2 * W + i]
-        total += np.int32(np.sqrt(dx * dx + dy * dy + dz * dz) - radii < best[0, i])
-    return total
-
-
-@allocation_free(fastmath=True)
-def _keep_least(a, s, b, first, last, spheres, radius, best):
-    """Lowers best[0] to the distances of sphere s of a to the spheres `first` to `last` of b."""
-    for t in range(first, last):
-        radii = radius + spheres[t, 3]
-        for i in range(W):
-            dx, dy, dz = a[s, i] - b[t, i], a[s, W + i] - b[t, W + i], a[s, 2 * W + i] - b[t, 2 * W + i]
-            best[0, i] = min(best[0, i], np.sqrt(dx * dx + dy * dy + dz * dz) - radii)
+_ZERO, _ONE, _TINY, _FAR = np.float32(0.0), np.float32(1.0), np.float32(1e-9), np.float32(1e9)
 
 
 class ClearanceWorkspace(NamedTuple):
-    """Scratch memory of `block_clearances` and `block_pair_clearances`."""
+    """Scratch memory for 16 configurations or motions."""
 
     frames: np.ndarray
-    """[dof + 1, 12 * W]"""
+    """[dof + 1, 12 * W] in the middles."""
+    twists: np.ndarray
+    """[dof + 1, 6 * W] angular velocity of each frame, and velocity of its point at the base's origin, per
+    unit of t."""
     centres: np.ndarray
     """[groups, 3 * W] centres of the bounding spheres."""
-    position: np.ndarray
-    """[1, 3 * W]"""
-    near: np.ndarray
-    """[obstacles]"""
-    bounds: np.ndarray
-    """[obstacles, W] distances of a bounding sphere's centre."""
-    least: np.ndarray
-    """[1, W]"""
     positions: np.ndarray
     """[spheres, 3 * W]"""
     placed: np.ndarray
     """[groups] whether the group's positions have been computed for this block."""
+    near: np.ndarray
+    """[obstacles]"""
+    bounds: np.ndarray
+    """[obstacles, W] distances of a bounding sphere's centre."""
+    need: np.ndarray
+    """[1, W] clearances are computed up to this [m]; a lane with a negative value is skipped."""
+    clearance: np.ndarray
+    """[1, W] signed distances in the middles."""
+    lower: np.ndarray
+    """[1, W] lower bounds along the motions, without the remainder."""
 
 
 @inner_kernel()
-def make_clearance_workspace(robot, obstacles):
-    """Scratch memory for one thread and at most so many obstacles; all point clouds and meshes count as
-    one."""
-    frames = np.zeros((len(robot.offsets) + 1, 12 * W), np.float32)
+def make_clearance_workspace(robot, solids):
+    """Scratch memory for one thread and at most so many solids."""
+    joints, groups = len(robot.offsets), len(robot.frame)
+    frames = np.zeros((joints + 1, 12 * W), np.float32)
     for k in (0, 4, 8):
         frames[0, k * W : (k + 1) * W] = 1.0
     return ClearanceWorkspace(
         frames,
-        np.empty((len(robot.frame), 3 * W), np.float32),
-        np.empty((1, 3 * W), np.float32),
-        np.empty(obstacles, np.bool_),
-        np.empty((obstacles, W), np.float32),
-        np.empty((1, W), np.float32),
+        np.zeros((joints + 1, 6 * W), np.float32),
+        np.empty((groups, 3 * W), np.float32),
         np.empty((len(robot.spheres), 3 * W), np.float32),
-        np.empty(len(robot.frame), np.bool_),
+        np.empty(groups, np.bool_),
+        np.empty(solids + 1, np.bool_),
+        np.empty((solids + 1, W), np.float32),
+        np.empty((1, W), np.float32),
+        np.empty((1, W), np.float32),
+        np.empty((1, W), np.float32),
     )
 
 
+@allocation_free(forceinline=True)
+def to_solid(x, y, z, vx, vy, vz, solid):
+    """Signed distances of points in 16 lanes to a row of `SceneArrays.solids`, and the parts of their
+    velocities along the lines to its nearest points."""
+    dx, dy, dz = x - solid[0], y - solid[1], z - solid[2]
+    u = dx * solid[3] + dy * solid[4] + dz * solid[5]
+    v = dx * solid[6] + dy * solid[7] + dz * solid[8]
+    w = dx * solid[9] + dy * solid[10] + dz * solid[11]
+    # speeds away from the solid's centre
+    p = vx * solid[3] + vy * solid[4] + vz * solid[5]
+    q = vx * solid[6] + vy * solid[7] + vz * solid[8]
+    r = (vx * solid[9] + vy * solid[10] + vz * solid[11]) * copysign(_ONE, w)
+    if solid[16] > _ZERO:
+        from_axis = sqrt(u * u + v * v)
+        p = (u * p + v * q) / maximum(from_axis, _TINY)
+        u, v = from_axis - solid[12], u * _ZERO - solid[12]
+    else:
+        p, q = p * copysign(_ONE, u), q * copysign(_ONE, v)
+        u, v = absolute(u) - solid[12], absolute(v) - solid[13]
+    w = absolute(w) - solid[14]
+    inside = minimum(maximum(maximum(u, v), w), _ZERO)
+    u, v, w = maximum(u, _ZERO), maximum(v, _ZERO), maximum(w, _ZERO)
+    d = sqrt(u * u + v * v + w * w)
+    return d + inside - solid[15], absolute(u * p + v * q + w * r) / maximum(d, _TINY)
+
+
+@allocation_free(forceinline=True)
+def _at(positions, s):
+    return load(positions, s, 0), load(positions, s, 1), load(positions, s, 2)
+
+
+@allocation_free(forceinline=True)
+def _velocity(twists, f, x, y, z):
+    """Velocities of points of a frame."""
+    a, b, c = _at(twists, f)
+    return (
+        b * z - c * y + load(twists, f, 3),
+        c * x - a * z + load(twists, f, 4),
+        a * y - b * x + load(twists, f, 5),
+    )
+
+
+@allocation_free(forceinline=True)
+def _speed(twists, f, other, x, y, z, radius):
+    """Upper bounds on the speed of any point of a ball that is fixed to a frame, seen from another frame."""
+    u, v, w = _velocity(twists, f, x, y, z)
+    p, q, r = _velocity(twists, other, x, y, z)
+    a, b, c = _at(twists, f)
+    d, e, g = _at(twists, other)
+    return _length(u - p, v - q, w - r) + radius * _length(a - d, b - e, c - g)
+
+
+@allocation_free(forceinline=True)
+def _length(x, y, z):
+    return sqrt(x * x + y * y + z * z)
+
+
 @allocation_free()
-def count_obstacles(scene):
-    """Number of obstacles for `make_clearance_workspace`."""
-    return len(scene.spheres) + len(scene.boxes) + len(scene.cylinders) + len(scene.capsules) + 1
-
-
-@allocation_free(fastmath=True)
-def _mark_near(solids, obstacles, radius, limit, near, bounds, least):
-    """Marks the obstacles that can be nearest to a group in any lane, from distances of its bounding sphere.
-
-    An obstacle at distance d from the centre is at least d - radius and at most d + radius away from the
-    group. For the points, which come after the solid obstacles, `bounds` holds only a lower bound. Returns
-    the number of marks.
-    """
-    for i in range(W):
-        least[0, i] = limit
-    for k in range(solids):
-        for i in range(W):
-            least[0, i] = min(least[0, i], bounds[k, i] + radius)
-    count = 0
-    for k in range(obstacles):
-        total = 0
-        for i in range(W):
-            total += np.int32(bounds[k, i] - radius < least[0, i])
-        near[k] = total > 0
-        count += near[k]
-    return count
-
-
-@allocation_free(fastmath=True)
-def _lower_to(least, radius, best):
-    """Lowers best[0] to the distances of centres less the radius."""
-    for i in range(W):
-        best[0, i] = min(best[0, i], least[0, i] - radius)
-
-
-@allocation_free()
-def group_clearance(robot, scene, g, limit, work, best):
-    """Writes signed distances of a group to the scene, at most `limit`, in 16 lanes to best[1, 16].
-
-    The frames and centres of `work` must be those of the configurations (`place_frames`).
-    """
-    solids = count_obstacles(scene) - 1
-    obstacles = solids + (len(scene.points) > 0)
-    radius = robot.bounds[g, 3]
-    to_scene(work.centres, g, scene, radius, work.near, True, work.bounds)
-    for i in range(W):
-        best[0, i] = limit
-    if _mark_near(solids, obstacles, radius, limit, work.near, work.bounds, work.least) > 0:
-        for s in range(robot.first[g], robot.first[g + 1]):
-            place(work.frames, robot.frame[g], robot.spheres, s, work.position, 0)
-            # distances beyond those of previous spheres do not matter
-            for i in range(W):
-                work.least[0, i] = best[0, i] + robot.spheres[s, 3]
-            to_scene(work.position, 0, scene, robot.spheres[s, 3], work.near, False, work.least)
-            _lower_to(work.least, robot.spheres[s, 3], best)
-
-
-@allocation_free(inner=False)
-def block_clearances(robot, scene, first, q, limit, work, best, out):
-    """Writes signed distances to the scene, at most `limit`, of the groups from `first` on to out[groups,
-    16].
-
-    q: [dof, 16]. `best` is scratch memory, [1, 16].
-    """
+def place_motions(robot, q, dq, work):
+    """Writes the frames in the middles q[dof, 16] and their twists along dq[dof, 16]; a joint's axis is the z
+    axis of its frame."""
     place_frames(robot, q, work.frames, work.centres)
-    for g in range(first, len(robot.frame)):
-        group_clearance(robot, scene, g, limit, work, best)
-        for i in range(W):
-            out[g - first, i] = best[0, i]
+    work.placed[:] = False
+    for j in range(len(robot.offsets)):
+        parent, f, slides = parent_of(robot.parents, j), j + 1, robot.offsets[j, 12]
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            axis = load(work.frames, f, 3 * k + 2) * load(dq, j, 0)
+            moment = load(work.frames, f, 9 + a) * load(work.frames, f, 3 * b + 2)
+            moment = moment - load(work.frames, f, 9 + b) * load(work.frames, f, 3 * a + 2)
+            moment = moment * load(dq, j, 0) * (_ONE - slides) + axis * slides
+            store(work.twists, f, k, load(work.twists, parent, k) + axis * (_ONE - slides))
+            store(work.twists, f, 3 + k, load(work.twists, parent, 3 + k) + moment)
 
 
-@allocation_free(inline="always")
+@allocation_free()
 def _place_group(robot, g, work):
     if not work.placed[g]:
         for s in range(robot.first[g], robot.first[g + 1]):
@@ -270,25 +168,122 @@ def _place_group(robot, g, work):
         work.placed[g] = True
 
 
-@allocation_free()
-def pair_clearance(robot, p, limit, work, best):
-    """Writes distances between the links of a checked pair, at most `limit`, in 16 lanes to best[1, 16].
+@allocation_free(forceinline=True)
+def _reset(work):
+    store(work.clearance, 0, 0, load(work.need, 0, 0))
+    store(work.lower, 0, 0, load(work.need, 0, 0))
 
-    The frames and centres of `work` must be those of the configurations; `placed` marks the groups whose
-    positions are.
+
+@allocation_free(forceinline=True)
+def _lower_to(distance, towards, work):
+    """Lowers clearances and bounds."""
+    store(work.clearance, 0, 0, minimum(load(work.clearance, 0, 0), distance))
+    store(work.lower, 0, 0, minimum(load(work.lower, 0, 0), distance - towards))
+
+
+@allocation_free(forceinline=True)
+def _mark_near(robot, scene, g, speed, work):
+    """Marks the obstacles that can be nearest to a group in any lane; returns whether there are any.
+
+    An obstacle at distance d from the centre of the bounding sphere is at least d - radius and at most d +
+    radius away from the group. For the points, which come after the solids, there is only a lower bound.
     """
+    x, y, z = _at(work.centres, g)
+    radius, least, zero, solids = robot.bounds[g, 3], load(work.need, 0, 0), x * _ZERO, len(scene.solids)
+    for k in range(solids):
+        distance, _ = to_solid(x, y, z, zero, zero, zero, scene.solids[k])
+        if len(scene.may_touch) and scene.may_touch[g, k]:
+            distance = zero + _FAR
+        store(work.bounds, k, 0, distance)
+        least = minimum(least, distance + radius)
+    obstacles = solids
+    if len(scene.points):
+        obstacles += 1
+        for i in range(W):
+            distance = points_lower_bound(scene, lane(x, i), lane(y, i), lane(z, i))
+            work.bounds[solids, i] = min(distance, POINT_RANGE + radius)
+    some = False
+    for k in range(obstacles):
+        work.near[k] = (load(work.bounds, k, 0) - radius - speed < least) != 0
+        some |= work.near[k]
+    return some
+
+
+@allocation_free(forceinline=True)
+def group_along(robot, scene, g, moving, work):
+    """Writes clearances of a group to the scene, at most `work.need`, and their bounds along the motions to
+    `work`. Without `moving` the twists are taken for zero."""
+    frame, solids = robot.frame[g], len(scene.solids)
+    x, y, z = _at(work.centres, g)
+    zero = x * _ZERO
+    speed = _speed(work.twists, frame, 0, x, y, z, robot.bounds[g, 3]) if moving else zero
+    _reset(work)
+    if not _mark_near(robot, scene, g, speed, work):
+        return
+    _place_group(robot, g, work)
+    for s in range(robot.first[g], robot.first[g + 1]):
+        x, y, z = _at(work.positions, s)
+        u, v, w = _velocity(work.twists, frame, x, y, z) if moving else (zero, zero, zero)
+        radius = robot.spheres[s, 3]
+        for k in range(solids):
+            if work.near[k]:
+                distance, towards = to_solid(x, y, z, u, v, w, scene.solids[k])
+                _lower_to(distance - radius, towards, work)
+        if len(scene.points) and work.near[solids]:
+            # the nearest point changes along the motion, so the sphere's whole speed counts
+            speed = _length(u, v, w)
+            for i in range(W):
+                limit = min(work.clearance[0, i] + lane(speed, i), POINT_RANGE) + radius
+                distance = points_distance(scene, lane(x, i), lane(y, i), lane(z, i), limit) - radius
+                work.clearance[0, i] = min(work.clearance[0, i], distance)
+                work.lower[0, i] = min(work.lower[0, i], distance - lane(speed, i))
+
+
+@allocation_free(forceinline=True)
+def pair_along(robot, p, moving, work):
+    """As `group_along`, between the links of a checked pair."""
     a, b = robot.pairs[p, 0], robot.pairs[p, 1]
-    centres, positions = work.centres, work.positions
-    spheres, bounds, first = robot.spheres, robot.bounds, robot.first
-    for i in range(W):
-        best[0, i] = limit
-    if _nearer(centres, a, centres, b, bounds[a, 3] + bounds[b, 3], best) > 0:
-        _place_group(robot, a, work)
-        _place_group(robot, b, work)
-        for s in range(first[a], first[a + 1]):
-            radius = spheres[s, 3]
-            if _nearer(positions, s, centres, b, radius + bounds[b, 3], best) > 0:
-                _keep_least(positions, s, positions, first[b], first[b + 1], spheres, radius, best)
+    spheres, bounds, twists, f, g = robot.spheres, robot.bounds, work.twists, robot.frame[a], robot.frame[b]
+    x, y, z = _at(work.centres, a)
+    u, v, w = _at(work.centres, b)
+    zero = x * _ZERO
+    speed = _speed(twists, f, g, x, y, z, bounds[a, 3]) if moving else zero
+    _reset(work)
+    gap = _length(x - u, y - v, z - w) - (bounds[a, 3] + bounds[b, 3])
+    if (gap - speed < load(work.clearance, 0, 0)) == 0:
+        return
+    _place_group(robot, a, work)
+    _place_group(robot, b, work)
+    for s in range(robot.first[a], robot.first[a + 1]):
+        x, y, z = _at(work.positions, s)
+        speed = _speed(twists, f, g, x, y, z, _ZERO) if moving else zero
+        gap = _length(x - u, y - v, z - w) - (spheres[s, 3] + bounds[b, 3])
+        if (gap - speed < load(work.clearance, 0, 0)) == 0:
+            continue
+        p, q, r = _velocity(twists, f, x, y, z) if moving else (zero, zero, zero)
+        for t in range(robot.first[b], robot.first[b + 1]):
+            dx, dy, dz = _at(work.positions, t)
+            # only the difference of the velocities along the line between the centres counts, whatever frame
+            # it is seen from
+            i, j, k = _velocity(twists, g, dx, dy, dz) if moving else (zero, zero, zero)
+            dx, dy, dz = x - dx, y - dy, z - dz
+            distance = _length(dx, dy, dz)
+            towards = absolute(dx * (p - i) + dy * (q - j) + dz * (r - k)) / maximum(distance, _TINY)
+            _lower_to(distance - (spheres[s, 3] + spheres[t, 3]), towards, work)
+
+
+@allocation_free(inner=False)
+def block_clearances(robot, scene, q, limit, work, out):
+    """Writes signed distances to the scene, at most `limit`, of the last groups to out[groups, 16].
+
+    q: [dof, 16].
+    """
+    place_frames(robot, q, work.frames, work.centres)
+    work.placed[:] = False
+    work.need[:] = limit
+    for g in range(len(out)):
+        group_along(robot, scene, len(robot.frame) - len(out) + g, False, work)
+        store(out, g, 0, load(work.clearance, 0, 0))
 
 
 @allocation_free()
@@ -301,75 +296,55 @@ def block_pair_clearances(robot, q, limit, work, out):
     """
     place_frames(robot, q, work.frames, work.centres)
     work.placed[:] = False
-    for p in range(len(robot.pairs)):
-        pair_clearance(robot, p, limit, work, work.least)
+    work.need[:] = limit
+    for p in range(len(out)):
+        pair_along(robot, p, False, work)
         table, bit, known = robot.pairs[p, 2], robot.pairs[p, 3], 0
-        if table >= 0 and reduce_min(load(work.least, 0, 0)) <= _ZERO:
+        if table >= 0 and reduce_min(load(work.clearance, 0, 0)) <= _ZERO:
             known = ~lanes_that_may_touch(robot, table, bit, q)
         for i in range(W):
-            apart = work.least[0, i] <= _ZERO and known >> i & 1
-            out[p, i] = limit if apart else work.least[0, i]
+            apart = work.clearance[0, i] <= _ZERO and known >> i & 1
+            out[p, i] = limit if apart else work.clearance[0, i]
 
 
 @inner_kernel()
 def pair_clearances_into(robot, q, limit, work, out):
     """Writes clearances of the checked pairs for the rows of q[n, dof] to out[n, pairs]."""
-    n, dof = q.shape
-    block, found = np.empty((dof, W), np.float32), np.empty((out.shape[1], W), np.float32)
-    for start in range(0, n, W):
-        for i in range(W):
-            row = min(start + i, n - 1)
-            for j in range(dof):
-                block[j, i] = q[row, j]
+    block, found = np.empty((q.shape[1], W), np.float32), np.empty((out.shape[1], W), np.float32)
+    for start in range(0, len(q), W):
+        take_block(q, start, block)
         block_pair_clearances(robot, block, limit, work, found)
-        for i in range(min(W, n - start)):
-            for p in range(out.shape[1]):
-                out[start + i, p] = found[p, i]
+        _put_block(found, start, out)
+
+
+@inner_kernel()
+def clearances_into(robot, scene, q, limit, work, out):
+    """Writes clearances of the moving groups for the rows of q[n, dof] to out[n, groups]."""
+    block, found = np.empty((q.shape[1], W), np.float32), np.empty((out.shape[1], W), np.float32)
+    for start in range(0, len(q), W):
+        take_block(q, start, block)
+        block_clearances(robot, scene, block, limit, work, found)
+        _put_block(found, start, out)
+
+
+@inner_kernel()
+def _put_block(found, start, out):
+    """Writes columns of a block to rows from `start` on."""
+    for i in range(min(W, len(out) - start)):
+        out[start + i] = found[:, i]
 
 
 @kernel(nogil=True)
 def pair_clearances(robot, q, limit):
     """Distances [n, pairs] between the checked pairs of links at q[n, dof], at most `limit`."""
     out = np.empty((len(q), len(robot.pairs)), np.float32)
-    pair_clearances_into(robot, q, limit, make_clearance_workspace(robot, 1), out)
+    pair_clearances_into(robot, q, limit, make_clearance_workspace(robot, 0), out)
     return out
-
-
-@inner_kernel()
-def clearances_into(robot, scene, q, limit, work, out):
-    """Writes clearances of the moving groups for the rows of q[n, dof] to out[n, groups]."""
-    n, dof = q.shape
-    first = len(robot.frame) - out.shape[1]
-    block, found = np.empty((dof, W), np.float32), np.empty((out.shape[1], W), np.float32)
-    best = np.empty((1, W), np.float32)
-    for start in range(0, n, W):
-        for i in range(W):
-            row = min(start + i, n - 1)
-            for j in range(dof):
-                block[j, i] = q[row, j]
-        block_clearances(robot, scene, first, block, limit, work, best, found)
-        for i in range(min(W, n - start)):
-            for g in range(out.shape[1]):
-                out[start + i, g] = found[g, i]
 
 
 @kernel(nogil=True)
 def link_clearances(robot, scene, q, limit):
     """Signed distances [n, moving groups] to the scene at q[n, dof], at most `limit`."""
-    moving = len(robot.frame) - np.searchsorted(robot.frame, 1)
-    out = np.empty((len(q), moving), np.float32)
-    work = make_clearance_workspace(robot, count_obstacles(scene))
-    clearances_into(robot, scene, q, limit, work, out)
+    out = np.empty((len(q), len(robot.frame) - np.searchsorted(robot.frame, 1)), np.float32)
+    clearances_into(robot, scene, q, limit, make_clearance_workspace(robot, len(scene.solids)), out)
     return out
-
-
-@kernel(nogil=True)
-def cost_gradients(robot, scene, q, margin, self_margin):
-    """Collision costs [n] of the rows of q[n, dof] and their gradients [n, dof]; see `cost_gradient_at`."""
-    n, dof = q.shape
-    costs, grads = np.empty(n, np.float32), np.zeros((n, dof), np.float32)
-    scratch = make_cost_workspace(dof)
-    pairs = pair_clearances(robot, q, self_margin)
-    for i in range(n):
-        costs[i] = cost_gradient_at(robot, scene, q[i], pairs[i], margin, self_margin, scratch, grads[i])
-    return costs, grads

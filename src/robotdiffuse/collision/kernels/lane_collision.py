@@ -361,18 +361,23 @@ def block_hits(robot, scene, q, padding, stop_at_first, work):
     return _hits_itself(robot, q, hits, stop_at_first, work)
 
 
+@allocation_free()
+def take_block(q, start, block):
+    """Writes 16 rows of q[n, dof] from `start` on to block[dof, 16]; the last row is repeated."""
+    for i in range(W):
+        for j in range(len(block)):
+            block[j, i] = q[min(start + i, len(q) - 1), j]
+
+
 @kernel(nogil=True)
 def free_many(robot, scene, q, padding):
     """Whether each row of q[n, dof] is free of collision."""
-    n, dof = q.shape
+    n = len(q)
     out = np.empty(n, np.bool_)
     work = make_workspace(robot, scene)
-    block = np.empty((dof, W), np.float32)
+    block = np.empty((q.shape[1], W), np.float32)
     for start in range(0, n, W):
-        for i in range(W):
-            row = min(start + i, n - 1)
-            for j in range(dof):
-                block[j, i] = q[row, j]
+        take_block(q, start, block)
         hits = block_hits(robot, scene, block, padding, False, work)
         for i in range(min(W, n - start)):
             out[start + i] = not hits >> i & 1

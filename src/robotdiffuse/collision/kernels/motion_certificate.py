@@ -21,14 +21,14 @@ from typing import NamedTuple
 import numpy as np
 
 from robotdiffuse.collision.kernels import convex_bounds as meshes
-from robotdiffuse.collision.kernels.lane_collision import W
-from robotdiffuse.collision.kernels.motion_pieces import Pieces, configuration, split
-from robotdiffuse.collision.kernels.swept_spheres import (
+from robotdiffuse.collision.kernels.lane_clearance import (
     group_along,
-    make_swept_spheres,
+    make_clearance_workspace,
     pair_along,
     place_motions,
 )
+from robotdiffuse.collision.kernels.lane_collision import W
+from robotdiffuse.collision.kernels.motion_pieces import Pieces, configuration, split
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
 CLEARANCE_CAP = 1.0
@@ -165,17 +165,17 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
             open_ones, kind = 0, checks.kind[c]
             for i in range(W):
                 row = first + i
-                work.need[i] = -1.0
+                work.need[0, i] = -1.0
                 if row < n and pieces.undecided[row, c]:
                     open_ones += 1
-                    work.need[i] = best[kind] + rest[row, c] + FLOAT32_SLACK
+                    work.need[0, i] = best[kind] + rest[row, c] + FLOAT32_SLACK
             if open_ones == 0:
                 continue
             if checks.where[c] >= 0:
                 if kind == SCENE:
-                    group_along(arm.spheres, scene, checks.where[c], work)
+                    group_along(arm.spheres, scene, checks.where[c], True, work)
                 else:
-                    pair_along(arm.spheres, checks.where[c], work)
+                    pair_along(arm.spheres, checks.where[c], True, work)
             for row in range(first, last):
                 if not pieces.undecided[row, c]:
                     continue
@@ -307,7 +307,7 @@ def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightnes
     Lowers best[2] and certified[2], by kind. Returns the last round, not yet settled, and the rows and
     columns of the checks that Coal has to decide, in the order of the motion.
     """
-    work = make_swept_spheres(arm.spheres, scene)
+    work = make_clearance_workspace(arm.spheres, len(scene.solids))
     posture = meshes.make_posture(arm.hulls, solids, motion.q.shape[1])
     while True:
         found = bound_by_spheres(arm, scene, motion, checks, pieces, best, work)

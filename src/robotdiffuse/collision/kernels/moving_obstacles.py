@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from robotdiffuse.collision.kernels.compiled import parent_of
-from robotdiffuse.collision.kernels.frames import placed, step
+from robotdiffuse.collision.kernels.frames import placed, step, write_rotation
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
 CLEARANCE_CAP = 1.0
@@ -102,22 +102,7 @@ def pose_at(tracks, o, time, rotation, xyz):
     y = a * tracks.wxyz[low, 2] + b * tracks.wxyz[high, 2]
     z = a * tracks.wxyz[low, 3] + b * tracks.wxyz[high, 3]
     scale = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w * scale, x * scale, y * scale, z * scale
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-    )
-    rotation[1, 0], rotation[1, 1], rotation[1, 2] = (
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-    )
-    rotation[2, 0], rotation[2, 1], rotation[2, 2] = (
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    )
+    write_rotation(w * scale, x * scale, y * scale, z * scale, rotation)
 
 
 @kernel()

@@ -1,7 +1,7 @@
 """SIMD in compiled code: sixteen float32 numbers as one value of the type `Lanes`, LLVM's <16 x float>.
 
 Operations on lanes become SIMD instructions without relying on LLVM's vectorizer: one instruction each with
-AVX-512, two with AVX2, four with SSE or NEON. `+ - *` work on lanes, and on lanes and a float32, which is
+AVX-512, two with AVX2, four with SSE or NEON. `+ - * /` work on lanes, and on lanes and a float32, which is
 broadcast. `a < b` is a mask: an int64 whose bit i belongs to lane i. Arithmetic may be contracted to fused
 multiply-add and ignores NaN.
 """
@@ -30,6 +30,8 @@ _VECTOR = ir.VectorType(_FLOAT, W)
 _INTEGERS = ir.VectorType(ir.IntType(32), W)
 _EVERYWHERE = ir.Constant(_INTEGERS, [0] * W)
 _ALIGN = 4
+# of any type, since the context is no argument of the calls
+_operation: Any = intrinsic
 
 
 class LanesType(types.Type):
@@ -69,11 +71,6 @@ def _mask(builder: Any, bits: Any) -> Any:
     return builder.zext(builder.bitcast(bits, ir.IntType(W)), _BITS)
 
 
-def _operation(generated: Callable) -> Any:
-    """An intrinsic from a function that maps argument types to a signature and a code generator."""
-    return intrinsic(generated)
-
-
 def _define_operator(function: Callable, result: types.Type, build: Callable[[Any, Any, Any], Any]) -> None:
     """Define a binary operator on lanes; `build` takes the builder and two vectors."""
 
@@ -95,6 +92,7 @@ def _define_operator(function: Callable, result: types.Type, build: Callable[[An
 _define_operator(operator.add, LANES, lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
 _define_operator(operator.sub, LANES, lambda builder, a, b: builder.fsub(a, b, flags=_FLAGS))
 _define_operator(operator.mul, LANES, lambda builder, a, b: builder.fmul(a, b, flags=_FLAGS))
+_define_operator(operator.truediv, LANES, lambda builder, a, b: builder.fdiv(a, b, flags=_FLAGS))
 _define_operator(
     operator.lt,
     types.int64,

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
+from robotdiffuse.collision.kernels.collision_cost import CLEARANCE_CAP
 from robotdiffuse.core.errors import InputError, distinct, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import parse_json, parse_yaml
 from robotdiffuse.core.results import PlanResult
