@@ -4,22 +4,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.robots.robot import Robot, once_per_robot
-
-Z = np.array([0.0, 0.0, 1.0])
 
 
 def link_pose(robot: Robot, q: Float[ndarray, "dof"], link: str) -> Float[ndarray, "4 4"]:
     """T_base_link at one configuration; raises InputError for an unknown link."""
-    T = np.eye(4)
-    for j in robot.chain(link):
-        T = T @ robot.frame_offsets[j] @ _motion(robot, j, q[j])
-    return T @ robot.T_frame_link(link)
-
-
-def _motion(robot: Robot, j: int, q: float) -> Float[ndarray, "4 4"]:
-    return transform(Z * q) if robot.prismatic[j] else transform(0 * Z, rotation_about(Z, q))
+    return link_poses(robot, np.asarray(q)[None], link)[0]
 
 
 def _motions(robot: Robot, j: int, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 4 4"]:
@@ -80,7 +70,7 @@ def placed_spheres(robot: Robot, q: Float[ndarray, "dof"]) -> Float[ndarray, "n 
     """All collision spheres at one configuration, x y z radius in the base frame [m]."""
     parts, frames = [], [np.eye(4)]
     for j, parent in enumerate(robot.parents):
-        frames.append(frames[parent] @ robot.frame_offsets[j] @ _motion(robot, j, q[j]))
+        frames.append(frames[parent] @ robot.frame_offsets[j] @ _motions(robot, j, q[None])[0])
     for T, spheres in zip(frames, _spheres_by_frame(robot), strict=True):
         parts.append(np.column_stack([spheres[:, :3] @ T[:3, :3].T + T[:3, 3], spheres[:, 3]]))
     return np.concatenate(parts)

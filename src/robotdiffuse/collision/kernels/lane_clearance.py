@@ -64,7 +64,7 @@ class ClearanceWorkspace(NamedTuple):
     """[1, W] lower bounds along the motions, without the remainder."""
 
 
-@inner_kernel()
+@kernel()
 def make_clearance_workspace(robot, solids):
     """Scratch memory for one thread and at most so many solids."""
     joints, groups = len(robot.offsets), len(robot.frame)
