@@ -26,6 +26,7 @@ from robotdiffuse.certificates.obstacles import (
     Surface,
 )
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Configurations, JointRows, Points, Pose, Values, Vector
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
@@ -47,8 +48,8 @@ class Stretches(NamedTuple):
 
     claim: Int[ndarray, "n"]
     """Index of the claim."""
-    start: Float[ndarray, "n"]
-    stop: Float[ndarray, "n"]
+    start: Values
+    stop: Values
 
     def some(self, rows: ndarray) -> "Stretches":
         """The stretches of these rows, given by indices or a mask."""
@@ -70,11 +71,11 @@ class Plane(NamedTuple):
 class Part(NamedTuple):
     """A convex part of a link: the convex hull of vertices, inflated by a radius, and a ball around it."""
 
-    vertices: Float[ndarray, "v 3"]
+    vertices: Points
     faces: Int[ndarray, "f 3"]
     """Empty for a single vertex."""
     rounding: float
-    center: Float[ndarray, "3"]
+    center: Vector
     radius: float
 
 
@@ -82,9 +83,9 @@ class Part(NamedTuple):
 class Bounds:
     """Bounds of stretches."""
 
-    clearance: Float[ndarray, "n"]
+    clearance: Values
     """In the middles of the stretches [m], at most CLEARANCE_CAP."""
-    displacement: Float[ndarray, "n"]
+    displacement: Values
     """Of any point of the link from the middle to anywhere on the stretch [m]."""
 
 
@@ -95,8 +96,8 @@ class Prover:
         self,
         robot: Robot,
         scene: Scene,
-        q: Float[ndarray, "rows dof"],
-        off: Float[ndarray, "rows1 dof"] | None = None,
+        q: Configurations,
+        off: JointRows | None = None,
     ) -> None:
         """`off`: how far the motion leaves the straight line from each configuration to the next; 0 if it is
         None."""
@@ -136,14 +137,14 @@ class Prover:
                     pairs.append(Claim(a, b) if level[a] > level[b] else Claim(b, a))
         return (*moving, *pairs)
 
-    def at(self, places: Float[ndarray, "n"]) -> Float[ndarray, "n dof"]:
+    def at(self, places: Values) -> Configurations:
         """Configurations at places."""
         low = np.clip(places.astype(int), 0, max(len(self.q) - 2, 0))
         high = np.minimum(low + 1, len(self.q) - 1)
         share = (places - low)[:, None]
         return (1 - share) * self.q[low] + share * self.q[high]
 
-    def spans(self, start: ndarray, stop: ndarray, middle: ndarray) -> Float[ndarray, "n dof"]:
+    def spans(self, start: ndarray, stop: ndarray, middle: ndarray) -> JointRows:
         """Largest distance of each joint from the middle of a stretch to anywhere on it [rad] or [m]."""
         q = self.at(middle)
         spans = np.maximum(np.abs(self.at(start) - q), np.abs(self.at(stop) - q))
@@ -158,7 +159,7 @@ class Prover:
             spans[within] = np.maximum(spans[within], beyond)
         return spans + self.deviations(start, stop)
 
-    def deviations(self, start: ndarray, stop: ndarray) -> Float[ndarray, "n dof"]:
+    def deviations(self, start: ndarray, stop: ndarray) -> JointRows:
         """How far each joint leaves the straight lines along stretches [rad] or [m]."""
         if not len(self.off):
             return np.zeros((len(start), self.q.shape[1]))
@@ -345,7 +346,7 @@ class Prover:
         return np.sqrt(((part.center - centers) ** 2).sum(axis=1)) - part.radius - radii
 
 
-def _steps(prover: Prover, start: float, stop: float) -> Float[ndarray, "rows dof"]:
+def _steps(prover: Prover, start: float, stop: float) -> JointRows:
     """Differences from the middle of a stretch to its start, its stop and the waypoints between."""
     inner = np.arange(int(np.floor(start)) + 1, int(np.ceil(stop)))
     ends = prover.at(np.array([start, (start + stop) / 2, stop]))
@@ -370,13 +371,13 @@ def gaps(
     return nearest - body.reach(normals)
 
 
-def placed(parts: tuple[Part, ...], T: Float[ndarray, "4 4"]) -> list[Part]:
+def placed(parts: tuple[Part, ...], T: Pose) -> list[Part]:
     """Parts in the base frame, T being the pose of their link."""
     R, t = T[:3, :3], T[:3, 3]
     return [part._replace(vertices=part.vertices @ R.T + t, center=R @ part.center + t) for part in parts]
 
 
-def _placed_points(T: Float[ndarray, "n 4 4"], points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+def _placed_points(T: Float[ndarray, "n 4 4"], points: Points) -> Float[ndarray, "n 3"]:
     return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
 
 
@@ -420,9 +421,9 @@ class MovingProver(Prover):
         self,
         robot: Robot,
         moving: Sequence[MovingObstacle],
-        q: Float[ndarray, "rows dof"],
-        times: Float[ndarray, "rows"],
-        off: Float[ndarray, "rows1 dof"] | None = None,
+        q: Configurations,
+        times: Values,
+        off: JointRows | None = None,
     ) -> None:
         super().__init__(robot, Scene(), q, off)
         self.times, self.moving = times, tuple(moving)

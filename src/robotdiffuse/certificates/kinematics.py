@@ -10,7 +10,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import (
+    Configurations,
+    JointRows,
+    JointValues,
+    Path,
+    Points,
+    Pose,
+    Rotation,
+    Trajectory,
+    Values,
+    Vector,
+)
 from robotdiffuse.robots.robot import Joint, Robot
 
 
@@ -44,7 +55,7 @@ class Linkage:
                 moved[joint.child][self._planned[joint.name]] = True
         return np.stack([moved[link] for link in self.links])
 
-    def place(self, q: Float[ndarray, "n dof"], link: str | None = None) -> Postures:
+    def place(self, q: Configurations, link: str | None = None) -> Postures:
         """Poses at configurations. With `link`, only the links between the base and that link; the rest is
         0."""
         n, dof = len(q), len(self._planned)
@@ -81,7 +92,7 @@ class Linkage:
             link = above[link].parent
         return found[::-1]
 
-    def levers(self, link: str, q: Float[ndarray, "n dof"]) -> Float[ndarray, "joints"]:
+    def levers(self, link: str, q: Configurations) -> Float[ndarray, "joints"]:
         """Upper bounds on the distance of a link's origin from the axes of the planned joints that move it,
         in order [m]; 1 for a joint that slides. `q` holds the extreme positions of a motion."""
         found, length = list[float](), 0.0
@@ -108,11 +119,11 @@ class Linkage:
         self,
         postures: Postures,
         rows: Int[ndarray, "m"],
-        centers: Float[ndarray, "m 3"],
-        radii: Float[ndarray, "m"],
+        centers: Points,
+        radii: Values,
         moved: Bool[ndarray, "m dof"],
-        spans: Float[ndarray, "n dof"],
-    ) -> Float[ndarray, "m"]:
+        spans: JointRows,
+    ) -> Values:
         """Upper bound on the displacement of any point of balls [m] when joints move by up to `spans`.
 
         Balls are given at their places in the postures of `rows`; `moved` marks the joints that move them,
@@ -133,11 +144,11 @@ class Linkage:
         self,
         origins: Float[ndarray, "dof 3"],
         axes: Float[ndarray, "dof 3"],
-        points: Float[ndarray, "v 3"],
+        points: Points,
         moved_by: Int[ndarray, "joints"],
-        steps: Float[ndarray, "rows dof"],
+        steps: JointRows,
         normals: Float[ndarray, "k 3"],
-        off: Float[ndarray, "dof"] | float = 0.0,
+        off: JointValues | float = 0.0,
     ) -> Float[ndarray, "k v"]:
         """Upper bound on the movement of points against unit vectors [m].
 
@@ -170,13 +181,13 @@ def _times(R: Float[ndarray, "n 3 3"], right: Float[ndarray, "3 m"]) -> Float[nd
     return (R.reshape(-1, 3) @ right).reshape(len(R), 3, right.shape[1])
 
 
-def cross_matrix(axis: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+def cross_matrix(axis: Vector) -> Rotation:
     """The matrix of the cross product with a vector."""
     x, y, z = axis
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def _motion(kind: str, axis: Float[ndarray, "3"], q: float) -> Float[ndarray, "4 4"]:
+def _motion(kind: str, axis: Vector, q: float) -> Pose:
     T, K = np.eye(4), cross_matrix(axis)
     if kind == "prismatic":
         T[:3, 3] = q * axis
@@ -188,20 +199,18 @@ def _motion(kind: str, axis: Float[ndarray, "3"], q: float) -> Float[ndarray, "4
 class Cubics(NamedTuple):
     """The cubics from each row to the next; their accelerations are linear in time."""
 
-    times: Float[ndarray, "m"]
+    times: Values
     """When each begins [s]."""
     steps: Float[ndarray, "m 1"]
     """Their durations [s]."""
-    positions: Float[ndarray, "m dof"]
+    positions: Configurations
     """At the start of each."""
-    velocities: Float[ndarray, "m dof"]
-    start: Float[ndarray, "m dof"]
+    velocities: JointRows
+    start: JointRows
     """Acceleration at the start of each."""
-    end: Float[ndarray, "m dof"]
+    end: JointRows
 
-    def at(
-        self, row: Int[ndarray, "n"], time: Float[ndarray, "n"]
-    ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
+    def at(self, row: Int[ndarray, "n"], time: Values) -> tuple[Configurations, JointRows, JointRows]:
         """Positions, velocities and accelerations of cubics `time` seconds after they begin."""
         t, a = time[:, None], self.start[row]
         jerk = (self.end[row] - a) / self.steps[row]
@@ -212,17 +221,17 @@ class Cubics(NamedTuple):
             a + t * jerk,
         )
 
-    def rows(self, times: Float[ndarray, "n"]) -> Int[ndarray, "n"]:
+    def rows(self, times: Values) -> Int[ndarray, "n"]:
         """The cubic at each time; at a row, the one that begins there."""
         return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
 
     @property
-    def pulls(self) -> Float[ndarray, "m dof"]:
+    def pulls(self) -> JointRows:
         """The greatest absolute acceleration of each."""
         return np.maximum(np.abs(self.start), np.abs(self.end))
 
     @property
-    def speeds(self) -> Float[ndarray, "m dof"]:
+    def speeds(self) -> JointRows:
         """The greatest absolute velocity of each, which is at an end or where the acceleration is 0."""
         curve = self.end - self.start
         share = np.clip(np.divide(-self.start, curve, out=np.zeros_like(curve), where=curve != 0), 0.0, 1.0)
@@ -231,7 +240,7 @@ class Cubics(NamedTuple):
         return np.maximum(np.abs(inner), np.maximum(np.abs(self.velocities), np.abs(last)))
 
     @property
-    def turns(self) -> Float[ndarray, "n dof"]:
+    def turns(self) -> Configurations:
         """Positions of each joint where a cubic has its extremes, or elsewhere on it if it has none."""
         v, curve = self.velocities / self.steps, self.end - self.start
         root = np.sqrt(np.maximum(self.start**2 - 2 * curve * v, 0.0))
@@ -246,7 +255,7 @@ class Cubics(NamedTuple):
             turns.append(self.positions + t * (self.velocities + t * (self.start / 2 + share * curve / 6)))
         return np.concatenate(turns)
 
-    def deviations(self, times: Float[ndarray, "n"]) -> Float[ndarray, "n1 dof"]:
+    def deviations(self, times: Values) -> JointRows:
         """Upper bounds on how far each joint leaves the straight lines between its positions at these times,
         among which are those of all rows: an eighth of its greatest acceleration times the square of the
         time."""
@@ -255,18 +264,18 @@ class Cubics(NamedTuple):
             most = np.maximum(most, np.abs(self.at(row, end - self.times[row])[2]))
         return most * np.diff(times)[:, None] ** 2 / 8
 
-    def jumps(self) -> Float[ndarray, "n dof"]:
+    def jumps(self) -> JointRows:
         """By how much the acceleration jumps at each row; before and after the motion it is 0."""
         none = np.zeros_like(self.start[:1])
         return np.abs(np.concatenate([self.start, none]) - np.concatenate([none, self.end]))
 
 
-def clock(motion: Path | Trajectory) -> Float[ndarray, "n"]:
+def clock(motion: Path | Trajectory) -> Values:
     """The times of a motion's rows; of a path, their numbers."""
     return motion.times if isinstance(motion, Trajectory) else np.arange(len(motion.positions), dtype=float)
 
 
-def places_of(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> Float[ndarray, "n"]:
+def places_of(motion: Path | Trajectory, between: Values) -> Values:
     """The `clock` of the rows, and of places between them, in order."""
     return np.sort(np.concatenate([clock(motion), between]), kind="stable")
 

@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_from_quaternion
+from robotdiffuse.core.types import Points, Rotation, Values, Vector
 from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
@@ -28,13 +29,13 @@ MAX_ARRAY_SIZE = 1_000_000
 class Rounded(NamedTuple):
     """The Minkowski sum of a box, a disc about its z axis and a ball: a sphere, box, cylinder or capsule."""
 
-    center: Float[ndarray, "3"]
-    R: Float[ndarray, "3 3"]
-    half: Float[ndarray, "3"]
+    center: Vector
+    R: Rotation
+    half: Vector
     disc: float
     rounding: float
 
-    def reach(self, n: Float[ndarray, "k 3"]) -> Float[ndarray, "k"]:
+    def reach(self, n: Float[ndarray, "k 3"]) -> Values:
         """The maximum of n · x over its points x, for unit vectors n (its support function)."""
         local = n @ self.R
         across = np.hypot(local[:, 0], local[:, 1])
@@ -70,7 +71,7 @@ class Obstacles:
         self._rounding = np.array([body.rounding for _, body in rounded])
         self._indices = {i: _Index(body) for i, body in enumerate(self.bodies) if isinstance(body, Surface)}
 
-    def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n obstacles"]:
+    def distances(self, points: Points) -> Float[ndarray, "n obstacles"]:
         """Distances of points to each obstacle [m], at most CLEARANCE_CAP; 0 or less inside."""
         found = np.full((len(points), len(self.bodies)), CLEARANCE_CAP)
         step = max(MAX_ARRAY_SIZE // max(3 * len(self._at), 1), 1)
@@ -81,7 +82,7 @@ class Obstacles:
             found[:, i] = index.distances(points)
         return found
 
-    def near(self, center: Float[ndarray, "3"], radius: float) -> tuple[Rounded | Surface, ...]:
+    def near(self, center: Vector, radius: float) -> tuple[Rounded | Surface, ...]:
         """The bodies; a surface is reduced to elements near a ball, at least to those within PLANE_RANGE."""
         return tuple(
             self._indices[i].near(center, radius + PLANE_RANGE) if isinstance(body, Surface) else body
@@ -127,7 +128,7 @@ class _Index:
         self.surface = surface
         self._classes = [(KDTree(middles), rows, size) for middles, rows, size in _by_size(surface.corners)]
 
-    def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+    def distances(self, points: Points) -> Values:
         """Distances to the nearest element [m], at most CLEARANCE_CAP: exact where it is near, else to a ball
         around it."""
         found = np.full(len(points), CLEARANCE_CAP)
@@ -147,7 +148,7 @@ class _Index:
                     np.minimum.at(found, of, _to_triangles(points[of], triangles))
         return np.minimum(found - self.surface.radius, CLEARANCE_CAP)
 
-    def near(self, center: Float[ndarray, "3"], reach: float) -> Surface:
+    def near(self, center: Vector, reach: float) -> Surface:
         """The elements that come within a distance of a point, and possibly others."""
         reach += self.surface.radius
         found = [rows[tree.query_ball_point(center, reach + size)] for tree, rows, size in self._classes]
@@ -165,7 +166,7 @@ def _by_size(corners: Float[ndarray, "m c 3"]) -> Iterator[tuple[ndarray, ndarra
         yield middles[rows], rows, float(sizes[rows].max())
 
 
-def _to_triangles(p: Float[ndarray, "n 3"], triangles: Float[ndarray, "n 3 3"]) -> Float[ndarray, "n"]:
+def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
     """Distances of points to one triangle each: to its plane if the foot point is inside, else to an edge."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Path, Trajectory, Values
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.mesh import Triangulated
@@ -58,9 +58,9 @@ class StretchProof:
     stretches: Stretches
     by_planes: Bool[ndarray, "n"]
     """Whether planes between convex meshes prove the stretch; else the covering spheres do."""
-    clearance: Float[ndarray, "n"]
+    clearance: Values
     """Clearance in the middle of each stretch [m], rounded down."""
-    displacement: Float[ndarray, "n"]
+    displacement: Values
     """Upper bound on the displacement of any point of the link from there [m], rounded up."""
     planes: tuple[Plane, ...]
 
@@ -78,7 +78,7 @@ class MotionProof:
     """Hash of the motion, without any rounding."""
     tolerances: Tolerances
     motion: Path | Trajectory
-    between: Float[ndarray, "k"]
+    between: Values
     """Further certified configurations between the rows: times on the cubics through the rows [s]; for a
     path, row plus share of the way to the next."""
     scene_clearance: float
@@ -95,7 +95,7 @@ class MotionProof:
     constraints: tuple[tuple[str, float], ...] = ()
     """For each quantity of a path constraint its name and an upper bound all along the motion [m] or
     [rad]."""
-    torque_samples: Float[ndarray, "samples"] = field(default_factory=lambda: np.zeros(0))
+    torque_samples: Values = field(default_factory=lambda: np.zeros(0))
     """Places between the rows at which torques are computed besides the rows, given as `between`."""
     torques: tuple[tuple[str, float], ...] = ()
     """For each joint its name and an upper bound of its torque with the payload all along [N m] or [N]."""

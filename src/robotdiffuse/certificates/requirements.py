@@ -33,7 +33,16 @@ from robotdiffuse.certificates.kinematics import (
 )
 from robotdiffuse.certificates.proof import BOUND_TOLERANCE, MotionProof, Tolerances
 from robotdiffuse.core.errors import InputError, joined
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import (
+    Configurations,
+    JointRows,
+    JointValues,
+    Path,
+    Points,
+    Rotation,
+    Trajectory,
+    Values,
+)
 from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
@@ -52,7 +61,7 @@ class ConstraintBound(NamedTuple):
     name: str
     limit: float
     """[m] or [rad]"""
-    bounds: Float[ndarray, "n"]
+    bounds: Values
     """From each configuration to the next."""
 
 
@@ -74,19 +83,19 @@ class _FrameMotion(NamedTuple):
 
     p: Float[ndarray, "n1 3"]
     R: Float[ndarray, "n1 3 3"]
-    turn: Float[ndarray, "n"]
+    turn: Values
     """Upper bound of its rotation [rad]."""
-    went: Float[ndarray, "n"]
+    went: Values
     """Upper bound of the path length of its origin [m]."""
-    sag: Float[ndarray, "n"]
+    sag: Values
     """Upper bound of the origin's distance from the chord [m]."""
-    slack: Float[ndarray, "n"]
+    slack: Values
     """Upper bound of the origin's displacement if every joint is off by 1 rad or 1 m [m]."""
     joints: int
     """Number of joints that move the frame."""
 
 
-def constraint_bounds(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[ConstraintBound]:
+def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list[ConstraintBound]:
     """Bounds along straight lines through configurations, and along all motions within `chord` of these lines
     in each joint [rad] or [m]. Raises InputError for a Cartesian line if the goal is not a single pose."""
     linkage = Linkage(problem.robot)
@@ -157,9 +166,7 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
     return lines
 
 
-def _frame_speeds(
-    linkage: Linkage, cubics: Cubics, frame: str, row: ndarray, time: ndarray
-) -> Float[ndarray, "n"]:
+def _frame_speeds(linkage: Linkage, cubics: Cubics, frame: str, row: ndarray, time: ndarray) -> Values:
     q, v, _ = cubics.at(row, time)
     joints, rates = linkage.rates(linkage.place(q, frame), frame)
     return np.linalg.norm((rates * v[:, joints, None]).sum(axis=1), axis=1)
@@ -198,7 +205,7 @@ def _segment(start: ndarray, goal: ndarray) -> _Body:
     return _Body((start + goal) / 2, _with_z((goal - start) / length), np.array([0.0, 0.0, length / 2]))
 
 
-def _with_z(z: ndarray) -> Float[ndarray, "3 3"]:
+def _with_z(z: ndarray) -> Rotation:
     """A rotation matrix with a given unit vector as its third column."""
     x = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
     x /= np.linalg.norm(x)
@@ -282,7 +289,7 @@ class States(NamedTuple):
     q: Float[ndarray, "2 m dof"]
     v: Float[ndarray, "2 m dof"]
     a: Float[ndarray, "2 m dof"]
-    durations: Float[ndarray, "m"]
+    durations: Values
     """Of the stretches [s]; 1 for a path."""
     places: Bound
     """Of positions."""
@@ -292,9 +299,7 @@ class States(NamedTuple):
     """Of accelerations."""
 
 
-def torque_bounds(
-    problem: Problem, motion: Path | Trajectory, samples: Float[ndarray, "k"]
-) -> Float[ndarray, "m dof"]:
+def torque_bounds(problem: Problem, motion: Path | Trajectory, samples: Values) -> JointRows:
     """Upper bounds of each joint's torque from each sample to the next [N m] or [N].
 
     Samples are the rows and, between them, `samples`: times, or for a path rows plus shares of the way to the
@@ -306,7 +311,7 @@ def torque_bounds(
     return np.maximum(*torques) + second_derivatives * states.durations[:, None] ** 2 / 8
 
 
-def _states(motion: Path | Trajectory, samples: Float[ndarray, "k"]) -> States:
+def _states(motion: Path | Trajectory, samples: Values) -> States:
     cubics = cubics_of(motion)
     if cubics is None:
         return _static_states(configurations(motion, samples))
@@ -322,7 +327,7 @@ def _states(motion: Path | Trajectory, samples: Float[ndarray, "k"]) -> States:
     return States(q, v, a, np.diff(at), *bounds)
 
 
-def _static_states(q: Float[ndarray, "n dof"]) -> States:
+def _static_states(q: Configurations) -> States:
     q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
     step = np.abs(np.diff(q, axis=0))
     places = Bound(np.maximum(np.abs(q[1:]), np.abs(q[:-1])), step, 0 * step)
@@ -334,7 +339,7 @@ def _static_states(q: Float[ndarray, "n dof"]) -> States:
 class Vectors(NamedTuple):
     """Vectors whose product is the cross product, as `Bound` is for their bounds."""
 
-    xyz: Float[ndarray, "n 3"]
+    xyz: Points
 
     def __add__(self, other: "Vectors") -> "Vectors":  # type: ignore[override]
         return Vectors(self.xyz + other.xyz)
@@ -346,9 +351,7 @@ class Vectors(NamedTuple):
         return Vectors(by * self.xyz)
 
 
-def inverse_dynamics(
-    problem: Problem, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
-) -> Float[ndarray, "n dof"]:
+def inverse_dynamics(problem: Problem, q: Configurations, v: JointRows, a: JointRows) -> JointRows:
     """Torques [n, dof] by the Newton-Euler equations of each link, in the base frame [N m] or [N]."""
     linkage = Linkage(problem.robot)
     postures = linkage.place(q)
@@ -419,7 +422,7 @@ def _newton_euler(
     return [loads[j] for j in range(len(number))]
 
 
-def _second_derivative_bounds(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
+def _second_derivative_bounds(problem: Problem, states: States) -> JointRows:
     """Upper bounds on the second derivatives of torques from each sample to the next: the same equations on
     bounds. Of a link, bounds of its rotation are needed."""
     robot, none = problem.robot, np.zeros(len(states.durations))
@@ -481,7 +484,7 @@ MIN_TIME = 1e-12
 """Shorter times are taken as this [s], so that rates over them are finite."""
 
 
-def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> Float[ndarray, "n dof"]:
+def configurations(motion: Path | Trajectory, between: Values) -> Configurations:
     """The rows of a motion and further configurations between them, in order.
 
     `between`: times [s], for which the configurations are on the cubics through the rows' positions and
@@ -499,7 +502,7 @@ def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> F
     return q[np.argsort(times, kind="stable")]
 
 
-def deviations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> Float[ndarray, "n1 dof"] | None:
+def deviations(motion: Path | Trajectory, between: Values) -> JointRows | None:
     """How far a motion leaves the straight line from each of its `configurations` to the next; None for a
     path, which does not."""
     cubics = cubics_of(motion)
@@ -566,7 +569,7 @@ def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
     return []
 
 
-def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> Float[ndarray, "dof"] | None:
+def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
     """The largest jerk of each joint along the cubics; None for a path, and where accelerations jump or are
     written otherwise."""
     cubics = cubics_of(motion)
@@ -640,9 +643,7 @@ def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     yield from _stated_errors("torques", stated, most, allowed)
 
 
-def _constraint_errors(
-    problem: Problem, certificate: MotionProof, q: Float[ndarray, "n dof"]
-) -> Iterator[str]:
+def _constraint_errors(problem: Problem, certificate: MotionProof, q: Configurations) -> Iterator[str]:
     """Path constraints that are not shown to be kept, and bounds that differ from the proof."""
     if not problem.constraints and not certificate.constraints:
         return
@@ -666,7 +667,7 @@ def _stated_errors(
 
 
 def _rate_errors(
-    robot: Robot, motion: Trajectory, certificate: MotionProof, begins: Float[ndarray, "dof"]
+    robot: Robot, motion: Trajectory, certificate: MotionProof, begins: JointValues
 ) -> Iterator[str]:
     tolerances, step = certificate.tolerances, np.diff(motion.times)[:, None]
     cubics, off = cubics_of(motion), deviations(motion, certificate.between)
@@ -726,7 +727,7 @@ def _position_errors(robot: Robot, motion: Trajectory, share: float, unsure: flo
 def _acceleration_errors(
     robot: Robot,
     motion: Trajectory,
-    begins: Float[ndarray, "dof"],
+    begins: JointValues,
     share: float,
     unsure: float,
     rest_slack: float,
@@ -759,7 +760,7 @@ def _acceleration_errors(
 
 
 def _agreement_errors(
-    robot: Robot, motion: Trajectory, cubics: Cubics, begins: Float[ndarray, "dof"], unsure: float
+    robot: Robot, motion: Trajectory, cubics: Cubics, begins: JointValues, unsure: float
 ) -> Iterator[str]:
     """Joints whose written accelerations are not near those of the cubics beside their rows."""
     before = np.concatenate([cubics.start[:1], cubics.end])
@@ -778,7 +779,7 @@ def _agreement_errors(
 
 
 def at_goal(
-    robot: Robot, goal: Goal, q: Float[ndarray, "n dof"], tolerances: Tolerances, blend: float = 0.0
+    robot: Robot, goal: Goal, q: Configurations, tolerances: Tolerances, blend: float = 0.0
 ) -> Bool[ndarray, "n"]:
     """Which configurations are at a goal, or within `blend` of it: of a configuration in joint space, of a
     pose by its position or its box of tolerances."""

@@ -51,7 +51,7 @@ from robotdiffuse.certificates.requirements import (
 )
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Path, Pose, Trajectory, Values
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.motion_bounds import motion_radii
@@ -67,7 +67,7 @@ Normal = tuple[float, float, float]
 
 class _Body(NamedTuple):
     geometry: coal.CollisionGeometry
-    T: Float[ndarray, "4 4"]
+    T: Pose
     """Its pose in the frame of its link, or in the base frame."""
 
 
@@ -81,7 +81,7 @@ class PlaneFinder:
             _rounded(body) if isinstance(body, Rounded) else None for body in prover.obstacles.bodies
         )
 
-    def planes(self, todo: Stretches, rows: ndarray, needed: Float[ndarray, "rows"]) -> list[Plane]:
+    def planes(self, todo: Stretches, rows: ndarray, needed: Values) -> list[Plane]:
         """Planes for the stretches of these rows; pairs of bodies with balls further apart than `needed` [m]
         need none, and bodies that touch have none."""
         prover = self.prover
@@ -226,7 +226,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     samples, torques = np.zeros(0), ()
     if problem.constraints:
 
-        def of_constraints(places: Float[ndarray, "k"]) -> tuple[Sequence[str], ndarray, Sequence[float]]:
+        def of_constraints(places: Values) -> tuple[Sequence[str], ndarray, Sequence[float]]:
             shown = constraint_bounds(problem, configurations(motion, places), tolerances.chord)
             names, limits, each = zip(*shown, strict=True)
             return names, np.column_stack(each), limits
@@ -271,10 +271,10 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
 
 def _refined(
     motion: Path | Trajectory,
-    places: Float[ndarray, "k"],
-    bounds_of: Callable[[Float[ndarray, "k"]], tuple[Sequence[str], Float[ndarray, "n b"], Any]],
+    places: Values,
+    bounds_of: Callable[[Values], tuple[Sequence[str], Float[ndarray, "n b"], Any]],
     what: str,
-) -> tuple[Float[ndarray, "m"], tuple[tuple[str, float], ...]]:
+) -> tuple[Values, tuple[tuple[str, float], ...]]:
     """Places between the rows (see `MotionProof.between`) from each of which to the next some bounds are
     within their limits, and the bounds by name.
 
@@ -301,7 +301,7 @@ def _record(problem: Problem) -> dict[str, object] | None:
         return None
 
 
-def _between(motion: Path | Trajectory, chord: float) -> Float[ndarray, "k"]:
+def _between(motion: Path | Trajectory, chord: float) -> Values:
     """Times between the rows such that the cubics leave the straight lines between them by at most
     `chord`."""
     cubics = cubics_of(motion)
@@ -444,9 +444,9 @@ def _join(prover: Prover, done: list[_Found]) -> tuple[StretchProof, dict[str, f
     return proof, least
 
 
-def _down(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
+def _down(values: Values) -> Values:
     return np.floor(values * 10.0**DECIMALS) / 10.0**DECIMALS
 
 
-def _up(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
+def _up(values: Values) -> Values:
     return -_down(-values)

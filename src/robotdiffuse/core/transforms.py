@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import unit_quaternion, vector
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Pose, Rotation, Vector
 
 IDENTITY = np.eye(4)
 
@@ -49,7 +50,7 @@ def _rotation(w: float, x: float, y: float, z: float) -> list[list[float]]:
     ]
 
 
-def quaternion_from_rotation(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "4"]:
+def quaternion_from_rotation(rotation: Rotation) -> Float[ndarray, "4"]:
     """Unit quaternion wxyz with w >= 0 of a rotation matrix (Bar-Itzhack's eigenvector method)."""
     r = rotation
     k = np.array(
@@ -65,7 +66,7 @@ def quaternion_from_rotation(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, 
     return wxyz if w >= 0 else -wxyz
 
 
-def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Float[ndarray, "3 3"]:
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Rotation:
     """URDF's fixed-axis roll, pitch, yaw: Rz(yaw) Ry(pitch) Rx(roll)."""
     (sr, cr), (sp, cp), (sy, cy) = [(np.sin(a), np.cos(a)) for a in (roll, pitch, yaw)]
     return np.array(
@@ -77,7 +78,7 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Float[ndarray, "
     )
 
 
-def rpy_from_rotation(rotation: Float[ndarray, "3 3"]) -> tuple[float, float, float]:
+def rpy_from_rotation(rotation: Rotation) -> tuple[float, float, float]:
     """URDF's roll, pitch, yaw [rad] of a rotation matrix, with pitch in [-pi/2, pi/2]; roll is 0 in gimbal
     lock."""
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
@@ -87,14 +88,14 @@ def rpy_from_rotation(rotation: Float[ndarray, "3 3"]) -> tuple[float, float, fl
     return float(roll), float(pitch), float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
 
-def rotation_about(axis: Float[ndarray, "3"], angle: float) -> Float[ndarray, "3 3"]:
+def rotation_about(axis: Vector, angle: float) -> Rotation:
     """Rotation by an angle [rad] about a unit axis (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def rotation_z_to(axis: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+def rotation_z_to(axis: Vector) -> Rotation:
     """A rotation R with R @ [0, 0, 1] = axis (a unit vector); the identity for +z."""
     z = np.array([0.0, 0.0, 1.0])
     sine, cosine = np.linalg.norm(np.cross(z, axis)), float(axis[2])
@@ -103,9 +104,7 @@ def rotation_z_to(axis: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
     return rotation_about(np.cross(z, axis) / sine, float(np.arctan2(sine, cosine)))
 
 
-def transform(
-    xyz: Float[ndarray, "3"], rotation: Float[ndarray, "3 3"] | None = None
-) -> Float[ndarray, "4 4"]:
+def transform(xyz: Vector, rotation: Rotation | None = None) -> Pose:
     """The 4 x 4 matrix of a rotation (default none) followed by a translation [m]."""
     T = IDENTITY.copy()
     T[:3, 3] = xyz
@@ -114,9 +113,7 @@ def transform(
     return T
 
 
-def pose(
-    xyz: ArrayLike, *, wxyz: ArrayLike | None = None, rpy: ArrayLike | None = None
-) -> Float[ndarray, "4 4"]:
+def pose(xyz: ArrayLike, *, wxyz: ArrayLike | None = None, rpy: ArrayLike | None = None) -> Pose:
     """The 4 x 4 matrix of a position and a rotation, as goals, bases, tools and cameras take it.
 
     Args:
@@ -137,17 +134,17 @@ def pose(
     return transform(vector("pose", "xyz", xyz, 3), rotation)
 
 
-def pose_entry(T: Float[ndarray, "4 4"]) -> dict[str, list[float]]:
+def pose_entry(T: Pose) -> dict[str, list[float]]:
     """The pose as files hold it: `xyz` [m] and `wxyz`."""
     return {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}
 
 
-def inverse(T: Float[ndarray, "4 4"]) -> Float[ndarray, "4 4"]:
+def inverse(T: Pose) -> Pose:
     """Inverse of a rigid transform."""
     return transform(-T[:3, :3].T @ T[:3, 3], T[:3, :3].T)
 
 
-def rotation_angle(rotation: Float[ndarray, "3 3"]) -> float:
+def rotation_angle(rotation: Rotation) -> float:
     """Angle [rad] of a rotation matrix, accurate near 0 and pi."""
     skew = rotation - rotation.T
     sine2 = np.sqrt(skew[0, 1] ** 2 + skew[0, 2] ** 2 + skew[1, 2] ** 2)

@@ -21,8 +21,18 @@ Configuration = Float[ndarray, "dof"]
 """Joint positions [rad], [m] for prismatic joints."""
 Configurations = Float[ndarray, "_ dof"]
 """Configurations in rows, such as waypoints, samples and goals."""
+JointValues = Float[ndarray, "dof"]
+"""A number for each joint, such as its limit, velocity or effort."""
+JointRows = Float[ndarray, "_ dof"]
+"""The same in rows, such as velocities along a motion."""
+Values = Float[ndarray, "_"]
+"""A number for each of many things, such as times, places and distances."""
 Points = Float[ndarray, "_ 3"]
 """[m]"""
+Vector = Float[ndarray, "3"]
+"""A point [m] or a direction."""
+Rotation = Float[ndarray, "3 3"]
+"""A rotation matrix."""
 Pose = Float[ndarray, "4 4"]
 """A rigid transform."""
 ROWS = ("positions", "velocities", "accelerations")

@@ -17,7 +17,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Configurations, Path, Pose, Trajectory, Values
 from robotdiffuse.datasets.shards import (
     SPLITS,
     Manifest,
@@ -42,10 +42,10 @@ def row_of(
     scene: PackedScenes,
     q: Float32[ndarray, "waypoints dof"],
     clearances: Float[ndarray, "waypoints"],
-    goals: Float[ndarray, "k dof"],
-    goal_costs: Float[ndarray, "k"],
+    goals: Configurations,
+    goal_costs: Values,
     goal_index: int,
-    T_base_tip: Float[ndarray, "4 4"],
+    T_base_tip: Pose,
     family: int,
     cost: float,
     safety_distance: float,

@@ -23,6 +23,7 @@ from robotdiffuse.core.errors import InputError, reading
 from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.core.types import Configuration, JointValues, Pose
 from robotdiffuse.interop.mcap_file import McapWriter, check_chunks, make_reader, messages_in, topics_in
 from robotdiffuse.interop.ros_messages import JOINT_STATE, header_seconds, to_plain
 from robotdiffuse.perception.depth_view import DepthView
@@ -81,7 +82,7 @@ def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], 
     write_atomically(Path(file), stream.getvalue())
 
 
-def _transform(parent: str, child: str, stamp: dict[str, int], T: Float[ndarray, "4 4"]) -> dict[str, Any]:
+def _transform(parent: str, child: str, stamp: dict[str, int], T: Pose) -> dict[str, Any]:
     w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
     place = dict(zip("xyz", T[:3, 3].tolist(), strict=True))
     return {
@@ -235,7 +236,7 @@ class TransformHistory:
     def __init__(self) -> None:
         self._parent: dict[str, str] = {}
         self._static: set[str] = set()
-        self._poses: dict[str, list[tuple[float, Float[ndarray, "4 4"]]]] = {}
+        self._poses: dict[str, list[tuple[float, Pose]]] = {}
 
     def add(self, message: Mapping[str, Any], static: bool) -> None:
         """Take a geometry_msgs/TransformStamped, in plain data, into account."""
@@ -253,7 +254,7 @@ class TransformHistory:
         stamped = header_seconds(message["header"]["stamp"]), T
         insert_by_time(self._poses.setdefault(child, []), stamped)
 
-    def at(self, base: str, frame: str, stamp: float, gap: float, where: str) -> Float[ndarray, "4 4"]:
+    def at(self, base: str, frame: str, stamp: float, gap: float, where: str) -> Pose:
         """T_base_frame at a time, interpolated between two transforms at most `gap` from it [s].
 
         Raises InputError, naming `where`, if no chain of transforms leads from the base to the frame, or if
@@ -272,7 +273,7 @@ class TransformHistory:
             passed.append(at)
         return T
 
-    def _one(self, frame: str, stamp: float, gap: float, where: str) -> Float[ndarray, "4 4"]:
+    def _one(self, frame: str, stamp: float, gap: float, where: str) -> Pose:
         """The pose of a frame in its parent's."""
         poses = self._poses[frame]
         if frame in self._static:
@@ -293,7 +294,7 @@ class _States:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._states: list[tuple[float, Float[ndarray, "dof"]]] = []
+        self._states: list[tuple[float, JointValues]] = []
 
     def add(self, stamp: float, state: Mapping[str, Any]) -> None:
         """Take a message into account, if it holds positions of the arm's joints."""
@@ -301,7 +302,7 @@ class _States:
         if all(name in at for name in self._robot.joint_names):
             insert_by_time(self._states, (stamp, np.array([at[name] for name in self._robot.joint_names])))
 
-    def at(self, stamp: float, where: str) -> Float[ndarray, "dof"]:
+    def at(self, stamp: float, where: str) -> Configuration:
         """The configuration at a time. Raises InputError, naming `where`, if none is near."""
         near = neighbours(self._states, stamp, MAX_GAP)
         if not near:

@@ -14,14 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, missing_package, reading
 from robotdiffuse.core.input_files import MEGABYTE, input_file, parse_json
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import Pose, Trajectory
 from robotdiffuse.drawables import Color, Drawable, Surface, drawables, link_surfaces
 from robotdiffuse.interop.recorded_motion import RecordedMotion, joint_trajectory
 from robotdiffuse.interop.ros_messages import (
@@ -154,7 +152,7 @@ def _set(vector: Any, values: Sequence[float]) -> None:
         setattr(vector, axis, value)
 
 
-def _turn(T: Float[ndarray, "4 4"]) -> list[float]:
+def _turn(T: Pose) -> list[float]:
     """The quaternion xyzw."""
     return np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
 
@@ -218,7 +216,7 @@ def _cloud(cloud: PointCloud, frame: str) -> PointCloudMessage:
     return message
 
 
-def _transforms(problem: Problem, poses: dict[str, Float[ndarray, "4 4"]], at: int) -> FrameTransforms:
+def _transforms(problem: Problem, poses: dict[str, Pose], at: int) -> FrameTransforms:
     """poses: in the base frame, of all links but the base and of moving obstacles."""
     update, robot = FrameTransforms(), problem.robot
     frames = {frame: (robot.base, T) for frame, T in poses.items()}

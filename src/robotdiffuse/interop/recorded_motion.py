@@ -18,7 +18,15 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, joined, missing_package, reading, shown
 from robotdiffuse.core.input_files import MAX_YAML_SIZE, parse_yaml, read_json, read_text
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.core.types import Path, Trajectory, check_increasing, check_motion_arrays
+from robotdiffuse.core.types import (
+    Configurations,
+    JointRows,
+    Path,
+    Trajectory,
+    Values,
+    check_increasing,
+    check_motion_arrays,
+)
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
@@ -38,7 +46,7 @@ class RecordedMotion:
 
     joint_names: tuple[str, ...]
     positions: Float[ndarray, "n joints"]
-    times: Float[ndarray, "n"] | None = None
+    times: Values | None = None
     """[s]; None if the rows are waypoints."""
     velocities: Float[ndarray, "n joints"] | None = None
     accelerations: Float[ndarray, "n joints"] | None = None
@@ -136,7 +144,7 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     return RobotMotion(Trajectory(robot.joint_names, motion.times, q, v, a), tuple(notes))
 
 
-def _check_locked(values: Float[ndarray, "n"], name: str, robot: Robot) -> None:
+def _check_locked(values: Values, name: str, robot: Robot) -> None:
     held = robot.locked.get(name, 0.0)
     low, high = float(values.min()), float(values.max())
     if high - low > STATIONARY_TOLERANCE + LOCKED_TOLERANCE:
@@ -150,7 +158,7 @@ def _check_locked(values: Float[ndarray, "n"], name: str, robot: Robot) -> None:
         )
 
 
-def _spline_velocities(times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+def _spline_velocities(times: Values, q: Configurations) -> JointRows:
     """Velocities of the cubic spline through the rows that starts and ends at rest."""
     if len(times) < 2:
         return np.zeros_like(q)
@@ -159,7 +167,7 @@ def _spline_velocities(times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -
     return CubicSpline(times, q, bc_type="clamped")(times, 1)
 
 
-def _mean_accelerations(motion: Trajectory) -> Float[ndarray, "n dof"]:
+def _mean_accelerations(motion: Trajectory) -> JointRows:
     """Means of the accelerations of the cubics before and after each row."""
     if len(motion.times) < 2:
         return np.zeros_like(motion.velocities)

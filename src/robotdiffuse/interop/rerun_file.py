@@ -4,13 +4,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.errors import missing_package
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import Pose, Trajectory
 from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_poses
@@ -61,9 +59,7 @@ def _motion(recording: rr.RecordingStream, problem: Problem, trajectory: Traject
             recording.send_columns(f"joints/{name}/{what}", [every], columns)
 
 
-def _send_poses(
-    recording: rr.RecordingStream, entity: str, at: rr.TimeColumn, poses: Iterable[Float[ndarray, "4 4"]]
-) -> None:
+def _send_poses(recording: rr.RecordingStream, entity: str, at: rr.TimeColumn, poses: Iterable[Pose]) -> None:
     places, turns = zip(*((T[:3, 3], _quaternion(T)) for T in poses), strict=True)
     recording.send_columns(entity, [at], rr.Transform3D.columns(translation=places, quaternion=turns))
 
@@ -72,7 +68,7 @@ def _entity(obstacle: str) -> str:
     return f"scene/{rr.escape_entity_path_part(obstacle)}"
 
 
-def _quaternion(T: Float[ndarray, "4 4"]) -> rr.Quaternion:
+def _quaternion(T: Pose) -> rr.Quaternion:
     return rr.Quaternion(xyzw=quaternion_from_rotation(T[:3, :3])[[1, 2, 3, 0]])
 
 

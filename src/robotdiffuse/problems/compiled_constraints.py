@@ -17,6 +17,16 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError, distinct
 from robotdiffuse.core.transforms import inverse, rotation_angle, rotation_z_to, transform
+from robotdiffuse.core.types import (
+    Configuration,
+    Configurations,
+    JointRows,
+    JointValues,
+    Pose,
+    Rotation,
+    Values,
+    Vector,
+)
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.constraint_kernel import CONE, DISTANCE, ROLL_PITCH_YAW, TURN, Rows
 from robotdiffuse.problems.constraints import (
@@ -125,34 +135,32 @@ class PathConstraints:
             and each[m][1].row_kind == DISTANCE
         ]
 
-    def values(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n rows"]:
+    def values(self, q: Configurations) -> Float[ndarray, "n rows"]:
         """The value of each row [m] or [rad]."""
         return kernel.values(self.rows, for_kernels(q))
 
-    def limits(self, tolerance_fraction: float) -> Float[ndarray, "rows"]:
+    def limits(self, tolerance_fraction: float) -> Values:
         """The largest allowed values with a fraction of the tolerances [m] or [rad]."""
         return self.rows.limit - (1 - tolerance_fraction) * self.rows.tolerance
 
-    def satisfied(self, q: Float[ndarray, "n dof"], tolerance_fraction: float = 1.0) -> Bool[ndarray, "n"]:
+    def satisfied(self, q: Configurations, tolerance_fraction: float = 1.0) -> Bool[ndarray, "n"]:
         """Which configurations satisfy all constraints within a fraction of their tolerances."""
         return np.all(self.values(q) <= self.limits(tolerance_fraction), axis=1)
 
-    def projected(
-        self, q: Float[ndarray, "n dof"], tolerance_fraction: float, most: int = -1
-    ) -> Float[ndarray, "k dof"]:
+    def projected(self, q: Configurations, tolerance_fraction: float, most: int = -1) -> Configurations:
         """The configurations projected onto a fraction of the tolerances, at most `most` of them unless that
         is -1; failed projections are left out."""
         rows, satisfied = self.project(q, tolerance_fraction, most)
         return rows[satisfied]
 
     def project(
-        self, q: Float[ndarray, "n dof"], tolerance_fraction: float, most: int = -1
-    ) -> tuple[Float[ndarray, "n dof"], Bool[ndarray, "n"]]:
+        self, q: Configurations, tolerance_fraction: float, most: int = -1
+    ) -> tuple[Configurations, Bool[ndarray, "n"]]:
         """As `projected`, but a row for each configuration, and which of them keep the tolerances."""
         rows = np.array(q, np.float64, order="C")
         return rows, project_each(self.rows, self.limits(tolerance_fraction), rows, most)
 
-    def worst_violation(self, q: Float[ndarray, "dof"]) -> ConstraintViolation | None:
+    def worst_violation(self, q: Configuration) -> ConstraintViolation | None:
         """The largest violation of a configuration, relative to the tolerances; None if there is none."""
         [values] = self.values(q[None])
         over = (values - self.rows.limit) / self.rows.tolerance
@@ -160,7 +168,7 @@ class PathConstraints:
         return self._violation(row, 0.0, float(values[row])) if over[row] > 0 else None
 
     def first_violation(
-        self, q: Float[ndarray, "n dof"], chord: float = 0.0, tolerance_fraction: float = 1.0
+        self, q: Configurations, chord: float = 0.0, tolerance_fraction: float = 1.0
     ) -> ConstraintViolation | None:
         """Where the straight segments through waypoints first violate a constraint, or are not proved to
         satisfy it; None if all constraints are proved along all segments.
@@ -178,9 +186,7 @@ class PathConstraints:
             return None
         return self._violation(row, segment + fraction, self._maximum(q, segment, fraction, row))
 
-    def speeds(
-        self, q: Float[ndarray, "n dof"], rates: Float[ndarray, "n dof"]
-    ) -> Float[ndarray, "n limited"]:
+    def speeds(self, q: Configurations, rates: JointRows) -> Float[ndarray, "n limited"]:
         """Speeds of the frames with a speed limit [m/s], one column each, at joint velocities `rates`."""
         columns = [kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates)) for m, _ in self._paced]
         return np.stack(columns, axis=1) if columns else np.zeros((len(q), 0))
@@ -271,7 +277,7 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     return rows
 
 
-def line_end(problem: Problem, line: CartesianLine) -> Float[ndarray, "4 4"]:
+def line_end(problem: Problem, line: CartesianLine) -> Pose:
     """T_base_frame of the link of a line at the goal. Raises InputError if the goal does not determine it."""
     robot, goal = problem.robot, problem.goal
     if isinstance(goal, JointGoal):
@@ -297,7 +303,7 @@ def line_end(problem: Problem, line: CartesianLine) -> Float[ndarray, "4 4"]:
     raise InputError(f"cartesian_line of {line.frame}: the goal must determine its pose, but {why}")
 
 
-def _rotation_vector(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
+def _rotation_vector(rotation: Rotation) -> Vector:
     """Axis times angle; accurate also near half a turn."""
     angle = rotation_angle(rotation)
     if angle < 1e-12:
@@ -359,7 +365,7 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
     )
 
 
-def _lever_bounds(robot: Robot, frame: str) -> Float[ndarray, "dof"]:
+def _lever_bounds(robot: Robot, frame: str) -> JointValues:
     """For each joint that moves a frame, in order, a bound of the distance from its axis to the frame's
     origin [m]; 1 for prismatic joints, 0 after the last joint."""
     out, length = np.zeros(robot.dof), float(np.linalg.norm(robot.T_frame_link(frame)[:3, 3]))

@@ -9,12 +9,11 @@ from types import NoneType
 from typing import TYPE_CHECKING, Any, ClassVar, get_args, no_type_check
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, rigid_transform, vector
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.types import Pose, Vector
 
 MIN_TOLERANCE, MIN_ANGLE = 1e-4, 1e-3
 """Tolerances of the tightest constraints [m], [rad]."""
@@ -37,9 +36,9 @@ class AxisCone(Value):
     kind: ClassVar[str] = "axis_cone"
     frame: str
     """Name of the link."""
-    axis: Float[ndarray, "3"]
+    axis: Vector
     """In the link's frame, of any length."""
-    direction: Float[ndarray, "3"]
+    direction: Vector
     """In the base's frame, of any length."""
     angle: float
     """Maximum angle between the axis and the direction [rad], up to pi."""
@@ -51,7 +50,7 @@ class AxisCone(Value):
 
         def __init__(self, frame: str, axis: ArrayLike, direction: ArrayLike, angle: float) -> None: ...
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "AxisCone":
+    def moved(self, T: Pose) -> "AxisCone":
         """The constraint after the rigid motion T."""
         return replace(self, direction=T[:3, :3] @ self.direction)
 
@@ -64,11 +63,11 @@ class PositionBox(Value):
     kind: ClassVar[str] = "position_box"
     frame: str
     """Name of the link."""
-    low: Float[ndarray, "3"]
+    low: Vector
     """Lower corner, in the frame of the box [m]."""
-    high: Float[ndarray, "3"]
+    high: Vector
     """Upper corner [m]."""
-    T_base_box: Float[ndarray, "4 4"] | None = None
+    T_base_box: Pose | None = None
     """Pose of the box; None: the frame of the base."""
 
     def __post_init__(self) -> None:
@@ -91,7 +90,7 @@ class PositionBox(Value):
             self, frame: str, low: ArrayLike, high: ArrayLike, T_base_box: ArrayLike | None = None
         ) -> None: ...
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "PositionBox":
+    def moved(self, T: Pose) -> "PositionBox":
         """The constraint after the rigid motion T."""
         return replace(self, T_base_box=T @ self.T_base_box)
 
@@ -104,9 +103,9 @@ class OnPlane(Value):
     kind: ClassVar[str] = "on_plane"
     frame: str
     """Name of the link."""
-    point: Float[ndarray, "3"]
+    point: Vector
     """A point of the plane [m]."""
-    normal: Float[ndarray, "3"]
+    normal: Vector
     """Of any length."""
     tolerance: float
     """Maximum distance from the plane, on either side [m]."""
@@ -118,7 +117,7 @@ class OnPlane(Value):
 
         def __init__(self, frame: str, point: ArrayLike, normal: ArrayLike, tolerance: float) -> None: ...
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "OnPlane":
+    def moved(self, T: Pose) -> "OnPlane":
         """The constraint after the rigid motion T."""
         return replace(self, point=T[:3, :3] @ self.point + T[:3, 3], normal=T[:3, :3] @ self.normal)
 
@@ -131,9 +130,9 @@ class OnLine(Value):
     kind: ClassVar[str] = "on_line"
     frame: str
     """Name of the link."""
-    point: Float[ndarray, "3"]
+    point: Vector
     """A point of the line [m]."""
-    direction: Float[ndarray, "3"]
+    direction: Vector
     """Of any length."""
     tolerance: float
     """Maximum distance from the line [m]."""
@@ -145,7 +144,7 @@ class OnLine(Value):
 
         def __init__(self, frame: str, point: ArrayLike, direction: ArrayLike, tolerance: float) -> None: ...
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "OnLine":
+    def moved(self, T: Pose) -> "OnLine":
         """The constraint after the rigid motion T."""
         return replace(self, point=T[:3, :3] @ self.point + T[:3, 3], direction=T[:3, :3] @ self.direction)
 
@@ -183,7 +182,7 @@ class CartesianLine(Value):
             speed: float | None = None,
         ) -> None: ...
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "CartesianLine":
+    def moved(self, T: Pose) -> "CartesianLine":
         """The constraint itself, which start and goal determine."""
         return self
 

@@ -30,12 +30,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import numbers, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, located, shown, unknown_name
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
+from robotdiffuse.core.types import Pose
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
@@ -128,12 +128,12 @@ def _entry_schema(kind: type[Shape] | type[Constraint]) -> Schema:
     return _object(known) | {"anyOf": [{"required": required}, {"required": in_file}]}
 
 
-def read_pose(where: str, data: object) -> Float[ndarray, "4 4"]:
+def read_pose(where: str, data: object) -> Pose:
     """The transform of {xyz: [...], wxyz: [...]}, both optional. Raises InputError for anything else."""
     return pose_of(where, check_fields(where, data, (), POSE))
 
 
-def pose_of(where: str, values: dict[str, Any]) -> Float[ndarray, "4 4"]:
+def pose_of(where: str, values: dict[str, Any]) -> Pose:
     """The transform of the fields xyz and wxyz, both optional; other fields are ignored."""
     xyz = vector(where, "xyz", values.get("xyz", (0.0, 0.0, 0.0)), 3)
     return transform(xyz, rotation_from_quaternion(unit_quaternion(where, values.get("wxyz", IDENTITY))))

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, no_type_check
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import Value, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, repeated, shown
+from robotdiffuse.core.types import Configurations, Pose, Vector
 
 
 @no_type_check
@@ -21,7 +20,7 @@ from robotdiffuse.core.errors import InputError, repeated, shown
 class JointGoal(Value):
     """Any of these configurations (one row each)."""
 
-    positions: Float[ndarray, "n dof"]
+    positions: Configurations
 
     def __post_init__(self) -> None:
         positions = numbers(self.positions)
@@ -36,7 +35,7 @@ class JointGoal(Value):
 
         def __init__(self, positions: ArrayLike) -> None: ...
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "JointGoal":
+    def moved(self, T: Pose) -> "JointGoal":
         """The goal itself: configurations do not move."""
         return self
 
@@ -55,10 +54,10 @@ class PoseGoal(Value):
 
     frame: str
     """Name of the link."""
-    T_base_frame: Float[ndarray, "4 4"]
-    xyz_tolerance: Float[ndarray, "3"] | None = None
+    T_base_frame: Pose
+    xyz_tolerance: Vector | None = None
     """Along the axes of the goal [m]; None: the exact position, validated to 1 cm."""
-    rpy_tolerance: Float[ndarray, "3"] | None = None
+    rpy_tolerance: Vector | None = None
     """About the axes of the goal [rad], pi for any angle; None: the exact orientation, validated to 15
     degrees."""
 
@@ -87,7 +86,7 @@ class PoseGoal(Value):
             rpy_tolerance: ArrayLike | None = None,
         ) -> None: ...
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "PoseGoal":
+    def moved(self, T: Pose) -> "PoseGoal":
         """The goal after the rigid motion T."""
         return replace(self, T_base_frame=T @ self.T_base_frame)
 
@@ -117,7 +116,7 @@ class PosesGoal(Value):
 
         def __init__(self, poses: Sequence[PoseGoal]) -> None: ...
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "PosesGoal":
+    def moved(self, T: Pose) -> "PosesGoal":
         """The goal after the rigid motion T."""
         return PosesGoal([pose.moved(T) for pose in self.poses])
 
@@ -143,7 +142,7 @@ class AnyGoal(Value):
             )
         object.__setattr__(self, "goals", tuple(goals))
 
-    def moved(self, T: Float[ndarray, "4 4"]) -> "AnyGoal":
+    def moved(self, T: Pose) -> "AnyGoal":
         """The goals after the rigid motion T."""
         return AnyGoal(tuple(goal.moved(T) for goal in self.goals))
 

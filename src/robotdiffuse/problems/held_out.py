@@ -13,12 +13,10 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, repeated
 from robotdiffuse.core.output_files import JsonLines
-from robotdiffuse.core.types import Path
+from robotdiffuse.core.types import Configuration, Path
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -37,7 +35,7 @@ REPORT_EVERY = 20
 """Problems between two progress messages."""
 
 
-def goal_of(problem: Problem) -> Float[ndarray, "dof"]:
+def goal_of(problem: Problem) -> Configuration:
     """The first goal configuration of a problem whose goal is a JointGoal."""
     assert isinstance(problem.goal, JointGoal)
     return problem.goal.positions[0]

@@ -25,6 +25,7 @@ from robotdiffuse.core.transforms import (
     rotation_z_to,
     transform,
 )
+from robotdiffuse.core.types import Pose, Vector
 from robotdiffuse.robots.bodies import AttachedBody
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
@@ -71,13 +72,11 @@ def mappings_of(where: str, entry: dict[str, Any], name: str) -> list[tuple[str,
     return [(place, mapping_of(place, value)) for place, value in places]
 
 
-def xyz_of(where: str, value: object) -> Float[ndarray, "3"]:
+def xyz_of(where: str, value: object) -> Vector:
     return vector(where, "xyz", [value.get(axis) for axis in "xyz"] if isinstance(value, dict) else value, 3)
 
 
-def pose_of(
-    where: str, value: object, position: str = "position", orientation: str = "orientation"
-) -> Float[ndarray, "4 4"]:
+def pose_of(where: str, value: object, position: str = "position", orientation: str = "orientation") -> Pose:
     """The transform of a geometry_msgs/Pose, or of a Transform with other names of its two fields."""
     value = mapping_of(where, value)
     turn = value.get(orientation)
@@ -129,9 +128,7 @@ class MoveItFrames(dict[str, ndarray]):
     says why the pose of the robot's base in the scene is unknown.
     """
 
-    def __init__(
-        self, robot: Robot | None, T_own_root: Float[ndarray, "4 4"], own: tuple[str, ...] = ("", "world")
-    ) -> None:
+    def __init__(self, robot: Robot | None, T_own_root: Pose, own: tuple[str, ...] = ("", "world")) -> None:
         """own: names of the scene's own frame; T_own_root: pose of the URDF's root in it."""
         super().__init__({} if robot is None else robot.above | robot.links_fixed_to_base)
         self.links = frozenset(self)
@@ -145,7 +142,7 @@ class MoveItFrames(dict[str, ndarray]):
         elif robot is not None:
             self.lost = f"a joint moves {robot.base} in {robot.root}"
 
-    def of(self, where: str, entry: dict[str, Any]) -> Float[ndarray, "4 4"]:
+    def of(self, where: str, entry: dict[str, Any]) -> Pose:
         """T_base_frame of the frame that the header of an entry names."""
         name = frame_name(where, entry)
         if name in self:
@@ -316,7 +313,7 @@ def _triangles(where: str, part: dict[str, Any], folder: Path) -> tuple[ndarray,
     return np.array(rows).reshape(-1, 3), faces
 
 
-def _cone(size: Float[ndarray, "2"], xyz: Float[ndarray, "3"], wxyz: Float[ndarray, "4"], name: str) -> Mesh:
+def _cone(size: Float[ndarray, "2"], xyz: Vector, wxyz: Float[ndarray, "4"], name: str) -> Mesh:
     """A pyramid around a cone of height and radius [m] about its z axis, with the tip at half the height."""
     height, radius = size
     if not (size > 0).all():
@@ -438,7 +435,7 @@ class MoveItRequest:
     """Joint values by name [rad] or [m], including fingers."""
     joint_goals: tuple[dict[str, float], ...] = ()
     """Alternative goals, each with joint values by name."""
-    pose_goal: tuple[str, Float[ndarray, "4 4"]] | None = None
+    pose_goal: tuple[str, Pose] | None = None
     """A link and its goal pose T_base_link."""
     attached: tuple[MoveItAttached, ...] = ()
     notes: tuple[str, ...] = ()

@@ -10,13 +10,12 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, ClassVar, TypedDict, Unpack, no_type_check
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, Value, numbers, rigid_transform, short
 from robotdiffuse.core.errors import InputError, check_type, distinct, shown, unknown_name
 from robotdiffuse.core.transforms import inverse
+from robotdiffuse.core.types import Configuration, JointValues, Pose, Values
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
@@ -39,7 +38,7 @@ MIN_BLEND, MAX_BLEND = 1e-3, 10.0
 """Bounds of a `Problem.blend` that is not 0 [rad] or [m]."""
 
 
-def base_pose(T_world_base: object) -> Float[ndarray, "4 4"] | None:
+def base_pose(T_world_base: object) -> Pose | None:
     return None if T_world_base is None else rigid_transform("T_world_base", T_world_base)
 
 
@@ -130,7 +129,7 @@ def moving_obstacles(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]
     )
 
 
-def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> Float[ndarray, "dof"] | None:
+def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointValues | None:
     """A velocity, clamped where it is within VELOCITY_SLACK of the limits; `notes` says where. None if it is
     zero, or nearly."""
     if value is None:
@@ -192,7 +191,7 @@ def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
             )
 
 
-def configuration(robot: Robot, field: str, value: object) -> Float[ndarray, "dof"]:
+def configuration(robot: Robot, field: str, value: object) -> Configuration:
     """The value of each planned joint, of a list of numbers or the name of a pose."""
     q = numbers(named_pose(robot, field, value) if isinstance(value, str) else value)
     names = ", ".join(robot.joint_names)
@@ -203,7 +202,7 @@ def configuration(robot: Robot, field: str, value: object) -> Float[ndarray, "do
     return q
 
 
-def checked_configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:
+def checked_configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Configuration:
     """The configuration, clamped where it is within LIMIT_SLACK of the limits; `notes` says where."""
     values = zip(robot.planned_joints, configuration(robot, field, value), strict=True)
     return np.array([_position(field, joint, position, notes) for joint, position in values])
@@ -296,7 +295,7 @@ class Problem(Value):
 
     robot: Robot
     scene: Scene
-    start: Float[ndarray, "dof"]
+    start: Configuration
     goal: Goal
     _: KW_ONLY
     notes: tuple[str, ...] = ()
@@ -309,7 +308,7 @@ class Problem(Value):
     unknown: str | None = None
     """Policy for space that no view observed, one of UNKNOWN_POLICIES; None: predicted where the completion
     network covers the arm's reach, else padded. Ignored without views."""
-    T_world_base: Float[ndarray, "4 4"] | None = None
+    T_world_base: Pose | None = None
     """Pose of the base in the world, for files and pictures; None: the base's frame is the world's. Scene,
     goal and views of a Problem are always in the base's frame; `in_world` accepts them in the world's."""
     waypoints: tuple[Goal, ...] = ()
@@ -318,7 +317,7 @@ class Problem(Value):
     """Path constraints, which hold along the whole motion."""
     moving: tuple[MovingObstacle, ...] = ()
     """Moving obstacles; the motion begins at their time 0. `scene` holds the static obstacles."""
-    start_velocity: Float[ndarray, "dof"] | None = None
+    start_velocity: JointValues | None = None
     """Joint velocities at the start [rad/s] or [m/s]; None, or all below 1e-6: the motion starts at rest."""
     blend: tuple[float, ...] = ()
     """For each waypoint, the distance within which the motion may pass it without stopping: for
@@ -414,7 +413,7 @@ class Problem(Value):
         T = self.T_world_base
         return self.moving if T is None else tuple(one.moved(T) for one in self.moving)
 
-    def clearance_at(self, q: ArrayLike) -> float | Float[ndarray, "n"]:
+    def clearance_at(self, q: ArrayLike) -> float | Values:
         """Lower bound on the distance of the arm to obstacles and between its links [m], at most 1 m.
 
         q: a configuration [dof], or several [n, dof]. Positive: free of collision. The bound is of the
@@ -506,7 +505,7 @@ def _is_empty(value: object) -> bool:
     return isinstance(value, tuple) and not value
 
 
-def moved(value: Any, T: Float[ndarray, "4 4"]) -> Any:
+def moved(value: Any, T: Pose) -> Any:
     """The value, or each of a list, after the rigid motion T; what has no pose is returned unchanged."""
     if isinstance(value, list | tuple):
         return [moved(one, T) for one in value]

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import reach_bound
+from robotdiffuse.core.types import Configuration, Points, Values, Vector
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView, SeenPoints
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -43,7 +44,7 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
     return found
 
 
-def arm_in_cloud_note(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str:
+def arm_in_cloud_note(robot: Robot, scene: Scene, q: Configuration) -> str:
     """A note on the cloud that has most points within the arm at a configuration; "" if none has many."""
     clouds = [shape for shape in scene.shapes if type(shape) is PointCloud]
     spheres = placed_spheres(robot, q)
@@ -58,7 +59,7 @@ def arm_in_cloud_note(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> s
     )
 
 
-def _size_note(shape: Shape, extents: Float[ndarray, "3"]) -> str:
+def _size_note(shape: Shape, extents: Vector) -> str:
     scanned = isinstance(shape, Mesh | PointCloud)
     if (extents.max() if scanned else extents.min()) <= MAX_EXTENT:
         return ""
@@ -81,12 +82,12 @@ def _is_empty(shape: Shape) -> bool:
     return isinstance(shape, PointCloud) and len(shape.points) == 0
 
 
-def _distances(bounds: Float[ndarray, "n 2 3"]) -> Float[ndarray, "n"]:
+def _distances(bounds: Float[ndarray, "n 2 3"]) -> Values:
     """Distances of axis-aligned boxes from the origin [m]."""
     return np.linalg.norm(np.maximum(np.maximum(bounds[:, 0], -bounds[:, 1]), 0.0), axis=1)
 
 
-def _points_within(points: Float[ndarray, "n 3"], spheres: Float[ndarray, "m 4"]) -> int:
+def _points_within(points: Points, spheres: Float[ndarray, "m 4"]) -> int:
     """Number of points within any sphere."""
     low, high = ((spheres[:, :3] + sign * spheres[:, 3:]) for sign in (-1, 1))
     points = points[((points >= low.min(axis=0)) & (points <= high.max(axis=0))).all(axis=1)]

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.types import Configuration, Configurations, JointRows, Values
 from robotdiffuse.trajectories.timing_kernel import BLEND_DEVIATION, evaluate, rounded_line
 
 
@@ -16,13 +17,13 @@ class BlendedPolyline:
     most 3/16 d_i |f - e|, at u = 0.
     """
 
-    def __init__(self, waypoints: Float[ndarray, "n dof"], half_widths: Float[ndarray, "corners"]) -> None:
+    def __init__(self, waypoints: Configurations, half_widths: Values) -> None:
         """`waypoints`: at least two, no two neighbours equal. `half_widths`: one for each inner waypoint; no
         two rounded corners overlap, and none reaches beyond an end."""
         self.waypoints = waypoints
         steps = waypoints[1:] - waypoints[:-1]
         lengths = np.linalg.norm(steps, axis=1)
-        self.knots: Float[ndarray, "n"] = np.concatenate([[0.0], np.cumsum(lengths)])
+        self.knots: Values = np.concatenate([[0.0], np.cumsum(lengths)])
         self.directions: Float[ndarray, "segments dof"] = steps / lengths[:, None]
         self.half_widths = half_widths
 
@@ -36,20 +37,18 @@ class BlendedPolyline:
         """The arguments of the compiled functions: waypoints, knots, directions and half widths."""
         return self.waypoints, self.knots, self.directions, self.half_widths
 
-    def __call__(self, s: Float[ndarray, "m"], order: int) -> Float[ndarray, "m dof"]:
+    def __call__(self, s: Values, order: int) -> JointRows:
         """The path (order 0) or its first or second derivative with respect to s."""
         return evaluate(self.arrays, s, order)
 
 
-def half_widths(
-    waypoints: Float[ndarray, "n dof"], deviations: Float[ndarray, "corners"]
-) -> Float[ndarray, "corners"]:
+def half_widths(waypoints: Configurations, deviations: Values) -> Values:
     """Half widths of the widest blends that leave the polyline by at most the deviations and do not
     overlap."""
     return rounded_line(np.asarray(waypoints, float), np.asarray(deviations, float))[3]
 
 
-def corner_middle(path: Float[ndarray, "n dof"], row: int, deviation: float) -> Float[ndarray, "dof"]:
+def corner_middle(path: Configurations, row: int, deviation: float) -> Configuration:
     """The middle of the rounded corner at an inner row, for a deviation [rad, joint-space L2]."""
     e, f = path[row] - path[row - 1], path[row + 1] - path[row]
     lengths = np.linalg.norm(e), np.linalg.norm(f)

@@ -12,39 +12,39 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.kernels import inner_kernel, kernel
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import Configuration, Configurations, JointRows, JointValues, Trajectory, Values
 
 
 class CubicStates(NamedTuple):
     """Positions, velocities and accelerations on the cubics."""
 
-    positions: Float[ndarray, "n dof"]
-    velocities: Float[ndarray, "n dof"]
-    accelerations: Float[ndarray, "n dof"]
+    positions: Configurations
+    velocities: JointRows
+    accelerations: JointRows
 
 
 class Extremes(NamedTuple):
     """Extremes of the cubics of a motion."""
 
-    mean: Float[ndarray, "m dof"]
+    mean: JointRows
     """Mean velocity of each step."""
-    start: Float[ndarray, "m dof"]
+    start: JointRows
     """Acceleration at the start of each step."""
-    end: Float[ndarray, "m dof"]
-    velocity: Float[ndarray, "m dof"]
+    end: JointRows
+    velocity: JointRows
     """The largest absolute velocity in each step."""
-    acceleration: Float[ndarray, "m dof"]
+    acceleration: JointRows
     """The same of the acceleration."""
-    jerk: Float[ndarray, "dof"]
+    jerk: JointValues
     """The largest absolute jerk within any step."""
-    chord: Float[ndarray, "m"]
+    chord: Values
     """How far each cubic may leave the straight line between its rows, for the joint that does most [rad] or
     [m]."""
-    chords: Float[ndarray, "dof"]
+    chords: JointValues
     """The same for each joint, in any step."""
-    lower: Float[ndarray, "dof"]
+    lower: Configuration
     """The least position of each joint."""
-    upper: Float[ndarray, "dof"]
+    upper: Configuration
 
 
 class Cubics:
@@ -56,7 +56,7 @@ class Cubics:
         rows = trajectory.times, trajectory.positions, trajectory.velocities
         self.extremes = Extremes(*_extremes(*map(for_kernels, rows)))
 
-    def states(self, step: Int[ndarray, "n"], share: Float[ndarray, "n"]) -> CubicStates:
+    def states(self, step: Int[ndarray, "n"], share: Values) -> CubicStates:
         """States at shares of steps."""
         u, h = share[:, None], self.steps[step]
         start, end = self.extremes.start[step], self.extremes.end[step]
@@ -68,7 +68,7 @@ class Cubics:
             start + u * jerk,
         )
 
-    def turns(self) -> tuple[Float[ndarray, "k"], Float[ndarray, "k dof"]]:
+    def turns(self) -> tuple[Values, Configurations]:
         """Times at which any joint turns round within a step, where its position is extreme, and positions of
         all joints there."""
         start, v = self.extremes.start, self.trajectory.velocities[:-1] / self.steps
@@ -84,9 +84,7 @@ class Cubics:
         times = self.trajectory.times[steps] + shares * self.steps[steps, 0]
         return times, self.states(steps, shares).positions
 
-    def sampled(
-        self, chord: float
-    ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "dof"]]:
+    def sampled(self, chord: float) -> tuple[Values, Configurations, JointValues]:
         """Times and positions of the rows and of added rows on the cubics, such that straight lines between
         them leave the cubics by at most `chord`; and by how much they do, for each joint [rad] or [m]."""
         times, q = self.trajectory.times, self.trajectory.positions

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.deadline import check_timing
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Settings
-from robotdiffuse.core.types import Rows, spline_rows
+from robotdiffuse.core.types import Configurations, JointRows, JointValues, Rows, Values, spline_rows
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import timing_kernel
@@ -94,7 +93,7 @@ class FrameSpeedLimits(NamedTuple):
     speeds: Callable[[ndarray, ndarray], ndarray]
     """Speeds [n, k] at configurations [n, dof] with joint velocities [n, dof]; linear in the velocities
     [m/s]."""
-    limits: Float[ndarray, "k"]
+    limits: Values
     """[m/s]"""
 
 
@@ -109,7 +108,7 @@ class ExtraLimits(NamedTuple):
 NO_EXTRA_LIMITS = ExtraLimits()
 
 
-def timing_grid(line: BlendedPolyline, settings: TimingSettings) -> Float[ndarray, "m"]:
+def timing_grid(line: BlendedPolyline, settings: TimingSettings) -> Values:
     """Values of s at which the limits of a motion along a line are applied; see the kernel."""
     counts = settings.corner_intervals, settings.line_intervals
     return timing_kernel.timing_grid(line.knots, line.half_widths, *counts)
@@ -160,7 +159,7 @@ def time_line(
     return times * slower, q, v / slower, a / slower**2
 
 
-def jerk_limits(robot: Robot, settings: TimingSettings = DEFAULT) -> Float[ndarray, "dof"]:
+def jerk_limits(robot: Robot, settings: TimingSettings = DEFAULT) -> JointValues:
     """The jerk limit of each joint: that of the settings, else the robot's, else DEFAULT_JERK_RATIO times the
     acceleration limit [rad/s³] or [m/s³]."""
     if settings.jerk is not None:
@@ -205,7 +204,7 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
     return best
 
 
-def stopping_distance(robot: Robot, settings: TimingSettings, velocity: Float[ndarray, "dof"]) -> float:
+def stopping_distance(robot: Robot, settings: TimingSettings, velocity: JointValues) -> float:
     """Length of a straight line on which a motion with a start velocity can stop [rad, joint-space L2]."""
     acceleration, speed = scaled_limits(robot, settings)[1], float(np.linalg.norm(velocity))
     moving = velocity != 0
@@ -217,14 +216,14 @@ def stopping_distance(robot: Robot, settings: TimingSettings, velocity: Float[nd
     return max(least, MIN_STOPPING_DISTANCE)
 
 
-def _windows(step: float, acceleration: Float[ndarray, "dof"], jerk: Float[ndarray, "dof"]) -> list[int]:
+def _windows(step: float, acceleration: JointValues, jerk: JointValues) -> list[int]:
     """Numbers of configurations over which `spline_rows` may average to keep the jerk limits, in the order
     tried; the last keeps them in any case."""
     enough = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
     return sorted({1, *(int(np.ceil(fraction * enough)) for fraction in WINDOW_FRACTIONS), enough})
 
 
-def _keeps_jerk(rows: Rows, step: float, jerk: Float[ndarray, "dof"]) -> bool:
+def _keeps_jerk(rows: Rows, step: float, jerk: JointValues) -> bool:
     """Whether the jerks between rows are within their limits."""
     return bool((np.abs(np.diff(rows[3], axis=0)) <= step * jerk).all())
 
@@ -239,14 +238,12 @@ def _row_count(duration: float, settings: TimingSettings) -> int:
     return count
 
 
-def _duration(grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"]) -> float:
+def _duration(grid: Values, speeds: Values) -> float:
     """Duration of a motion with these speeds [s]."""
     return float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
 
 
-def symmetric_bounds(
-    acceleration: Float[ndarray, "dof"], rows: int
-) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
+def symmetric_bounds(acceleration: JointValues, rows: int) -> tuple[JointRows, JointRows]:
     """Lowest and highest accelerations [rows, dof] at each of the grid's points."""
     highest = np.tile(acceleration, (rows, 1))
     return -highest, highest
@@ -254,12 +251,12 @@ def symmetric_bounds(
 
 def _fastest_speeds(
     line: BlendedPolyline,
-    grid: Float[ndarray, "m"],
-    velocity: Float[ndarray, "dof"],
-    acceleration: Float[ndarray, "dof"],
+    grid: Values,
+    velocity: JointValues,
+    acceleration: JointValues,
     start_speed: float = 0.0,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
-) -> Float[ndarray, "m"]:
+) -> Values:
     """ṡ at each value of s in the grid, such that limits hold between grid points too."""
     share, at_start = 1.0, start_speed * np.abs(line(grid[:1], 1)[0])
     for _ in range(MAX_SHARES):
@@ -280,9 +277,9 @@ def _fastest_speeds(
 
 def _derivatives_and_limits(
     line: BlendedPolyline,
-    grid: Float[ndarray, "m"],
-    velocity: Float[ndarray, "dof"],
-    acceleration: Float[ndarray, "dof"],
+    grid: Values,
+    velocity: JointValues,
+    acceleration: JointValues,
     extra: ExtraLimits,
 ) -> tuple[ndarray, ndarray, ndarray, ndarray, ndarray, ndarray]:
     """q' and q'' along the path, the grid, velocity limits, and lowest and highest accelerations.
@@ -314,9 +311,7 @@ def _derivatives_and_limits(
     return first, second, grid, velocity, least, most
 
 
-def _slow_to_extra_limits(
-    line: BlendedPolyline, grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"], extra: ExtraLimits
-) -> Float[ndarray, "m"]:
+def _slow_to_extra_limits(line: BlendedPolyline, grid: Values, speeds: Values, extra: ExtraLimits) -> Values:
     """The speeds, slowed down so that frame speeds and torques keep their limits between grid points too."""
     if extra is NO_EXTRA_LIMITS:
         return speeds
@@ -331,9 +326,7 @@ def _slow_to_extra_limits(
     return speeds / _extra_slowdown(extra, q, rates, accelerations)
 
 
-def _extra_slowdown(
-    extra: ExtraLimits, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
-) -> float:
+def _extra_slowdown(extra: ExtraLimits, q: Configurations, v: JointRows, a: JointRows) -> float:
     """How many times slower a motion must be, at least 1, to keep the extra limits."""
     slower = 1.0
     if extra.frame_speeds is not None:

@@ -6,14 +6,15 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Configuration, JointValues
 
 
 def straight_line_time(
-    start: Float[ndarray, "dof"],
+    start: Configuration,
     goal: Float[ndarray, "*batch dof"],
-    velocity: Float[ndarray, "dof"],
-    acceleration: Float[ndarray, "dof"],
-    jerk: Float[ndarray, "dof"] | None = None,
+    velocity: JointValues,
+    acceleration: JointValues,
+    jerk: JointValues | None = None,
 ) -> Float[ndarray, "*batch"]:
     """Least time [s] from rest at `start` to rest at each goal along the straight line in joint space.
 

@@ -7,12 +7,12 @@ from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import MIN_RATE
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.core.types import Configurations, JointRows, JointValues, Path, Trajectory, Values
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import (
@@ -52,7 +52,7 @@ def time_parameterize(
     keeps: Callable[[ndarray], bool] = lambda _: True,
     start_speed: float = 0.0,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
-    deviations: Float[ndarray, "n"] | None = None,
+    deviations: Values | None = None,
 ) -> Trajectory:
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
 
@@ -95,9 +95,9 @@ def rounded_corners(
     settings: TimingSettings = DEFAULT,
     keeps: Callable[[ndarray], bool] = lambda _: True,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
-    deviations: Float[ndarray, "n"] | None = None,
+    deviations: Values | None = None,
     stops: Sequence[int] = (),
-) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "corners"]]:
+) -> tuple[JointRows, Values]:
     """The distinct waypoints of a path, at least two, and by how much `time_parameterize` would round each
     corner [rad]. Corners at the path's rows `stops` are not rounded."""
     _check_limits(robot)
@@ -109,8 +109,8 @@ def rounded_corners(
 
 
 def _largest_deviations(
-    rows: Int[ndarray, "m"], settings: TimingSettings, deviations: Float[ndarray, "n"] | None
-) -> Float[ndarray, "m"]:
+    rows: Int[ndarray, "m"], settings: TimingSettings, deviations: Values | None
+) -> Values:
     """How far the motion may leave each of these rows of a path [rad]; a new array."""
     return np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
 
@@ -118,15 +118,15 @@ def _largest_deviations(
 def _round_and_time(
     robot: Robot,
     path: Path,
-    waypoints: Float[ndarray, "n dof"],
-    deviations: Float[ndarray, "corners"],
+    waypoints: Configurations,
+    deviations: Values,
     valid: Callable[[Trajectory], bool],
     free: Callable[[Path], bool],
     settings: TimingSettings,
     keeps: Callable[[ndarray], bool],
     start_speed: float,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
-) -> tuple[Float[ndarray, "corners"], Trajectory]:
+) -> tuple[Values, Trajectory]:
     """By how much each corner is rounded, at most by the deviations, and the resulting motion; see
     `time_parameterize`."""
     deviations = _shrunk(waypoints, deviations, keeps, MIN_DEVIATION)
@@ -155,18 +155,18 @@ def _round_and_time(
     return deviations, _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
 
 
-def _smaller(deviations: Float[ndarray, "corners"]) -> Float[ndarray, "corners"]:
+def _smaller(deviations: Values) -> Values:
     """The next deviations to try: 0, a stop, below MIN_DEVIATION."""
     less = SHRINK_FACTOR * deviations
     return np.where(less < MIN_DEVIATION, 0.0, less)
 
 
 def _shrunk(
-    waypoints: Float[ndarray, "n dof"],
-    deviations: Float[ndarray, "corners"],
+    waypoints: Configurations,
+    deviations: Values,
     accepts: Callable[[ndarray], bool],
     least: float = 0.0,
-) -> Float[ndarray, "corners"]:
+) -> Values:
     """The deviations, each shrunk until the configurations of its rounded corner are accepted, but not below
     `least`."""
     deviations, accepted = deviations.copy(), np.zeros(len(deviations))
@@ -198,7 +198,7 @@ def _check_limits(robot: Robot) -> None:
                 )
 
 
-def _distinct(positions: Float[ndarray, "n dof"]) -> Int[ndarray, "m"]:
+def _distinct(positions: Configurations) -> Int[ndarray, "m"]:
     """Indices of rows that differ from the previous one; the first and the last row are always kept."""
     if (np.linalg.norm(positions[1:] - positions[:-1], axis=1) > SAME_WAYPOINT_DISTANCE).all():
         return np.arange(len(positions))
@@ -221,8 +221,8 @@ def _resting_trajectory(path: Path, settings: TimingSettings) -> Trajectory:
 def _time_segments(
     robot: Robot,
     path: Path,
-    waypoints: Float[ndarray, "n dof"],
-    deviations: Float[ndarray, "corners"],
+    waypoints: Configurations,
+    deviations: Values,
     settings: TimingSettings,
     start_speed: float,
     extra: ExtraLimits = NO_EXTRA_LIMITS,
@@ -279,7 +279,7 @@ class StopGraph:
         step: float,
         keeps: Callable[[ndarray], bool] = lambda _: True,
         extra: ExtraLimits = NO_EXTRA_LIMITS,
-        deviations: Float[ndarray, "n"] | None = None,
+        deviations: Values | None = None,
         required_stops: Sequence[int] = (),
     ) -> None:
         """Every motion lasts a whole number of time steps `step` [s].
@@ -300,7 +300,7 @@ class StopGraph:
             if not ((low < sharp) & (sharp < high)).any():  # else it would pass a stop
                 self.motions += self._between(robot, settings, i, j)
 
-    def _find_stops(self, deviations: Float[ndarray, "corners"]) -> Float[ndarray, "k"]:
+    def _find_stops(self, deviations: Values) -> Values:
         """Values of s of all stops: none within a rounded corner, and every corner that is not rounded."""
         line, length = self.line, self.line.length
         corners, widths = line.knots[1:-1], line.half_widths
@@ -333,9 +333,7 @@ class StopGraph:
             found += [Motion(i, j, ticks, rows), Motion(j, i, ticks, back)]
         return found
 
-    def sample(
-        self, radii: Float[ndarray, "dof"], travel: float
-    ) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
+    def sample(self, radii: JointValues, travel: float) -> tuple[Values, Configurations]:
         """Values of s, and the configurations there, between which no point of the arm moves further than
         `travel` [m]. All stops are among them. `radii` as of `motion_radii`."""
         parts = []
@@ -346,9 +344,7 @@ class StopGraph:
         s = np.concatenate([*parts, self.stops[-1:]])
         return s, self.line(s, 0)
 
-    def nearest_samples(
-        self, motion: Motion, configurations: Float[ndarray, "m dof"]
-    ) -> Int[ndarray, "ticks"]:
+    def nearest_samples(self, motion: Motion, configurations: Configurations) -> Int[ndarray, "ticks"]:
         """Index of the nearest of some configurations at each tick of a motion, from its start to its end."""
         times, q = motion.rows[:2]
         ticks = self.step * np.arange(motion.ticks + 1)

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import JointRows, JointValues, Trajectory, Values
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.validation.report import Violation
@@ -40,7 +40,7 @@ def rate_violations(
     robot: Robot,
     trajectory: Trajectory,
     settings: VerifySettings = DEFAULT,
-    start_velocity: Float[ndarray, "dof"] | None = None,
+    start_velocity: JointValues | None = None,
     cubics: Cubics | None = None,
 ) -> list[Violation]:
     """The first violation of each kind in the rates of a trajectory, whose rows are finite and times
@@ -73,8 +73,8 @@ class _Check(NamedTuple):
     kind: str
     what: str
     """The rate in words."""
-    rates: Float[ndarray, "n dof"]
-    off: Float[ndarray, "n dof"]
+    rates: JointRows
+    off: JointRows
     """Deviation of the rates."""
     allowed: Float[ndarray, "#n dof"]
     """Allowed deviation."""
@@ -82,9 +82,7 @@ class _Check(NamedTuple):
     """The expected value in words, by row and joint."""
 
 
-def _checks(
-    robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Float[ndarray, "dof"]
-) -> Iterator[_Check]:
+def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: JointValues) -> Iterator[_Check]:
     trajectory = cubics.trajectory
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
     step, mean, change = cubics.steps, cubics.extremes.mean, np.diff(v, axis=0) / cubics.steps
@@ -185,14 +183,14 @@ def _checks(
         yield limited("acceleration", what, second, most, share * most + unsure)
 
 
-def _cumulative(steps: Float[ndarray, "m dof"]) -> Float[ndarray, "n dof"]:
+def _cumulative(steps: JointRows) -> JointRows:
     """Sums of all steps before each row."""
     return _padded(np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0))
 
 
 def _worst_earlier_row(
-    times: Float[ndarray, "n"], way: Float[ndarray, "n dof"], allowed: Float[ndarray, "n dof"]
-) -> tuple[Int[ndarray, "n dof"], Float[ndarray, "n dof"]]:
+    times: Values, way: JointRows, allowed: JointRows
+) -> tuple[Int[ndarray, "n dof"], JointRows]:
     """For each row and joint the earlier row with the largest excess, and the time since then [s].
 
     The excess is the change of `way` since that row, in either direction, minus the growth of `allowed`. The
@@ -211,17 +209,17 @@ def _worst_earlier_row(
     return first, np.maximum(times[:, None] - times[first], MIN_TIME)
 
 
-def _change_since(rows: Float[ndarray, "n dof"], first: Int[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+def _change_since(rows: JointRows, first: Int[ndarray, "n dof"]) -> JointRows:
     return rows - np.take_along_axis(rows, first, axis=0)
 
 
 def _second_differences(
     trajectory: Trajectory,
-    begins: Float[ndarray, "dof"],
+    begins: JointValues,
     window: float,
     resolution: float,
-    nothing: Float[ndarray, "dof"],
-) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
+    nothing: JointValues,
+) -> tuple[JointRows, JointRows]:
     """Mean accelerations about each row, from positions at the nearest rows at least `window` [s] away, and
     their uncertainty. Before the motion the arm moves at its start velocity, and afterwards it stands
     still."""
@@ -241,5 +239,5 @@ def _padded(*rows: ndarray) -> ndarray:
     return np.concatenate(rows)
 
 
-def _peak(*rates: ndarray) -> Float[ndarray, "dof"]:
+def _peak(*rates: ndarray) -> JointValues:
     return np.abs(np.concatenate(rates)).max(axis=0, initial=0.0)

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
+from robotdiffuse.core.types import Configuration, Configurations, JointRows, Values
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
@@ -79,7 +80,7 @@ class GoalError(NamedTuple):
 
 
 def goal_error(
-    robot: Robot, goal: Goal, q: Float[ndarray, "dof"], settings: VerifySettings = DEFAULT, blend: float = 0.0
+    robot: Robot, goal: Goal, q: Configuration, settings: VerifySettings = DEFAULT, blend: float = 0.0
 ) -> GoalError | None:
     """The error of a configuration with respect to a goal; None at the goal. Of several goals, the smallest
     error.
@@ -121,7 +122,7 @@ def goal_error(
     return GoalError(message, goal.frame, distance)
 
 
-def goal_index(robot: Robot, goal: Goal, q: Float[ndarray, "dof"]) -> int | None:
+def goal_index(robot: Robot, goal: Goal, q: Configuration) -> int | None:
     """Which of several goals, or of several goal configurations, a configuration is at; 0 at a single goal,
     and None at none. Where several goals are close to each other, one that is reached exactly comes first."""
     goals: Sequence[Goal] = goal.goals if isinstance(goal, AnyGoal) else (goal,)
@@ -137,7 +138,7 @@ def goal_index(robot: Robot, goal: Goal, q: Float[ndarray, "dof"]) -> int | None
 def first_place_within(
     robot: Robot,
     goal: Goal,
-    q: Float[ndarray, "n dof"],
+    q: Configurations,
     blend: float,
     settings: VerifySettings = DEFAULT,
     after: float = 0.0,
@@ -154,9 +155,7 @@ def first_place_within(
     return None
 
 
-def sample_path(
-    q: Float[ndarray, "n dof"], step: float, after: float = 0.0
-) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
+def sample_path(q: Configurations, step: float, after: float = 0.0) -> tuple[Values, JointRows]:
     """Places after `after` at most a step apart [rad, joint-space L2] on a path, and the configurations
     there.
 
@@ -171,7 +170,7 @@ def sample_path(
 
 
 def _near(
-    robot: Robot, goal: Goal, q: Float[ndarray, "n dof"], blend: float, settings: VerifySettings
+    robot: Robot, goal: Goal, q: Configurations, blend: float, settings: VerifySettings
 ) -> Bool[ndarray, "n"]:
     """Marks configurations that may be within `blend` of a goal, by position alone."""
     if isinstance(goal, AnyGoal):

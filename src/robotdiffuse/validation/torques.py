@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.types import Trajectory
+from robotdiffuse.core.types import Configurations, JointRows, Trajectory, Values
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.torque_bounds import Stretches
 from robotdiffuse.trajectories.cubics import Cubics
@@ -25,14 +25,14 @@ MAX_OPEN_PIECES = 100_000
 limit."""
 PLACE_RESOLUTION = 1 / 64
 """The place where a value first exceeds its limit is located to this share of a piece."""
-States = tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]
+States = tuple[JointRows, JointRows, JointRows]
 """Positions, velocities and accelerations."""
 
 
 class Pieces(NamedTuple):
     """The pieces of a motion, from each row to the next."""
 
-    states: Callable[[Int[ndarray, "n"], Float[ndarray, "n"]], States]
+    states: Callable[[Int[ndarray, "n"], Values], States]
     """States by piece and share of the piece."""
     along: Stretches
     """Bounds along each piece, with derivatives by the share."""
@@ -65,7 +65,7 @@ def trajectory_pieces(trajectory: Trajectory) -> Pieces:
     return Pieces(cubics.states, Stretches(farthest, h * speed, speed, pull))
 
 
-def static_pieces(q: Float[ndarray, "n dof"]) -> Pieces:
+def static_pieces(q: Configurations) -> Pieces:
     """Pieces of a path on straight lines, at rest everywhere."""
     q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
     step = np.diff(q, axis=0)
@@ -80,7 +80,7 @@ def static_pieces(q: Float[ndarray, "n dof"]) -> Pieces:
     return Pieces(states, Stretches(_farthest(q), v, still, still))
 
 
-def _farthest(q: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+def _farthest(q: Configurations) -> JointRows:
     return np.maximum(np.abs(q[:-1]), np.abs(q[1:]))
 
 
@@ -92,7 +92,7 @@ def first_excess(dynamics: Dynamics, pieces: Pieces, slack: float) -> Excess | N
 
 
 def first_beyond(
-    limits: Float[ndarray, "k"],
+    limits: Values,
     values: Callable[[ndarray, ndarray, ndarray], ndarray],
     bends: Float[ndarray, "m k"],
     states: Callable[[ndarray, ndarray], States],

@@ -12,6 +12,7 @@ from numpy.random import Generator
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Positive, Settings
+from robotdiffuse.core.types import Configuration, Configurations, JointRows, Pose
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_origins
@@ -60,9 +61,9 @@ class SampledProblem:
 
     scene: Scene
     """The floor first, if the family has one."""
-    start: Float[ndarray, "dof"]
-    goals: Float[ndarray, "k dof"]
-    T_base_tip: Float[ndarray, "4 4"]
+    start: Configuration
+    goals: Configurations
+    T_base_tip: Pose
     """The target; if only its position is given, the orientation is that of the first goal."""
 
     def problem(self, robot: Robot) -> Problem:
@@ -125,7 +126,7 @@ def sample_until_found(
 
 def uniform_configurations(
     robot: Robot, region: Float[ndarray, "2 3"], checker: CollisionChecker, count: int, rng: Generator
-) -> Float[ndarray, "k dof"]:
+) -> JointRows:
     """Up to `count` collision-free configurations with the origin of the tip link in the region.
 
     They are uniform within the joint limits. There are fewer if MAX_BATCHES batches contain no more.
@@ -143,12 +144,12 @@ def uniform_configurations(
 
 def reaching_configurations(
     robot: Robot,
-    T_base_tip: Float[ndarray, "4 4"],
+    T_base_tip: Pose,
     count: int,
     checker: CollisionChecker,
     rng: Generator,
     settings: InverseKinematicsSettings = POSE_IK,
-) -> Float[ndarray, "k dof"]:
+) -> JointRows:
     """Up to `count` free configurations with the tip at its target. Arms with fewer than six joints only
     reach the position.
 
@@ -156,7 +157,7 @@ def reaching_configurations(
     joint at a limit are left out: the solver clips joints there, so they would be far too frequent.
     """
 
-    def accept(q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
+    def accept(q: Configurations) -> Bool[ndarray, "n"]:
         inside = ((q > robot.lower + LIMIT_MARGIN) & (q < robot.upper - LIMIT_MARGIN)).all(axis=1)
         return inside & checker.free(q)
 

@@ -18,6 +18,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Share
 from robotdiffuse.core.transforms import rotation_about, rotation_z_to, transform
+from robotdiffuse.core.types import Pose, Values, Vector
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
     MIN_POSE_DOF,
@@ -72,13 +73,13 @@ AtLeastTwo = Annotated[int, Bound(least=2.0)]
 class Region:
     """A box without obstacles, rotated about the vertical axis, for the fingers at start or goal."""
 
-    center: Float[ndarray, "3"]
+    center: Vector
     """In the base frame [m]."""
-    size: Float[ndarray, "3"]
+    size: Vector
     """Full edge lengths [m]."""
     yaw: float
     """Rotation of the box about the vertical axis [rad]."""
-    approach: Float[ndarray, "3"]
+    approach: Vector
     """Unit vector, in the base frame, in which the hand points: into a compartment, or down into a crate."""
 
 
@@ -93,7 +94,7 @@ class FurnishedScene:
 
 def sample_target(
     region: Region, rng: Generator, spread: float = 0.4, finger_length: float = FINGER_LENGTH
-) -> Float[ndarray, "4 4"]:
+) -> Pose:
     """A random pose T_base_tip of the robot's tip link, with its fingers in the region.
 
     The point at `finger_length` [m] along the link's z axis is uniform in the region, less a margin. The z
@@ -209,7 +210,7 @@ class FurnitureFrame:
         self.xy = away * np.array([np.cos(bearing), np.sin(bearing)])
         self.rotation = rotation_about(-DOWN, self.yaw)
 
-    def point(self, xyz: Float[ndarray, "3"]) -> Float[ndarray, "3"]:
+    def point(self, xyz: Vector) -> Vector:
         """A point of this frame, in the base frame [m]."""
         return self.rotation @ xyz + [*self.xy, 0.0]
 
@@ -219,7 +220,7 @@ class FurnitureFrame:
         middle, size = (np.array(low) + high) / 2, np.subtract(high, low)
         return Box(self.point(middle), size, (np.cos(half), 0.0, 0.0, np.sin(half)), name)
 
-    def region(self, low: Corner, high: Corner, approach: Float[ndarray, "3"]) -> Region:
+    def region(self, low: Corner, high: Corner, approach: Vector) -> Region:
         middle, size = (np.array(low) + high) / 2, np.subtract(high, low)
         return Region(self.point(middle), size, self.yaw, self.rotation @ approach)
 
@@ -326,7 +327,7 @@ def loose_in_cells(
     return shapes
 
 
-def edges(sizes: Float[ndarray, "n"], t: float) -> Float[ndarray, "n+1"]:
+def edges(sizes: Values, t: float) -> Values:
     """Positions of the boards between gaps of these sizes, beginning with 0."""
     return np.concatenate([[0.0], np.cumsum(sizes + t)])
 
@@ -752,7 +753,7 @@ class Cabinet(Furniture):
         shapes += [frame.box((0.0, y, low), (depth, y + t, height), "upright") for y in sides.tolist()]
         if rng.random() < self.back_share:
             shapes.append(frame.box((depth, left, low), (depth + t, right, height), "back"))
-        regions: list[tuple[Corner, Corner, Float[ndarray, "3"]]] = []
+        regions: list[tuple[Corner, Corner, Vector]] = []
         if not on_ground and rng.random() < self.legs_share:
             w = 2 * t
             for x in (0.0, depth - w):
@@ -806,7 +807,7 @@ class Cabinet(Furniture):
         return [frame.box(a, b, "drawer") for a, b in corners], inside
 
 
-def _is_wide(low: Corner, high: Corner, approach: Float[ndarray, "3"]) -> bool:
+def _is_wide(low: Corner, high: Corner, approach: Vector) -> bool:
     """Whether the hand gets into a region."""
     size = np.subtract(high, low)
     return bool(size.min() > MIN_REGION and (approach is DOWN or size[1:].min() > MIN_OPENING))
