@@ -1,6 +1,7 @@
 """Rigid transforms as 4 x 4 matrices and quaternions in wxyz order (NumPy, float64)."""
 
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,32 +18,16 @@ IDENTITY = np.eye(4)
 def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b 3 3"]:
     """Rotation matrix of a quaternion, normalised first."""
     if wxyz.ndim == 1:  # plain floats: NumPy takes several times as long for four numbers
-        return np.array(_rotation(*wxyz.tolist()))
+        w, x, y, z = wxyz.tolist()
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        return np.array(_rotation(w / norm, x / norm, y / norm, z / norm))
     unit = wxyz / np.linalg.norm(wxyz, axis=-1, keepdims=True)
-    w, x, y, z = unit[..., 0], unit[..., 1], unit[..., 2], unit[..., 3]
-    out = np.empty((*unit.shape[:-1], 3, 3))
-    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-    )
-    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = (
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-    )
-    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = (
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    )
-    return out
+    rows = np.array(_rotation(*np.moveaxis(unit, -1, 0)))
+    return np.ascontiguousarray(np.moveaxis(rows, (0, 1), (-2, -1)))
 
 
-def _rotation(w: float, x: float, y: float, z: float) -> list[list[float]]:
-    """`rotation_from_quaternion` of a single quaternion, as nested lists."""
-    norm = math.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+def _rotation(w: Any, x: Any, y: Any, z: Any) -> list[list[Any]]:
+    """The rows of the matrix of a unit quaternion, or of arrays of them."""
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_DURATION, MAX_RATE, Value, numbers, one_line, rows
 from robotdiffuse.core.errors import InputError, distinct, joined, repeated, shown
@@ -35,6 +36,24 @@ Rotation = Float[ndarray, "3 3"]
 """A rotation matrix."""
 Pose = Float[ndarray, "4 4"]
 """A rigid transform."""
+if TYPE_CHECKING:  # fields of values, whose constructors take all that NumPy reads as arrays
+
+    class _Given:
+        def __get__(self, owner: Any, kind: Any = None) -> ndarray: ...
+        def __set__(self, owner: Any, value: ArrayLike) -> None: ...
+
+    class _GivenOrNone:
+        def __get__(self, owner: Any, kind: Any = None) -> ndarray | None: ...
+        def __set__(self, owner: Any, value: ArrayLike | None) -> None: ...
+
+    GivenVector = _Given
+    GivenPose = _Given
+    GivenConfigurations = _Given
+    VectorOrNone = _GivenOrNone
+    PoseOrNone = _GivenOrNone
+else:
+    GivenVector, GivenPose, GivenConfigurations = Vector, Pose, Configurations
+    VectorOrNone, PoseOrNone = Vector | None, Pose | None
 ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
 REST = 1e-3

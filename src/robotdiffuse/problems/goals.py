@@ -5,14 +5,13 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, no_type_check
+from typing import no_type_check
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import Value, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, repeated, shown
-from robotdiffuse.core.types import Configurations, Pose, Vector
+from robotdiffuse.core.types import GivenConfigurations, GivenPose, Pose, VectorOrNone
 
 
 @no_type_check
@@ -20,7 +19,7 @@ from robotdiffuse.core.types import Configurations, Pose, Vector
 class JointGoal(Value):
     """Any of these configurations (one row each)."""
 
-    positions: Configurations
+    positions: GivenConfigurations
 
     def __post_init__(self) -> None:
         positions = numbers(self.positions)
@@ -30,10 +29,6 @@ class JointGoal(Value):
             )
         object.__setattr__(self, "positions", np.atleast_2d(positions))
         super().__post_init__()
-
-    if TYPE_CHECKING:
-
-        def __init__(self, positions: ArrayLike) -> None: ...
 
     def moved(self, T: Pose) -> "JointGoal":
         """The goal itself: configurations do not move."""
@@ -54,10 +49,10 @@ class PoseGoal(Value):
 
     frame: str
     """Name of the link."""
-    T_base_frame: Pose
-    xyz_tolerance: Vector | None = None
+    T_base_frame: GivenPose
+    xyz_tolerance: VectorOrNone = None  # pyright: ignore[reportAssignmentType]
     """Along the axes of the goal [m]; None: the exact position, validated to 1 cm."""
-    rpy_tolerance: Vector | None = None
+    rpy_tolerance: VectorOrNone = None  # pyright: ignore[reportAssignmentType]
     """About the axes of the goal [rad], pi for any angle; None: the exact orientation, validated to 15
     degrees."""
 
@@ -76,16 +71,6 @@ class PoseGoal(Value):
                 object.__setattr__(self, name, array)
         super().__post_init__()
 
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            frame: str,
-            T_base_frame: ArrayLike,
-            xyz_tolerance: ArrayLike | None = None,
-            rpy_tolerance: ArrayLike | None = None,
-        ) -> None: ...
-
     def moved(self, T: Pose) -> "PoseGoal":
         """The goal after the rigid motion T."""
         return replace(self, T_base_frame=T @ self.T_base_frame)
@@ -101,7 +86,7 @@ class PoseGoal(Value):
 class PosesGoal(Value):
     """A pose for each of several links at once, e.g. for both hands of two arms, each with its tolerances."""
 
-    poses: tuple[PoseGoal, ...]
+    poses: Sequence[PoseGoal]
 
     def __post_init__(self) -> None:
         poses = self.poses if isinstance(self.poses, list | tuple) else ()
@@ -111,10 +96,6 @@ class PosesGoal(Value):
         if twice:
             raise InputError(f"goal.poses names {twice[0]!r} twice; each link has one pose")
         object.__setattr__(self, "poses", tuple(poses))
-
-    if TYPE_CHECKING:
-
-        def __init__(self, poses: Sequence[PoseGoal]) -> None: ...
 
     def moved(self, T: Pose) -> "PosesGoal":
         """The goal after the rigid motion T."""
@@ -151,7 +132,7 @@ OneGoal = JointGoal | PoseGoal | PosesGoal
 Goal = OneGoal | AnyGoal
 
 
-def poses_of(goal: Goal) -> tuple[PoseGoal, ...]:
+def poses_of(goal: Goal) -> Sequence[PoseGoal]:
     """The poses that must be reached together; empty for configurations and for AnyGoal."""
     if isinstance(goal, PosesGoal):
         return goal.poses

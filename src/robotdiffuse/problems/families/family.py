@@ -20,6 +20,8 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
+Spheres = Float[ndarray, "_ 4"]
+"""x, y, z, radius [m]."""
 Range = tuple[float, float]
 PositiveRange = tuple[Positive, Positive]
 """A range that is sampled uniformly; equal bounds fix the value."""
@@ -94,7 +96,7 @@ class Family(Protocol):
         """Maximum number of obstacles of a scene, without the floor."""
         ...
 
-    def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
+    def scene(self, rng: Generator, keep_out: Spheres | None = None) -> Scene:
         """A random scene. keep_out: spheres (x, y, z, radius) that only the floor may intersect."""
         ...
 
@@ -166,7 +168,7 @@ def reaching_configurations(
     return robot.unwound(q).astype(np.float32)
 
 
-def base_spheres(robot: Robot) -> Float[ndarray, "m 4"]:
+def base_spheres(robot: Robot) -> Spheres:
     """Collision spheres (x, y, z, radius) of the links that no planned joint moves, in the base frame [m]."""
     parts = [np.zeros((0, 4))]
     for link, spheres in robot.spheres.items():
@@ -176,7 +178,7 @@ def base_spheres(robot: Robot) -> Float[ndarray, "m 4"]:
     return np.concatenate(parts)
 
 
-def is_clear_of(shape: Sphere | Box, keep_out: Float[ndarray, "m 4"] | None) -> bool:
+def is_clear_of(shape: Sphere | Box, keep_out: Spheres | None) -> bool:
     """Whether a shape intersects none of the spheres (x, y, z, radius)."""
     if keep_out is None:
         return True

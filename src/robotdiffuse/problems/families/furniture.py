@@ -26,6 +26,7 @@ from robotdiffuse.problems.families.family import (
     Range,
     Ranges,
     SampledProblem,
+    Spheres,
     base_spheres,
     is_clear_of,
     reaching_configurations,
@@ -149,7 +150,7 @@ class Furniture(Ranges, ABC):
         far = self.reach + HAND_LENGTH
         return np.array([[-far, -far, 0.0], [far, far, SHOULDER[2] + far]])
 
-    def furnish(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> FurnishedScene:
+    def furnish(self, rng: Generator, keep_out: Spheres | None = None) -> FurnishedScene:
         """A random scene; the same state of `rng` gives the same scene.
 
         keep_out: spheres (x, y, z, radius), e.g. of the robot's fixed base, that only the floor may
@@ -168,7 +169,7 @@ class Furniture(Ranges, ABC):
             f"{MAX_TRIES} samples; change distance or reach"
         )
 
-    def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
+    def scene(self, rng: Generator, keep_out: Spheres | None = None) -> Scene:
         return self.furnish(rng, keep_out).scene
 
     def draw(

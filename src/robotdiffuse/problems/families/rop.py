@@ -19,6 +19,7 @@ from robotdiffuse.problems.families.family import (
     Range,
     Ranges,
     SampledProblem,
+    Spheres,
     base_spheres,
     is_clear_of,
     reaching_configurations,
@@ -79,7 +80,7 @@ class Rop(Ranges):
     def max_obstacles(self) -> int:
         return self.obstacles[1]
 
-    def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
+    def scene(self, rng: Generator, keep_out: Spheres | None = None) -> Scene:
         """A random scene. keep_out: spheres (x, y, z, radius), e.g. of the robot's fixed base, that no
         obstacle may intersect; the floor may.
 
@@ -88,7 +89,7 @@ class Rop(Ranges):
         low, high = self.obstacles
         return Scene([self.floor, *(self._placed(rng, keep_out) for _ in range(rng.integers(low, high + 1)))])
 
-    def _placed(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None) -> Sphere | Box:
+    def _placed(self, rng: Generator, keep_out: Spheres | None) -> Sphere | Box:
         for _ in range(MAX_TRIES):
             shape = self._obstacle(rng)
             if is_clear_of(shape, keep_out):

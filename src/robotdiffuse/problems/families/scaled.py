@@ -12,7 +12,7 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.problems.families import load_family
-from robotdiffuse.problems.families.family import CONFIGURATION, Family, SampledProblem
+from robotdiffuse.problems.families.family import CONFIGURATION, Family, SampledProblem, Spheres
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.robots.scaling import reach, scaled
 from robotdiffuse.scenes.scene import Scene
@@ -56,7 +56,7 @@ class ScaledFamily:
     def max_obstacles(self) -> int:
         return self.family.max_obstacles
 
-    def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
+    def scene(self, rng: Generator, keep_out: Spheres | None = None) -> Scene:
         keep_out = None if keep_out is None else keep_out / self.scale
         return _scene(self.family.scene(rng, keep_out), self.scale)
 
