@@ -16,8 +16,9 @@ MAX_BOX_DIFFERENCE = 0.03
 """Largest difference between the bounding boxes of a visual mesh that is used and of the collision geometry
 [m]."""
 LINK_COLOR = (236, 238, 240)
-HELD_COLOR, TOOL_COLOR = (0xD9, 0x7B, 0x5C), (176, 182, 190)
-"""Colours of held objects, as of obstacles, and of tools [sRGB]."""
+# Colors of held objects and of tools [sRGB].
+HELD_COLOR = (0xE3, 0xB2, 0x3C)
+TOOL_COLOR = (0xB0, 0xB6, 0xBE)
 
 
 @dataclass(frozen=True, eq=False)
