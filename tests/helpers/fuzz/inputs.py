@@ -285,11 +285,12 @@ def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     from robotdiffuse.core.errors import InputError
     from robotdiffuse.robots import load_robot
     from robotdiffuse.server import worker
+    from robotdiffuse.server.settings import ServeSettings
 
     what, body = asked(rng)
 
     def ask() -> None:
-        worker.accept({"panda": load_robot("panda")}, 0.1, worker.Shared())
+        worker.accept({"panda": load_robot("panda")}, ServeSettings(max_time_limit=0.1))
         answer = worker.respond(1, what, body)
         if answer.code == 400:
             raise InputError(json.loads(answer.body)["error"])
