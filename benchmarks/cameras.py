@@ -90,8 +90,9 @@ TRUE = "true voxels"
 """As `predicted`, with the voxels of 2 cm that obstacles fill in truth."""
 BY = "predicted by "
 """As `predicted`, with the weights of the folder of this name."""
-TIMED_CALLS, WARM_UP_CALLS = 140, 7
-"""Of the network."""
+# Of the network.
+TIMED_CALLS = 140
+WARM_UP_CALLS = 7
 SECOND_VIEWS = ("next_view", "random", "opposite")
 UNSURE = 0.9
 """Another view is most wanted if the motion of one view has a stated confidence below this."""
@@ -212,7 +213,8 @@ def table(rows: list[Row], title: str) -> None:
         mine = [row for row in rows if row["method"] == method]
         if not mine:
             continue
-        free, solved = sum(row["free"] for row in mine), sum(row["solved"] for row in mine)
+        free = sum(row["free"] for row in mine)
+        solved = sum(row["solved"] for row in mine)
         low, high = wilson_interval(free, len(mine))
         first = [row for row in mine if row["assumption"] == FIRST_ASSUMPTIONS.get(method, FIRST_PREDICTED)]
         shares = [np.mean([row["free"] for row in mine if row["family"] == family]) for family in families]
@@ -262,7 +264,8 @@ def calibration(rows: list[Row], of: str) -> None:
             continue
         stated = np.array([row["confidence"] for row in mine])
         free = np.array([row["free"] for row in mine], float)
-        lines, error = [], 0.0
+        lines = []
+        error = 0.0
         for low in np.arange(0, 1, 0.2):
             part = (stated >= low) & (stated < low + 0.2 + 1e-9 * (low > 0.7))
             if part.any():
@@ -302,12 +305,14 @@ def times(families: list[str]) -> None:
         problem = held_out_problem(family, 0)
         seen = observe(views(problem, family, 0, 1, False), problem.robot, problem.start)
         volumes.append(pack(seen))
-    network, spent = exported_completion(), list[float]()
+    network = exported_completion()
+    spent = list[float]()
     for i in range(TIMED_CALLS + WARM_UP_CALLS):
         began = time.process_time()
         network(*volumes[i % len(volumes)])
         spent.append(time.process_time() - began)
-    least, median = 1e3 * min(spent[WARM_UP_CALLS:]), 1e3 * np.median(spent[WARM_UP_CALLS:])
+    least = 1e3 * min(spent[WARM_UP_CALLS:])
+    median = 1e3 * np.median(spent[WARM_UP_CALLS:])
     print(f"network: {median:.1f} ms of CPU time (median), {least:.1f} least, {TIMED_CALLS} calls")
 
 

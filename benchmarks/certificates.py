@@ -47,8 +47,9 @@ PLANNERS = {
     "BKPIECE1": og.BKPIECE1,
 }
 FAMILIES = ("shelf", "table", "crate", "rop_dense")
-LIMIT, TRUTH_STEP = 4.0, 0.002
-"""Wall time of a call [s]; largest joint motion between two configurations of the truth [rad]."""
+# Wall time of a call [s]; largest joint motion between two configurations of the truth [rad].
+LIMIT = 4.0
+TRUTH_STEP = 0.002
 LENIENT = VerifySettings(reversals=1000)
 """OMPL's raw paths go back and forth, which is no collision."""
 
@@ -68,7 +69,8 @@ class Checked(NamedTuple):
 
 def motions(count: int, resolution: float) -> Iterator[Motion]:
     """Solved motions, planners and families in turn, each problem for all planners."""
-    found, number = 0, 0
+    found = 0
+    number = 0
     while found < count:
         problem = held_out_problem(FAMILIES[number % len(FAMILIES)], number)
         for k, name in enumerate(PLANNERS):
@@ -80,11 +82,13 @@ def motions(count: int, resolution: float) -> Iterator[Motion]:
 
 
 def _planned(problem: Problem, name: str, resolution: float, seed: int) -> JointPath | None:
-    robot, exact = problem.robot, ExactCollision(problem.robot, problem.scene)
+    robot = problem.robot
+    exact = ExactCollision(problem.robot, problem.scene)
     if not isinstance(problem.goal, JointGoal):
         return None
     ou.RNG.setSeed(seed)
-    space, bounds = ob.RealVectorStateSpace(robot.dof), ob.RealVectorBounds(robot.dof)
+    space = ob.RealVectorStateSpace(robot.dof)
+    bounds = ob.RealVectorBounds(robot.dof)
     for j in range(robot.dof):
         bounds.setLow(j, robot.lower[j])
         bounds.setHigh(j, robot.upper[j])
@@ -107,7 +111,8 @@ def _planned(problem: Problem, name: str, resolution: float, seed: int) -> Joint
     path = setup.getSolutionPath()
     path.interpolate()
     rows = np.array([row(state) for state in path.getStates()])
-    rows[0], rows[-1] = problem.start, problem.goal.positions[0]
+    rows[0] = problem.start
+    rows[-1] = problem.goal.positions[0]
     return JointPath(robot.joint_names, rows)
 
 
@@ -153,7 +158,8 @@ def cost(problem: Problem, motion: rd.Path | rd.Trajectory, folder: Path) -> Cos
             return verify_trajectory(problem, motion, LENIENT)  # type: ignore[arg-type]
         return verify(problem, motion, LENIENT)  # type: ignore[arg-type]
 
-    certificate, file = certify(problem, motion, LENIENT), folder / "certificate.json"
+    certificate = certify(problem, motion, LENIENT)
+    file = folder / "certificate.json"
     certificate.save(file)
     assert certificate.check(problem).valid
     proved = min(certificate.scene_clearance, certificate.self_clearance)
@@ -240,7 +246,8 @@ def main() -> None:
         measure(drawn, validated, Path(name), arguments.commands)
 
 
-LOW, FAR = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2], [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
+LOW = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
+FAR = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 TABLE = rd.Box([0.55, 0.0, 0.0], [0.5, 1.0, 0.2], name="table")
 POST = rd.Cylinder([0.42, 0.35, 0.4], 0.06, 0.6, name="post")
 REQUESTS: dict[str, dict[str, Any]] = {
@@ -254,7 +261,8 @@ REQUESTS: dict[str, dict[str, Any]] = {
 
 def of_requests(folder: Path, count: int) -> None:
     """Print what the proof of one motion over a table costs, for each kind of request."""
-    robot, rows = rd.load_robot("panda"), []
+    robot = rd.load_robot("panda")
+    rows = []
     for name, asked in REQUESTS.items():
         problem = Problem(robot, rd.Scene([TABLE]), LOW, FAR, **asked)
         result = rd.load_planner("aorrtc").plan(problem, time_limit=20.0)
@@ -278,8 +286,11 @@ def of_requests(folder: Path, count: int) -> None:
 
 def measure(drawn: list[Motion], validated: list[Checked], folder: Path, count: int) -> None:
     """Print the costs of valid motions of OMPL, and of what this package plans for the same problems."""
-    rough, smooth, failed = [], [], 0
-    verified, checked = list[float](), list[float]()
+    rough = []
+    smooth = []
+    failed = 0
+    verified = list[float]()
+    checked = list[float]()
     of_requests(folder, count)
     problems = list({id(motion.problem): motion.problem for motion in drawn}.values())
     for motion, one in progress(list(zip(drawn, validated, strict=True)), "certifying"):
@@ -294,12 +305,14 @@ def measure(drawn: list[Motion], validated: list[Checked], folder: Path, count: 
             smooth.append(cost(problem, result.trajectory, folder))
             if len(verified) < 3 * count:
                 a, b = commands(problem, result, folder, count)
-                verified, checked = verified + a, checked + b
+                verified = verified + a
+                checked = checked + b
     rows = []
     for name, costs in (("paths of OMPL", rough), ("timed motions of rrt_connect", smooth)):
         if costs:
             table = np.array(costs, float)
-            middle, worst = np.median(table, axis=0), np.percentile(table, 95, axis=0)
+            middle = np.median(table, axis=0)
+            worst = np.percentile(table, 95, axis=0)
             ratio = np.median(table[:, 2] / table[:, 1])
             for label, line in ((f"{name}, median of {len(costs)}", middle), ("95th percentile", worst)):
                 numbers = [f"{line[0]:.1f}", f"{line[1]:.0f}", f"{line[2]:.1f}", f"{line[3]:.0f}"]
@@ -315,7 +328,8 @@ def measure(drawn: list[Motion], validated: list[Checked], folder: Path, count: 
         ],
     )
     if verified:
-        a, b = float(np.median(verified)), float(np.median(checked))
+        a = float(np.median(verified))
+        b = float(np.median(checked))
         print(f"commands, median of {len(verified)}: verify {a:.2f} s, check {b:.2f} s, {b / a:.2f} of it")
 
 

@@ -45,8 +45,9 @@ EDGES = 500
 """Edges of 1 rad in each of them."""
 PASSES = 5
 """The fastest one counts."""
-POINTS, POINT_RADIUS = 100_000, 0.01
-"""Of clouds; [m]."""
+# Of clouds; [m].
+POINTS = 100_000
+POINT_RADIUS = 0.01
 CONFIGURATIONS_PER_SCENE = 2_000
 RESOLUTION = RRTConnectSettings().resolution
 """Of searches [m]."""
@@ -57,7 +58,8 @@ Place = tuple[Robot, Scene]
 
 
 def rop_places(robot: Robot, dense: bool, count: int) -> list[Place]:
-    settings, keep_out = (ROP_DENSE if dense else ROP), base_spheres(robot)
+    settings = ROP_DENSE if dense else ROP
+    keep_out = base_spheres(robot)
     seeds = [np.random.default_rng([SEED, dense, i]) for i in range(count)]
     return [(robot, settings.scene(rng, keep_out)) for rng in seeds]
 
@@ -78,7 +80,8 @@ def family_places(folder: Path) -> list[Place]:
 
 @njit
 def check_edges(space: Space, starts: ndarray, ends: ndarray) -> ndarray:
-    work, block = make_workspace(space.robot, space.scene), np.empty((starts.shape[1], W), np.float32)
+    work = make_workspace(space.robot, space.scene)
+    block = np.empty((starts.shape[1], W), np.float32)
     free = np.empty(len(starts), np.bool_)
     for i in range(len(starts)):
         free[i] = motion_free(space, starts[i], ends[i], block, work)
@@ -87,7 +90,8 @@ def check_edges(space: Space, starts: ndarray, ends: ndarray) -> ndarray:
 
 def random_edges(checker: CollisionChecker, rng: Generator) -> tuple[ndarray, ndarray]:
     """Edges of 1 rad from free configurations in random directions, within the limits."""
-    robot, found = checker.robot, np.zeros((0, checker.robot.dof))
+    robot = checker.robot
+    found = np.zeros((0, checker.robot.dof))
     for _ in range(1000):
         q = rng.uniform(robot.lower, robot.upper, (EDGES, robot.dof))
         found = np.concatenate([found, q[checker.free(q)]])
@@ -119,7 +123,11 @@ def fastest(call: Callable[[], object]) -> float:
 def kernel_speed(title: str, places: list[Place]) -> list[str]:
     """One row: mean times over some scenes."""
     rng = np.random.default_rng(SEED)
-    along, every, edge, share, build = [], [], [], [], []
+    along = []
+    every = []
+    edge = []
+    share = []
+    build = []
     for robot, scene in places[:SCENES]:
         start = time.process_time()
         checker = CollisionChecker(robot, scene)
@@ -150,7 +158,8 @@ def without_pairs(robot: Robot) -> Robot:
 def soundness(title: str, places: list[Place], configurations: int) -> tuple[ndarray, list[list[str]]]:
     """Counts [scene, self, both; free on meshes, of these refused, colliding on meshes, of these called
     free], and their rows."""
-    rng, counts = np.random.default_rng(SEED), np.zeros((3, 4), int)
+    rng = np.random.default_rng(SEED)
+    counts = np.zeros((3, 4), int)
     per_scene = min(CONFIGURATIONS_PER_SCENE, -(-configurations // len(places)))
     rounds = -(-configurations // per_scene)
     for i in progress(range(rounds), title):
@@ -185,7 +194,8 @@ def count_row(title: str, counts: Int[ndarray, "4"]) -> list[str]:
 @njit
 def place_along(space, starts, ends, counts):
     """The forward kinematics of a check of these edges, with so many configurations each."""
-    work, block = make_workspace(space.robot, space.scene), lanes_array(starts.shape[1], 1)
+    work = make_workspace(space.robot, space.scene)
+    block = lanes_array(starts.shape[1], 1)
     for i in range(len(starts)):
         for j in range(starts.shape[1]):
             block[j, :] = np.float32(0.5) * (starts[i, j] + ends[i, j])
@@ -196,7 +206,8 @@ def place_along(space, starts, ends, counts):
 
 def free_edges(path: ndarray, space: Space) -> tuple[ndarray, ndarray]:
     """The edges of a path that are free in both directions, repeated."""
-    starts, ends = np.concatenate([path[:-1], path[1:]]), np.concatenate([path[1:], path[:-1]])
+    starts = np.concatenate([path[:-1], path[1:]])
+    ends = np.concatenate([path[1:], path[:-1]])
     free = check_edges(space, starts, ends)
     free &= np.roll(free, len(path) - 1)
     return np.tile(starts[free], (PATH_REPEATS, 1)), np.tile(ends[free], (PATH_REPEATS, 1))
@@ -204,10 +215,13 @@ def free_edges(path: ndarray, space: Space) -> tuple[ndarray, ndarray]:
 
 def along_paths(robot: Robot, families: list[str], each: int) -> None:
     """Print what a configuration costs along the paths of aorrtc, and which part of the check takes it."""
-    planner, rows, rng = load_planner("aorrtc"), [], np.random.default_rng(SEED)
+    planner = load_planner("aorrtc")
+    rows = []
+    rng = np.random.default_rng(SEED)
     bare = search_space(CollisionChecker(robot, Scene()), RESOLUTION)
     for family in families:
-        spent, checked = np.zeros(4), np.zeros(2)
+        spent = np.zeros(4)
+        checked = np.zeros(2)
         for case in draw_hard_cases(family, each):
             path = planner.plan(case.problem, 1.0, until=FIRST, clearance=0.0).path
             if path is None:
@@ -243,7 +257,8 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=8, help="problems of each family, for paths (8)")
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="for paths (all)")
     arguments = parse(parser, configurations=200, scenes=1, each=1, families=["rop"])
-    robot, count = load_robot("panda"), arguments.scenes
+    robot = load_robot("panda")
+    count = arguments.scenes
     print(header("numpy", "numba", "coal"))
     sizes = sum(map(len, robot.spheres.values()))
     print(f"Panda: {sizes} spheres, {len(CollisionChecker(robot, Scene()).pairs)} checked pairs of links")
@@ -266,7 +281,8 @@ def main() -> None:
     along_paths(robot, arguments.families, arguments.each)
 
     sampled = {"ROP": rop_places(robot, False, 500), "ROP dense": rop_places(robot, True, 500), **published}
-    total, rows = np.zeros((3, 4), int), []
+    total = np.zeros((3, 4), int)
+    rows = []
     for title, of in sampled.items():
         counts, family = soundness(title, of, -(-arguments.configurations // len(sampled)))
         total += counts

@@ -67,7 +67,8 @@ def parse(parser: argparse.ArgumentParser, **smallest: object) -> argparse.Names
 
 def parts_of(text: str, known: Iterable[str]) -> list[str]:
     """Names separated by commas. Raises SystemExit, listing the known names, for an unknown one."""
-    names, known = text.split(","), list(known)
+    names = text.split(",")
+    known = list(known)
     unknown = [name for name in names if name not in known]
     if unknown:
         raise SystemExit(f"{unknown[0]!r} is unknown; known: {', '.join(known)}")

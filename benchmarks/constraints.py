@@ -59,15 +59,19 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.validator import verifier
 
-SHORT, LONG = 1.0, 10.0
-"""Time limits [s]; the longer one says what can be solved."""
+# Time limits [s]; the longer one says what can be solved.
+SHORT = 1.0
+LONG = 10.0
 HAND, CUP = "panda_hand", rd.Cylinder([0, 0, 0.14], 0.03, 0.06, name="cup")
 LOW, HIGH = np.array([0.25, -0.5, 0.25]), np.array([0.7, 0.5, 0.8])
 """Where the hand is drawn [m]."""
-UPRIGHT, OFF_LINE, TURNED = np.radians(10), 0.002, 0.05
-"""Tolerances of the constraints [rad], [m], [rad]."""
-GOALS, LINE_PLACES = 10, 9
-"""Goal configurations of a problem; places of a line at which some configuration must be free."""
+# Tolerances of the constraints [rad], [m], [rad].
+UPRIGHT = np.radians(10)
+OFF_LINE = 0.002
+TURNED = 0.05
+# Goal configurations of a problem; places of a line at which some configuration must be free.
+GOALS = 10
+LINE_PLACES = 9
 STEP = 0.001
 """Between two checks of a motion [rad]; links reach less than 1 m, so that the hand moves less than 1 mm."""
 CONTACT_FRAMES = 600
@@ -97,7 +101,8 @@ class Checked(NamedTuple):
 
 def drawn(kind: str, number: int) -> Iterator[Problem]:
     """Held-out problems with a cup in the hand and a constraint."""
-    found, i = 0, 0
+    found = 0
+    i = 0
     while found < number:
         rng = np.random.default_rng([SEED, 2, i])
         given = held_out_problem(("shelf", "table")[i % 2], i // 2)
@@ -167,7 +172,8 @@ class _Arm:
 
     def __init__(self, problem: Problem) -> None:
         self.robot, self.checker = problem.robot, CollisionChecker(problem.robot, problem.scene)
-        self.dof, self.joint_limits = self.robot.dof, (self.robot.lower, self.robot.upper)
+        self.dof = self.robot.dof
+        self.joint_limits = (self.robot.lower, self.robot.upper)
 
     def forward_kinematics(self, q: ndarray) -> ndarray:
         return link_pose(self.robot, q, HAND)
@@ -198,7 +204,8 @@ def peer(problem: Problem, seed: int) -> Answer:
     import sscbirrt  # pyright: ignore[reportMissingImports]
     from sscbirrt.testing import PlanarIK  # pyright: ignore[reportMissingImports]
 
-    arm, goal = _Arm(problem), problem.goal
+    arm = _Arm(problem)
+    goal = problem.goal
     assert isinstance(goal, JointGoal)
     began = time.process_time()
     config = sscbirrt.CBiRRTConfig(timeout=1e4, abort_fn=lambda: time.process_time() - began > LONG)
@@ -243,8 +250,10 @@ def _excess(problem: Problem, frames: ndarray) -> float:
         cosines = [T[:3, :3] @ one.axis @ one.direction for T in poses]
         return float((np.arccos(np.clip(cosines, -1, 1)).max() - ROUNDING) / one.angle - 1)
     assert isinstance(one, rd.CartesianLine)
-    first, last = poses[0], poses[-1]
-    way, p = last[:3, 3] - first[:3, 3], np.array([T[:3, 3] for T in poses])
+    first = poses[0]
+    last = poses[-1]
+    way = last[:3, 3] - first[:3, 3]
+    p = np.array([T[:3, 3] for T in poses])
     shares = np.clip((p - first[:3, 3]) @ way / (way @ way), 0, 1)
     off = np.linalg.norm(p - first[:3, 3] - shares[:, None] * way, axis=1).max()
     turned = max(rotation_angle(first[:3, :3].T @ T[:3, :3]) for T in poses)
@@ -253,7 +262,8 @@ def _excess(problem: Problem, frames: ndarray) -> float:
 
 def compared(kind: str, number: int, with_peer: bool) -> None:
     """Plan with each planner, check on meshes, and print."""
-    problems, answers = list(drawn(kind, number)), dict[str, list[Answer]]()
+    problems = list(drawn(kind, number))
+    answers = dict[str, list[Answer]]()
     for name in ("aorrtc", "diffusion"):
         planner = rd.load_planner(name)
         planner.warm_up(problems[0])

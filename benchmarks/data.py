@@ -40,17 +40,24 @@ STAGES = {
     "validator": ("validator.py", "path"),
 }
 """Files and functions of the profile."""
-WAYPOINTS, SLOTS, GOALS, SHARD = 254, 12, 10, 1000
-POINTS, BATCH, DENSE_SHARE = 1400, 256, 0.15
+WAYPOINTS = 254
+SLOTS = 12
+GOALS = 10
+SHARD = 1000
+POINTS = 1400
+BATCH = 256
+DENSE_SHARE = 0.15
 WARM_UP_BATCHES = 8
 
 
 def cost(count: int) -> None:
     """Print the CPU time of a problem, and the share of each stage."""
-    settings, robot = GenerationSettings(), load_robot("panda")
+    settings = GenerationSettings()
+    robot = load_robot("panda")
     for number in range(5):
         solve(settings, robot, number)
-    spent, trivial = np.empty(count), np.zeros(count, bool)
+    spent = np.empty(count)
+    trivial = np.zeros(count, bool)
     for i in progress(range(count), "problems"):
         began = time.process_time()
         row = solve(settings, robot, i)
@@ -110,7 +117,8 @@ def write_store(folder: str, robot: Robot, trajectories: int) -> None:
         versions={},
     )
     write_manifest(folder, manifest)
-    rng, s = np.random.default_rng(0), np.linspace(0, 1, WAYPOINTS, dtype=np.float32)[:, None]
+    rng = np.random.default_rng(0)
+    s = np.linspace(0, 1, WAYPOINTS, dtype=np.float32)[:, None]
     for index in range(-(-trajectories // SHARD)):
         n = min(SHARD, trajectories - index * SHARD)
         ends = rng.uniform(robot.lower, robot.upper, (2, n, robot.dof)).astype(np.float32)

@@ -63,7 +63,8 @@ def find_best(cases: list[Case], planner: str, seed: int, seconds: float) -> Non
     loaded = load_planner(planner)
     for case in progress(cases, f"{planner}, seed {seed}"):
         result = loaded.plan(case.problem, seconds, seed, until=TIME_LIMIT)
-        best, name = known(), key(case)
+        best = known()
+        name = key(case)
         if result.duration is not None and result.duration < best.get(name, {"duration": np.inf})["duration"]:
             best[name] = {
                 "duration": round(result.duration, 5),
@@ -80,7 +81,8 @@ def key(case: Case) -> str:
 
 def straight(problem: Problem, motion: Trajectory) -> float:
     """Least time along the straight line between the ends of a motion, without limits of jerk [s]."""
-    robot, q = problem.robot, motion.positions
+    robot = problem.robot
+    q = motion.positions
     return float(straight_line_time(q[0], q[-1], robot.velocity, robot.acceleration))
 
 

@@ -132,11 +132,14 @@ class FrontierExplorer(TimedExplorer):
 
 def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -> Row:
     """A record of one problem and method: from the arm's pose "ready" to the start, and on to the goal."""
-    noise, rng = DepthNoise() if noisy else None, np.random.default_rng([number, 16])
-    camera, known = wrist_camera(problem.robot), known_scene(problem)
+    noise = DepthNoise() if noisy else None
+    rng = np.random.default_rng([number, 16])
+    camera = wrist_camera(problem.robot)
+    known = known_scene(problem)
     legs = [replace(problem, start=HOME, goal=JointGoal(problem.start[None])), problem]
     [beside] = views(legs[0], family, number, 1, False)
-    seen, reason = [measured(beside, np.inf, noise, rng)], ""
+    seen = [measured(beside, np.inf, noise, rng)]
+    reason = ""
     reached = collided = False
     about = METHODS.get(method, METHODS["strict"])
     settings = ExplorerSettings(
@@ -145,7 +148,8 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
     zone = free_zone(problem) if about.free_zone else None
     kind = FrontierExplorer if about.frontier else TimedExplorer
     explorer = kind(problem.robot, [camera], known, zone, settings)
-    spent, looks = list[float](), list[int]()
+    spent = list[float]()
+    looks = list[int]()
     if method not in ONCE and about.standing:
         explorer.observe(seen[0])
     for leg in legs:
@@ -156,12 +160,14 @@ def play(problem: Problem, family: str, number: int, method: str, noisy: bool) -
             partial = Problem(leg.robot, known, leg.start, leg.goal, views=seen, unknown=ONCE[method])
             result = plan_with_unknown_space(PLANNER, partial, PlanRequest(TIME_LIMIT, until=FIRST))
             explorer.spent = time.process_time() - began
-            reached, reason = is_free(leg, result), result.reason
+            reached = is_free(leg, result)
+            reason = result.reason
             collided = result.solved and not reached
             looks.append(0)
         else:
             events = list(explore(leg, explorer, noise, number, seen[0] if about.standing else None))
-            reached, collided = events[-1].step.kind == DONE, not all(event.free for event in events)
+            reached = events[-1].step.kind == DONE
+            collided = not all(event.free for event in events)
             looks.append(sum(event.step.kind == LOOK for event in events))
             reason = events[-1].step.reason
         spent.append(explorer.spent)

@@ -22,16 +22,20 @@ from robotdiffuse.robots import ROBOTS, load_robot
 
 FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
 PLANNERS = ("robotdiffuse", "aorrtc")
-SEED, SELECTION = 23, 9_000
-"""Seeds of the problems, and of the calls that select the hard ones."""
+# Seeds of the problems, and of the calls that select the hard ones.
+SEED = 23
+SELECTION = 9_000
 SELECTION_LIMIT = 0.15
 """Time limit of the calls that select the hard ones [s]."""
 
 
 def hard_ones(name: str, count: int) -> list[Problem]:
     """The first `count` problems that are not solved soon, of the families in turn."""
-    robot, rng = load_robot(name), np.random.default_rng(SEED)
-    search, found, drawn = load_planner("aorrtc"), list[Problem](), 0
+    robot = load_robot(name)
+    rng = np.random.default_rng(SEED)
+    search = load_planner("aorrtc")
+    found = list[Problem]()
+    drawn = 0
     while len(found) < count:
         family = FAMILIES[drawn % len(FAMILIES)]
         drawn += 1

@@ -55,8 +55,9 @@ PANDA = load_robot("panda")
 PARTS = ("alone", "controls", "planner")
 PLANNER_LIMIT = 5.0
 """Time limit of the whole planner [s]."""
-TIMED, TIMED_ROUNDS = 10, 4
-"""Problems and rounds that the equal number of gradient steps is measured on."""
+# Problems and rounds that the equal number of gradient steps is measured on.
+TIMED = 10
+TIMED_ROUNDS = 4
 TIMED_STEPS = (10, 60)
 
 
@@ -241,7 +242,8 @@ def main() -> None:
     parser.add_argument("--cases", type=Path, help="folder that keeps what is known of the problems")
     parser.add_argument("--weights", help="folder of a trained model; default: the bundled one")
     arguments = parse(parser, parts=",".join(PARTS), families="rop", problems=2)
-    parts, families = parts_of(arguments.parts, PARTS), parts_of(arguments.families, FAMILIES)
+    parts = parts_of(arguments.parts, PARTS)
+    families = parts_of(arguments.families, FAMILIES)
     print(header("numpy", "numba", "onnxruntime"))
     print(f"weights: {arguments.weights or 'the bundled ones'}")
     alone = dict[str, list[Record]]()

@@ -25,13 +25,18 @@ from robotdiffuse.planning.baselines.lattice import DStarLiteSearch, DStarLiteSe
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.validator import PyBulletOracle
 
-SPEED, RADIUS = 0.4, 0.1
-START, GOAL = [-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8], [1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]
+SPEED = 0.4
+RADIUS = 0.1
+START = [-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]
+GOAL = [1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]
 FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
-PERIOD, CHECK_PERIOD, RUN_LIMIT = 0.02, 0.005, 30.0
-"""Of the loop, and of PyBullet's checks; runs end after the last [s]."""
-BASE_DISTANCE, START_DISTANCE = 0.45, 0.2
-"""Least distance of balls from the axis of the base, and from the arm at its start [m]."""
+# Of the loop, and of PyBullet's checks; runs end after the last [s].
+PERIOD = 0.02
+CHECK_PERIOD = 0.005
+RUN_LIMIT = 30.0
+# Least distance of balls from the axis of the base, and from the arm at its start [m].
+BASE_DISTANCE = 0.45
+START_DISTANCE = 0.2
 LATTICE_LIMIT = 1.0
 """For a search of D* Lite [s]."""
 
@@ -42,17 +47,20 @@ def scene(robot: Robot, count: int, seed: int) -> tuple[rd.MovingObstacle, ...]:
     checker = CollisionChecker(robot, rd.Scene())
     balls: list[rd.MovingObstacle] = []
     while len(balls) < count:
-        radius, angle = rng.uniform(0.35, 0.75), rng.uniform(-1.3, 1.3)
+        radius = rng.uniform(0.35, 0.75)
+        angle = rng.uniform(-1.3, 1.3)
         through = np.array([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.2, 0.8)])
         way = rng.normal(size=3) * [1, 1, 0.3]
         way /= np.linalg.norm(way)
         flat = way[:2] / np.linalg.norm(way[:2])
         if np.linalg.norm(through[:2] - flat * (through[:2] @ flat)) < BASE_DISTANCE:
             continue
-        speed, before = SPEED * rng.uniform(0.5, 1.0), rng.uniform(0.8, 3.5)
+        speed = SPEED * rng.uniform(0.5, 1.0)
+        before = rng.uniform(0.8, 3.5)
         ends = [through - speed * before * way, through + speed * rng.uniform(2.0, 4.0) * way]
         legs = np.linalg.norm(ends[1] - ends[0]) / speed
-        times, places = legs * np.arange(4), [ends[i % 2] for i in range(4)]
+        times = legs * np.arange(4)
+        places = [ends[i % 2] for i in range(4)]
         ball = rd.MovingObstacle(
             rd.Sphere(ends[0], RADIUS), times=times, poses=[transform(place) for place in places]
         )
@@ -94,14 +102,16 @@ def check(
     """Note contacts at one moment."""
     oracle.set_scene(rd.Scene([FLOOR, *(ball.at(at) for ball in balls)]))
     if oracle.check_frames(q[None]) is not None:
-        run.moving, run.resting = run.moving or moves, run.resting or not moves
+        run.moving = run.moving or moves
+        run.resting = run.resting or not moves
 
 
 def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOracle, int], Run]:
     """A function that runs the loop."""
 
     def go(problem: rd.Problem, oracle: PyBulletOracle, seed: int) -> Run:
-        run, balls = Run(), problem.moving
+        run = Run()
+        balls = problem.moving
         tracked = tuple(rd.MovingObstacle(ball.shape, max_speed=SPEED) for ball in balls)
         loop = rd.Replanner(replace(problem, moving=tracked), settings, seed)
         doing = None
@@ -117,7 +127,8 @@ def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOrac
                     check(run, oracle, balls, q, at, moves)
             doing = command
             if command.arrived:
-                run.arrived, run.took = True, command.begins
+                run.arrived = True
+                run.took = command.begins
                 break
         return run
 
@@ -126,13 +137,15 @@ def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOrac
 
 def played(problem: rd.Problem, oracle: PyBulletOracle, seed: int) -> Run:
     """Plan as if nothing moved, and play the motion."""
-    run, still = Run(), replace(problem, moving=())
+    run = Run()
+    still = replace(problem, moving=())
     trajectory = rd.load_planner("rrt_connect").plan(still, 5.0, seed, until=FIRST).trajectory
     assert trajectory is not None
     for at in np.arange(0.0, trajectory.duration, CHECK_PERIOD):
         q, moves = followed(trajectory, at)
         check(run, oracle, problem.moving, q, at, moves)
-    run.arrived, run.took = True, trajectory.duration
+    run.arrived = True
+    run.took = trajectory.duration
     return run
 
 
@@ -164,7 +177,8 @@ def repairs(robot: Robot, runs: int) -> Iterator[float]:
 
 
 def row(name: str, count: int, runs: list[Run]) -> tuple[str, ...]:
-    done, steps = [run.took for run in runs if run.arrived], [ms for run in runs for ms in run.steps]
+    done = [run.took for run in runs if run.arrived]
+    steps = [ms for run in runs for ms in run.steps]
 
     def share(number: int) -> str:
         return f"{100 * number / max(len(runs), 1):.1f} %"
@@ -188,14 +202,16 @@ def main() -> None:
     parser.add_argument("--balls", type=int, nargs="*", default=[1, 3, 5], help="(1 3 5)")
     arguments = parse(parser, runs=1, lattice_runs=1, balls=[1])
     print(header("numba", "numpy", "pybullet"))
-    robot, planner = rd.load_robot("panda"), rd.load_planner("rrt_connect")
+    robot = rd.load_robot("panda")
+    planner = rd.load_planner("rrt_connect")
     methods = {
         "the loop": looped(rd.ReplannerSettings()),
         "played blindly": played,
     }
     compiling = problem_of(robot, scene(robot, 3, 10**6))
     methods["the loop"](compiling, PyBulletOracle(robot, rd.Scene()), 0)
-    rows, notes = [], []
+    rows = []
+    notes = []
     with PyBulletOracle(robot, rd.Scene()) as oracle:
         for count in arguments.balls:
             every = [problem_of(robot, scene(robot, count, seed)) for seed in range(arguments.runs)]

@@ -62,7 +62,8 @@ PLANNER_LIMIT = 20.0
 SEEDS = (1, 2)
 BATCH_STAGES = ("network", "refinement", "smooth_noise")
 """Stages of answers that come from batches."""
-MOTIONS, WAYPOINTS = 16, 48
+MOTIONS = 16
+WAYPOINTS = 48
 SMOOTHNESS = ("turning", "jerk", "duration")
 """Metrics of the motions that both planners return."""
 
@@ -95,7 +96,8 @@ def report_hybrid(every: dict[str, list[Case]]) -> None:
             name: planned(planner, until=TIME_LIMIT, clearance=0.0, objective=objective)
             for name, planner in planners.items()
         }
-        rows, ratios = [], dict[str, ndarray]()
+        rows = []
+        ratios = dict[str, ndarray]()
         answers = {name: list[bool]() for name in planners}
         for family, cases in every.items():
             found = run_all(cases, methods, seeds=SEEDS, limit=EQUAL_TIME, title=f"{family}, {metric}")
@@ -183,7 +185,8 @@ def of_search(planner: AORRTC) -> Method:
 
 def report_diversity(every: dict[str, list[Case]]) -> None:
     """Print how motions of `diffusion` and of search differ among themselves, and how smooth they are."""
-    network, search = Diffusion(DiffusionSettings(samples=MOTIONS)), AORRTC()
+    network = Diffusion(DiffusionSettings(samples=MOTIONS))
+    search = AORRTC()
     for planner in (network, search):
         planner.warm_up(next(iter(every.values()))[0].problem)
     methods = {"diffusion": of_network(network), "aorrtc": of_search(search)}
@@ -217,7 +220,8 @@ def main() -> None:
     parser.add_argument("--problems", type=int, default=60, help="of each family (60)")
     parser.add_argument("--cases", type=Path, help="folder that keeps what is known of the problems")
     arguments = parse(parser, families="rop", problems=2)
-    parts, families = parts_of(arguments.parts, PARTS), parts_of(arguments.families, FAMILIES)
+    parts = parts_of(arguments.parts, PARTS)
+    families = parts_of(arguments.families, FAMILIES)
     use_processor_time()
     print(header("numpy", "numba", "onnxruntime"))
     every = {name: draw_hard_cases(name, arguments.problems, arguments.cases) for name in families}

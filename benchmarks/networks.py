@@ -43,9 +43,12 @@ def median_time(call: Callable[[], object], calls: int) -> float:
 def speed(calls: int) -> None:
     """The networks, run both ways."""
     torch.set_num_threads(1)
-    panda, rng, rows = load_robot("panda"), np.random.default_rng(0), []
+    panda = load_robot("panda")
+    rng = np.random.default_rng(0)
+    rows = []
     for name in ("model", "trajectory_prior"):
-        exported, network = exported_model(name, None, panda), load_network(name, None, panda)
+        exported = exported_model(name, None, panda)
+        network = load_network(name, None, panda)
         features = rng.normal(size=(BATCH, exported.waypoints, exported.feature_count)).astype(np.float32)
         condition = rng.normal(size=(BATCH, exported.condition_count)).astype(np.float32)
         given = features, np.ones(BATCH, np.float32), condition
@@ -58,7 +61,8 @@ def speed(calls: int) -> None:
     seen = rng.integers(0, sum(BITS) + 1, SHAPE).astype(np.uint8)
     behind = rng.integers(0, 100, SHAPE).astype(np.uint8)
     tensors = torch.from_numpy(seen)[None], torch.from_numpy(behind)[None]
-    network, exported = load_completion(), exported_completion()
+    network = load_completion()
+    exported = exported_completion()
 
     def probabilities() -> np.ndarray:
         with torch.inference_mode():

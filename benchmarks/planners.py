@@ -174,8 +174,11 @@ def limits(cases: Sequence[Case]) -> None:
 
 def timing(cases: Sequence[Case], count: int = TIMED_PATHS) -> None:
     """Print how long the time parameterization takes, and what limits it keeps."""
-    planner, worst, times = load_planner("aorrtc"), [0.0, 0.0], []
-    longer, jerk = [], 0.0
+    planner = load_planner("aorrtc")
+    worst = [0.0, 0.0]
+    times = []
+    longer = []
+    jerk = 0.0
     rng = np.random.default_rng(SEED)
     paths: list[JointPath] = []
     for case in progress(cases, "paths"):
@@ -212,7 +215,8 @@ def with_thin_obstacles(problem: Problem, rng: np.random.Generator) -> Problem:
     shapes = list(problem.scene.shapes)
     ends = np.stack([problem.start, goal_of(problem)])
     for _ in range(6):
-        at, wxyz = rng.uniform([-0.7, -0.7, 0.1], [0.7, 0.7, 1.1]), rng.normal(size=4)
+        at = rng.uniform([-0.7, -0.7, 0.1], [0.7, 0.7, 1.1])
+        wxyz = rng.normal(size=4)
         wxyz /= np.linalg.norm(wxyz)
         shape = Box(at, [0.3, 0.3, 0.001], wxyz) if rng.random() < 0.5 else Cylinder(at, 0.001, 0.5, wxyz)
         scene = Scene([*shapes, shape])
@@ -224,12 +228,16 @@ def with_thin_obstacles(problem: Problem, rng: np.random.Generator) -> Problem:
 def collisions(motions: int, seed: int) -> None:
     """Print how many returned motions collide on meshes, half of them in scenes with thin obstacles, how many
     stop on the way, and the largest shares of the limits of velocity, acceleration and jerk."""
-    rng, rows = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    rows = []
     families = [load_family(name) for name in FAMILIES]
     numbers = np.array_split(np.arange(motions), 2)  # every motion has a problem of its own
     with PyBulletOracle(PANDA, Scene()) as oracle:
         for name, of in zip(("aorrtc", "robotdiffuse"), numbers, strict=True):
-            planner, hits, checked, configurations = load_planner(name), [0, 0, 0], 0, 0
+            planner = load_planner(name)
+            hits = [0, 0, 0]
+            checked = 0
+            configurations = 0
             shares = np.zeros(3)
             for i in progress(of.tolist(), name):
                 family = families[i % len(families)]
@@ -239,7 +247,8 @@ def collisions(motions: int, seed: int) -> None:
                 if result.trajectory is None:
                     continue
                 q = dense(result.trajectory.positions, MESH_STEP)
-                checked, configurations = checked + 1, configurations + len(q)
+                checked = checked + 1
+                configurations = configurations + len(q)
                 contacts = contacts_on_meshes(problem, q, tolerance=0.0, oracle=oracle)
                 hits[0] += contacts.coal > 0
                 hits[1] += contacts.pybullet

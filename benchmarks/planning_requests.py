@@ -67,9 +67,11 @@ from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.tolerances import goal_error
 
-SHORT, LONG = 1.0, 10.0
-"""Time limits [s]; the longer one says which problems can be solved."""
-CAN, HAND = "Can1", "panda_hand"
+# Time limits [s]; the longer one says which problems can be solved.
+SHORT = 1.0
+LONG = 10.0
+CAN = "Can1"
+HAND = "panda_hand"
 PLACE_GAP = 0.005
 """Between the can and the table where it is put [m]."""
 PLACE_REACH = 0.75
@@ -111,7 +113,8 @@ def carried(folder: Path, places: int) -> Iterator[NamedProblem]:
         rng = np.random.default_rng([SEED, number])
         if entry.problem is None or not isinstance(entry.problem.goal, JointGoal):
             continue
-        robot, q = entry.problem.robot, entry.problem.goal.positions[0]
+        robot = entry.problem.robot
+        q = entry.problem.goal.positions[0]
         scene, holding = entry.problem.scene.attach(CAN, robot, q)
         kept = 0
         for _ in range(PLACE_TRIES):
@@ -131,12 +134,14 @@ def _place(scene: rd.Scene, whole: rd.Scene, rng: np.random.Generator) -> ndarra
     [top] = [shape for shape in scene.shapes if shape.name == "table_top"]
     [can] = [shape for shape in whole.shapes if shape.name == CAN]
     assert isinstance(top, rd.Box) and isinstance(can, rd.Cylinder)
-    T, grown = transform(top.center, top.rotation), np.array([[-can.radius], [can.radius]])
+    T = transform(top.center, top.rotation)
+    grown = np.array([[-can.radius], [can.radius]])
     while True:
         x, y = rng.uniform(-0.5, 0.5, 2) * top.size[:2]
         at = T @ [x, y, top.size[2] / 2 + can.height / 2 + PLACE_GAP, 1.0]
         around = [shape.bounds + grown for shape in scene.shapes if shape is not top]
-        low, high = at[2] - can.height / 2, at[2] + can.height / 2
+        low = at[2] - can.height / 2
+        high = at[2] + can.height / 2
         taken = any(
             (b[0, :2] < at[:2]).all() and (at[:2] < b[1, :2]).all() and b[0, 2] < high and low < b[1, 2]
             for b in around
@@ -149,7 +154,8 @@ def together(number: int) -> Iterator[NamedProblem]:
     """Held-out problems with base, tool, held box, tolerances and a waypoint, that do not start in
     collision."""
     for i in range(number):
-        rng, given = np.random.default_rng([SEED, 1, i]), held_out_problem(("shelf", "table")[i % 2], i // 2)
+        rng = np.random.default_rng([SEED, 1, i])
+        given = held_out_problem(("shelf", "table")[i % 2], i // 2)
         assert isinstance(given.goal, JointGoal)
         T_hand_tool = transform(np.array([0.0, 0.0, 0.12]))
         robot = given.robot.with_tool("panda_hand", T_hand_tool, [rd.Cylinder([0, 0, 0.09], 0.01, 0.06)])
@@ -177,7 +183,8 @@ def both_hands(number: int) -> Iterator[NamedProblem]:
     robot = rd.load_robot("baxter")
     table = rd.Box([0.75, 0.0, 0.05], [0.5, 1.2, 0.04], name="table")
     scene = rd.Scene([table, rd.Box([0.75, 0.0, 0.27], [0.12, 0.12, 0.4], name="post")])
-    checker, rng = CollisionChecker(robot, scene), np.random.default_rng([SEED, 3])
+    checker = CollisionChecker(robot, scene)
+    rng = np.random.default_rng([SEED, 3])
     for i in range(number):
         free = np.zeros((0, robot.dof))
         while len(free) < 2:
@@ -219,7 +226,9 @@ def measured(title: str, every: list[NamedProblem], name: str) -> None:
     """Plan, check on meshes, and print."""
     planner = rd.load_planner(name)
     planner.warm_up(every[0].problem, TIME_LIMIT)
-    results, longer, seen = [], [], []
+    results = []
+    longer = []
+    seen = []
     for i, named in enumerate(progress(every, title)):
         result = planner.plan(named.problem, time_limit=SHORT, seed=i)
         long = result if result.solved else planner.plan(named.problem, time_limit=LONG, seed=i + 1)
@@ -227,7 +236,8 @@ def measured(title: str, every: list[NamedProblem], name: str) -> None:
         longer.append(long)
         if long.solved:
             seen.append(checked(named, long))
-    solved, possible = sum(r.solved for r in results), sum(r.solved for r in longer)
+    solved = sum(r.solved for r in results)
+    possible = sum(r.solved for r in longer)
     times = [1e3 * r.planning_time for r in results if r.solved]
     print_table(
         f"{title}: {len(every)} problems, {name}",
@@ -257,7 +267,8 @@ def measured(title: str, every: list[NamedProblem], name: str) -> None:
 
 def attaching() -> None:
     """Print the CPU time of attaching a box of a new size."""
-    robot, rng = rd.load_robot("panda"), np.random.default_rng(0)
+    robot = rd.load_robot("panda")
+    rng = np.random.default_rng(0)
     rows = []
     for what, prepared in (("robot.attach", False), ("and all arrays of search and validator", True)):
         spent = []
@@ -274,8 +285,10 @@ def attaching() -> None:
 def sequences(number: int) -> Iterator[Problem]:
     """Problems with three waypoints, configurations and poses in turn."""
     for i in range(number):
-        rng, given = np.random.default_rng([SEED, 2, i]), held_out_problem(("shelf", "table")[i % 2], i // 2)
-        robot, exact = given.robot, ExactCollision(given.robot, given.scene)
+        rng = np.random.default_rng([SEED, 2, i])
+        given = held_out_problem(("shelf", "table")[i % 2], i // 2)
+        robot = given.robot
+        exact = ExactCollision(given.robot, given.scene)
         way: list[Any] = []
         while len(way) < 3:
             q = given.start + rng.uniform(-1.0, 1.0, robot.dof)
@@ -302,9 +315,11 @@ def nearest(problem: Problem, motion: Trajectory) -> list[float]:
 
 def blended(number: int, name: str) -> None:
     """Plan with stops and with blends, check on meshes, and print."""
-    planner, every = rd.load_planner(name), list(sequences(number))
+    planner = rd.load_planner(name)
+    every = list(sequences(number))
     planner.warm_up(every[0], TIME_LIMIT)
-    rows, collisions = [], 0
+    rows = []
+    collisions = 0
     for i, problem in enumerate(progress(every, "Blended")):
         found: dict[str, Any] = {}
         for blend in (0.0, *BLENDS):
@@ -359,9 +374,13 @@ def blended(number: int, name: str) -> None:
 
 def payloads(number: int, name: str) -> None:
     """Print durations and torques of motions with payloads."""
-    planner, rows = rd.load_planner(name), []
+    planner = rd.load_planner(name)
+    rows = []
     for mass in MASSES:
-        ratios, shares, refused, spent = list[float](), list[float](), 0, list[float]()
+        ratios = list[float]()
+        shares = list[float]()
+        refused = 0
+        spent = list[float]()
         for i in range(number):
             free = held_out_problem(("shelf", "table")[i % 2], i // 2)
             problem = replace(free, payload=rd.Payload(mass, [0.0, 0.0, 0.1], HAND))
@@ -416,7 +435,8 @@ def main() -> None:
     parts = parts_of(arguments.parts or ",".join(default), PARTS)
     use_processor_time()
     print(header("numba", "numpy", "coal", "pybullet"))
-    number, planner = arguments.number, arguments.planner
+    number = arguments.number
+    planner = arguments.planner
     if "carried" in parts:
         attaching()
         measured("Carried", list(carried(arguments.scenes, arguments.places)), planner)

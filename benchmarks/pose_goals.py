@@ -28,8 +28,9 @@ from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot
 
 ROBOTS = ("iiwa14", "gen3", "xarm7", "panda", "ur5e", "fr3")
-SEEDS, STEPS = 150, 80
-"""Of the search for the nearest configuration."""
+# Of the search for the nearest configuration.
+SEEDS = 150
+STEPS = 80
 PULL = 0.3
 """Part of the way to the start that a step of this search goes, as far as the pose allows."""
 EXACT = 1e-4
@@ -63,7 +64,8 @@ def nearest_distance(
     q[1 : SEEDS // 4] = np.clip(start + rng.normal(0, 0.5, (SEEDS // 4 - 1, robot.dof)), lower, upper)
     for k in range(STEPS):
         pull = PULL if STEPS // 4 < k < STEPS - 15 else 0.0
-        poses, jacobians = link_poses(robot, q, frame), link_jacobians(robot, q, frame)
+        poses = link_poses(robot, q, frame)
+        jacobians = link_jacobians(robot, q, frame)
         turned = rotation_vectors(T[:3, :3] @ poses[:, :3, :3].transpose(0, 2, 1))
         error = np.concatenate([T[:3, 3] - poses[:, :3, 3], turned], axis=1)
         drift = pull * (start - q)
@@ -94,12 +96,16 @@ def free_configurations(robot: Robot, count: int, rng: np.random.Generator) -> F
 
 def length_rows(name: str, starts: int) -> list[list[str]]:
     """Lengths and durations of motions to poses where the hand is, 5 cm away, and anywhere."""
-    robot, rng = rd.load_robot(name), np.random.default_rng(7)
+    robot = rd.load_robot(name)
+    rng = np.random.default_rng(7)
     configurations = free_configurations(robot, 2 * starts, rng)
     rd.plan(rd.Problem(robot, rd.Scene(), configurations[0], rd.PoseGoal(robot.tip, np.eye(4))))
     rows = []
     for where in ("here", "5 cm", "anywhere"):
-        ratios, durations, seconds, solved = [], [], [], 0
+        ratios = []
+        durations = []
+        seconds = []
+        solved = 0
         for k, start in enumerate(progress([*configurations[:starts]], f"{name}, {where}")):
             T = link_pose(robot, start, robot.tip)
             if where == "5 cm":
@@ -150,7 +156,8 @@ def few_joints_rows(poses: int) -> list[list[str]]:
             rng = np.random.default_rng(11)
             there = free_configurations(robot, poses, rng)
             start = 0.5 * (robot.lower + robot.upper)
-            solved, seconds = 0, []
+            solved = 0
+            seconds = []
             for k, q in enumerate(there):
                 T = link_pose(robot, q, robot.tip)
                 if rpy is not None:
@@ -169,12 +176,17 @@ def few_joints_rows(poses: int) -> list[list[str]]:
 
 def several_rows(problems: int) -> list[list[str]]:
     """Twenty poses of the hand, half of them in an obstacle, and a limit of 0.1 s."""
-    robot, rng, rows = rd.load_robot("panda"), np.random.default_rng(3), []
+    robot = rd.load_robot("panda")
+    rng = np.random.default_rng(3)
+    rows = []
     for until in ("first", "converged"):
-        seconds, walls, solved = [], [], 0
+        seconds = []
+        walls = []
+        solved = 0
         for k in range(problems):
             configurations = free_configurations(robot, 200, rng)
-            start, rest = configurations[0], configurations[1:]
+            start = configurations[0]
+            rest = configurations[1:]
             balls = [rd.Sphere(link_pose(robot, q, robot.tip)[:3, 3], 0.06) for q in rest[:10]]
             exact = ExactCollision(robot, rd.Scene(balls))
             if exact.collides(start[None])[0]:
@@ -184,7 +196,8 @@ def several_rows(problems: int) -> list[list[str]]:
             problem = rd.Problem(robot, rd.Scene(balls), start, rd.AnyGoal(tuple(goals)))
             if k == 0:
                 rd.plan(problem, 1.0, until=until)
-            cpu, began = time.process_time(), time.perf_counter()
+            cpu = time.process_time()
+            began = time.perf_counter()
             result = rd.plan(problem, 0.1, seed=k, until=until)
             seconds.append(time.process_time() - cpu)
             walls.append(time.perf_counter() - began)

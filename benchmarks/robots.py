@@ -39,8 +39,9 @@ from robotdiffuse.simulation.validator import PyBulletOracle
 FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
 SEED = 11
 """Of the problems; no setting was chosen on them."""
-SHORT, LONG = 1.0, 10.0
-"""Time limits [s]."""
+# Time limits [s].
+SHORT = 1.0
+LONG = 10.0
 COMPARED_EVERY = 10
 """Of so many problems, one is planned for all of SHORT by both planners."""
 STEP = 0.005
@@ -80,7 +81,8 @@ def check(problem: Problem, result: PlanResult, oracle: PyBulletOracle, tally: T
 
 def draw(family: str, robot: Robot, count: int) -> list[tuple[str, Problem]]:
     """Problems of a family with their names; fewer than `count` if its furniture rarely suits the arm."""
-    rng, found = np.random.default_rng(SEED), list[tuple[str, Problem]]()
+    rng = np.random.default_rng(SEED)
+    found = list[tuple[str, Problem]]()
     for _ in range(2 * count):
         with suppress(InputError):  # no free ends in many scenes
             problem = family_for(family, robot).draw(robot, rng).problem(robot)
@@ -92,8 +94,10 @@ def draw(family: str, robot: Robot, count: int) -> list[tuple[str, Problem]]:
 
 def measure(name: str, problems: int) -> Tally:
     """Plan the problems of one robot."""
-    robot, tally = load_robot(name), Tally()
-    hybrid, search = load_planner("robotdiffuse"), load_planner("aorrtc")
+    robot = load_robot(name)
+    tally = Tally()
+    hybrid = load_planner("robotdiffuse")
+    search = load_planner("aorrtc")
     drawn = [problem for family in FAMILIES for problem in draw(family, robot, problems // len(FAMILIES))]
     if not drawn:
         return tally
@@ -125,7 +129,8 @@ def measure(name: str, problems: int) -> Tally:
 
 def report(head: str, tallies: dict[str, Tally]) -> None:
     """Print the tables of the robots measured so far."""
-    rows, notes = [], []
+    rows = []
+    notes = []
     for name, of in tallies.items():
         if of.problems == 0:
             rows.append([name, "0", *["-"] * 9])
@@ -158,7 +163,8 @@ def report(head: str, tallies: dict[str, Tally]) -> None:
 
 def measure_inverse_kinematics(poses: int) -> None:
     """Print the share solved, errors and times of inverse kinematics of the Panda."""
-    robot, rng = load_robot("panda"), np.random.default_rng(0)
+    robot = load_robot("panda")
+    rng = np.random.default_rng(0)
     start = time.perf_counter()
     inverse_kinematics(robot, FRAME, transform(np.array([0.4, 0.0, 0.4])), rng=rng)
     print(f"first call (compiled, or read from the cache): {time.perf_counter() - start:.2f} s")
@@ -168,7 +174,11 @@ def measure_inverse_kinematics(poses: int) -> None:
         ("pose, 10 distinct solutions", 10, InverseKinematicsSettings()),
         ("position only, 10 distinct solutions", 10, InverseKinematicsSettings(position_only=True)),
     ):
-        milliseconds, found, position, rotation, gap = [], [], 0.0, 0.0, np.inf
+        milliseconds = []
+        found = []
+        position = 0.0
+        rotation = 0.0
+        gap = np.inf
         for T in targets:
             start = time.perf_counter()
             solutions = inverse_kinematics(robot, FRAME, T, count, rng=rng, settings=settings)
@@ -180,7 +190,8 @@ def measure_inverse_kinematics(poses: int) -> None:
                 position = max(position, float(np.linalg.norm(reached[:3, 3] - T[:3, 3])))
                 rotation = max(rotation, rotation_angle(reached[:3, :3] @ T[:3, :3].T))
                 gap = min(gap, np.abs(solutions[:i] - q).max(-1).min(initial=np.inf))
-        counts, times = np.array(found), np.array(milliseconds)
+        counts = np.array(found)
+        times = np.array(milliseconds)
         print(
             f"{what}: {(counts > 0).mean():.2%} of {poses} solved, all {count} found for"
             f" {(counts == count).mean():.1%}; median {np.median(times):.3f} ms, p95"
@@ -207,7 +218,8 @@ def main() -> None:
     parser.add_argument("--inverse-kinematics", action="store_true", help="of the Panda, not problems")
     parser.add_argument("--poses", type=int, default=1000, help="for inverse kinematics (1000)")
     arguments = parse(parser, robots=["panda"], problems=5, poses=5)
-    head, tallies = header("numpy", "numba", "coal", "pybullet"), {}
+    head = header("numpy", "numba", "coal", "pybullet")
+    tallies = {}
     if arguments.inverse_kinematics or arguments.smoke:
         print(header("numpy", "numba"))
         measure_inverse_kinematics(arguments.poses)

@@ -76,11 +76,14 @@ def faults(arguments: argparse.Namespace) -> None:
     """Kill data generation, start it again, and compare the files with those of an undisturbed run."""
     planned = -(-arguments.trajectories // arguments.shard)
     print(header("numpy", "numba", "zarr"), "\n")
-    rng, rows = np.random.default_rng(arguments.seed), []
+    rng = np.random.default_rng(arguments.seed)
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
-        disturbed, undisturbed = Path(folder, "disturbed"), Path(folder, "undisturbed")
+        disturbed = Path(folder, "disturbed")
+        undisturbed = Path(folder, "undisturbed")
         for kill in range(arguments.kills):
-            run, begun = start(disturbed, arguments), time.monotonic()
+            run = start(disturbed, arguments)
+            begun = time.monotonic()
             if kill % 2:
                 wait_for_shard(run, disturbed)
                 time.sleep(rng.uniform(0, 3))
@@ -113,7 +116,8 @@ def faults(arguments: argparse.Namespace) -> None:
 def fuzz(arguments: argparse.Namespace) -> None:
     """Run damaged inputs and print their outcomes."""
     kinds = tuple(parts_of(arguments.only, KINDS))
-    found, rows = run_campaign(arguments.seconds, arguments.seed, kinds), []
+    found = run_campaign(arguments.seconds, arguments.seed, kinds)
+    rows = []
     for kind in kinds:
         counts = [found.counts[kind, what] for what in ("answer", "error", "fault")]
         rows.append([kind, f"{sum(counts):,}", *(f"{n:,}" for n in counts), f"{found.slowest[kind]:.2f}"])

@@ -73,8 +73,9 @@ SEARCH_TIME = 3.0
 SAMPLING_STEPS = 6
 BEST_OF = 16
 """Samples for each problem in the report."""
-CURVE_PROBLEMS, CURVE_SAMPLES = 100, 4
-"""Problems that a checkpoint of a training is tried on, and samples for each."""
+# Problems that a checkpoint of a training is tried on, and samples for each.
+CURVE_PROBLEMS = 100
+CURVE_SAMPLES = 4
 WAYPOINTS = 48
 ERROR_LEVELS = (200, 150, 100, 50)
 """Noise levels at which predictions are compared; 200 is noise alone."""
@@ -91,8 +92,10 @@ DECISIVE = 10.0
 def obstacle_numbers(scenes: PackedScenes) -> Float32[Tensor, "n slots 9"]:
     """Of each obstacle: whether it is a sphere, whether it is a cube, centre, half width [m], sine and cosine
     of four times its turn about the vertical, and 1 if it exists; a cube is the same after a quarter turn."""
-    kinds, params = scenes.kinds, scenes.params
-    sphere, box = kinds == SPHERE, kinds == BOX
+    kinds = scenes.kinds
+    params = scenes.params
+    sphere = kinds == SPHERE
+    box = kinds == BOX
     half = np.where(sphere, params[..., 3], params[..., 3] / 2)
     turn = np.where(box, 8 * np.arctan2(params[..., 9], params[..., 6]), 0.0)
     columns = (
@@ -228,7 +231,8 @@ class Study:
                 name="compression_autoencoder", minutes=None, samples=self.encoder_samples, max_obstacles=2
             )
             train_encoder(training, str(self.encoder))
-        settings, processes = self.training(row), Processes("cpu")
+        settings = self.training(row)
+        processes = Processes("cpu")
         train(SceneTask(row, self, settings, processes), str(self.folder(row)))
 
     def trained(self, row: str) -> tuple[MotionNetwork, int]:
@@ -256,7 +260,8 @@ class SceneTask(PlannerTask):
 
     def __init__(self, row: str, study: Study, settings: PlannerTraining, processes: Processes) -> None:
         super().__init__(settings, processes)
-        self.row, self.study = row, study
+        self.row = row
+        self.study = study
         self.cases = study.cases(CURVE_PROBLEMS)
         with_parts_of(row, self.model)
         self.identity = {"robot": PANDA.name, "row": row}
@@ -275,7 +280,8 @@ class SceneTask(PlannerTask):
 
     def validate(self, fraction: float) -> Validation:
         """Adds to the learning curve, and keeps the averaged weights."""
-        samples, folder = round(fraction * (self.settings.samples or 0)), self.study.folder(self.row)
+        samples = round(fraction * (self.settings.samples or 0))
+        folder = self.study.folder(self.row)
         notes = {"samples": samples, "motions": len(self.train_data)}
         write_tensors(folder / "averaged.safetensors", self.model.state_dict(), notes)
         found = tried(self.row, self.model, self.cases, ("own", "hidden"), CURVE_SAMPLES)
@@ -306,7 +312,8 @@ def tried(
     """For each kind of code, which of `count` samples for each problem pass the validator."""
     scenes = PackedScenes.pack([case.problem.scene for case in cases], 2, floor=True)
     assert model.encoder is not None
-    z, found = codes_of(row, model.encoder, scenes), {}
+    z = codes_of(row, model.encoder, scenes)
+    found = {}
     for name in codes:
         q = sampled_motions(model, cases, z[name], count, hidden=name == "hidden")
         pairs = zip(cases, q, strict=True)
@@ -330,7 +337,8 @@ def sampled_motions(
     model: MotionNetwork, cases: Sequence[Case], z: Float32[ndarray, "n code"], count: int, hidden: bool
 ) -> Float[ndarray, "n count waypoints dof"]:
     """Samples for each problem with its code, or with the condition hidden."""
-    rng, motions = np.random.default_rng(11), []
+    rng = np.random.default_rng(11)
+    motions = []
     each = max(CHUNK // count, 1)
     starts, goals = (
         np.array([end(case.problem) for case in cases]) for end in (lambda problem: problem.start, goal_of)
@@ -366,7 +374,8 @@ def errors(row: str, study: Study) -> list[tuple[str, ...]]:
     assert model.encoder is not None
     z = codes_of(row, model.encoder, scenes)
     reference = model.reference(q[:, 0], q[:, -1])
-    clean, rows = model.normalize(q, reference), []
+    clean = model.normalize(q, reference)
+    rows = []
     for level in ERROR_LEVELS:
         noise = model.draw_noise(len(q), np.random.default_rng(1))
         signal, deviation = (float(of[level]) for of in (model.schedule.signal, model.schedule.noise))
@@ -382,7 +391,8 @@ def errors(row: str, study: Study) -> list[tuple[str, ...]]:
 
 def validation_motions(data: Path) -> tuple[Float32[ndarray, "n waypoints dof"], PackedScenes]:
     """Motions of scenes that no training saw; the straight line is not free."""
-    motions, scenes = [], []
+    motions = []
+    scenes = []
     for rows in read_rows(data, PANDA, WAYPOINTS):
         kept = (rows.split != SPLITS.index("train")) & ~rows.shard["line_free"]
         motions.append(rows.q[kept])
@@ -392,7 +402,8 @@ def validation_motions(data: Path) -> tuple[Float32[ndarray, "n waypoints dof"],
 
 def without_network(cases: Sequence[Case]) -> Float[ndarray, "n count"]:
     """Which samples of smooth noise about the straight line pass."""
-    rng, found = np.random.default_rng(5), []
+    rng = np.random.default_rng(5)
+    found = []
     for case in progress(cases, "smooth noise"):
         ends = case.problem.start, goal_of(case.problem)[None]
         found.append(validated(case.problem, smooth_noise(*ends, BEST_OF, WAYPOINTS, PANDA, rng)).passed)
@@ -409,13 +420,17 @@ def report(study: Study, rows: Sequence[str], plot: Path) -> None:
     """Print the tables and draw the learning curves of the rows that have a checkpoint."""
     rows = [row for row in rows if (study.folder(row) / "averaged.safetensors").exists()]
     cases = study.cases()
-    table, worth, conclusion = [], [], ""
+    table = []
+    worth = []
+    conclusion = ""
     for row in progress(rows, "networks"):
         samples, found = results(row, study, cases, CODES)
         for name, passed in found.items():
-            single, best = passed.mean(1), passed.max(1)
+            single = passed.mean(1)
+            best = passed.max(1)
             table.append((f"{ROWS[row].title}: {name}", f"{samples:,}", in_points(single), in_points(best)))
-        own, mean = found["own"], found["mean"]
+        own = found["own"]
+        mean = found["mean"]
         for name in CODES[1:]:
             less = own.mean(1) - found[name].mean(1), own.max(1) - found[name].max(1)
             worth.append((f"{ROWS[row].title}: over {name}", *(in_points(part, "+") for part in less)))
@@ -499,7 +514,8 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, default=Path("scene_code.png"))
     arguments = parse(parser, trajectories=40, samples=128, encoder_samples=64, problems=2)
     use_processor_time()
-    parts, rows = parts_of(arguments.parts, PARTS), parts_of(arguments.rows, ROWS)
+    parts = parts_of(arguments.parts, PARTS)
+    rows = parts_of(arguments.rows, ROWS)
     sizes = arguments.trajectories, arguments.samples, arguments.encoder_samples, arguments.problems
     study = Study(arguments.out, *sizes)
     if "data" in parts:

@@ -62,7 +62,8 @@ class ClientCounts:
 
 def requests(planner: str, count: int) -> list[PlanRequest]:
     """Requests for `count` problems of each family."""
-    plan_requests, rng = [], np.random.default_rng(SEED)
+    plan_requests = []
+    rng = np.random.default_rng(SEED)
     for number in range(count):
         for family in FAMILIES:
             record: dict[str, Any] = problem_record(held_out_problem(family, number))
@@ -86,7 +87,8 @@ def plan_alone(plan_requests: list[PlanRequest], planner: str) -> tuple[float, f
         waypoints = None if result.path is None else result.path.positions.tolist()
         assert one.expected is None or one.expected == waypoints, "the planner contradicts itself"
         one.expected = waypoints
-    wall, spent = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    spent = time.process_time()
     for _ in range(ROUNDS):
         for one in plan_requests:
             loaded.plan(one.problem, TIME_LIMIT, one.seed)
@@ -103,10 +105,12 @@ def run_client(
 ) -> None:
     import orjson
 
-    rng, kind = random.Random(seed), {"Content-Type": "application/json"}
+    rng = random.Random(seed)
+    kind = {"Content-Type": "application/json"}
     with httpx.Client(base_url=url, timeout=60.0) as http:
         while time.monotonic() < until:
-            one, begun = rng.choice(plan_requests), time.monotonic()
+            one = rng.choice(plan_requests)
+            begun = time.monotonic()
             try:
                 answer = http.post("/plan", content=one.body, headers=kind)
             except httpx.HTTPError:
@@ -125,7 +129,9 @@ def load(
     url: str, plan_requests: list[PlanRequest], clients: int, seconds: float, meanwhile: Any
 ) -> ClientCounts:
     """What clients see in this time; `meanwhile` is called every second with the seconds since the start."""
-    counts, lock, begun = ClientCounts(), threading.Lock(), time.monotonic()
+    counts = ClientCounts()
+    lock = threading.Lock()
+    begun = time.monotonic()
     threads = [
         threading.Thread(target=run_client, args=(url, plan_requests, i, begun + seconds, counts, lock))
         for i in range(clients)

@@ -42,7 +42,8 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
     from robotdiffuse.scenes.scene_arrays import PackedScenes
     from robotdiffuse.validation.validator import Verifier
 
-    rng, robot = np.random.default_rng(seed), rd.load_robot("panda")
+    rng = np.random.default_rng(seed)
+    robot = rd.load_robot("panda")
     q = rng.uniform(robot.lower, robot.upper, (ROWS, robot.dof))
     solids = [
         rd.Sphere([0.5, 0.3, 0.6], 0.15),
@@ -157,7 +158,8 @@ def main() -> None:
     kept: dict[str, dict[str, ndarray]] = {}
     with tempfile.TemporaryDirectory() as folder:
         for i, run in enumerate(RUNS):
-            file, order = str(Path(folder, f"{i}.npz")), names[::-1] if i == 2 else names
+            file = str(Path(folder, f"{i}.npz"))
+            order = names[::-1] if i == 2 else names
             subprocess.run(
                 [
                     sys.executable,

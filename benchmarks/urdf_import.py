@@ -49,8 +49,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from helpers.awkward_urdfs import REFUSED, WORKS
 
 MADE = {name: make for name, (make, _) in (WORKS | REFUSED).items()}
-MAX_SECONDS, MAX_MEBIBYTES = 60, 2048
-"""Of one core and of memory, to prepare an arm; the report names URDFs that need more."""
+# Of one core and of memory, to prepare an arm; the report names URDFs that need more.
+MAX_SECONDS = 60
+MAX_MEBIBYTES = 2048
 CPU_LIMIT = 600
 """CPU time after which a case is given up [s]."""
 PLAN_LIMIT = 10.0
@@ -161,11 +162,14 @@ def outcome(urdf: Path, found: Urdf | None, samples: int, problems: int) -> Outc
         try:
             report = add_robot(urdf, base=how.base, group=how.group, out=Path(folder) / "arm")
         except InputError as error:
-            seconds, mebibytes = time.process_time(), _peak_mebibytes()
+            seconds = time.process_time()
+            mebibytes = _peak_mebibytes()
             return Outcome(seconds, mebibytes, str(error).replace(f"{urdf.parent}/", ""))
         of = Outcome(time.process_time(), _peak_mebibytes(), "", tuple(report.warnings), report.robot.dof)
-        of.parts, of.spheres = sum(link.parts for link in report.links), report.sphere_count
-        of.free, of.refused_by_parts = report.false_collisions.free, report.false_collisions.by_parts
+        of.parts = sum(link.parts for link in report.links)
+        of.spheres = report.sphere_count
+        of.free = report.false_collisions.free
+        of.refused_by_parts = report.false_collisions.by_parts
         of.refused_by_spheres = report.false_collisions.by_spheres
         of.points_outside = points_outside(urdf, report)
         of.free_on_table, of.refused_on_table = on_table(report.robot, samples)
@@ -181,7 +185,9 @@ def _peak_mebibytes() -> float:
 
 def points_outside(urdf: Path, report: AddReport) -> int:
     """Random points of the links' meshes that no sphere contains."""
-    robot, tree, outside = report.robot, UrdfTree(urdf, {}), 0
+    robot = report.robot
+    tree = UrdfTree(urdf, {})
+    outside = 0
     for link in robot.meshes:
         parts = [trimesh.Trimesh(s.vertices, s.faces) for s in tree.surfaces(link)]
         points = trimesh.sample.sample_surface(trimesh.util.concatenate(parts), SURFACE_POINTS, seed=1)[0]
@@ -205,7 +211,8 @@ def planned(robot: Robot) -> tuple[str, str]:
     q = q[CollisionChecker(robot, Scene()).free(q)]
     if len(q) < 2:
         return "no free configuration", "-"
-    planner, shown = load_planner("robotdiffuse"), []
+    planner = load_planner("robotdiffuse")
+    shown = []
     planner.warm_up(Problem(robot, Scene(), q[0], q[1]))
     boxes = past_a_box(robot, q)
     for problem in (Problem(robot, Scene(), q[0], q[1]), boxes):
@@ -276,7 +283,9 @@ def find(case: str, sites: list[str], folder: Path) -> Path | None:
 def report(outcomes: dict[str, Outcome]) -> None:
     """Print the tables."""
     prepared = {name: one for name, one in outcomes.items() if not one.refusal}
-    rows, notes, plans = [], [], []
+    rows = []
+    notes = []
+    plans = []
     for name, one in prepared.items():
         figures = (one.free, one.refused_by_parts, one.refused_by_spheres)
         shares = [f"{share:.1%}" for share in (*figures, one.free_on_table, one.refused_on_table)]

@@ -19,8 +19,9 @@ WHOLE_MOTION = PictureSettings(width=720, height=450, ghosts=10)
 FRAME_TIME = 0.05
 """How long a frame is shown [s]; a multiple of 10 ms, in which GIF counts."""
 SLOWDOWN = 2.0
-FIRST_FRAME_TIME, LAST_FRAME_TIME = 0.5, 1.5
-"""The motion rests at its ends for so long [s]."""
+# The motion rests at its ends for so long [s].
+FIRST_FRAME_TIME = 0.5
+LAST_FRAME_TIME = 1.5
 COLORS = 256
 
 
@@ -42,7 +43,8 @@ def gif(pictures: list[Image.Image]) -> bytes:
     palette = strip.quantize(COLORS, method=Image.Quantize.MEDIANCUT)
     reduced = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     times = [FIRST_FRAME_TIME, *[FRAME_TIME] * (len(reduced) - 2), LAST_FRAME_TIME]
-    content, durations = BytesIO(), [round(1000 * time) for time in times]
+    content = BytesIO()
+    durations = [round(1000 * time) for time in times]
     reduced[0].save(content, "GIF", save_all=True, append_images=reduced[1:], duration=durations, loop=0)
     return content.getvalue()
 

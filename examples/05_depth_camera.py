@@ -8,7 +8,8 @@ from robotdiffuse.planning.pipeline.unknown_space import predicted_obstacles
 from robotdiffuse.visualization.picture import write_picture
 
 robot = rd.load_robot("panda")
-start, goal = [-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+start = [-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+goal = [0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 true_scene = rd.Scene([rd.Box([0.55, 0.0, 0.3], [0.4, 0.2, 0.6]), rd.Cylinder([0.6, 0.45, 0.15], 0.08, 0.3)])
 
 # In place of a camera; a real one gives `image` [m], its intrinsics and where it stands.

@@ -6,7 +6,8 @@ import robotdiffuse as rd
 from robotdiffuse.visualization.picture import write_picture
 
 robot = rd.load_robot("panda")
-start, goal = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+start = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+goal = [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 problem = rd.Problem(
     robot, rd.Scene([rd.Box([0.55, 0.0, 0.55], [0.5, 0.01, 0.5], name="sheet")]), start, goal
 )

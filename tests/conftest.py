@@ -37,7 +37,8 @@ def parse_in_one_thread_at_a_time() -> None:
     """CPython 3.11 counts the depth of the syntax trees of all threads together (gh-106905): parsing in two
     ended in "SystemError: AST constructor recursion depth mismatch", and the live page's first plan failed.
     The hook parses each module, and NumPy and beartype parse too: a lock of the hook alone is not enough."""
-    parse, parsing = ast.parse, threading.RLock()
+    parse = ast.parse
+    parsing = threading.RLock()
 
     def alone(*args: Any, **kwargs: Any) -> Any:
         with parsing:

@@ -154,7 +154,8 @@ def _module(full: str, names: dict[str, Path]) -> str | None:
 
 def strongly_connected(graph: dict[str, set[str]]) -> list[set[str]]:
     """Sets of nodes that all reach each other (Kosaraju's algorithm)."""
-    order, seen = [], set()
+    order = []
+    seen = set()
     for root in graph:
         stack = [(root, False)]
         while stack:
@@ -165,9 +166,11 @@ def strongly_connected(graph: dict[str, set[str]]) -> list[set[str]]:
                 seen.add(node)
                 stack += [(node, True), *((other, False) for other in graph[node])]
     back = {node: [n for n in graph if node in graph[n]] for node in graph}
-    rings, placed = [], set()
+    rings = []
+    placed = set()
     for root in reversed(order):
-        ring, stack = set(), [root]
+        ring = set()
+        stack = [root]
         while stack:
             node = stack.pop()
             if node not in placed:

@@ -153,7 +153,8 @@ def gallery() -> str:
 def _example(file: Path) -> str:
     source = file.read_text(encoding="utf-8")
     tree = ast.parse(source)
-    text, first = ast.get_docstring(tree) or "", tree.body[0]
+    text = ast.get_docstring(tree) or ""
+    first = tree.body[0]
     code = "\n".join(source.splitlines()[first.end_lineno :]).strip()
     title = file.stem.split("_", 1)[1].replace("_", " ").capitalize().replace("Moveit", "MoveIt")
     picture = f"![{title}](images/gallery/{file.stem}.png)"

@@ -22,12 +22,14 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape
 
 Color = tuple[int, int, int]
 """sRGB."""
-START, GOAL = (0x4F, 0x7F, 0xD9), (0x10, 0xA3, 0x7F)
-"""Colours of the start and goal of a motion; the trace fades from one to the other."""
+# Colours of the start and goal of a motion; the trace fades from one to the other.
+START = (0x4F, 0x7F, 0xD9)
+GOAL = (0x10, 0xA3, 0x7F)
 OBSTACLES = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
 FURNITURE = (0xCD, 0xC0, 0xAC)
-OBSERVED, ASSUMED = (0x4F, 0x7C, 0xAC), (0xB9, 0x8A, 0xD9)
-"""Points that cameras observed, and points assumed to be occupied in unknown space."""
+# Points that cameras observed, and points assumed to be occupied in unknown space.
+OBSERVED = (0x4F, 0x7C, 0xAC)
+ASSUMED = (0xB9, 0x8A, 0xD9)
 FURNITURE_SIZE = 0.7
 """Obstacles with a longer side than this count as furniture, with its own colour [m]."""
 CREASE_ANGLE = np.radians(38)
@@ -205,7 +207,8 @@ def _surface(shape: Shape, color: Color) -> Surface:
                 assert isinstance(shape, Capsule)
                 solid = trimesh.creation.capsule(shape.height, shape.radius, count=(48, 32))
                 solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
-        vertices, faces = np.asarray(solid.vertices, np.float64), np.asarray(solid.faces, np.int64)
+        vertices = np.asarray(solid.vertices, np.float64)
+        faces = np.asarray(solid.faces, np.int64)
     return creased(vertices, faces, painted(color, len(faces))).moved(T)
 
 

@@ -62,7 +62,8 @@ def test_links_are_where_the_validator_has_them(name: str) -> None:
 
 
 def _triangle(corners: np.ndarray) -> coal.Convex:
-    points, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    points = coal.StdVec_Vec3s()
+    faces = coal.StdVec_Triangle()
     for corner in corners:
         points.append(corner)
     faces.append(coal.Triangle(0, 1, 2))
@@ -88,11 +89,13 @@ def test_distances_are_those_of_coal() -> None:
                 geometry = coal.Cylinder(body.disc, z)
             elif body.rounding:
                 geometry = coal.Capsule(body.rounding, z) if z else coal.Sphere(body.rounding)
-            pieces, at = [geometry], [body.center]
+            pieces = [geometry]
+            at = [body.center]
         R = body.R if isinstance(body, Rounded) else np.eye(3)
         less = body.radius if isinstance(body, Surface) else 0.0
         for point, distance in zip(points, found[:, k], strict=True):
-            ball, place = coal.Sphere(1e-9), coal.Transform3s(np.eye(3), point)
+            ball = coal.Sphere(1e-9)
+            place = coal.Transform3s(np.eye(3), point)
             request = coal.DistanceRequest()
             right = min(
                 coal.distance(ball, place, piece, coal.Transform3s(R, t), request, coal.DistanceResult())
@@ -128,9 +131,11 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
     ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
     ends[1] = ends[0] + (ends[1] - ends[0]) * rng.uniform(0, 0.5)
     prover = Prover(robot, Scene(), ends)
-    claims, ones = np.arange(len(prover.claims)), np.ones(len(prover.claims))
+    claims = np.arange(len(prover.claims))
+    ones = np.ones(len(prover.claims))
     bounds = prover.bounds(Stretches(claims, 0 * ones, ones), ones < 0, [])
-    middle, linkage = prover.at(np.array([0.5])), prover.linkage
+    middle = prover.at(np.array([0.5]))
+    linkage = prover.linkage
     places = linkage.place(np.concatenate([middle, prover.at(rng.uniform(0, 1, 8))])).T
     for claim, displacement in zip(prover.claims, bounds.displacement, strict=True):
         link = linkage.links.index(claim.link)
@@ -147,7 +152,8 @@ def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> 
     """Vertices of the hand along a bent path, seen from the base and from a link between."""
     rng = np.random.default_rng(seed)
     robot = load_robot("panda")
-    linkage, link = Linkage(robot), "panda_hand"
+    linkage = Linkage(robot)
+    link = "panda_hand"
     middle = rng.uniform(robot.lower, robot.upper)
     steps = rng.normal(0, 0.1, (4, robot.dof)) * rng.integers(0, 2, robot.dof)
     normals = rng.normal(size=(2, 3))
@@ -162,14 +168,16 @@ def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> 
         T = places.T[0, base] @ np.linalg.inv(places.T[:, base]) @ places.T[:, k]
         points = mesh.vertices @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
         moved_by = np.flatnonzero(linkage.moved[k] & ~linkage.moved[base])
-        origins, axes = places.origins[0], places.axes[0]
+        origins = places.origins[0]
+        axes = places.axes[0]
         bound = linkage.approach(origins, axes, points[0], moved_by, steps, normals)
         went = (points[0] - points) @ normals.T
         assert (bound + 1e-12 >= went.max(axis=0).T).all()
 
 
 def test_sphere_clearances_are_distances_of_the_placed_spheres() -> None:
-    robot, scene = load_robot("panda"), Scene([Sphere([0.5, 0.2, 0.5], 0.1)])
+    robot = load_robot("panda")
+    scene = Scene([Sphere([0.5, 0.2, 0.5], 0.1)])
     q = np.zeros((1, robot.dof)) + (robot.lower + robot.upper) / 2
     prover = Prover(robot, scene, q)
     claims = np.array([k for k, claim in enumerate(prover.claims) if claim.against == SCENE])
@@ -184,14 +192,16 @@ def test_sphere_clearances_are_distances_of_the_placed_spheres() -> None:
 def test_spans_know_the_rows_between_the_ends() -> None:
     rows = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 0.5]])
     prover = Prover(box_arm(), Scene(), rows)
-    start, stop = np.array([0.0, 2.0, 0.5]), np.array([3.0, 3.0, 1.5])
+    start = np.array([0.0, 2.0, 0.5])
+    stop = np.array([3.0, 3.0, 1.5])
     spans = prover.spans(start, stop, (start + stop) / 2)
     np.testing.assert_allclose(spans, [[0.5, 0, 0.5], [0, 0, 0.25], [0.5, 0, 0]])
 
 
 def test_unknown_shapes_are_refused_by_name() -> None:
     class Strange(Shape):
-        kind, name = "strange", "odd"
+        kind = "strange"
+        name = "odd"
         area, bounds = 0.0, np.zeros((2, 3))  # type: ignore[assignment]
 
     with pytest.raises(InputError, match="odd: a Strange cannot be certified"):
@@ -207,7 +217,8 @@ def test_a_link_that_is_called_like_the_scene_is_refused(monkeypatch: pytest.Mon
 
 def test_bounds_hold_for_cubics_that_leave_the_straight_lines() -> None:
     """Along the cubics, clearances are at least what is left of those in the middle of the straight lines."""
-    rng, robot = np.random.default_rng(0), box_arm()
+    rng = np.random.default_rng(0)
+    robot = box_arm()
     for _ in range(30):
         rows, v = rng.uniform(-0.5, 0.5, (2, 4, 3))
         motion = Trajectory(robot.joint_names, 0.3 * np.arange(4.0), rows, v, 0 * v)

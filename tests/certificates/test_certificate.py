@@ -169,7 +169,8 @@ def removed_stretch(record: dict[str, Any]) -> None:
     entry = widest(record)
     for name in ("start", "stop", "clearance", "displacement"):
         del entry[name][0]
-    entry["by_planes"], entry["planes"] = [], []
+    entry["by_planes"] = []
+    entry["planes"] = []
 
 
 def removed_claim(record: dict[str, Any]) -> None:
@@ -228,7 +229,8 @@ def test_tampering_is_caught_and_named(
 
 
 def test_another_robot_is_caught_and_named(file: FilePath, planned: tuple[Problem, rd.PlanResult]) -> None:
-    certificate, problem = load_certificate(file), planned[0]
+    certificate = load_certificate(file)
+    problem = planned[0]
     opened = replace(problem, robot=problem.robot.with_locked({"panda_finger_joint1": 0.01}))
     found = certificate.check(opened).differences
     assert "robot: joint panda_finger_joint1 has changed" in found
@@ -246,7 +248,8 @@ def test_whoever_forges_the_hashes_too_still_needs_a_proof(
     planned: tuple[Problem, rd.PlanResult], file: FilePath
 ) -> None:
     """An obstacle in the way, with forged hashes."""
-    problem, certificate = planned[0], load_certificate(file)
+    problem = planned[0]
+    certificate = load_certificate(file)
     blocked = replace(problem, scene=Scene([*problem.scene.shapes, Sphere([0.0, 0.0, 0.6], 0.3, "new")]))
     forged = replace(certificate, scene_parts=scene_parts(blocked.scene))
     found = forged.check(blocked).differences
@@ -308,7 +311,8 @@ def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytes
 @pytest.mark.parametrize("with_times", [False, True])
 def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
     """Start and goal inside a box: a motion of one row has no gap even without stretches."""
-    robot, here = box_arm(), np.zeros((1, 3))
+    robot = box_arm()
+    here = np.zeros((1, 3))
     problem = Problem(robot, Scene([Box([0.3, 0, 0], [2, 2, 2])]), here[0], JointGoal(here))
     motion = Trajectory(robot.joint_names, np.zeros(1), here, here, here)
     motion = motion if with_times else Path(robot.joint_names, here)

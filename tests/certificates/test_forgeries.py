@@ -25,12 +25,10 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.timing import time_parameterize
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
-HAND, START, MIDDLE, GOAL = (
-    "panda_hand",
-    [-0.5, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785],
-    [0.0, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785],
-    [0.5, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785],
-)
+HAND = "panda_hand"
+START = [-0.5, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785]
+MIDDLE = [0.0, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785]
+GOAL = [0.5, 0.2, 0.0, -2.0, 0.0, 2.2, 0.785]
 Record = dict[str, Any]
 """The content of a certificate file."""
 
@@ -149,14 +147,18 @@ def sparse(record: Record) -> None:
     motion = record["motion"]
     for name in ("positions", "velocities", "accelerations", "times"):
         motion[name] = [motion[name][0], motion[name][-1]]
-    record["between"], record["looks"], record["jerks"] = [], [], []
+    record["between"] = []
+    record["looks"] = []
+    record["jerks"] = []
 
 
 def without_rates(record: Record) -> None:
     """A path: velocities and moving obstacles would go unchecked."""
     for name in ("times", "velocities", "accelerations"):
         del record["motion"][name]
-    record["between"], record["looks"], record["jerks"] = [], [], []
+    record["between"] = []
+    record["looks"] = []
+    record["jerks"] = []
 
 
 def still_row(record: Record) -> None:
@@ -211,7 +213,8 @@ def against_nothing(record: Record) -> None:
 
 
 def exchanged_claims(record: Record) -> None:
-    one, other = record["proof"][0], record["proof"][-1]
+    one = record["proof"][0]
+    other = record["proof"][-1]
     one["link"], other["link"] = other["link"], one["link"]
 
 
@@ -370,7 +373,8 @@ def test_forgeries_are_refused_with_the_reason(
     name: str, true: tuple[Record, Problem], tmp_path: FilePath
 ) -> None:
     forge, wanted = FORGED[name]
-    record, problem = copy.deepcopy(true[0]), true[1]
+    record = copy.deepcopy(true[0])
+    problem = true[1]
     forge(record)
     file = tmp_path / "forged.json"
     alone = ["closed fingers", "a faster ball", "a ball of unknown motion"]

@@ -23,8 +23,10 @@ from robotdiffuse.core.types import Trajectory
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
 
-PANDA, HAND = rd.load_robot("panda"), "panda_hand"
-START, GOAL = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2], [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
+PANDA = rd.load_robot("panda")
+HAND = "panda_hand"
+START = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
+GOAL = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 TABLE = rd.Box([0.55, 0.0, 0.0], [0.5, 1.0, 0.2], name="table")
 POST = rd.Cylinder([0.42, 0.35, 0.4], 0.06, 0.6, name="post")
 ACROSS = rd.MovingObstacle(POST, velocity=[0.25, -0.1, 0.0])
@@ -186,7 +188,8 @@ def test_bounds_of_constraints_are_bounds() -> None:
 
 def test_bounds_in_time_are_bounds() -> None:
     """Anywhere on a stretch, all spheres are at least clearance minus displacement from a rotating box."""
-    rng, times = np.random.default_rng(1), np.linspace(0.0, 1.0, 6)
+    rng = np.random.default_rng(1)
+    times = np.linspace(0.0, 1.0, 6)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3, 3] = [[0.5, 0.5, 0.5], [0.5, 0.0, 0.6], [0.3, -0.4, 0.4]]
     poses[1, :3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]

@@ -22,7 +22,8 @@ from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.inertias import Payload
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
-LOW, FAR = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2], [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
+LOW = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
+FAR = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
 PAYLOAD = Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03])
 
 
@@ -44,7 +45,8 @@ def loaded(name: str) -> Problem:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_dynamics_are_pinocchios(name: str) -> None:
-    problem, rng = loaded(name), np.random.default_rng(0)
+    problem = loaded(name)
+    rng = np.random.default_rng(0)
     q, v, a = rng.normal(size=(3, 50, problem.robot.dof))
     expected = Dynamics(problem.robot, PAYLOAD, TURNED).torques(q, v, a)
     assert np.allclose(inverse_dynamics(problem, q, v, a), expected, atol=1e-9)
@@ -55,7 +57,8 @@ def test_dynamics_are_pinocchios(name: str) -> None:
 def test_bounds_are_bounds(name: str, step: float) -> None:
     """Against torques of motions with a row at each of many samples, by which nothing of the motion
     changes."""
-    problem, rng = loaded(name), np.random.default_rng(1)
+    problem = loaded(name)
+    rng = np.random.default_rng(1)
     for _ in range(5):
         motion = wild(problem.robot, rng, step)
         samples = np.linspace(0, motion.times[-1], 201)[1:-1]
@@ -140,7 +143,8 @@ def test_torques_without_a_payload_are_refused() -> None:
 
 def test_a_motion_of_one_row() -> None:
     problem, _ = certified()
-    row, still = np.array([LOW]), np.zeros((1, 7))
+    row = np.array([LOW])
+    still = np.zeros((1, 7))
     there = replace(problem, goal=rd.JointGoal([LOW]))
     motion = Trajectory(problem.robot.joint_names, np.zeros(1), row, still, still)
     assert certify(there, motion).check(there).valid

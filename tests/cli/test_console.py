@@ -24,7 +24,8 @@ def test_a_log_says_what_is_compiled(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_a_spinner_that_ends_as_it_appears_gives_stdout_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plan of two seconds printed its result to standard error: rich had replaced sys.stdout for good."""
-    ending, stop = threading.Event(), console.Spinner.stop
+    ending = threading.Event()
+    stop = console.Spinner.stop
 
     class Terminal(rich.console.Console):
         def __init__(self, **_: object) -> None:

@@ -65,7 +65,8 @@ def test_elsewhere_no_browser_gets_data_without_the_token() -> None:
         assert server.stdout is not None
         printed = re.search(r"http://\S+/\?websocket=ws://\S+:(\d+)/([\w-]{20,}) ", server.stdout.readline())
         assert printed is not None
-        url, token = f"ws://127.0.0.1:{printed[1]}/", printed[2]
+        url = f"ws://127.0.0.1:{printed[1]}/"
+        token = printed[2]
         assert hears(url, token)
         assert not hears(url)
         assert not hears(url, token[:-1])

@@ -24,7 +24,8 @@ from robotdiffuse.planning.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.robots import load_robot
 
-STEPS, BATCH = 20, 8
+STEPS = 20
+BATCH = 8
 SMALL = TransformerSettings(width=16, layers=1, heads=2, hidden=24, patch=8)
 TINY = {"samples": STEPS * BATCH, "batch": BATCH, "denoiser_settings": SMALL, "validation_problems": 2}
 

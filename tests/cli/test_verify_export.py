@@ -9,7 +9,8 @@ import yaml
 from helpers.commands import run
 from helpers.full_disk import full_disk
 
-START, GOAL = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+START = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+GOAL = [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 BALL = {"sphere": {"center": [0.5, 0.0, 0.5], "radius": 0.15, "name": "ball"}}
 PROBLEM = {"robot": "panda", "scene": [BALL], "start": START, "goal": {"joints": GOAL}}
 SCENE = {

@@ -45,8 +45,10 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Spher
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_clearances_are_exact(name: str) -> None:
-    robot, scene = with_spheres(name), solids()
-    checker, q = CollisionChecker(robot, scene), rows(robot, 150)
+    robot = with_spheres(name)
+    scene = solids()
+    checker = CollisionChecker(robot, scene)
+    q = rows(robot, 150)
     right = link_distances(robot, scene, q)
     assert checker.link_clearances(q).shape == (150, len(checker.links))
     np.testing.assert_allclose(checker.link_clearances(q), right, atol=TOLERANCE)
@@ -61,7 +63,8 @@ def test_clearances_are_exact(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("padding", [0.0, 0.05])
 def test_free_is_the_sign_of_the_clearance(name: str, padding: float) -> None:
-    robot, scene = with_spheres(name), solids()
+    robot = with_spheres(name)
+    scene = solids()
     q = rows(robot, 500, seed=1)
     checker = CollisionChecker(robot, scene, padding)
     least = np.minimum(
@@ -75,9 +78,11 @@ def test_free_is_the_sign_of_the_clearance(name: str, padding: float) -> None:
 
 @given(kind=st.sampled_from(["sphere", "box", "cylinder", "capsule", "cloud"]), seed=st.integers(0, 2**32))
 def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
-    robot, rng = with_spheres("panda"), np.random.default_rng(seed)
+    robot = with_spheres("panda")
+    rng = np.random.default_rng(seed)
     scene = Scene([random_shape(kind, rng), random_shape(kind, rng)])
-    q, checker = rng.uniform(robot.lower, robot.upper, (33, robot.dof)), CollisionChecker(robot, scene)
+    q = rng.uniform(robot.lower, robot.upper, (33, robot.dof))
+    checker = CollisionChecker(robot, scene)
     right = link_distances(robot, scene, q)
     found = checker.link_clearances(q)
     hit = (right < 0).any(axis=1) | (pair_distances(robot, q) < 0).any(axis=1)
@@ -98,7 +103,8 @@ def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
 @pytest.mark.parametrize("count", [15, 16, 17, 70])
 def test_any_number_of_obstacles(count: int) -> None:
     """Obstacles are processed in groups of sixteen."""
-    robot, rng = with_spheres("panda"), np.random.default_rng(count)
+    robot = with_spheres("panda")
+    rng = np.random.default_rng(count)
     kinds = ("sphere", "box", "cylinder", "capsule")
     shapes = [random_shape(kinds[i % 4], rng) for i in range(count)]
     scene = Scene([shape for shape in shapes if np.linalg.norm(shape.center) > 0.6])  # type: ignore[attr-defined]
@@ -113,12 +119,14 @@ def test_any_number_of_obstacles(count: int) -> None:
 @pytest.mark.parametrize("count", [16, 17, 50])
 def test_links_with_any_number_of_spheres(count: int) -> None:
     """Links with many spheres are divided into rows, each with its own bounding sphere."""
-    arm, rng = with_spheres("ur5"), np.random.default_rng(count)
+    arm = with_spheres("ur5")
+    rng = np.random.default_rng(count)
     spheres = {
         link: np.column_stack([rng.uniform(-0.06, 0.06, (count, 3)), rng.uniform(0.002, 0.01, count)])
         for link in arm.spheres
     }
-    robot, scene = replace(arm, spheres=spheres), solids()
+    robot = replace(arm, spheres=spheres)
+    scene = solids()
     q = rows(robot, 200, seed=2)
     least = np.minimum(link_distances(robot, scene, q).min(axis=1), pair_distances(robot, q).min(axis=1))
     clear = np.abs(least) > TOLERANCE
@@ -129,12 +137,15 @@ def test_links_with_any_number_of_spheres(count: int) -> None:
 
 @pytest.mark.parametrize("stop_at_first", [False, True])
 def test_the_bits_of_a_block_are_its_configurations(stop_at_first: bool) -> None:
-    robot, scene = with_spheres("panda"), solids()
-    checker, q = CollisionChecker(robot, scene), rows(robot, 16, seed=4).astype(np.float32)
+    robot = with_spheres("panda")
+    scene = solids()
+    checker = CollisionChecker(robot, scene)
+    q = rows(robot, 16, seed=4).astype(np.float32)
     arrays = checker.robot_arrays, checker.scene_arrays
     work = make_workspace(*arrays)
     hits = block_hits(*arrays, np.ascontiguousarray(q.T), np.float32(0), stop_at_first, work)
-    found, right = hits >> np.arange(16) & 1 == 1, ~checker.free(q)
+    found = hits >> np.arange(16) & 1 == 1
+    right = ~checker.free(q)
     assert 0 < right.sum() < 16
     if stop_at_first:
         assert found.sum() == 1
@@ -157,7 +168,8 @@ def test_configurations_beyond_the_limits() -> None:
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17])
 def test_any_number_of_configurations(count: int) -> None:
     robot = with_spheres("panda")
-    checker, q = CollisionChecker(robot, solids()), rows(robot, 17)
+    checker = CollisionChecker(robot, solids())
+    q = rows(robot, 17)
     np.testing.assert_array_equal(checker.free(q[:count]), checker.free(q)[:count])
     np.testing.assert_array_equal(least_clearance(checker, q[:count]), least_clearance(checker, q)[:count])
     assert checker.cost_gradients(q[:count], 0.05)[1].shape == (count, robot.dof)
@@ -168,7 +180,8 @@ def test_any_number_of_configurations(count: int) -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
-    robot, rng = with_spheres("panda"), np.random.default_rng(seed)
+    robot = with_spheres("panda")
+    rng = np.random.default_rng(seed)
     scene = (ROP if seed < 2 else ROP_DENSE).scene(rng, base_spheres(robot))
     shapes = [random_shape(kind, rng) for kind in ("cylinder", "capsule", "box", "cloud")]
     scene = Scene([*scene.shapes, *shapes[: seed % 5]])
@@ -180,7 +193,8 @@ def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
 
 
 def test_self_collision() -> None:
-    robot, q = with_spheres("panda"), rows(load_robot("panda"), 3000)
+    robot = with_spheres("panda")
+    q = rows(load_robot("panda"), 3000)
     free = CollisionChecker(robot, Scene()).free(q)
     meshes = ExactCollision(robot, Scene()).collides(q)
     assert not (free & meshes).any()
@@ -195,7 +209,8 @@ def test_self_collision() -> None:
 def test_locked_fingers_change_the_result() -> None:
     robot = with_spheres("panda")
     wide = robot.with_locked({"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065})
-    scene, q = solids(), rows(robot, 5000)
+    scene = solids()
+    q = rows(robot, 5000)
     one, other = (CollisionChecker(r, scene) for r in (robot, wide))
     np.testing.assert_allclose(
         other.link_clearances(q[:50]), link_distances(wide, scene, q[:50]), atol=TOLERANCE
@@ -204,8 +219,10 @@ def test_locked_fingers_change_the_result() -> None:
 
 
 def test_padding_holds_towards_the_scene_alone() -> None:
-    robot, q = with_spheres("panda"), rows(load_robot("panda"), 300)
-    near, far = CollisionChecker(robot, solids()), CollisionChecker(robot, solids(), 0.03)
+    robot = with_spheres("panda")
+    q = rows(load_robot("panda"), 300)
+    near = CollisionChecker(robot, solids())
+    far = CollisionChecker(robot, solids(), 0.03)
     np.testing.assert_allclose(far.link_clearances(q), near.link_clearances(q) - 0.03, atol=1e-6)
     np.testing.assert_array_equal(far.pair_clearances(q), near.pair_clearances(q))
 
@@ -213,7 +230,8 @@ def test_padding_holds_towards_the_scene_alone() -> None:
 @pytest.mark.parametrize("size", [2.0, 1e3, 9.9e3])
 def test_a_huge_floor_is_as_exact_as_a_small_one(size: float) -> None:
     robot = with_spheres("panda")
-    q, scene = rows(robot, 400), Scene([Box((0.3, 0.1, -size / 2 - 0.05), (size + 4, size + 4, size))])
+    q = rows(robot, 400)
+    scene = Scene([Box((0.3, 0.1, -size / 2 - 0.05), (size + 4, size + 4, size))])
     right = (
         np.stack(
             [
@@ -322,7 +340,9 @@ def cost(robot: Robot, scene: Scene, q: ndarray, margin: float, self_margin: flo
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_cost_gradients_are_finite_differences(name: str) -> None:
-    robot, scene, step = with_spheres(name), solids(), 1e-6
+    robot = with_spheres(name)
+    scene = solids()
+    step = 1e-6
     q = rows(robot, 60)
     costs, gradients = CollisionChecker(robot, scene).cost_gradients(q, 0.05, 0.02)
     np.testing.assert_allclose(costs, cost(robot, scene, q, 0.05, 0.02), rtol=1e-3, atol=1e-7)
@@ -337,7 +357,8 @@ def test_cost_gradients_are_finite_differences(name: str) -> None:
 
 
 def test_cost_gradients_of_a_cloud_point_away_from_it() -> None:
-    robot, rng = with_spheres("panda"), np.random.default_rng(0)
+    robot = with_spheres("panda")
+    rng = np.random.default_rng(0)
     points = rng.normal(0, 0.05, (200, 3)) + np.array([0.45, 0.0, 0.5])
     checker = CollisionChecker(robot, Scene([PointCloud(points, 0.01)]))
     q = rows(robot, 3000)
@@ -345,6 +366,7 @@ def test_cost_gradients_of_a_cloud_point_away_from_it() -> None:
     own = CollisionChecker(robot, Scene()).cost_gradients(q, 0.05, 0.0)[0]
     touched = (costs > 1e-5) & (own == 0)
     assert touched.sum() > 30
-    q, gradients = q[touched], gradients[touched]
+    q = q[touched]
+    gradients = gradients[touched]
     after = q - 0.002 * gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
     assert (checker.cost_gradients(after, 0.05, 0.0)[0] < costs[touched]).mean() > 0.95

@@ -29,7 +29,8 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
 PANDA = load_robot("panda")
-LIMIT, MARGIN = 0.4, 0.1
+LIMIT = 0.4
+MARGIN = 0.1
 SHAPES = Scene(
     [
         Sphere((0.5, 0.3, 0.6), 0.2),
@@ -58,7 +59,8 @@ def test_inputs_are_the_same_in_training_and_planning() -> None:
     scenes = [family.scene(rng) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     scenes.append(Scene(scenes[0].shapes[:1]))
     packed = PackedScenes.pack(scenes, 12, floor=True)
-    q, config = configurations(len(packed), 60), model_settings(clearance_gradients=True)
+    q = configurations(len(packed), 60)
+    config = model_settings(clearance_gradients=True)
     given = compile_robot(PANDA), packed, q, MAX_CLEARANCE
     clearances, gradients = packed_clearances_and_gradients(*given, GRADIENT_MARGIN)
     np.testing.assert_array_equal(clearances, packed_link_clearances(*given))
@@ -74,8 +76,10 @@ def test_gradients_are_those_of_the_clearances() -> None:
     """Of a robot with one sphere for each link, whose clearances say all: against automatic differentiation
     of the signed distance of training's losses, and finite differences of it."""
     robot = replace(PANDA, spheres={link: balls[:1] for link, balls in PANDA.spheres.items()})
-    q, scene = configurations(400).astype(np.float64), Scene(SHAPES.shapes[:2])
-    checker, packed = CollisionChecker(robot, scene), PackedScenes.pack([scene] * len(q), 2)
+    q = configurations(400).astype(np.float64)
+    scene = Scene(SHAPES.shapes[:2])
+    checker = CollisionChecker(robot, scene)
+    packed = PackedScenes.pack([scene] * len(q), 2)
     distance = ArmDistance(ForwardKinematics(robot, torch.float64))
 
     def too_close(at: torch.Tensor) -> torch.Tensor:
@@ -86,7 +90,8 @@ def test_gradients_are_those_of_the_clearances() -> None:
     too_close(at).sum().backward()
     assert at.grad is not None
     # where two obstacles are as near, or a margin is just touched, rounding decides
-    near, far = too_close(at.detach()).numpy() > 1e-3, clearances.min(axis=1) >= MARGIN
+    near = too_close(at.detach()).numpy() > 1e-3
+    far = clearances.min(axis=1) >= MARGIN
     assert near.sum() > 50 and far.sum() > 50
     same = np.isclose(found[near], at.grad.numpy()[near], atol=2e-3).all(axis=1)
     assert same.mean() > 0.98
@@ -99,7 +104,8 @@ def test_gradients_are_those_of_the_clearances() -> None:
 @pytest.mark.parametrize("padding", [0.0, 0.03])
 def test_gradients_are_differences_over_all_spheres(padding: float) -> None:
     """For the whole robot: the root of guidance's collision cost, without self-collision."""
-    checker, q = CollisionChecker(PANDA, SHAPES, padding), configurations(300).astype(np.float64)
+    checker = CollisionChecker(PANDA, SHAPES, padding)
+    q = configurations(300).astype(np.float64)
     clearances, found = checker.clearances_and_gradients(q, LIMIT, MARGIN)
     np.testing.assert_array_equal(clearances, checker.link_clearances(q, LIMIT))
 
@@ -136,7 +142,8 @@ def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
 
 def test_the_denoiser_s_inputs() -> None:
     """Rows, joints, clearances, and then gradients of order 1, whose sign points into the obstacle."""
-    scene, rng = Scene([Box((0.5, 0.0, 0.5), (0.4, 0.4, 0.4))]), np.random.default_rng(5)
+    scene = Scene([Box((0.5, 0.0, 0.5), (0.4, 0.4, 0.4))])
+    rng = np.random.default_rng(5)
     seen = {}
     q = configurations(2, 16, seed=6).astype(np.float64)
     for with_gradients in (False, True):
@@ -160,7 +167,8 @@ def test_the_denoiser_s_inputs() -> None:
         checker.cost_gradients(at, MARGIN, self_margin=-1.0)[0] for at in (q.reshape(-1, 7)[hit], inwards)
     ]
     assert hit.sum() > 3 and (costs[1] > costs[0]).all()
-    code, settings = np.zeros(model.settings.code), SamplingSettings(samples=2, sampling_steps=2)
+    code = np.zeros(model.settings.code)
+    settings = SamplingSettings(samples=2, sampling_steps=2)
     sampled = model.sample(q[0, 0], q[0, -1], code, clearances, rng, settings)
     assert sampled.shape == (2, 16, 7)
 

@@ -120,10 +120,8 @@ def test_an_empty_point_cloud_is_an_empty_scene() -> None:
 
 def test_a_mesh_is_its_surface() -> None:
     mesh = trimesh.creation.box((0.2, 0.3, 0.4)).subdivide()
-    solid, q = (
-        Box(vector(0.6, 0.6, 0.1), vector(0.2, 0.3, 0.4), vector(0.9, 0.1, 0.3, 0.2)),
-        np.array([0.2, 0.1, 0.3]),
-    )
+    solid = Box(vector(0.6, 0.6, 0.1), vector(0.2, 0.3, 0.4), vector(0.9, 0.1, 0.3, 0.2))
+    q = np.array([0.2, 0.1, 0.3])
     surface = Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), solid.center, solid.wxyz)
     a, b = (ExactCollision(box_arm(), Scene([shape])) for shape in (solid, surface))
     assert least(a, q) == pytest.approx(least(b, q), abs=1e-6)
@@ -134,7 +132,8 @@ def test_a_mesh_is_its_surface() -> None:
 
 def test_nearest_honours_cutoffs_and_stops() -> None:
     exact = ExactCollision(box_arm(), Scene([Sphere(vector(0.2, 0.5, 0), 0.1)]))
-    q, checks = np.zeros((4, 3)), np.array([0, 0, 2, 0])
+    q = np.zeros((4, 3))
+    checks = np.array([0, 0, 2, 0])
     distances, names = exact.nearest(q, checks, np.array([1.0, 0.2, 1.0, 1.0]), stop=0.3)
     assert distances[0] == pytest.approx(0.4 - HALF_WIDTH)
     assert distances[1] == 0.2
@@ -152,7 +151,8 @@ def test_frames_agree_with_the_kinematics() -> None:
 
 
 def test_collides_is_the_sign_of_the_distance() -> None:
-    robot, rng = box_arm(), np.random.default_rng(3)
+    robot = box_arm()
+    rng = np.random.default_rng(3)
     scene = Scene(
         [
             Cylinder(vector(0.5, 0.5, 0), 0.1, 0.3),

@@ -30,7 +30,8 @@ def swing(duration: float) -> tuple[np.ndarray, np.ndarray]:
 
 def obstacle(k: int, rng: np.random.Generator) -> rd.MovingObstacle:
     """Obstacles of every shape and every kind of motion in turn."""
-    at, velocity = rng.uniform([-0.2, -0.8, 0.2], [0.9, 0.8, 1.0]), 0.4 * rng.normal(size=3)
+    at = rng.uniform([-0.2, -0.8, 0.2], [0.9, 0.8, 1.0])
+    velocity = 0.4 * rng.normal(size=3)
     shape = [
         rd.Sphere(at, 0.08),
         rd.Box(at, [0.1, 0.15, 0.2]),
@@ -50,7 +51,9 @@ def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> 
 
     Where they are far apart, those are left out at which they cannot be nearer than MOVED.
     """
-    moments, k, least = np.arange(0.0, times[-1], STEP), 0, np.inf
+    moments = np.arange(0.0, times[-1], STEP)
+    k = 0
+    least = np.inf
     while k < len(moments):
         now = moments[k]
         row = np.array([np.interp(now, times, column) for column in q.T])

@@ -26,14 +26,16 @@ from robotdiffuse.scenes.shapes import Box, PointCloud, Sphere
 
 def test_a_point_cloud_is_many_spheres() -> None:
     """Far enough apart that thinning joins none."""
-    robot, rng = with_spheres("panda"), np.random.default_rng(0)
+    robot = with_spheres("panda")
+    rng = np.random.default_rng(0)
     points = rng.uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (60, 3))
     cloud = CollisionChecker(robot, Scene([PointCloud(points, 0.02)]))
     spheres = CollisionChecker(robot, Scene([Sphere(point, 0.02) for point in points]))
     q = rows(robot, 3000)
     np.testing.assert_array_equal(cloud.free(q), spheres.free(q))
     assert 0.05 < cloud.free(q).mean() < 0.95
-    found, right = cloud.link_clearances(q), spheres.link_clearances(q)
+    found = cloud.link_clearances(q)
+    right = spheres.link_clearances(q)
     assert (found <= right + TOLERANCE).all()
     near = right < 0.08
     np.testing.assert_allclose(found[near], right[near], atol=TOLERANCE)
@@ -53,7 +55,8 @@ def test_a_dense_cloud_is_joined_on_the_safe_side() -> None:
 
 def test_the_nearest_of_a_dense_cloud() -> None:
     """The search in cells must not miss a point that the grid promises."""
-    robot, rng = with_spheres("box_arm"), np.random.default_rng(3)
+    robot = with_spheres("box_arm")
+    rng = np.random.default_rng(3)
     points = rng.normal(size=(3000, 3))
     points = 0.4 * points / np.linalg.norm(points, axis=1, keepdims=True) + np.array([0.7, 0.5, 0])
     cloud = thin_points(points, 0.004, 2.0)
@@ -67,7 +70,8 @@ def test_the_nearest_of_a_dense_cloud() -> None:
 
 
 def test_a_hundred_thousand_points() -> None:
-    robot, rng = with_spheres("panda"), np.random.default_rng(0)
+    robot = with_spheres("panda")
+    rng = np.random.default_rng(0)
     points = np.column_stack(
         [rng.uniform(0.3, 0.9, (100_000, 1)), rng.uniform(-0.5, 0.5, (100_000, 1)), np.zeros(100_000) + 0.3]
     )
@@ -104,7 +108,8 @@ def test_points_just_beyond_the_reach_count() -> None:
 
 @pytest.mark.parametrize("radius", [1e-9, 1e-4, 0.3])
 def test_tiny_and_large_points(radius: float) -> None:
-    robot, rng = with_spheres("panda"), np.random.default_rng(0)
+    robot = with_spheres("panda")
+    rng = np.random.default_rng(0)
     points = rng.uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 1.2], (20, 3))
     scene = Scene([PointCloud(points, radius)])
     q = rows(robot, 500)
@@ -132,7 +137,8 @@ def test_links_with_spheres_larger_than_the_grids_band() -> None:
 
 def test_mesh_obstacles_are_covered() -> None:
     vertices, faces = box_triangles((0.5, 0.3, 0.4))
-    spheres, rng = cover_triangles(vertices[faces], 1.5), np.random.default_rng(0)
+    spheres = cover_triangles(vertices[faces], 1.5)
+    rng = np.random.default_rng(0)
     weights = rng.dirichlet((1, 1, 1), 300)
     points = np.einsum("nk,nkd->nd", weights, vertices[faces[rng.integers(len(faces), size=300)]])
     gap = np.linalg.norm(points[:, None] - spheres[:, :3], axis=-1) - spheres[:, 3]
@@ -141,9 +147,11 @@ def test_mesh_obstacles_are_covered() -> None:
 
 
 def test_mesh_obstacles_against_the_exact_surface() -> None:
-    robot, rng = with_spheres("panda"), np.random.default_rng(1)
+    robot = with_spheres("panda")
+    rng = np.random.default_rng(1)
     vertices, faces = box_triangles((0.3, 0.4, 0.5))
-    center, wxyz = np.array([0.5, 0.1, 0.4]), np.array([0.9, 0.1, 0.2, 0.3])
+    center = np.array([0.5, 0.1, 0.4])
+    wxyz = np.array([0.9, 0.1, 0.2, 0.3])
     scene = Scene([Mesh(vertices, faces, center, wxyz)])
     q = rng.uniform(robot.lower, robot.upper, (1500, robot.dof))
     free = CollisionChecker(robot, scene).free(q)
@@ -167,7 +175,9 @@ def test_the_grid_is_a_lower_bound() -> None:
     rng = np.random.default_rng(0)
     cloud = np.column_stack([rng.uniform(-0.5, 0.5, (300, 3)), np.full(300, 0.01)])
     found = build_grid(cloud, 0.05)
-    low, voxel, shape = found.grid_frame[:3], found.grid_frame[3], found.grid_frame[8:11].astype(int)
+    low = found.grid_frame[:3]
+    voxel = found.grid_frame[3]
+    shape = found.grid_frame[8:11].astype(int)
     axes = [low[i] + voxel * (np.arange(shape[i]) + 0.5) for i in range(3)]
     centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     pick = rng.integers(len(centres), size=3000)

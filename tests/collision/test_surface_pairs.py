@@ -27,13 +27,15 @@ from robotdiffuse.validation.validator import verify
 TURN = 0.6
 BESIDE = np.array([TURN, -TURN])
 """The second link is parallel to the wall, with a gap of GAP between the meshes."""
-GAP, LIP = 0.001, 0.003
+GAP = 0.001
+LIP = 0.003
 EMPTY = Scene(())
 
 
 def boxes(*ends: tuple[tuple[float, ...], tuple[float, ...]]) -> Surface:
     """Closed boxes from their lowest to their highest corners, which share no vertices."""
-    vertices, faces = [], []
+    vertices = []
+    faces = []
     for low, high in ends:
         box = trimesh.creation.box(bounds=np.array([low, high]))
         faces.append(np.array(box.faces) + 8 * len(vertices))
@@ -177,14 +179,17 @@ FOREARM, *OTHERS = BAXTER
     "name, link", [FOREARM, *(pytest.param(*other, marks=pytest.mark.slow) for other in OTHERS)]
 )
 def test_baxters_torso_and_arms_graze_as_trimesh_finds_too(name: str, link: str) -> None:
-    robot, q, links = load_robot(name), np.array(BAXTER[name, link]), ("torso", link)
+    robot = load_robot(name)
+    q = np.array(BAXTER[name, link])
+    links = ("torso", link)
     by_parts = replace(robot, surfaces={}, grazing=frozenset())
     assert explain_collision(robot, EMPTY, q) is None
     assert explain_collision(by_parts, EMPTY, q) is not None
     [found] = [d for d in ExactCollision(robot, EMPTY).pair_distances(q) if {d.link, d.other} == {*links}]
     meshes = []
     for each in links:
-        T, surface = link_pose(robot, q, each), robot.surfaces[each]
+        T = link_pose(robot, q, each)
+        surface = robot.surfaces[each]
         meshes.append(
             trimesh.Trimesh(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces, process=False)
         )

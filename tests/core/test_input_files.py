@@ -241,7 +241,8 @@ def test_xml_bombs_are_refused_in_one_line(text: str) -> None:
 
 @pytest.mark.parametrize("ending", [".npy", ".npz"])
 def test_arrays_of_python_objects_are_refused(ending: str, tmp_path: Path) -> None:
-    file, objects = tmp_path / f"points{ending}", np.array([{"a": 1}], object)
+    file = tmp_path / f"points{ending}"
+    objects = np.array([{"a": 1}], object)
     if ending == ".npy":
         np.save(file, objects, allow_pickle=True)
     else:

@@ -92,7 +92,9 @@ def _built(clock: Clock):
 def test_compile_time_is_all_of_the_block_that_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     """The note once gave 17.6 s of 95 s."""
     clock = stop_clock(monkeypatch)
-    count, before, loaded = len(compiled), compile_seconds(), loading_seconds()
+    count = len(compiled)
+    before = compile_seconds()
+    loaded = loading_seconds()
     with global_compiler_lock:
         clock.now += 3.0
         njit(lambda x: x + 1)(1)

@@ -11,7 +11,8 @@ from robotdiffuse.core.output_files import JsonLines, write_atomically
 
 def test_threads_that_write_one_file_leave_one_of_their_texts(tmp_path: Path) -> None:
     """They shared a temporary file, which one moved away while another wrote it."""
-    file, errors = tmp_path / "a.json", list[Exception]()
+    file = tmp_path / "a.json"
+    errors = list[Exception]()
     texts = [letter * 100_000 for letter in "ab"]
 
     def write(text: str) -> None:

@@ -40,7 +40,9 @@ def test_worker_processes_have_added_entries(one: Rop) -> None:
 
 
 def test_adopted_entries_are_in_registries_made_later() -> None:
-    before, ours, theirs = Registry("fruit", {}), Entry("a:B", "ours"), Entry("c:D", "theirs")
+    before = Registry("fruit", {})
+    ours = Entry("a:B", "ours")
+    theirs = Entry("c:D", "theirs")
     adopt_entries(AddedEntries({"fruit": {"fig": theirs}, "nut": {"hazel": theirs}}, ()))
     assert before == {"fig": theirs}
     assert Registry("nut", {"pecan": ours}) == {"pecan": ours, "hazel": theirs}

@@ -29,9 +29,11 @@ def smooth(legs: int = 1, rate: float = 40.0) -> Trajectory:
     u = np.linspace(0.0, 1.0, int(rate) + 1)[:, None]
     far = np.array([[0.9, -0.5, 0.2]])
     q = (10 * u**3 - 15 * u**4 + 6 * u**5) * far
-    v, a = 30 * u**2 * (1 - u) ** 2 * far, 60 * u * (1 - u) * (1 - 2 * u) * far
+    v = 30 * u**2 * (1 - u) ** 2 * far
+    a = 60 * u * (1 - u) * (1 - 2 * u) * far
     shift = [(1.5 * k + u[:, 0], q + k * far) for k in range(legs)]
-    times, positions = np.concatenate([s[0] for s in shift]), np.concatenate([s[1] for s in shift])
+    times = np.concatenate([s[0] for s in shift])
+    positions = np.concatenate([s[1] for s in shift])
     return Trajectory(("a", "b", "c"), times, positions, np.tile(v, (legs, 1)), np.tile(a, (legs, 1)))
 
 
@@ -57,7 +59,8 @@ def test_no_cell_of_csv_begins_a_formula(tmp_path: Path) -> None:
 
 
 def test_a_cubic_is_exact_at_any_time():
-    rough, fine = cubic(), cubic(101)
+    rough = cubic()
+    fine = cubic(101)
     state = rough.at(fine.times)
     for got, right in zip(state, (fine.positions, fine.velocities, fine.accelerations), strict=False):
         assert np.allclose(got, right, atol=1e-12)

@@ -183,7 +183,8 @@ def test_a_value_of_read_only_arrays_keeps_them() -> None:
 
 
 def test_compiled_code_gets_arrays_of_one_type() -> None:
-    mine, kept = np.zeros(3), read_only(np.zeros(3))
+    mine = np.zeros(3)
+    kept = read_only(np.zeros(3))
     assert for_kernels(mine) is mine
     assert for_kernels(kept).flags.writeable
     assert not np.shares_memory(for_kernels(kept), kept)

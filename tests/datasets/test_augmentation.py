@@ -13,7 +13,8 @@ from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 
 def test_turned_motions_have_the_same_clearances():
-    robot, rng = load_robot("panda"), np.random.default_rng(3)
+    robot = load_robot("panda")
+    rng = np.random.default_rng(3)
     scenes = [ROP_DENSE.scene(rng) for _ in range(6)]
     packed = PackedScenes.pack(scenes, ROP_DENSE.max_obstacles, floor=True)
     start, goal = rng.uniform(robot.lower, robot.upper, (2, 6, robot.dof))

@@ -17,7 +17,9 @@ from robotdiffuse.datasets.rows import resample
 from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_path, split_of, write_manifest, write_shard
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 
-ARM, WAYPOINTS, SIZES = box_arm(), 20, (150, 0, 130, 40)
+ARM = box_arm()
+WAYPOINTS = 20
+SIZES = (150, 0, 130, 40)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +40,8 @@ def stored(store, name):
 
 def test_every_row_of_a_split_once(store):
     split = split_of(PackedScenes(stored(store, "obstacle_kinds"), stored(store, "obstacle_params")))
-    q, pose = stored(store, "trajectories"), stored(store, "target_pose")
+    q = stored(store, "trajectories")
+    pose = stored(store, "target_pose")
     scaled = (q - (ARM.upper + ARM.lower) / 2) / ((ARM.upper - ARM.lower) / 2)
     for i, name in enumerate(SPLITS):
         data = RopDataset(store, name, points=8)
@@ -47,14 +50,16 @@ def test_every_row_of_a_split_once(store):
         np.testing.assert_allclose(batch.trajectories, scaled[split == i], atol=1e-6)
         np.testing.assert_array_equal(batch.target_pose, pose[split == i])
         torch.testing.assert_close(batch.start, batch.trajectories[:, 0], atol=0, rtol=0)
-        goals, index = stored(store, "goals")[split == i], stored(store, "goal_index")[split == i]
+        goals = stored(store, "goals")[split == i]
+        index = stored(store, "goal_index")[split == i]
         goal = data.normalizer.to_unit(goals[np.arange(len(goals)), index])
         np.testing.assert_allclose(batch.goal, goal, atol=1e-6)
         shuffled = joined(data.batches(32))
         assert not torch.equal(shuffled.target_pose, batch.target_pose)
         ours, theirs = (np.lexsort(part.target_pose.numpy().T) for part in (shuffled, batch))
         for field in fields(RopBatch)[:-1]:
-            a, b = getattr(shuffled, field.name)[ours], getattr(batch, field.name)[theirs]
+            a = getattr(shuffled, field.name)[ours]
+            b = getattr(batch, field.name)[theirs]
             torch.testing.assert_close(a, b, atol=0, rtol=0)
 
 
@@ -78,7 +83,8 @@ def test_clouds_lie_on_the_obstacles(store, view, sort_points):
 
 
 def test_the_same_epoch_from_the_same_generator(store):
-    data, threads = RopDataset(store, points=16), torch.get_num_threads()
+    data = RopDataset(store, points=16)
+    threads = torch.get_num_threads()
 
     def epoch(seed):
         return joined(data.batches(50, generator=torch.Generator().manual_seed(seed)))

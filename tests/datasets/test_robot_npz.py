@@ -59,7 +59,8 @@ def test_export_for_the_authors(tmp_path):
     write_shard(tmp_path, 2, arrays, {})
     count, left_out = export_npz(tmp_path, tmp_path / "robot.npz")
     with np.load(tmp_path / "robot.npz") as file:
-        x, y = file["x_train"], file["y_train"]
+        x = file["x_train"]
+        y = file["y_train"]
     kinds = np.concatenate([read_shard(tmp_path, i)["obstacle_kinds"] for i in (0, 1)])
     assert left_out == 53 - count  # 30 + 20 + 3 motions
     assert count == len(x) == ((kinds == SPHERE).sum(1) == 2).sum() + 1
@@ -89,10 +90,12 @@ def test_what_cannot_be_exported(tmp_path):
 
 
 def test_what_was_exported_is_a_data_set_again(tmp_path):
-    file, seen = made(tmp_path), []
+    file = made(tmp_path)
+    seen = []
     assert import_npz(file, tmp_path / "again", progress=lambda *n: seen.append(n)) == 3
     assert seen == [(3, 3)]
-    manifest, before = read_manifest(tmp_path / "again"), read_shard(tmp_path / "set", 0)
+    manifest = read_manifest(tmp_path / "again")
+    before = read_shard(tmp_path / "set", 0)
     shard = check_shard(tmp_path / "again", 0, manifest)
     for name in ("trajectories", "start", "cost", "detour"):
         np.testing.assert_allclose(shard[name], before[name], rtol=1e-6)
@@ -134,11 +137,14 @@ def test_a_header_that_breaks_off_is_one_line(tmp_path):
 
 def test_what_cannot_be_imported(tmp_path, monkeypatch):
     good = arrays_of(tmp_path / "good")
-    x, y = good["x_train"], good["y_train"]
-    moved, endless = y.copy(), x.copy()
+    x = good["x_train"]
+    y = good["y_train"]
+    moved = y.copy()
+    endless = x.copy()
     moved[1, 8] += 0.01
     endless[2, 5, 0] = np.inf
-    file, out = tmp_path / "bad.npz", tmp_path / "out"
+    file = tmp_path / "bad.npz"
+    out = tmp_path / "out"
     for arrays, message in [
         ({"x_train": x}, "is no robot.npz: .*y_train"),
         ({"x_train": x[:, :200], "y_train": y}, r"x_train has shape \(3, 200, 7\); it must be n x 254 x 7"),

@@ -36,7 +36,8 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
-ARM, WAYPOINTS = box_arm(), 12
+ARM = box_arm()
+WAYPOINTS = 12
 
 
 @pytest.fixture
@@ -102,7 +103,8 @@ def test_a_full_disk(tmp_path, arrays, monkeypatch):
     """zarr writes some arrays, then the disk is full: the error names the shard, and nothing stays."""
     write_shard(tmp_path, 0, arrays, {})
     before = files(tmp_path)
-    create, made = zarr.Group.create_array, []
+    create = zarr.Group.create_array
+    made = []
 
     def full(self, name, **how):
         made.append(name)
@@ -155,7 +157,8 @@ def test_arrays_that_do_not_fit(tmp_path, arrays):
 def rewrite(store, name, change):
     """Replace an array of shard 0 behind the back of its fingerprints."""
     group = zarr.open_group(shard_path(store, 0), mode="a")
-    prints, data = dict(group[name].attrs), change(zarr.open_array(shard_path(store, 0) / name)[...])
+    prints = dict(group[name].attrs)
+    data = change(zarr.open_array(shard_path(store, 0) / name)[...])
     group.create_array(name, data=data, chunks=data.shape, attributes=prints, overwrite=True)
 
 

@@ -66,7 +66,8 @@ def test_points_lie_on_surfaces(seen):
 
 def test_uniform_by_area():
     """Shares of shapes and of the six faces of a turned box; heights on a sphere."""
-    kinds, params = np.array([[0, BOX, SPHERE]], np.int8), np.zeros((1, 3, 10), np.float32)
+    kinds = np.array([[0, BOX, SPHERE]], np.int8)
+    params = np.zeros((1, 3, 10), np.float32)
     params[0, 1] = [0.5, -0.3, 0.4, 0.2, 0.5, 0.3, 0.5, 0.5, -0.5, 0.5]
     params[0, 2, :4] = [-0.4, 0.2, 0.6, 0.15]
     n = 40_000
@@ -89,7 +90,8 @@ def test_uniform_by_area():
 
 def test_agrees_with_the_clouds_of_single_scenes():
     scenes, _ = some_scenes(20, 5, 3)
-    n, rng = 4000, np.random.default_rng(0)
+    n = 4000
+    rng = np.random.default_rng(0)
     ours = surface_clouds(scenes, n, seeded(), region=PANDA_REGION).numpy()
     single = [sample_surface(scenes.scene(i), n, rng, PANDA_REGION) for i in range(len(scenes))]
     theirs = np.stack([points if len(points) else np.zeros((n, 3)) for points in single])

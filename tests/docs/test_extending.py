@@ -34,7 +34,8 @@ TABLES: tuple[dict[str, Any], ...] = (
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     """What the page's Python made, while its lines are in the tables."""
-    folder, tables = tmp_path_factory.mktemp("extending"), [dict(table) for table in TABLES]
+    folder = tmp_path_factory.mktemp("extending")
+    tables = [dict(table) for table in TABLES]
     notebook = Notebook(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -84,7 +85,8 @@ def test_a_metric_is_measured(names: dict[str, Any]) -> None:
 
 
 def test_a_shape_is_everywhere(names: dict[str, Any], tmp_path: Path) -> None:
-    problem, result = names["around_cone"], names["result"]
+    problem = names["around_cone"]
+    result = names["result"]
     [cone] = problem.scene.shapes
     assert result.solved and problem_record(problem)["scene"][0]["cone"]["height"] == cone.height  # type: ignore[index]
     line = np.linspace(problem.start, problem.goal.positions[0], 50)

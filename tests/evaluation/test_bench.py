@@ -64,7 +64,8 @@ def keys(records: list[Record]) -> Counter:
 
 @pytest.mark.slow
 def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -> None:
-    plain, with_settings = "rrt_connect", "rrt_connect:optimize_time=0.05:tightenings=0"
+    plain = "rrt_connect"
+    with_settings = "rrt_connect:optimize_time=0.05:tightenings=0"
     asked = replace(settings(tmp_path, f"{plain},{with_settings}", count=2), seeds=2)
     assert run_bench(asked, quiet, quiet) == 8
     assert run_bench(asked, quiet, quiet) == 0
@@ -212,7 +213,9 @@ def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> Non
 
 def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever else the machine does then hits them alike; so many calls are made at once all the time."""
-    calls, at_once, most = [], [0], [0]
+    calls = []
+    at_once = [0]
+    most = [0]
 
     def plan(self: PlannerProcess, run: Run, restarts: bool) -> list[dict]:
         at_once[0] += 1
@@ -291,7 +294,8 @@ def test_nontrivial_problems_are_not_solved_by_the_line(tmp_path: Path) -> None:
     assert [case.key for case in again] == [case.key for case in cases]
     more = gather_cases(["rop"], 5, tmp_path, quiet)
     assert [case.name for case in more] == [f"rop/{i}" for i in range(5)]
-    kept, drawn = cases[2].problem, held_out_problem("rop", 0)
+    kept = cases[2].problem
+    drawn = held_out_problem("rop", 0)
     np.testing.assert_array_equal(kept.start, drawn.start)
 
 
@@ -320,7 +324,8 @@ def test_other_problems_of_the_same_name_are_refused(tmp_path: Path) -> None:
     for folder, line in zip("ab", lines, strict=True):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "mine.jsonl").write_text(line)
-    first, other = str(tmp_path / "a" / "mine.jsonl"), str(tmp_path / "b" / "mine.jsonl")
+    first = str(tmp_path / "a" / "mine.jsonl")
+    other = str(tmp_path / "b" / "mine.jsonl")
     for _ in range(2):
         assert len(gather_cases([first], None, tmp_path / "out", quiet)) == 1
     with pytest.raises(InputError, match=r"problems called mine that were read from .*; those in .* others"):

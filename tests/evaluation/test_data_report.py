@@ -64,7 +64,8 @@ def test_large_sets_are_sampled_evenly(tmp_path, rows, monkeypatch):
 
 
 def test_page(tmp_path, rows):
-    data, file = tmp_path / "arm <1>", tmp_path / "report.html"
+    data = tmp_path / "arm <1>"
+    file = tmp_path / "report.html"
     write_motions(data, ARM, rows)
     write_page(data, file, ARM)
     page = file.read_text("utf-8")

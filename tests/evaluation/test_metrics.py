@@ -45,7 +45,8 @@ END = np.array([0.6, -0.4, 0.3, -2.0, 0.2, 1.8, 0.5])
 
 
 def minimum_jerk(duration: float, start: np.ndarray, end: np.ndarray, rows: int = 501) -> Trajectory:
-    s, way = np.linspace(0, 1, rows), np.asarray(end) - start
+    s = np.linspace(0, 1, rows)
+    way = np.asarray(end) - start
     p, v, a = (MINIMUM_JERK.deriv(k)(s)[:, None] * way / duration**k for k in range(3))
     names = tuple(f"j{i}" for i in range(len(way)))
     return Trajectory(names, s * duration, start + p, v, a)
@@ -90,7 +91,9 @@ def test_turning_is_the_sum_of_the_angles() -> None:
 
 def test_bending_of_a_sine_by_hand() -> None:
     """q = (u, a sin(pi k u)), in its length's unit; a small amplitude leaves its speed even."""
-    u, a, k = np.linspace(0, 1, 4001), 0.003, 3
+    u = np.linspace(0, 1, 4001)
+    a = 0.003
+    k = 3
     q = np.stack([u, a * np.sin(np.pi * k * u)], axis=1)
     assert bending(q) == pytest.approx((a * (np.pi * k) ** 2) ** 2 / 2, rel=0.01)
     assert bending(5 * q) == pytest.approx(bending(q))
@@ -106,7 +109,8 @@ def test_dimensionless_jerk_of_minimum_jerk_is_720(duration: float, amplitude: f
 
 def test_jerk_of_jumps_of_the_acceleration_by_hand() -> None:
     """Full speed up, then full braking: three jumps of a, 2a and a, each spread over a row of 10 ms."""
-    t, a = np.linspace(0, 2, 201), 1.5
+    t = np.linspace(0, 2, 201)
+    a = 1.5
     acceleration = np.where(t < 1, a, -a)
     velocity = np.where(t < 1, a * t, a * (2 - t))
     position = np.where(t < 1, a * t**2 / 2, a - a * (2 - t) ** 2 / 2)
@@ -132,7 +136,8 @@ def arc_length_by_quadrature(speed: np.polynomial.Polynomial, duration: float) -
     last = frequencies[np.flatnonzero(values >= 0.05)[-1]]
 
     def curve(f: float) -> float:
-        v, slope = spectrum(f, 0), -2j * np.pi * spectrum(f, 1)
+        v = spectrum(f, 0)
+        slope = -2j * np.pi * spectrum(f, 1)
         return float(np.hypot(1 / last, (v.conjugate() * slope).real / abs(v) / whole))
 
     return -quad(curve, 0, last, epsrel=1e-6)[0]
@@ -239,7 +244,8 @@ def test_one_centimetre_and_fifteen_degrees_are_settings(shift: float, angle: fl
     axis = np.array([0.6, 0.0, 0.8])
     T = link_pose(PANDA, END, "panda_hand")
     T = transform(T[:3, 3] + shift * axis, rotation_about(axis, np.radians(angle)) @ T[:3, :3])
-    goal, rows = PoseGoal("panda_hand", T), np.stack([START, END])
+    goal = PoseGoal("panda_hand", T)
+    rows = np.stack([START, END])
     assert panda_verdict(rows, goal) == kind
     loose = {"goal_distance": 0.012, "goal_angle": float(np.radians(17))}
     strict = {"goal_distance": 0.008, "goal_angle": float(np.radians(13))}
@@ -254,7 +260,8 @@ def test_exceeded_limits_fail(joint: int, upper: bool) -> None:
     base = np.array([0, 0, 0, -2.0, 0, 1.571, 0.785])
     if joint == 3 and not upper:
         base = START  # bent back, so that closing the elbow does not put the hand into the base
-    at, beyond = base.copy(), base.copy()
+    at = base.copy()
+    beyond = base.copy()
     at[joint] = (PANDA.upper if upper else PANDA.lower)[joint]
     beyond[joint] = at[joint] + (1e-3 if upper else -1e-3)
     assert panda_verdict(np.stack([base, at, base])) == ""
@@ -284,7 +291,8 @@ def test_scene_collision_fails_from_contact_on(gap: float, kind: str | None) -> 
 
 @pytest.mark.parametrize(("reversals", "kind"), [(3, ""), (4, "twitch")])
 def test_twitching_fails_by_the_number_of_reversals(reversals: int, kind: str) -> None:
-    there, back = START, START + 0.1
+    there = START
+    back = START + 0.1
     rows = np.stack([back if i % 2 else there for i in range(reversals + 2)])
     assert panda_verdict(rows) == kind
     assert panda_verdict(rows, reversals=reversals) == ""
@@ -327,7 +335,8 @@ def test_bootstrap_of_the_mean_has_the_normal_width() -> None:
 
 
 def test_paired_success_is_the_exact_test_of_mcnemar() -> None:
-    a, b = np.full(100, np.nan), np.full(100, np.nan)
+    a = np.full(100, np.nan)
+    b = np.full(100, np.nan)
     a[:80] = b[:80] = 2.0
     b[80:85] = a[85:97] = 2.0
     found = compare(a, b)

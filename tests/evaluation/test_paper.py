@@ -103,7 +103,8 @@ def test_a_small_page_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_both_goals_are_of_one_problem() -> None:
     drawn = draw_problem(3)
-    pose, joint = drawn[POSE], drawn[JOINT]
+    pose = drawn[POSE]
+    joint = drawn[JOINT]
     assert isinstance(pose.goal, PoseGoal)
     np.testing.assert_array_equal(pose.start, joint.start)
     configuration = goal_configurations(joint)[0]

@@ -28,7 +28,9 @@ SETTINGS = GenerationSettings(
 
 
 def rows_of(settings: GenerationSettings, count: int) -> list[tuple[int, dict[str, Any]]]:
-    robot, found, number = load_robot(settings.robot), [], 0
+    robot = load_robot(settings.robot)
+    found = []
+    number = 0
     while len(found) < count:
         row = solve(settings, robot, number)
         if not isinstance(row, str):
@@ -39,7 +41,8 @@ def rows_of(settings: GenerationSettings, count: int) -> list[tuple[int, dict[st
 
 @pytest.mark.parametrize("name", ["panda", "ur5e"])
 def test_motions_are_free_reach_a_goal_and_keep_their_distance(name: str) -> None:
-    settings, robot = replace(SETTINGS, robot=name), load_robot(name)
+    settings = replace(SETTINGS, robot=name)
+    robot = load_robot(name)
     for number, row in rows_of(settings, 3):
         drawn = draw(settings, robot, np.random.default_rng([settings.seed, number]))[1]
         q = np.asarray(row["trajectories"], np.float64)
@@ -66,7 +69,8 @@ def test_the_same_number_gives_the_same_row() -> None:
 def test_goals_a_turn_away_are_taken_the_short_way() -> None:
     """Of an arm whose joints turn twice, a seventh of the motions went the long way round, to a goal that the
     validator did not know."""
-    robot, far = load_robot("ur5e"), list[int]()
+    robot = load_robot("ur5e")
+    far = list[int]()
     settings = GenerationSettings(robot="ur5e", mix={"rop": 1.0}, target="pose", goals=1, waypoints=16)
     turning = robot.upper - robot.lower > 2 * np.pi + 0.1
     for number in range(60):

@@ -38,7 +38,8 @@ PANDA = load_robot("panda")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out, seen = tmp_path_factory.mktemp("data") / "new", []
+    out = tmp_path_factory.mktemp("data") / "new"
+    seen = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(factory, "on_this_machine", in_this_process)
         assert generate(SETTINGS, out, progress=lambda *at: seen.append(at)) == 12
@@ -192,7 +193,8 @@ def test_thinning_leaves_out_what_the_line_solves_and_nothing_else() -> None:
 
 def test_frames_in_time_keep_the_velocity_limits() -> None:
     arrays, _ = make_shard(replace(SETTINGS, trajectories=3, timing="time"), 0)
-    times, q = arrays["times"].astype(float), arrays["trajectories"].astype(float)
+    times = arrays["times"].astype(float)
+    q = arrays["trajectories"].astype(float)
     assert times.shape == (3, 32) and (times[:, 0] == 0).all() and (np.diff(times) > 0).all()
     np.testing.assert_allclose(np.diff(times, 2), 0, atol=1e-5)
     rates = np.abs(np.diff(q, axis=1)) / np.diff(times)[..., None]
@@ -329,7 +331,8 @@ def test_furniture_among_the_families(tmp_path: Path) -> None:
     """Fingers in a compartment, a crate or on a table at both ends; scenes with their own floor."""
     settings = replace(SETTINGS, mix={"shelf": 1.0, "crate": 1.0, "table": 1.0}, trajectories=6, shard=6)
     generate(settings, tmp_path, 1)
-    manifest, shard = read_manifest(tmp_path), check_shard(tmp_path, 0, read_manifest(tmp_path))
+    manifest = read_manifest(tmp_path)
+    shard = check_shard(tmp_path, 0, read_manifest(tmp_path))
     assert manifest.slots == 16 and len(set(shard["family"].tolist())) > 1
     robot = load_robot("panda")
     for row in range(6):

@@ -23,7 +23,9 @@ from helpers.factory_runs import (
 from robotdiffuse.core.errors import InputError, OutputError
 from robotdiffuse.generation import GenerationSettings, factory, generate
 
-TRAJECTORIES, SHARD, WAYPOINTS = 54, 3, 16
+TRAJECTORIES = 54
+SHARD = 3
+WAYPOINTS = 16
 SHARDS = TRAJECTORIES // SHARD
 SETTINGS = GenerationSettings(trajectories=TRAJECTORIES, shard=SHARD, waypoints=WAYPOINTS)
 

@@ -58,7 +58,8 @@ def test_a_node_killed_midway_changes_nothing(
 ) -> None:
     node = cluster.add_node(num_cpus=1, object_store_memory=STORE)
     cluster.wait_for_nodes()
-    begun, seen = threading.Event(), []
+    begun = threading.Event()
+    seen = []
 
     def kill() -> None:
         begun.wait()

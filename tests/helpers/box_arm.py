@@ -34,9 +34,12 @@ def box_arm(spheres: bool = True) -> Robot:
     """
     lengths = (0.5, 0.4, 0.3)
     robot = planar_arm(*lengths)
-    meshes, covers, w = {}, {}, HALF_WIDTH
+    meshes = {}
+    covers = {}
+    w = HALF_WIDTH
     for i, length in enumerate(lengths, 1):
-        low, high = np.array([0.0, -w, -w]), np.array([length, w, w])
+        low = np.array([0.0, -w, -w])
+        high = np.array([length, w, w])
         cells = int(length / 0.05)
         xs = (np.arange(cells) + 0.5) * length / cells
         radius = float(np.linalg.norm([length / cells / 2, w, w]))

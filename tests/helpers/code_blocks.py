@@ -59,7 +59,8 @@ def code_blocks(page: Path) -> list[Block]:
     opened: tuple[int, str, int] | None = None
     lines = page.read_text(encoding="utf-8").split("\n")
     for i, text in enumerate(lines):
-        fence, mark = FENCE.match(text), MARK.match(text)
+        fence = FENCE.match(text)
+        mark = MARK.match(text)
         if opened is None and fence:
             opened = i + 1, fence.group(2), len(fence.group(1))
         elif opened is not None and fence:
@@ -67,7 +68,9 @@ def code_blocks(page: Path) -> list[Block]:
             code = "".join(line[indent:] + "\n" for line in lines[begin:i])
             where = f"{page.relative_to(ROOT)}:{begin + 1}"
             blocks.append(Block(where, begin + 1, language, code, marks, tuple(needs)))
-            opened, marks, needs = None, {}, []
+            opened = None
+            marks = {}
+            needs = []
         elif opened is None and mark and mark.group(1) == "needs":
             needs.append(mark.group(2))
         elif opened is None and mark:
@@ -185,7 +188,8 @@ def _command(words: list[str], run: bool) -> None:
     if "robotdiffuse" in words and program in ("python", "torchrun"):
         at = words.index("robotdiffuse")
         assert words[at - 1] == "-m", f"{' '.join(words)}: robotdiffuse is a module"
-        program, words = "robotdiffuse", words[at:]
+        program = "robotdiffuse"
+        words = words[at:]
     if program == "robotdiffuse":
         build_parser().parse_args(words[1:])
         if run:

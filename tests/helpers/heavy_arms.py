@@ -21,8 +21,10 @@ def pendulum(effort: float) -> Robot:
 
 def sliding() -> Robot:
     """Turns, slides, turns and slides, about and along axes of all directions."""
-    kinds, axes = ("revolute", "prismatic", "revolute", "prismatic"), np.eye(3)[[2, 0, 1, 2]]
-    joints, inertias = [], {}
+    kinds = ("revolute", "prismatic", "revolute", "prismatic")
+    axes = np.eye(3)[[2, 0, 1, 2]]
+    joints = []
+    inertias = {}
     for k, (kind, axis) in enumerate(zip(kinds, axes, strict=True)):
         limits = (-1.0, 1.0, 2.0, 8.0, 80.0)
         offset = transform(np.array([0.1, 0.2, 0.1 * k]), rotation_about(axes[(k + 1) % 4], 0.5 * k))

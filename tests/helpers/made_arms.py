@@ -28,7 +28,8 @@ def joint(
 
 def chain(base: str, names: Iterable[str], **how: str) -> str:
     """Joints in a row, each with a link of its name and `_link`, from an existing base on."""
-    parts, parent = [], base
+    parts = []
+    parent = base
     for i, name in enumerate(names):
         axis = "0 0 1" if i % 2 == 0 else "0 1 0"
         parts += [link(f"{name}_link"), joint(name, parent, f"{name}_link", **({"axis": axis} | how))]

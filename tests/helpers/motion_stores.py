@@ -26,8 +26,10 @@ def record(
     robot: Robot, scene: Scene, q: ndarray, family: int = 0, line_free: bool = True
 ) -> dict[str, ndarray]:
     """The row of a motion; the last goal is missing, the second one was not reached."""
-    goals, costs = np.full((GOALS, robot.dof), np.nan), np.full(GOALS, np.nan)
-    goals[0], goals[1] = q[-1], q[-1] + 0.1
+    goals = np.full((GOALS, robot.dof), np.nan)
+    costs = np.full(GOALS, np.nan)
+    goals[0] = q[-1]
+    goals[1] = q[-1] + 0.1
     length = np.linalg.norm(np.diff(q.astype(np.float64), axis=0), axis=1).sum()
     costs[:2] = length, np.inf
     packed = PackedScenes.pack([scene], SLOTS)

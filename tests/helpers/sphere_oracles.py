@@ -22,7 +22,9 @@ TOLERANCE = 1e-5
 
 def sphere_centres(robot: Robot, q: ndarray) -> tuple[list[ndarray], list[ndarray]]:
     """Centres [n, k, 3] and radii [k] of the spheres of each group, base frame."""
-    frames, centres, radii = forward_frames(robot, q), [], []
+    frames = forward_frames(robot, q)
+    centres = []
+    radii = []
     for link in robot_groups(robot):
         T = frames[:, robot.link_frame(link)] @ robot.T_frame_link(link)
         spheres = robot.spheres[link]
@@ -79,7 +81,8 @@ def with_spheres(name: str) -> Robot:
         return load_robot("panda")
     if name == "box_arm":
         return box_arm()
-    robot, rng = example_robot(name), np.random.default_rng(0)
+    robot = example_robot(name)
+    rng = np.random.default_rng(0)
     links = [link for link in robot.link_names if robot.link_frame(link) > 0 or link == robot.base]
     spheres = {
         link: np.column_stack([rng.uniform(-0.1, 0.1, (4, 3)), rng.uniform(0.01, 0.06, 4)]) for link in links

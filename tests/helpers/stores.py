@@ -12,7 +12,9 @@ from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE
 
-WAYPOINTS, SLOTS, GOALS = 254, 4, 3
+WAYPOINTS = 254
+SLOTS = 4
+GOALS = 3
 
 
 def manifest_of(robot: Robot, waypoints: int = WAYPOINTS, **changes: Any) -> Manifest:
@@ -79,7 +81,8 @@ def random_arrays(robot: Robot, n: int, rng: Generator, waypoints: int = WAYPOIN
 
 def write_store(folder: Path, robot: Robot, sizes: tuple[int, ...], waypoints: int = WAYPOINTS) -> Manifest:
     """A manifest and a shard of each size."""
-    rng, manifest = np.random.default_rng(0), manifest_of(robot, waypoints)
+    rng = np.random.default_rng(0)
+    manifest = manifest_of(robot, waypoints)
     write_manifest(folder, manifest)
     for i, n in enumerate(sizes):
         write_shard(folder, i, random_arrays(robot, n, rng, waypoints), {"tried": n, "solved": n})

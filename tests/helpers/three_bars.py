@@ -18,7 +18,8 @@ def bar(length: float) -> ConvexMesh:
 def three_bars() -> Robot:
     """Three bars: a turning pillar, a hinge with its axis off z, a slide."""
     quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    z, y = np.array([0.0, 0, 1]), np.array([0.0, 1, 0])
+    z = np.array([0.0, 0, 1])
+    y = np.array([0.0, 1, 0])
     limits = (-3.0, 3.0, 2.0, 5.0, 50.0)
     joints = (
         Joint("turn", "revolute", "base", "pillar", transform(np.array([0, 0, 0.1])), z, *limits),

@@ -84,7 +84,10 @@ def _read_mesh(file: Path, T_link_mesh: ndarray) -> list[tuple[ndarray, ndarray,
 
 
 def _joined(parts: list[tuple[ndarray, ndarray, ndarray]], share: float) -> VisualMesh:
-    vertices, faces, colors, count = [], [], [], 0
+    vertices = []
+    faces = []
+    colors = []
+    count = 0
     for points, triangles, color in parts:
         # Small pieces (covers, lamps, labels) lose their shape first, so they keep more of their faces.
         target = min(len(triangles), max(int(share * len(triangles)), 500))

@@ -72,7 +72,8 @@ def recording(file: Path, change: Callable[[dict[str, Any]], None] = lambda mess
     pixels = np.array([[500, 0], [1500, 2000]], "<u2")
     k = [300.0, 0.0, 0.5, 0.0, 310.0, 0.4, 0.0, 0.0, 1.0]
     image = {"header": header, "height": 2, "width": 2, "encoding": "16UC1", "step": 4}
-    names, rows = list(reversed(PANDA.joint_names)), (1.0, 1.1)
+    names = list(reversed(PANDA.joint_names))
+    rows = (1.0, 1.1)
     messages: dict[str, Any] = {
         "/joint_states": [
             {"header": {"stamp": stamp(at)}, "name": names, "position": (HOME[::-1] + at).tolist()}

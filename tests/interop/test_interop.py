@@ -30,7 +30,8 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify_trajectory
 
-START, GOAL = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+START = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+GOAL = [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 
 
 @pytest.fixture(scope="module")
@@ -291,7 +292,8 @@ def test_times_that_begin_later_and_no_times() -> None:
 
 
 def test_positions_and_times_alone_are_validated_on_the_smoothest_curve() -> None:
-    robot, t = box_arm(), np.linspace(0, 2, 41)
+    robot = box_arm()
+    t = np.linspace(0, 2, 41)
     s = 10 * (t / 2) ** 3 - 15 * (t / 2) ** 4 + 6 * (t / 2) ** 5
     q = np.outer(s, [0.5, -0.4, 0.3])
     found = motion_of_robot(checked_motion(robot.joint_names, q, t), robot)
@@ -438,7 +440,8 @@ def test_bad_csv(text: str, wanted: str, tmp_path: Path) -> None:
 
 
 def test_names_of_joints_are_no_formulas_for_a_spreadsheet(tmp_path: Path) -> None:
-    names, rows = ("=1+1", "-a", "+b", "@c", "plain"), np.arange(10.0).reshape(2, 5) - 4
+    names = ("=1+1", "-a", "+b", "@c", "plain")
+    rows = np.arange(10.0).reshape(2, 5) - 4
     Trajectory(names, np.array([0.0, 1.0]), rows, rows, rows).save(tmp_path / "m.csv")
     header = (tmp_path / "m.csv").read_text().partition("\n")[0].split(",")
     assert not [cell for cell in header if cell[0] in "=+-@"] and "plain_position" in header
@@ -567,7 +570,8 @@ PROBLEM = Problem(
 
 def test_a_bag_replaces_a_link_to_one(tmp_path: Path) -> None:
     """It failed, since a folder cannot be renamed to a link."""
-    link, first = tmp_path / "m.rosbag2", tmp_path / "first.rosbag2"
+    link = tmp_path / "m.rosbag2"
+    first = tmp_path / "first.rosbag2"
     write_motion(PROBLEM, MOTION, first)
     link.symlink_to(first)
     write_motion(PROBLEM, MOTION, link)
@@ -597,7 +601,8 @@ def test_two_exports_to_one_bag_do_not_share_a_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each deleted the half-written bag of the other."""
-    bag, to_message = tmp_path / "m.rosbag2", rosbag.to_message
+    bag = tmp_path / "m.rosbag2"
+    to_message = rosbag.to_message
 
     def interrupted(kind: str, content: dict) -> object:
         monkeypatch.setattr(rosbag, "to_message", to_message)

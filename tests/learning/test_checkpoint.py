@@ -35,7 +35,8 @@ def test_checkpoint_round_trip(tmp_path):
     loaded = load_model(tmp_path, box_arm())
     assert loaded.settings == model.settings
     torch.testing.assert_close(loaded.noise_factor, model.noise_factor, atol=0, rtol=0)
-    weights, kept = loaded.denoiser.state_dict(), model.denoiser.state_dict()
+    weights = loaded.denoiser.state_dict()
+    kept = model.denoiser.state_dict()
     for name, weight in kept.items():
         torch.testing.assert_close(weights[name].float(), weight, atol=1e-3, rtol=1e-2)
     z = [m.encode(cloud(50)[0].numpy()) for m in (model.requires_grad_(False), loaded)]
@@ -62,7 +63,8 @@ def test_other_links_with_spheres_are_refused(tmp_path):
 
 
 def damage(folder, case):
-    weights, about = folder / "model.safetensors", folder / "model.json"
+    weights = folder / "model.safetensors"
+    about = folder / "model.json"
     if case == "truncated":
         weights.write_bytes(weights.read_bytes()[:-100])
     elif case == "bit":

@@ -31,7 +31,8 @@ def test_a_held_object_counts_as_a_part_of_what_carries_it(carrier: str, clearan
     checkers = CollisionChecker(PANDA, scene), CollisionChecker(held, scene)
     bare, carrying = (link_clearances(checker, settings)(q) for checker in checkers)
     assert bare.shape == carrying.shape, "the network was trained for the bare arm"
-    links, own = checkers[0].links, checkers[1]
+    links = checkers[0].links
+    own = checkers[1]
     rod = own.link_clearances(q.reshape(-1, 7), MAX_CLEARANCE)[:, own.links.index("rod")]
     at = links.index(carrier)
     expected = bare[..., : len(links)].copy()

@@ -59,7 +59,8 @@ def test_samples_agree_with_the_scene(family: str) -> None:
     """Almost none of the voxels seen free are occupied, and most of those seen occupied are."""
     samples = draw_samples((family,), PANDA, range(4))
     truth = unpack_fine(samples.truth)
-    free, occupied = (samples.seen & FREE) > 0, (samples.seen & OCCUPIED) > 0
+    free = (samples.seen & FREE) > 0
+    occupied = (samples.seen & OCCUPIED) > 0
     assert free.mean() > 0.05 and truth[free].mean() < 1e-3
     assert truth[occupied].any(axis=-1).mean() > 0.85, "the rest touch a corner"
     assert (samples.behind[free | occupied] == 0).all()
@@ -160,10 +161,12 @@ def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path
     assert again.keys() == report.keys() and report["samples"] == 8
     whole = load_completion(tmp_path / "whole")
     assert whole.temperature > 0 and not any(p.requires_grad for p in whole.parameters())
-    rng, other = np.random.default_rng(2), np.random.default_rng(2)
+    rng = np.random.default_rng(2)
+    other = np.random.default_rng(2)
     ahead, alone = (SamplePrefetcher(("rop",), PANDA, 2, workers) for workers in (1, 0))
     for _ in range(3):
-        a, b = ahead.next(rng), alone.next(other)
+        a = ahead.next(rng)
+        b = alone.next(other)
         assert all((x == y).all() for x, y in zip(a, b, strict=True))
     skipped = np.random.default_rng(3)
     assert (ahead.next(skipped).seen == alone.next(np.random.default_rng(3)).seen).all()
@@ -216,11 +219,13 @@ def test_bundled_weights_are_better_than_a_constant(family: str) -> None:
     """Average precision over unknown voxels of 2 cm above the ground; a constant has the share of occupied
     ones."""
     samples = draw_samples((family,), PANDA, range(11, 19))
-    network, above = exported_completion(), training.voxel_centers()[..., 2] > 0.02
+    network = exported_completion()
+    above = training.voxel_centers()[..., 2] > 0.02
     p = [network(*volume) for volume in zip(samples.seen, samples.behind, strict=True)]
     truth = unpack_fine(samples.truth)
     counted = ((samples.seen & (FREE | OCCUPIED)) == 0) & training.reachable() & above
     stated = np.stack([unpack_fine(pack_fine(one > 0.1)) for one in p])
-    called, true = stated[counted], truth[counted]
+    called = stated[counted]
+    true = truth[counted]
     assert called[true].mean() > 0.4, "recall"
     assert true[called].mean() > 3 * true.mean(), "precision"

@@ -28,7 +28,9 @@ from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.weight_files import RobotIdentity
 
-DOF, FEATURES, CODE = 3, 9, 9
+DOF = 3
+FEATURES = 9
+CODE = 9
 CONDITION = CODE + 2 * DOF
 SMALL = {
     "transformer": TransformerSettings(32, 2, 2, 48, 1),
@@ -162,7 +164,8 @@ def test_sizes(name):
 
 def test_z_tk_as_a_token_only():
     plain = replace(SMALL["transformer"], add_z_tk=False)
-    network, added = denoiser("transformer", settings=plain), denoiser("transformer")
+    network = denoiser("transformer", settings=plain)
+    added = denoiser("transformer")
     added.load_state_dict(network.state_dict())
     assert not torch.allclose(network(*inputs()), added(*inputs()))
     for parameter, values in network.named_parameters():
@@ -245,7 +248,8 @@ def model_with(name: str, null_condition: bool = False) -> MotionNetwork:
 
 def sample(model: MotionModel, scale: float = 1.0) -> np.ndarray:
     code = np.ones(model.settings.code, np.float32)
-    start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
+    start = np.array([-1.0, 0.5, 2.0])
+    goal = np.array([1.5, -0.5, 0.1])
 
     def clearances(q: np.ndarray) -> np.ndarray:
         return np.full((*q.shape[:-1], len(model.robot.links)), 0.1, np.float32)

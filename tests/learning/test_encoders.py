@@ -71,7 +71,8 @@ def small(name, seed=0):
 def cloud(n, batch=1, seed=0):
     """Points in the region."""
     generator = torch.Generator().manual_seed(seed)
-    low, high = torch.tensor([-0.5, -0.5, 0.1]), torch.tensor([0.5, 0.5, 0.9])
+    low = torch.tensor([-0.5, -0.5, 0.1])
+    high = torch.tensor([0.5, 0.5, 0.9])
     return low + (high - low) * torch.rand(batch, n, 3, generator=generator)
 
 
@@ -95,7 +96,8 @@ def test_any_number_of_points(name, n):
 def test_any_number_of_obstacles(name):
     encoder = small(name)
     scenes = random_scenes(13, 12, np.random.default_rng(0))
-    kinds, params = scenes.kinds, scenes.params
+    kinds = scenes.kinds
+    params = scenes.params
     kinds[:] = np.where(np.arange(12) < np.arange(13)[:, None], SPHERE, 0)
     params[..., :3] = np.random.default_rng(1).uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 1.2], (13, 12, 3))
     params[..., 3] = 0.1
@@ -111,7 +113,8 @@ def test_any_number_of_obstacles(name):
 @settings(max_examples=10, deadline=None)
 @given(n=st.integers(1, 90), seed=st.integers(0, 1000))
 def test_order_does_not_matter(name, n, seed):
-    encoder, points = small(name), cloud(n, 2, seed)
+    encoder = small(name)
+    points = cloud(n, 2, seed)
     order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
     torch.testing.assert_close(encoder(points[:, order]), encoder(points), atol=2e-5, rtol=1e-5)
 
@@ -120,13 +123,15 @@ def test_order_does_not_matter(name, n, seed):
 @pytest.mark.parametrize("n", [1, 2, 20])
 def test_repetition_does_not_matter(name, n):
     """DGCNN is left out: repeated points are each other's nearest neighbours."""
-    encoder, points = small(name), cloud(n)
+    encoder = small(name)
+    points = cloud(n)
     torch.testing.assert_close(encoder(points.repeat(1, 3, 1)), encoder(points), atol=1e-5, rtol=1e-5)
 
 
 @every_encoder
 def test_points_out_of_the_region_do_not_count(name):
-    encoder, points = small(name), cloud(20)
+    encoder = small(name)
+    points = cloud(20)
     out = torch.tensor([[[3.0, 0.0, 0.5], [0.3, 0.0, -0.2], [0.0, 0.0, 0.0]]])
     torch.testing.assert_close(encoder(torch.cat([out, points], 1)), encoder(points), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(encoder(out), encoder(torch.zeros(1, 1, 3)))
@@ -271,7 +276,8 @@ def test_compression_autoencoder_reconstructs_a_small_set():
 def test_edge_convolution_is_the_maximum_over_edges():
     """Against the layer as in the paper, edge by edge."""
     torch.manual_seed(0)
-    layer, x = EdgeConvolution(5, 7, 4), torch.randn(2, 12, 5)
+    layer = EdgeConvolution(5, 7, 4)
+    x = torch.randn(2, 12, 5)
     near = torch.ones(2, 12, dtype=torch.bool)
     index = neighbours(x, near, 4)
     for b in range(2):

@@ -34,7 +34,8 @@ def assert_same(exported: np.ndarray, ours: np.ndarray) -> None:
 @pytest.mark.parametrize("name", ["model", "trajectory_prior"])
 @pytest.mark.parametrize("batch", [1, 16])
 def test_bundled_denoisers(name: str, batch: int) -> None:
-    exported, network = exported_model(name, None, PANDA), load_network(name, None, PANDA)
+    exported = exported_model(name, None, PANDA)
+    network = load_network(name, None, PANDA)
     assert isinstance(network, MotionNetwork) and exported.settings == network.settings
     for ours, its in zip(network.statistics, exported.statistics, strict=True):
         np.testing.assert_array_equal(ours, its)
@@ -51,7 +52,8 @@ def test_bundled_denoisers(name: str, batch: int) -> None:
 @pytest.mark.parametrize("points", [0, 1, 320, 5000])
 def test_bundled_encoder(points: int) -> None:
     cloud = np.random.default_rng(points).uniform(-0.7, 0.7, (points, 3))
-    exported, network = exported_model("model", None, PANDA), load_network("model", None, PANDA)
+    exported = exported_model("model", None, PANDA)
+    network = load_network("model", None, PANDA)
     assert_same(exported.encode(cloud), network.encode(cloud))
 
 

@@ -96,7 +96,10 @@ def test_limits_are_kept() -> None:
 
 
 def test_random_motions_of_the_panda_get_better() -> None:
-    robot, before, after, solved = load_robot("panda"), 0.0, 0.0, 0
+    robot = load_robot("panda")
+    before = 0.0
+    after = 0.0
+    solved = 0
     for seed in range(20):
         problem = ROP_DENSE.draw(robot, np.random.default_rng(seed)).problem(robot)
         assert isinstance(problem.goal, JointGoal)
@@ -164,7 +167,8 @@ def formulas(guidance: CollisionGuidance, q: ndarray) -> dict[str, ndarray]:
 
     In rad², the collision costs in m². All waypoints count.
     """
-    checker, given = guidance.checker, guidance.settings
+    checker = guidance.checker
+    given = guidance.settings
 
     def collision(margin: float, self_margin: float) -> ndarray:
         costs, _ = checker.cost_gradients(q.reshape(-1, q.shape[2]), margin, self_margin)
@@ -183,7 +187,8 @@ def formulas(guidance: CollisionGuidance, q: ndarray) -> dict[str, ndarray]:
 @settings(max_examples=15)
 @given(seed=st.integers(0, 10_000))
 def test_steps_descend(name: str, seed: int) -> None:
-    guidance, q = CollisionGuidance(CROWDED, ALONE[name]), random_motions(seed)
+    guidance = CollisionGuidance(CROWDED, ALONE[name])
+    q = random_motions(seed)
     before = formulas(guidance, q)[name]
     for _ in range(4):
         moved, _ = guidance(q, 1)
@@ -191,7 +196,8 @@ def test_steps_descend(name: str, seed: int) -> None:
         assert (after <= before * (1 + 1e-5) + 1e-7).all(), "up to rounding in float32"
         np.testing.assert_array_equal(moved[:, [0, -1]], q[:, [0, -1]])
         assert ((moved >= PANDA.lower.astype(np.float32)) & (moved <= PANDA.upper.astype(np.float32))).all()
-        q, before = moved, after
+        q = moved
+        before = after
 
 
 @pytest.mark.parametrize("name", ALONE)
@@ -327,7 +333,8 @@ def test_steps_go_down_until_all_waypoints_keep_it(constraint: Constraint) -> No
     before = constraint_cost(constraints, 0.95, q)
     off = before > 0
     assert off.sum() >= 3
-    once, many = guidance(q, 1)[0], guidance(q, 30)[0]
+    once = guidance(q, 1)[0]
+    many = guidance(q, 30)[0]
     assert (constraint_cost(constraints, 0.95, once) < before)[off].all()
     np.testing.assert_array_equal(many[:, [0, -1]], q[:, [0, -1]])
     assert constraints.satisfied(many.reshape(-1, PANDA.dof).astype(np.float64)).all()

@@ -37,7 +37,8 @@ def test_standardized_codes():
 
 
 def test_nearest_and_chamfer_against_all_pairs():
-    a, b = cloud(7, 1), cloud(11, 2)
+    a = cloud(7, 1)
+    b = cloud(11, 2)
     allowed = torch.arange(11)[None] < 9
     distance = (a[0, :, None] - b[0, None]).norm(dim=-1)
     forth, back = nearest(a, b, allowed)
@@ -86,7 +87,8 @@ def test_noise_is_zero_at_the_ends_and_has_the_data_s_covariance(smooth):
 def test_samples_hold_start_and_goal(guided):
     model = small_model().requires_grad_(False).eval()
     model.residual_scale.fill_(0.3)
-    start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
+    start = np.array([-1.0, 0.5, 2.0])
+    goal = np.array([1.5, -0.5, 0.1])
     levels = []
 
     def guide(q, level):
@@ -151,7 +153,8 @@ def test_residual_and_joints_are_inverse():
     ],
 )
 def test_the_last_share_of_the_steps_is_guided(steps: int, share: float, guided: int) -> None:
-    model, levels = small_model(), []
+    model = small_model()
+    levels = []
 
     def guide(q: np.ndarray, level: float) -> np.ndarray:
         levels.append(level)
@@ -184,7 +187,8 @@ def sample_with(model: MotionNetwork, settings: SamplingSettings, guide: GuideFn
     def far(q: np.ndarray) -> np.ndarray:
         return np.full((*q.shape[:2], 3), 0.4, np.float32)
 
-    start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
+    start = np.array([-1.0, 0.5, 2.0])
+    goal = np.array([1.5, -0.5, 0.1])
     code = np.zeros(8, np.float32)
     return model.sample(start, goal, code, far, np.random.default_rng(0), settings, guide)
 

@@ -35,7 +35,8 @@ def best_predictor(schedule: NoiseSchedule) -> Callable[[np.ndarray, int], np.nd
     """E[x_0 | x_t] for Gaussian data and white noise."""
 
     def predict(x, level):
-        a, s = schedule.signal[level], schedule.noise[level]
+        a = schedule.signal[level]
+        s = schedule.noise[level]
         gain = a * COVARIANCE @ np.linalg.inv(a**2 * COVARIANCE + s**2 * np.eye(2))
         return MEAN + (x - a * MEAN) @ gain.T
 
@@ -44,7 +45,8 @@ def best_predictor(schedule: NoiseSchedule) -> Callable[[np.ndarray, int], np.nd
 
 def exact_flow(schedule: NoiseSchedule, x: np.ndarray) -> np.ndarray:
     """Where the probability flow takes x from the last level: deviations along each principal axis scale."""
-    a, s = schedule.signal[-1], schedule.noise[-1]
+    a = schedule.signal[-1]
+    s = schedule.noise[-1]
     values, axes = np.linalg.eigh(COVARIANCE)
     scale = np.sqrt(values / (a**2 * values + s**2))
     return MEAN + (x - a * MEAN) @ (axes * scale) @ axes.T
@@ -53,7 +55,8 @@ def exact_flow(schedule: NoiseSchedule, x: np.ndarray) -> np.ndarray:
 def flow_errors(name: str, schedule: NoiseSchedule, steps: list[int]) -> np.ndarray:
     """RMS distance of samples to the points where the exact flow takes the same noise."""
     noise = np.random.default_rng(0).standard_normal((64, 2))
-    exact, predict = exact_flow(schedule, noise), best_predictor(schedule)
+    exact = exact_flow(schedule, noise)
+    predict = best_predictor(schedule)
     samples = [SAMPLERS.load(name)(predict, schedule, lambda: noise, n, 0.0) for n in steps]
     return np.array([np.sqrt(((x - exact) ** 2).mean()) for x in samples])
 
@@ -82,7 +85,8 @@ def slope(steps: list[int], errors: np.ndarray) -> float:
 
 
 def test_order_of_ddim() -> None:
-    steps, schedule = [32, 64, 128, 256], log_snr_schedule()
+    steps = [32, 64, 128, 256]
+    schedule = log_snr_schedule()
     errors = flow_errors("ddim", schedule, steps)
     assert (np.diff(errors) < 0).all()
     assert slope(steps, errors) == pytest.approx(1, abs=0.1)
@@ -100,7 +104,8 @@ def test_order_of_ddim_on_the_schedule() -> None:
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_stochastic_samples_have_the_data_s_moments(name):
     """With all noise drawn afresh, the covariance converges at first order."""
-    schedule, steps = cosine_schedule(1024), [32, 64, 128, 256]
+    schedule = cosine_schedule(1024)
+    steps = [32, 64, 128, 256]
     moments = [exact_moments(name, schedule, n, 1.0) for n in steps]
     off = np.array([np.abs(covariance - COVARIANCE).max() for _, covariance in moments])
     assert (np.diff(off) < 0).all()
@@ -111,7 +116,9 @@ def test_stochastic_samples_have_the_data_s_moments(name):
 
 def test_ddpm_samples():
     """Mean and covariance within four standard errors of what 200 steps must give, near the data's."""
-    schedule, count, rng = cosine_schedule(), 20_000, np.random.default_rng(1)
+    schedule = cosine_schedule()
+    count = 20_000
+    rng = np.random.default_rng(1)
     x = ddpm(best_predictor(schedule), schedule, lambda: rng.standard_normal((count, 2)), 200)
     mean, covariance = exact_moments("ddpm", schedule, 200, 1.0)
     variance = np.diag(COVARIANCE)
@@ -128,7 +135,10 @@ def test_ddpm_samples():
 def test_calls_of_the_predictor(name, steps):
     """One call per step, from the last level downwards. All values are finite, also between levels of equal
     noise, whatever the predictor returns. The result is the last prediction."""
-    schedule, rng, levels, predictions = cosine_schedule(), np.random.default_rng(0), [], []
+    schedule = cosine_schedule()
+    rng = np.random.default_rng(0)
+    levels = []
+    predictions = []
 
     def predict(x, level):
         levels.append(level)
@@ -146,7 +156,8 @@ def test_calls_of_the_predictor(name, steps):
 
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_refused_steps_and_shares(name):
-    schedule, predict = cosine_schedule(), best_predictor(cosine_schedule())
+    schedule = cosine_schedule()
+    predict = best_predictor(cosine_schedule())
     for steps in (-1, 0, 201):
         with pytest.raises(InputError, match=f"sampling steps is {steps}; it must be between 1 and 200"):
             SAMPLERS.load(name)(predict, schedule, lambda: np.zeros((1, 2)), steps, 0.0)
@@ -172,7 +183,8 @@ def draws_for(steps: int) -> list[np.ndarray]:
 
 def our_steps(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> np.ndarray:
     """x at each level, from the noise to the sample."""
-    found, draws = [], iter(draws_for(steps))
+    found = []
+    draws = iter(draws_for(steps))
 
     def predict(x, level):
         found.append(x)
@@ -185,7 +197,8 @@ def our_steps(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> np.
 def their_steps(levels: list[int], scheduler, outputs, variance_noise: bool, **settings) -> np.ndarray:
     """The same by a scheduler of diffusers. `outputs`: of the network, from x, x_0 and the level."""
     draws = [torch.from_numpy(n) for n in draws_for(len(levels) - 1)]
-    x, found = draws[0], [draws[0].numpy()]
+    x = draws[0]
+    found = [draws[0].numpy()]
     for timestep, level, noise in zip(scheduler.timesteps, levels[:-1], draws[1:], strict=True):
         if variance_noise:
             settings["variance_noise"] = noise
@@ -262,7 +275,8 @@ def test_refused_schedules(settings, message):
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_objective_round_trip(name, tensors):
     """The clean trajectory follows from x_t and the target at all levels."""
-    schedule, objective = cosine_schedule(), OBJECTIVES.make(name)
+    schedule = cosine_schedule()
+    objective = OBJECTIVES.make(name)
     clean, noise = np.random.default_rng(0).standard_normal((2, 201, 5, 2))
     a, s = (v[:, None, None] for v in (schedule.signal, schedule.noise))
     if tensors:
@@ -278,9 +292,11 @@ def test_objective_round_trip(name, tensors):
 def test_objectives_weigh_levels_alike(name, limit):
     """The weighted error of the output is that of the clean trajectory wherever the weight is below the
     limit."""
-    schedule, objective = cosine_schedule(), OBJECTIVES.make(name)
+    schedule = cosine_schedule()
+    objective = OBJECTIVES.make(name)
     t = np.arange(1, 200)
-    a, s = schedule.signal[t], schedule.noise[t]
+    a = schedule.signal[t]
+    s = schedule.noise[t]
     weight = objective.weight(schedule, t, limit)
     moved = objective.clean(np.zeros(199), np.ones(199), a, s)  # by an error of 1, as x_t is 0
     wanted = schedule.weight(t, limit)
@@ -301,7 +317,8 @@ def test_bundled_model_samples_as_when_it_was_published():
     t = np.arange(201) / 200
     curve = np.cos((t + 0.008) / 1.008 * np.pi / 2) ** 2
     alpha_bar = np.maximum(curve / curve[0], 1e-4)
-    signal, noise = np.sqrt(alpha_bar), np.sqrt(1 - alpha_bar)
+    signal = np.sqrt(alpha_bar)
+    noise = np.sqrt(1 - alpha_bar)
     np.testing.assert_array_equal(model.schedule.signal, signal)
     np.testing.assert_array_equal(model.schedule.noise, noise)
     rng = np.random.default_rng(0)
@@ -312,7 +329,8 @@ def test_bundled_model_samples_as_when_it_was_published():
         return np.repeat(0.2 + 0.1 * np.sin(q.sum(-1, keepdims=True)), len(model.robot.links), -1)
 
     def as_it_was(predict, schedule, draw_noise, steps, eta):
-        a, s = signal.tolist(), noise.tolist()
+        a = signal.tolist()
+        s = noise.tolist()
         levels = np.linspace(200, 0, steps + 1).round().astype(np.int64).tolist()
         x = draw_noise()
         for level, lower in pairwise(levels[:-1]):

@@ -67,7 +67,8 @@ def test_single_stray_pixels_do_not_undo_free_space() -> None:
 
 def test_spheres_grow_with_the_square_of_their_distance() -> None:
     T = looking_at(np.array([2.0, 0.0, 0.0]), np.zeros(3))
-    near, far = np.array([1.0, 0.0, 0.0, 0.1]), np.array([0.0, 0.0, 0.0, 0.1])
+    near = np.array([1.0, 0.0, 0.0, 0.1])
+    far = np.array([0.0, 0.0, 0.0, 0.1])
     grown = grown_for_noise(np.stack([near, far]), T, 0.002)[:, 3] - 0.1
     assert grown[1] == pytest.approx(4 * grown[0]) and grown[0] > 0
     assert (grown_for_noise(np.stack([near, far]), T, 0.0)[:, 3] == 0.1).all()

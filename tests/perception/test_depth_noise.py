@@ -10,13 +10,16 @@ from robotdiffuse.perception.depth_view import DepthNoise, DepthView
 
 
 def test_noise_is_as_its_settings_say() -> None:
-    rng, none = np.random.default_rng(1), DepthNoise(0.0, 0.0, 0.0, 0.0, 0.0, grazing=0.0)
+    rng = np.random.default_rng(1)
+    none = DepthNoise(0.0, 0.0, 0.0, 0.0, 0.0, grazing=0.0)
     depth = np.full((200, 300), 2.0, np.float32)
     depth[:, 150:] = 1.0
     depth[:20] = np.inf
     view = DepthView(depth, (300.0, 300.0, 150.0, 100.0), np.eye(4))
     noisy = replace(none, spread=0.003, missing=0.05).applied(view, rng).depth
-    missing, near, far = noisy == 0, noisy[20:, 150:], noisy[20:, :150]
+    missing = noisy == 0
+    near = noisy[20:, 150:]
+    far = noisy[20:, :150]
     assert abs(missing.mean() - 0.05) < 0.005
     for part, at in ((near[near > 0], 1.0), (far[far > 0], 2.0)):
         assert abs(part.std() / (0.003 * at**2) - 1) < 0.03 and abs(part.mean() - at) < 1e-3
@@ -40,7 +43,8 @@ def test_stray_pixels_lie_before_the_surface() -> None:
 @pytest.mark.parametrize("angle", (0.1, 0.25))
 def test_a_floor_at_a_grazing_angle_gives_no_return(angle: float) -> None:
     """A floor 1 m below a camera that looks ahead: a row sees it at its angle below the horizon."""
-    focal, rows = 200.0, np.arange(1, 150)
+    focal = 200.0
+    rows = np.arange(1, 150)
     depth = np.broadcast_to((focal / rows)[:, None], (len(rows), 40))
     view = DepthView(depth, (focal, focal, 20.0, -1.0), np.eye(4))
     noise = DepthNoise(spread=0.0, stray=0.0, flying=0.0, edge_missing=0.0, grazing=angle)

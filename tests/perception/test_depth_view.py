@@ -21,7 +21,10 @@ T = transform(np.array([1.5, 0.2, 0.8]), rotation_about(np.array([0.6, 0.0, 0.8]
 
 def test_points_of_pixels() -> None:
     depth = np.zeros((48, 64))
-    depth[10, 20], depth[0, 0], depth[1, 1], depth[2, 2] = 2.0, np.nan, np.inf, -1.0
+    depth[10, 20] = 2.0
+    depth[0, 0] = np.nan
+    depth[1, 1] = np.inf
+    depth[2, 2] = -1.0
     view = DepthView(depth, K, T)
     by_hand = T @ [(20 - 31.5) / 50 * 2, (10 - 23.5) / 50 * 2, 2.0, 1.0]
     assert np.allclose(view.points(), by_hand[:3])
@@ -35,7 +38,8 @@ def test_a_cloud_becomes_the_image_that_its_camera_had() -> None:
     view = DepthView.from_cloud(points, T)
     h, w = view.depth.shape
     assert np.array_equal(view.points(), points) and h * w <= 320 * 240
-    upper, lower = view.depth[2 : h // 2 - 2, 2:-2], view.depth[h // 2 + 2 : -2, 2:-2]
+    upper = view.depth[2 : h // 2 - 2, 2:-2]
+    lower = view.depth[h // 2 + 2 : -2, 2:-2]
     for half, z in ((upper, 1.0), (lower, 2.0)):
         assert np.mean(half > 0) > 0.6 and np.allclose(half[half > 0], z, atol=1e-5)
     with pytest.raises(InputError, match="none of 10 is in front"):

@@ -14,7 +14,9 @@ PANDA = load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 AWAY = np.array([3.0, 0.0, 0.0, -0.1, 0.0, 1.571, 0.785])
 """The arm stretched upwards, out of the way of what these views look at."""
-WIDTH, HEIGHT, FOCAL = 320, 240, 262.0
+WIDTH = 320
+HEIGHT = 240
+FOCAL = 262.0
 WALL = 0.83
 """Where the wall stands: x = 1.6 - WALL in the base frame [m]."""
 
@@ -75,7 +77,9 @@ def test_free_voxels_hold_no_point_of_any_pixel(seed: int) -> None:
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     depth = flat(2.5)
     for _ in range(30):
-        a, b, r = rng.uniform(0, WIDTH), rng.uniform(0, HEIGHT), rng.uniform(3, 40)
+        a = rng.uniform(0, WIDTH)
+        b = rng.uniform(0, HEIGHT)
+        r = rng.uniform(3, 40)
         depth[(u - a) ** 2 + (v - b) ** 2 < r * r] = rng.uniform(0.6, 2.4)
     seen = observe([view(depth)], PANDA, AWAY)
     points = view(depth).points()
@@ -92,7 +96,8 @@ def test_free_voxels_hold_no_point_of_any_pixel(seed: int) -> None:
 
 
 def test_several_views_add_up() -> None:
-    front, back = view(flat(WALL)), view(flat(0.82), camera(x=-1.6, back=True))
+    front = view(flat(WALL))
+    back = view(flat(0.82), camera(x=-1.6, back=True))
     both = observe([front, back], PANDA, AWAY)
     for one in (observe([front], PANDA, AWAY), observe([back], PANDA, AWAY)):
         assert both.occupied[one.occupied].all()
@@ -112,7 +117,8 @@ def test_the_arm_is_no_obstacle_and_casts_a_shadow() -> None:
     rays = np.stack([(u - (WIDTH - 1) / 2) / FOCAL, (v - (HEIGHT - 1) / 2) / FOCAL, np.ones(u.shape)], -1)
     depth = flat(2.2)
     for center, radius in zip(local, spheres[:, 3], strict=True):  # by hand: |d ray - center| = radius
-        a, b = (rays**2).sum(-1), rays @ center
+        a = (rays**2).sum(-1)
+        b = rays @ center
         under = b * b - a * (center @ center - radius**2)
         depth = np.where(under > 0, np.minimum(depth, (b - np.sqrt(np.maximum(under, 0))) / a), depth)
     arm = depth < 2.19
@@ -141,7 +147,8 @@ def test_missing_returns_and_flying_pixels_change_little() -> None:
     clean[:, :100] = 2.0
     clean[:, 100:160] = 1.2
     exact = observe([view(clean)], PANDA, AWAY)
-    flying, lost = clean.copy(), clean.copy()
+    flying = clean.copy()
+    lost = clean.copy()
     flying[:, 100] = rng.uniform(1.3, 1.9, HEIGHT)
     lost[rng.random(lost.shape) < 0.05] = 0
     for image in (flying, lost):

@@ -33,7 +33,8 @@ def true(margin: float) -> np.ndarray:
 
 @pytest.mark.parametrize("noisy", (False, True))
 def test_free_voxels_hold_no_obstacle_and_most_of_the_space_is_seen(noisy: bool) -> None:
-    rng, known = np.random.default_rng(0), OccupancyMap(PANDA)
+    rng = np.random.default_rng(0)
+    known = OccupancyMap(PANDA)
     for bearing in np.linspace(-1.5, 1.5, 5):
         view = view_from(bearing)
         known.add(DepthNoise().applied(view, rng) if noisy else view)
@@ -49,7 +50,8 @@ def test_free_voxels_hold_no_obstacle_and_most_of_the_space_is_seen(noisy: bool)
 
 
 def test_a_view_counts_once_and_the_order_does_not_matter() -> None:
-    ahead, back = OccupancyMap(PANDA), OccupancyMap(PANDA)
+    ahead = OccupancyMap(PANDA)
+    back = OccupancyMap(PANDA)
     views = [view_from(b) for b in (-1.0, 0.2, 1.1)]
     for view in views:
         ahead.add(view)
@@ -70,7 +72,8 @@ def test_a_voxel_is_the_same_wherever_its_block_begins() -> None:
 
 
 def test_pixels_without_a_return_say_nothing() -> None:
-    view, known = view_from(0.0), OccupancyMap(PANDA)
+    view = view_from(0.0)
+    known = OccupancyMap(PANDA)
     known.add(replace(view, depth=np.zeros_like(view.depth)))
     assert known.unknown.all()
 

@@ -20,7 +20,8 @@ from robotdiffuse.robots.robot import Robot
 
 PANDA = rd.load_robot("panda")
 Q = np.array([0.3, -0.5, 0.2, -2.0, 0.4, 1.7, 0.5])
-INTRINSICS, SIZE = (150.0, 150.0, 79.5, 59.5), (160, 120)
+INTRINSICS = (150.0, 150.0, 79.5, 59.5)
+SIZE = (160, 120)
 T = looking_at(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.1, 0.4]))
 RNG = np.random.default_rng(0)
 BALLS = RNG.uniform((0.2, -0.5, 0.2), (1.2, 0.5, 0.9), (2000, 3)).astype(np.float32)
@@ -38,8 +39,12 @@ def returns(depth: np.ndarray, ball: np.ndarray, radius: float, more: int) -> np
     ways = RNG.standard_normal((400, 3))
     points = (ball + radius * ways / np.linalg.norm(ways, axis=1)[:, None] - T[:3, 3]) @ T[:3, :3]
     fx, fy, cx, cy = INTRINSICS
-    u, v = fx * points[:, 0] / points[:, 2] + cx, fy * points[:, 1] / points[:, 2] + cy
-    u0, u1, v0, v1 = np.floor(u.min()), np.ceil(u.max()), np.floor(v.min()), np.ceil(v.max())
+    u = fx * points[:, 0] / points[:, 2] + cx
+    v = fy * points[:, 1] / points[:, 2] + cy
+    u0 = np.floor(u.min())
+    u1 = np.ceil(u.max())
+    v0 = np.floor(v.min())
+    v1 = np.ceil(v.max())
     u0, u1, v0, v1 = (int(n) for n in (u0 - more, u1 + more, v0 - more, v1 + more))
     if points[:, 2].min() <= 0 or min(u0, v0) < 0 or u1 >= SIZE[0] or v1 >= SIZE[1]:
         return None
@@ -48,7 +53,8 @@ def returns(depth: np.ndarray, ball: np.ndarray, radius: float, more: int) -> np
 
 def test_balls_seen_through_are_those_with_nothing_in_any_of_their_pixels() -> None:
     scene = rd.Scene([rd.Box((0.8, 0.1, 0.5), (0.05, 0.3, 0.3)), rd.Sphere((0.6, -0.2, 0.4), 0.1)])
-    depth, radius = ray_cast(scene, T, INTRINSICS, SIZE).depth, 0.02
+    depth = ray_cast(scene, T, INTRINSICS, SIZE).depth
+    radius = 0.02
     far = (BALLS - T[:3, 3]) @ T[:3, 2] + radius
     seen = seen_in(depth, radius=radius)
     least, most = (
@@ -73,7 +79,8 @@ def test_pixels_without_a_return_show_nothing(lost: float, seen: bool) -> None:
 
 
 def test_noise_asks_for_more_distance_and_filtered_images_for_more_pixels() -> None:
-    depth, far = np.full(SIZE[::-1], 0.7), (BALLS - T[:3, 3]) @ T[:3, 2] + 0.02
+    depth = np.full(SIZE[::-1], 0.7)
+    far = (BALLS - T[:3, 3]) @ T[:3, 2] + 0.02
     seen = seen_in(depth)
     assert seen.any() and (far[seen] < 0.7).all()
     noisy = seen_in(depth, noise=0.1)
@@ -84,7 +91,10 @@ def test_noise_asks_for_more_distance_and_filtered_images_for_more_pixels() -> N
 
 
 def test_balls_lie_within_voxels_if_all_of_them_do() -> None:
-    marked, low, edge, radius = RNG.random((30, 30, 30)) < 0.95, np.array((0.2, -0.3, 0.2)), 0.02, 0.008
+    marked = RNG.random((30, 30, 30)) < 0.95
+    low = np.array((0.2, -0.3, 0.2))
+    edge = 0.02
+    radius = 0.008
     within = np.zeros(len(BALLS), np.bool_)
     within_voxels(BALLS, np.float32(radius), marked, low.astype(np.float32), np.float32(edge), within)
     for ball, found in zip(BALLS[:500].astype(np.float64), within[:500], strict=True):

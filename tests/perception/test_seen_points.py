@@ -88,7 +88,8 @@ def test_flying_pixels_are_removed() -> None:
 def test_clouds_and_several_views_add_up() -> None:
     seen = view(BALL_ROW)
     cloud = DepthView.from_cloud(seen.points(), T)
-    one, both = seen_points([seen], PANDA, START), seen_points([seen, cloud], PANDA, START)
+    one = seen_points([seen], PANDA, START)
+    both = seen_points([seen, cloud], PANDA, START)
     assert len(one) == len(both) and np.linalg.norm(one[:, None] - both, axis=2).min(axis=1).max() < 1e-5
     many = DepthView.from_cloud(np.random.default_rng(0).uniform(-1, 1, (60_000, 3)), T)
     assert len(seen_points([many], PANDA, START, 0.005)) > 40_000

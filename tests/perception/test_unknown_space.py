@@ -15,7 +15,8 @@ PREDICTED = np.full(FINE_SHAPE, 0.01, np.float32)
 
 def test_only_what_the_arm_fills_at_the_ends_is_left_out_without_a_margin() -> None:
     """A hand that grazes an unseen cupboard beside its goal stated a confidence of 0.98."""
-    ends, path = START[None], Path(PANDA.joint_names, np.stack([START, START + 0.015, START]))
+    ends = START[None]
+    path = Path(PANDA.joint_names, np.stack([START, START + 0.015, START]))
     filled = FINE.filled(PANDA, [START])
     bare = UnknownSpace(PANDA, ends, EVERYWHERE, PREDICTED, margin=0.0).crossed(path)
     usual = UnknownSpace(PANDA, ends, EVERYWHERE, PREDICTED).crossed(path)

@@ -27,8 +27,11 @@ def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:
 
 
 def test_the_part_that_weighs_most_is_boxed() -> None:
-    marked, weights = np.zeros((6, 7, 8), np.bool_), np.ones((6, 7, 8), np.float32)
-    marked[0, 0, :3], marked[5, 6, 7], marked[3:5, 3, 3] = True, True, True
+    marked = np.zeros((6, 7, 8), np.bool_)
+    weights = np.ones((6, 7, 8), np.float32)
+    marked[0, 0, :3] = True
+    marked[5, 6, 7] = True
+    marked[3:5, 3, 3] = True
     assert heaviest_part(marked, weights).tolist() == [[0, 0, 0], [1, 1, 3]]
     weights[5, 6, 7] = 4.0
     assert heaviest_part(marked, weights).tolist() == [[5, 6, 7], [6, 7, 8]]

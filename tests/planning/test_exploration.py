@@ -82,7 +82,8 @@ def test_a_view_of_another_thread_waits_for_the_step(monkeypatch: pytest.MonkeyP
 
 def test_an_arm_at_a_goal_pose_is_done() -> None:
     # it went on for ever: only configurations were compared
-    one, q = explorer(), PROBLEM.start
+    one = explorer()
+    q = PROBLEM.start
     one.set_goal(rd.PoseGoal("panda_hand", link_pose(PANDA, q + 0.05, "panda_hand")))
     step = one.next(q)
     assert step.kind != "done"
@@ -94,7 +95,8 @@ def test_strict_motions_enter_no_voxel_that_was_not_seen_free() -> None:
     one.set_goal(PROBLEM.start + 0.05)
     step = one.next(PROBLEM.start)
     assert step.kind in ("go", "look") and step.motion is not None and step.motion.path is not None
-    swept, positions = np.zeros(MAP.shape, np.bool_), step.motion.path.positions.astype(np.float32)
+    swept = np.zeros(MAP.shape, np.bool_)
+    positions = step.motion.path.positions.astype(np.float32)
     sweep(compile_robot(PANDA), positions, np.float32(0), *MAP.frame, swept)
     unseen = swept & ~one.map.free
     ends = [placed_spheres(PANDA, q).astype(np.float32) for q in step.motion.path.positions[[0, -1]]]
@@ -129,7 +131,8 @@ def test_goals_that_were_hardly_seen() -> None:
 
 def test_looks_see_what_is_wanted() -> None:
     one = explorer()
-    camera, wanted = one.cameras[0], np.zeros(MAP.shape, np.bool_)
+    camera = one.cameras[0]
+    wanted = np.zeros(MAP.shape, np.bool_)
     wanted[75:80, 55:60, 40:45] = True
     target = (np.array([77.5, 57.5, 42.5]) * MAP.edge) + MAP.low
     scene = rd.Scene([FLOOR])
@@ -168,7 +171,8 @@ def test_what_keeps_the_arm_from_going_is_said() -> None:
 def test_a_strict_arm_does_not_look_for_a_goal_outside_of_the_map() -> None:
     """It used up its looks on goals that no motion within the map reaches."""
     long = rd.load_robot("ur10")
-    stretched, folded = np.zeros(6), np.array([0.0, -1.2, 2.0, -0.8, 1.5, 0.0])
+    stretched = np.zeros(6)
+    folded = np.array([0.0, -1.2, 2.0, -0.8, 1.5, 0.0])
     one = rd.Explorer(long, [wrist_camera(long)], free_zone=ZONE)
     one.observe(camera_beside(rd.Problem(long, rd.Scene([WALL]), folded, stretched), None, 0))
     one.set_goal(stretched)
@@ -193,13 +197,15 @@ def test_a_look_is_found_where_a_narrow_gap_alone_leads_out() -> None:
     known = OccupancyMap(PANDA)
     known.declare_free(((-1.1, 0.3, 0.0), (1.1, 1.1, 1.1)))
     scene = rd.Scene(not_seen_free(known, rd.Scene(), (HOME,)))
-    tree, rng = ReachableTree(PANDA, scene, HOME), np.random.default_rng(0)
+    tree = ReachableTree(PANDA, scene, HOME)
+    rng = np.random.default_rng(0)
     tree.grow(HOME + 0.3 * rng.standard_normal((3000, 7)), rng.random(3000) ** 2)
     assert len(tree) > 10
 
 
 def test_stray_points_that_other_views_see_through_are_no_obstacles() -> None:
-    one, view = explorer(seen=False), camera_beside(PROBLEM, None, 0)
+    one = explorer(seen=False)
+    view = camera_beside(PROBLEM, None, 0)
     depth, (v, u) = view.depth.copy(), (200, 150)
     depth[v - 8 : v + 8, u - 8 : u + 8] = 1.0
     fx, fy, cx, cy = view.intrinsics
@@ -260,7 +266,8 @@ ABOVE_AND_BESIDE = ((1.3, -0.5, 0.6), (-0.3, 1.1, 0.9), (0.4, 1.3, 0.2))
 
 def test_a_goal_behind_a_plate_is_refused_until_views_show_it() -> None:
     """`strict` takes it on trust: all of this motion is within 2 cm of the arm at its ends."""
-    plate, goal = rd.Box((1.0, 0.7, 0.6), (0.02, 0.8, 1.2), wxyz=(0.94, 0, 0, 0.34)), LEFT.copy()
+    plate = rd.Box((1.0, 0.7, 0.6), (0.02, 0.8, 1.2), wxyz=(0.94, 0, 0, 0.34))
+    goal = LEFT.copy()
     goal[0] += 0.12
     for see_goal in (False, True):
         settings = ExplorerSettings(time_limit=1.0, see_goal=see_goal)

@@ -44,13 +44,15 @@ def test_what_hides_counts_as_often_as_it_is_there() -> None:
     """One voxel, cameras to both sides of it along x; before one of them something that is there by half."""
     filled = np.zeros((20, 9, 9), np.float32)
     filled[14, 4, 4] = 0.5
-    voxel, low = np.array([[8, 4, 4]]), np.zeros(3, np.float32)
+    voxel = np.array([[8, 4, 4]])
+    low = np.zeros(3, np.float32)
     middle = np.array([0.85, 0.45, 0.45])
     poses = [looking_at(middle + np.array([x, 0, 0]), middle) for x in (3.0, -3.0)]
     away = looking_at(middle + np.array([3, 0, 0]), middle + np.array([6, 0, 0]))
     intrinsics = np.array([100, 100, 50, 40], np.float32)
     stacked = np.stack([*poses, away]).astype(np.float32)
-    weights, far = np.array([2.0], np.float32), np.float32(np.inf)
+    weights = np.array([2.0], np.float32)
+    far = np.float32(np.inf)
     above = np.tile(np.zeros(PANDA.dof, np.float32), (3, 1))
     scene = voxel, weights, filled, low + np.array([0, 1, 0], np.float32), np.float32(0.1)
     stacked[:, :3, 3] += [0, 1, 0]  # beside the arm
@@ -62,18 +64,20 @@ def test_what_hides_counts_as_often_as_it_is_there() -> None:
 
 def test_the_arm_hides_what_is_behind_it() -> None:
     """Single voxels, beside and behind what the ray caster shows of the arm."""
-    filled, low, edge = (
-        np.zeros((60, 60, 50), np.float32),
-        np.array([-0.6, -0.6, 0.0], np.float32),
-        np.float32(0.02),
-    )
+    filled = np.zeros((60, 60, 50), np.float32)
+    low = np.array([-0.6, -0.6, 0.0], np.float32)
+    edge = np.float32(0.02)
     camera = (600.0, 600.0, 319.5, 239.5)
     arm = ray_cast(Scene(), BEYOND, camera, (640, 480), PANDA, START).depth
     voxels = np.argwhere(filled == 0)[::397]
     x, y, z = (((voxels + 0.5) * edge + low - BEYOND[:3, 3]) @ BEYOND[:3, :3]).T
-    rows, columns = np.rint(600 * y / z + 239.5).astype(int), np.rint(600 * x / z + 319.5).astype(int)
-    image, q = (np.array(camera, np.float32), (480, 640)), START.astype(np.float32)[None]
-    pose, seen, expected = BEYOND[None].astype(np.float32), [], []
+    rows = np.rint(600 * y / z + 239.5).astype(int)
+    columns = np.rint(600 * x / z + 319.5).astype(int)
+    image = (np.array(camera, np.float32), (480, 640))
+    q = START.astype(np.float32)[None]
+    pose = BEYOND[None].astype(np.float32)
+    seen = []
+    expected = []
     for i in np.flatnonzero((abs(rows - 240) < 239) & (abs(columns - 320) < 319)):
         around = np.s_[
             max(rows[i] - ARM_CELL, 0) : rows[i] + ARM_CELL,

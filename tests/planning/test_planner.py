@@ -72,7 +72,8 @@ def test_any_of_several_goals_will_do(name: str) -> None:
 
 
 def test_time_limit_and_seed_are_checked(name: str) -> None:
-    problem, planner = Problem(load_robot("panda"), Scene([]), START, GOAL), load_planner(name)
+    problem = Problem(load_robot("panda"), Scene([]), START, GOAL)
+    planner = load_planner(name)
     with pytest.raises(InputError, match="time_limit is 0"):
         planner.plan(problem, time_limit=0.0)
     with pytest.raises(InputError, match="seed is -1"):
@@ -128,7 +129,8 @@ def test_warming_up_loads_what_a_plan_needs_by_default() -> None:
 
 def test_at_most_nine_functions_lead_to_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """docs/architecture.md lists them."""
-    depths, search = set[int](), rrt_kernel.search
+    depths = set[int]()
+    search = rrt_kernel.search
 
     def measured(*arguments: object) -> object:
         frames = [frame for frame, _ in traceback.walk_stack(None)]

@@ -42,7 +42,8 @@ def baxter() -> Robot:
 @cache
 def free() -> ndarray:
     """Configurations that are free over the table."""
-    robot, rng = baxter(), np.random.default_rng(4)
+    robot = baxter()
+    rng = np.random.default_rng(4)
     drawn = rng.uniform(robot.lower, robot.upper, (400, robot.dof))
     return drawn[CollisionChecker(robot, rd.Scene([TABLE])).free(drawn)]
 
@@ -195,7 +196,8 @@ FREE = rd.Scene()
 def apart(robot: Robot, count: int, seed: int = 5) -> ndarray:
     """Configurations without a collision, away from the limits and anywhere within them."""
     rng = np.random.default_rng(seed)
-    middle, half = 0.5 * (robot.lower + robot.upper), 0.5 * (robot.upper - robot.lower)
+    middle = 0.5 * (robot.lower + robot.upper)
+    half = 0.5 * (robot.upper - robot.lower)
     drawn = rng.uniform(middle - 0.9 * half, middle + 0.9 * half, (60 * count, robot.dof))
     return drawn[CollisionChecker(robot, FREE).free(drawn)][:count]
 
@@ -237,7 +239,8 @@ def test_a_pose_where_the_hand_is_costs_no_motion(arm: str) -> None:
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None:
     """Alone, after a waypoint, as one of several goals, and along a straight line."""
-    robot, rng = rd.load_robot(arm), np.random.default_rng(2)
+    robot = rd.load_robot(arm)
+    rng = np.random.default_rng(2)
     tested = 0
     for start in apart(robot, 12):
         shift = rng.normal(size=3)
@@ -247,7 +250,8 @@ def test_a_pose_nearby_is_reached_by_the_nearest_configuration(arm: str) -> None
             continue
         tested += 1
         T = link_pose(robot, start, robot.tip)
-        here, goal = rd.PoseGoal(robot.tip, T), rd.PoseGoal(robot.tip, transform(T[:3, 3] + shift, T[:3, :3]))
+        here = rd.PoseGoal(robot.tip, T)
+        goal = rd.PoseGoal(robot.tip, transform(T[:3, 3] + shift, T[:3, :3]))
         far = rd.PoseGoal(robot.tip, link_pose(robot, apart(robot, 1, seed=9)[0], robot.tip))
         longest = 1.1 * float(np.linalg.norm(there - start))
         for problem in (

@@ -11,7 +11,8 @@ from robotdiffuse.scenes.scene import Scene
 
 def test_steps_and_views_are_kept_with_their_times() -> None:
     problem, explorer = recorded()
-    acts, views = explorer.acts, explorer.views
+    acts = explorer.acts
+    views = explorer.views
     assert len(acts) >= 2 and acts[-1].step.motion is None
     np.testing.assert_array_equal(acts[0].configuration, problem.start)
     for before, after in pairwise(acts):

@@ -51,7 +51,8 @@ def motions(threads: int) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_the_same_seed_gives_the_same_motion() -> None:
-    here, there = motions(1), motions(2)
+    here = motions(1)
+    there = motions(2)
     assert len(here) == 2 * len(PLANNERS)
     assert here[::2] == here[1::2], "twice in one process"
     assert here == there, "in another process with other threads"

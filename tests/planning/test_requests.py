@@ -24,7 +24,8 @@ from robotdiffuse.validation.validator import verify, verify_trajectory
 PANDA = rd.load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 GOAL = START + np.array([0.4, 0.1, 0.0, 0.1, 0.0, 0.0, 0.1])
-HAND, ELBOW = "panda_hand", "panda_link4"
+HAND = "panda_hand"
+ELBOW = "panda_link4"
 FAR = rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6], name="crate")
 SCENE = rd.Scene([FAR])
 T_GOAL = link_pose(PANDA, GOAL, HAND)

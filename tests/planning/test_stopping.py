@@ -99,7 +99,8 @@ def test_certified_stops_are_free_in_the_true_scene(motion: rd.Trajectory) -> No
 @pytest.mark.parametrize("share", np.linspace(0.0, 0.95, 8))
 def test_stops_keep_the_limits_and_begin_as_the_motion_was(motion: rd.Trajectory, share: float) -> None:
     time = float(share * motion.duration)
-    stop, state = braked(PANDA, motion, time), motion.at(time)
+    stop = braked(PANDA, motion, time)
+    state = motion.at(time)
     for rows, wanted in (
         (stop.positions, state.positions),
         (stop.velocities, state.velocities),

@@ -72,7 +72,8 @@ def true_values(made: Problem, constraint: Constraint, q: np.ndarray) -> list[fl
 
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_values_are_those_of_the_book(constraint: Constraint) -> None:
-    made, rng = problem(constraint), np.random.default_rng(0)
+    made = problem(constraint)
+    rng = np.random.default_rng(0)
     q = np.concatenate([[START, GOAL], rng.uniform(PANDA.lower, PANDA.upper, (30, 7))])
     right = [true_values(made, constraint, row) for row in q]
     np.testing.assert_allclose(PathConstraints(made).values(q), right, atol=1e-7)
@@ -81,7 +82,8 @@ def test_values_are_those_of_the_book(constraint: Constraint) -> None:
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_what_is_proved_holds_at_every_sample_and_what_is_not_proved_does_not(constraint: Constraint) -> None:
     """Limits a hair above and below the greatest of many samples: the proof tells one from the other."""
-    made, rng = problem(constraint), np.random.default_rng(1)
+    made = problem(constraint)
+    rng = np.random.default_rng(1)
     ready = PathConstraints(made)
     for _ in range(20):
         a, b = rng.uniform(PANDA.lower, PANDA.upper, (2, 7))
@@ -101,8 +103,10 @@ def test_what_is_proved_holds_at_every_sample_and_what_is_not_proved_does_not(co
 
 
 def test_proofs_hold_for_sliding_and_endless_joints_on_skew_axes() -> None:
-    robot, rng = example_robot("awkward"), np.random.default_rng(6)
-    lower, upper = np.maximum(robot.lower, -6), np.minimum(robot.upper, 6)
+    robot = example_robot("awkward")
+    rng = np.random.default_rng(6)
+    lower = np.maximum(robot.lower, -6)
+    upper = np.minimum(robot.upper, 6)
     frame = robot.tip
     start, goal = rng.uniform(lower, upper, (2, robot.dof))
     kept = [
@@ -125,15 +129,18 @@ def test_proofs_hold_for_sliding_and_endless_joints_on_skew_axes() -> None:
 
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_projection_ends_where_the_constraint_is_kept(constraint: Constraint) -> None:
-    ready, rng = PathConstraints(problem(constraint)), np.random.default_rng(2)
+    ready = PathConstraints(problem(constraint))
+    rng = np.random.default_rng(2)
     found = ready.projected(rng.uniform(PANDA.lower, PANDA.upper, (50, 7)), 0.9)
     assert len(found) >= 20 and ready.satisfied(found, 0.9).all()
     assert ((found >= PANDA.lower) & (found <= PANDA.upper)).all()
 
 
 def test_speeds_are_finite_differences() -> None:
-    ready, rng = PathConstraints(problem(rd.CartesianLine(HAND, 0.05, None, 0.3))), np.random.default_rng(3)
-    q, rates = rng.uniform(PANDA.lower, PANDA.upper, (10, 7)), rng.normal(size=(10, 7))
+    ready = PathConstraints(problem(rd.CartesianLine(HAND, 0.05, None, 0.3)))
+    rng = np.random.default_rng(3)
+    q = rng.uniform(PANDA.lower, PANDA.upper, (10, 7))
+    rates = rng.normal(size=(10, 7))
     at = [np.array([link_pose(PANDA, row, HAND)[:3, 3] for row in q + h * rates]) for h in (-1e-6, 1e-6)]
     right = np.linalg.norm(at[1] - at[0], axis=1) / 2e-6
     np.testing.assert_allclose(ready.speeds(q, rates)[:, 0], right, atol=1e-7)
@@ -142,7 +149,8 @@ def test_speeds_are_finite_differences() -> None:
 def test_levers_are_within_reach() -> None:
     """At random configurations of an arm of three boxes."""
     robot = box_arm()
-    frame, rng = robot.tip, np.random.default_rng(4)
+    frame = robot.tip
+    rng = np.random.default_rng(4)
     start, goal = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
     made = Problem(robot, rd.Scene(), start, goal, constraints=[rd.OnPlane(frame, [0, 0, 0], [0, 0, 1], 1.0)])
     rows = PathConstraints(made).rows
@@ -241,7 +249,8 @@ def test_projection_onto_tolerances_of_goals_agrees_with_the_validator(seed: int
     """Roll, pitch and yaw near half a turn too, and tolerances of 0 and of any angle."""
     rng = np.random.default_rng(seed)
     q = rng.uniform(PANDA.lower, PANDA.upper, (40, 7))
-    xyz, rpy = rng.choice([0.0, 0.02, 0.3], 3), rng.choice([0.0, 0.1, 1.5, 3.0, np.pi], 3)
+    xyz = rng.choice([0.0, 0.02, 0.3], 3)
+    rpy = rng.choice([0.0, 0.1, 1.5, 3.0, np.pi], 3)
     goal = rd.PoseGoal(HAND, link_pose(PANDA, q[0], HAND), xyz, rpy)
     ready = PathConstraints(Problem(PANDA, rd.Scene(), START, goal), [goal])
     at_goal = np.array([goal_error(PANDA, goal, row) is None for row in q])

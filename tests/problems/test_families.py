@@ -26,7 +26,8 @@ every_target = pytest.mark.parametrize("target", [CONFIGURATION, *TARGETS])
 @every_target
 @every_family
 def test_problems_are_as_the_family_says(name: str, target: str) -> None:
-    family, rng = load_family(name), np.random.default_rng(8)
+    family = load_family(name)
+    rng = np.random.default_rng(8)
     for _ in range(2):
         drawn = family.draw(PANDA, rng, goals=3, target=target)
         q = np.concatenate([drawn.start[None], drawn.goals]).astype(np.float64)

@@ -24,11 +24,9 @@ from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 ROBOT = rd.load_robot("panda")
-START, MIDDLE, END = (
-    [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2],
-    [0, -0.9, 0, -2.6, 0, 1.8, 0.2],
-    [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2],
-)
+START = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
+MIDDLE = [0, -0.9, 0, -2.6, 0, 1.8, 0.2]
+END = [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
 POST = rd.Cylinder([0.5, 0.0, 0.3], 0.04, 0.6, name="post")
 TABLE = {
     "box": {"center": [0.55, 0, 0.1], "size": [0.5, 1.0, 0.2], "wxyz": [0.9, 0, 0, 0.2], "name": "table"}

@@ -43,7 +43,8 @@ def names(cases: list[Case]) -> list[str]:
 
 @pytest.mark.parametrize("kept", [True, False])
 def test_one_rule(tmp_path: Path, kept: bool) -> None:
-    referee, cases = Referee(), CaseFile(tmp_path / "a" / "rop.jsonl" if kept else None)
+    referee = Referee()
+    cases = CaseFile(tmp_path / "a" / "rop.jsonl" if kept else None)
     hard = cases.held_out("rop", 4, referee.validator, referee.search)
     assert names(hard) == ["rop/1", "rop/2", "rop/4", "rop/7"]
     assert [case.reference for case in hard] == [1.0, 2.0, 4.0, 7.0]
@@ -59,7 +60,9 @@ def test_one_rule(tmp_path: Path, kept: bool) -> None:
 
 
 def test_goes_on_with_what_is_known(tmp_path: Path) -> None:
-    file, first, second = tmp_path / "rop.jsonl", Referee(), Referee()
+    file = tmp_path / "rop.jsonl"
+    first = Referee()
+    second = Referee()
     CaseFile(file).held_out("rop", 5, first.validator)
     assert len(first.validated) == 5 and not first.searched
     hard = CaseFile(file).held_out("rop", 4, second.validator, second.search)
@@ -73,7 +76,8 @@ def test_goes_on_with_what_is_known(tmp_path: Path) -> None:
 
 
 def test_line_that_was_cut_off_is_made_again(tmp_path: Path) -> None:
-    file, referee = tmp_path / "rop.jsonl", Referee()
+    file = tmp_path / "rop.jsonl"
+    referee = Referee()
     whole = CaseFile(file).held_out("rop", 3, referee.validator)
     text = file.read_text()
     file.write_text(text[:-20])

@@ -112,7 +112,8 @@ def test_errors_of_calls_keep_the_process() -> None:
 def test_running_and_waiting_calls_are_cancelled() -> None:
     with Workers(1) as workers:
         first = workers.submit(os.getpid).result(HELD)
-        running, waiting = workers.submit(wait_until_cancelled), workers.submit(os.getpid)
+        running = workers.submit(wait_until_cancelled)
+        waiting = workers.submit(os.getpid)
         time.sleep(0.2)
         assert waiting.cancel() and not running.cancel()
         assert running.result(HELD) is None

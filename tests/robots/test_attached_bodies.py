@@ -167,7 +167,8 @@ def test_scene_objects_are_taken_up_and_put_down_where_the_arm_is() -> None:
     robot: Robot = rd.load_robot("panda")
     cup = rd.Cylinder([0.5, 0.1, 0.3], 0.03, 0.1, name="cup")
     scene = rd.Scene([rd.Box([0.5, 0, 0.1], [0.4, 0.4, 0.2], name="table"), cup])
-    q0, q1 = np.array([0.0, -0.3, 0, -2.2, 0, 2.0, 0.8]), np.array([0.5, -0.5, 0, -2.0, 0, 2.0, 0.8])
+    q0 = np.array([0.0, -0.3, 0, -2.2, 0, 2.0, 0.8])
+    q1 = np.array([0.5, -0.5, 0, -2.0, 0, 2.0, 0.8])
     left, holding = scene.attach("cup", robot, q0)
     assert [shape.name for shape in left.shapes] == ["table"]
     assert np.allclose(link_pose(holding, q0, "cup")[:3, 3], cup.center)

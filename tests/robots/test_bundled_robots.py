@@ -36,9 +36,11 @@ def test_no_sampled_point_of_the_meshes_is_outside_the_spheres(name: str) -> Non
 @pytest.mark.parametrize("name", ROBOTS)
 def test_what_spheres_call_free_is_free_and_little_else_is(name: str) -> None:
     """Preparation warns of more than 8 % false collisions; the standard error with 400 samples is 1.5 %."""
-    robot, scene = load_robot(name), Scene()
+    robot = load_robot(name)
+    scene = Scene()
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (400, robot.dof))
-    by_spheres, by_meshes = CollisionChecker(robot, scene).free(q), ~ExactCollision(robot, scene).collides(q)
+    by_spheres = CollisionChecker(robot, scene).free(q)
+    by_meshes = ~ExactCollision(robot, scene).collides(q)
     assert not (by_spheres & ~by_meshes).any()
     assert by_meshes.mean() > 0.4 and (by_meshes & ~by_spheres).sum() < 0.12 * by_meshes.sum()
 
@@ -68,7 +70,8 @@ def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
 def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
     """One random problem in ten was unsolvable for a UR even without obstacles: its upper arm hung down
     beside the base, and only the equivalent goal one turn further can be reached, over the top."""
-    robot, home = load_robot("ur5e"), np.array([0, -1.57, 1.57, -1.57, -1.57, 0])
+    robot = load_robot("ur5e")
+    home = np.array([0, -1.57, 1.57, -1.57, -1.57, 0])
     start = np.array([0.5, 2.9, 0.7, 0.4, 2.7, 0.2])
     goals = robot.equivalent_configurations(home, start)
     assert np.allclose(goals[0], home + 2 * np.pi * np.array([0, 1, 0, 0, 1, 0])) and len(goals) == 6

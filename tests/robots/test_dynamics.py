@@ -23,7 +23,8 @@ from robotdiffuse.validation.validator import verify, verify_trajectory
 
 pinocchio: Any = pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
 PANDA = rd.load_robot("panda")
-LOW, FAR = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2], [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
+LOW = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
+FAR = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
 Y = np.array([0.0, 1.0, 0.0])
 
 
@@ -36,7 +37,9 @@ def pendulum(effort: float = 10.0) -> Robot:
 
 def test_a_pendulum_by_hand() -> None:
     dynamics = Dynamics(pendulum(), Payload(1.5, [0.0, 0.0, -1.0]))
-    q, v, a = np.array([[0.7]]), np.array([[1.3]]), np.array([[2.0]])
+    q = np.array([[0.7]])
+    v = np.array([[1.3]])
+    a = np.array([[2.0]])
     moment = 2 / 12 + 2 * 0.25 + 1.5
     expected = (2 * 0.5 + 1.5) * GRAVITY * np.sin(0.7) + moment * 2.0
     assert dynamics.torques(q, v, a)[0, 0] == pytest.approx(expected, abs=1e-9)
@@ -52,7 +55,9 @@ def test_torques_are_those_of_the_urdf(name: str, tmp_path: Path) -> None:
     held = [model.getJointId(joint) for joint in model.names[1:] if joint not in robot.joint_names]
     model = pinocchio.buildReducedModel(model, held, pinocchio.neutral(model))
     robot = robot.with_locked({joint: 0.0 for joint in robot.locked})
-    data, ours, rng = model.createData(), Dynamics(robot, Payload(0.0)), np.random.default_rng(0)
+    data = model.createData()
+    ours = Dynamics(robot, Payload(0.0))
+    rng = np.random.default_rng(0)
     assert tuple(model.names[1:]) == robot.joint_names
     assert np.allclose(ours.limits, model.effortLimit)
     for _ in range(50):

@@ -34,7 +34,8 @@ def smallest_gap(q: np.ndarray) -> float:
 
 @pytest.mark.parametrize("name", TIPS)
 def test_solutions_are_exact_distinct_and_within_limits(name: str) -> None:
-    robot, rng = example_robot(name), np.random.default_rng(3)
+    robot = example_robot(name)
+    rng = np.random.default_rng(3)
     for _ in range(25):
         T = link_pose(robot, rng.uniform(robot.lower, robot.upper), robot.tip)
         q = inverse_kinematics(robot, robot.tip, T, 10, rng=rng)
@@ -48,7 +49,8 @@ def test_solutions_are_exact_distinct_and_within_limits(name: str) -> None:
 
 def test_every_configuration_of_the_panda_can_be_found_again() -> None:
     """All of 300 reachable poses are solved; the benchmark solves 1,000 with ten solutions each."""
-    robot, rng = example_robot("panda"), np.random.default_rng(4)
+    robot = example_robot("panda")
+    rng = np.random.default_rng(4)
     for _ in range(300):
         T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "panda_hand")
         assert len(inverse_kinematics(robot, "panda_hand", T, 1, rng=rng)) == 1
@@ -57,7 +59,8 @@ def test_every_configuration_of_the_panda_can_be_found_again() -> None:
 def test_ur5_has_at_most_eight_solutions() -> None:
     """A 6R arm with a nearly spherical wrist and joints of one turn has the eight solutions of the
     textbook."""
-    robot, rng = example_robot("ur5"), np.random.default_rng(5)
+    robot = example_robot("ur5")
+    rng = np.random.default_rng(5)
     counts = []
     for _ in range(20):
         T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "tool0")
@@ -76,7 +79,8 @@ def test_planar_elbow_up_and_down() -> None:
 
 @pytest.mark.parametrize("limit", ["lower", "upper"])
 def test_poses_that_need_a_joint_at_its_limit(limit: str) -> None:
-    robot, rng = example_robot("panda"), np.random.default_rng(6)
+    robot = example_robot("panda")
+    rng = np.random.default_rng(6)
     for joint in range(robot.dof):
         q = rng.uniform(robot.lower, robot.upper)
         q[joint] = getattr(robot, limit)[joint]
@@ -95,7 +99,8 @@ def test_position_only(seed: int, x: float, y: float, z: float) -> None:
 
 
 def test_a_link_in_the_middle_of_the_chain() -> None:
-    robot, rng = example_robot("panda"), np.random.default_rng(7)
+    robot = example_robot("panda")
+    rng = np.random.default_rng(7)
     T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "panda_link4")
     q = inverse_kinematics(robot, "panda_link4", T, 4, rng=rng)
     assert len(q) == 4
@@ -113,7 +118,8 @@ def test_unreachable_poses_give_nothing(xyz: tuple[float, float, float]) -> None
 
 
 def test_accept_is_honoured() -> None:
-    robot, rng = example_robot("panda"), np.random.default_rng(8)
+    robot = example_robot("panda")
+    rng = np.random.default_rng(8)
     T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
     q = inverse_kinematics(robot, "panda_hand", T, 6, rng=rng, accept=lambda q: q[:, 0] > 0.5)
     assert len(q) == 6 and (q[:, 0] > 0.5).all()
@@ -122,7 +128,8 @@ def test_accept_is_honoured() -> None:
 
 def test_a_narrow_range_of_acceptance_is_found() -> None:
     """Solutions close to rejected ones are tried too: here a range of 0.02 rad of the elbow is accepted."""
-    robot, rng = example_robot("panda"), np.random.default_rng(8)
+    robot = example_robot("panda")
+    rng = np.random.default_rng(8)
     T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
     q = inverse_kinematics(robot, "panda_hand", T, 1, rng=rng, accept=lambda q: abs(q[:, 0] - 0.5) < 0.01)
     assert len(q) == 1
@@ -151,7 +158,9 @@ def test_same_generator_state_same_solutions() -> None:
 
 
 def test_bad_input() -> None:
-    robot, rng, T = example_robot("panda"), np.random.default_rng(0), np.eye(4)
+    robot = example_robot("panda")
+    rng = np.random.default_rng(0)
+    T = np.eye(4)
     with pytest.raises(InputError, match="unknown link 'wrist'"):
         inverse_kinematics(robot, "wrist", T, rng=rng)
     with pytest.raises(InputError, match="no planned joint moves the link 'panda_link0'"):

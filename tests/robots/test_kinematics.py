@@ -84,7 +84,9 @@ def test_poses_and_jacobians_match_pinocchio(name: str, tmp_path: Path) -> None:
     oracle = PinocchioArm(name, robot, tmp_path)
     q = configurations(robot, 5).numpy()
     for link in robot.link_names:
-        T, J, origins = robot.fk(q, link), robot.jacobian(q, link), link_origins(robot, q, link)
+        T = robot.fk(q, link)
+        J = robot.jacobian(q, link)
+        origins = link_origins(robot, q, link)
         for i in range(len(q)):
             oracle.update(q[i])
             np.testing.assert_allclose(T[i], oracle.pose(link), rtol=0, atol=1e-9, err_msg=link)
@@ -97,7 +99,8 @@ def test_poses_and_jacobians_match_pinocchio(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", TIPS)
 def test_jacobian_matches_finite_differences(name: str) -> None:
     robot = example_robot(name)
-    q, step = configurations(robot, 3).numpy(), 1e-6
+    q = configurations(robot, 3).numpy()
+    step = 1e-6
     for link in robot.link_names:
         before, after = (
             np.stack([robot.fk(row + sign * step * np.eye(robot.dof), link) for row in q]) for sign in (-1, 1)

@@ -18,7 +18,8 @@ from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, write_robot_
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
 
-LEFT, RIGHT = "panda_finger_joint1", "panda_finger_joint2"
+LEFT = "panda_finger_joint1"
+RIGHT = "panda_finger_joint2"
 
 
 def test_fifty_problem_files_with_locked_joints_share_one_robot(tmp_path: Path) -> None:

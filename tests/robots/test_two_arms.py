@@ -91,11 +91,14 @@ def test_files_keep_all_tips(tmp_path: Path) -> None:
 def test_spheres_parts_and_the_arms_of_one_robot_agree() -> None:
     """Configurations that are free by spheres are free by parts; Baxter's left arm has the same poses as
     alone."""
-    robot, rng = two_arms(), np.random.default_rng(0)
+    robot = two_arms()
+    rng = np.random.default_rng(0)
     q = rng.uniform(robot.lower, robot.upper, (2000, robot.dof))
-    free, hits = CollisionChecker(robot, rd.Scene()).free(q), ExactCollision(robot, rd.Scene()).collides(q)
+    free = CollisionChecker(robot, rd.Scene()).free(q)
+    hits = ExactCollision(robot, rd.Scene()).collides(q)
     assert not (free & hits).any() and 0.2 < free.mean() < (~hits).mean()
-    both, left = rd.load_robot("baxter"), rd.load_robot("baxter_left")
+    both = rd.load_robot("baxter")
+    left = rd.load_robot("baxter_left")
     assert both.dof == 14 and both.with_locked({n: 0.0 for n in both.joint_names if n[0] == "r"}).dof == 7
     q = rng.uniform(both.lower, both.upper)
     own = [both.joint_names.index(name) for name in left.joint_names]
@@ -103,9 +106,11 @@ def test_spheres_parts_and_the_arms_of_one_robot_agree() -> None:
 
 
 def test_the_other_arm_keeps_its_values_in_inverse_kinematics() -> None:
-    robot, rng = two_arms(), np.random.default_rng(1)
+    robot = two_arms()
+    rng = np.random.default_rng(1)
     q = rng.uniform(robot.lower, robot.upper)
-    T, rest = link_pose(robot, q, "right_lower"), rng.uniform(robot.lower, robot.upper)
+    T = link_pose(robot, q, "right_lower")
+    rest = rng.uniform(robot.lower, robot.upper)
     found = inverse_kinematics(robot, "right_lower", T, 3, rng=rng, rest=rest)
     assert len(found) and len(robot.chain("right_lower")) == 3
     for one in found:
@@ -143,10 +148,12 @@ def _crossing(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 def test_a_pose_of_one_hand_leaves_the_other_arm_where_it_starts() -> None:
-    robot, rng = two_arms(), np.random.default_rng(5)
+    robot = two_arms()
+    rng = np.random.default_rng(5)
     checker = CollisionChecker(robot, rd.Scene())
     free = [q for q in rng.uniform(robot.lower, robot.upper, (200, robot.dof)) if checker.free(q[None])[0]]
-    start, there = free[0], free[1].copy()
+    start = free[0]
+    there = free[1].copy()
     there[4:] = start[4:]  # left arm and waist elsewhere
     goal = rd.PoseGoal("left_hand", link_pose(robot, there, "left_hand"))
     problem = rd.Problem(robot=robot, scene=rd.Scene(), start=start, goal=goal)
@@ -169,7 +176,8 @@ def test_certificates_prove_motions_of_both_arms() -> None:
 
 
 def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:
-    robot, rng = two_arms(), np.random.default_rng(7)
+    robot = two_arms()
+    rng = np.random.default_rng(7)
     plane = rd.OnPlane("right_hand", point=[0.0, 0.0, 0.5], normal=[0.0, 0.6, 0.8], tolerance=5.0)
     ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
     q = np.linspace(ends[0], ends[1], 12)
@@ -195,12 +203,14 @@ def test_a_locked_arm_weighs_as_much_as_one_that_stands_still() -> None:
 
     body = inertia_of([1.5, 0.05, 0.02, -0.01, 0.02, 0, 0, 0.03, 0, 0.01])
     both = replace(two_arms(), inertias={link: body for link in two_arms().link_names})
-    rng, rows = np.random.default_rng(8), np.arange(4)
+    rng = np.random.default_rng(8)
+    rows = np.arange(4)
     q, v, a = (np.zeros((1, both.dof)) for _ in range(3))
     q[0] = rng.uniform(both.lower, both.upper)
     v[0, rows], a[0, rows] = rng.normal(size=(2, len(rows)))
     left = both.with_locked(dict(zip(both.joint_names[4:], q[0, 4:], strict=True)))
-    whole, part = Dynamics(both, Payload(0.0)), Dynamics(left, Payload(0.0))
+    whole = Dynamics(both, Payload(0.0))
+    part = Dynamics(left, Payload(0.0))
     expected = part.torques(q[:, rows], v[:, rows], a[:, rows])
     np.testing.assert_allclose(whole.torques(q, v, a)[:, rows], expected, atol=1e-9)
 

@@ -17,7 +17,9 @@ Key = tuple[int, int, int]
 
 def tree(keys: set[Key], level: int = TREE_DEPTH, low: Key = (-HALF, -HALF, -HALF)) -> bytes:
     """The bytes of a tree whose voxels with these lower corners, in voxels, are occupied."""
-    bits, below, edge = 0, b"", 2 ** (level - 1)
+    bits = 0
+    below = b""
+    edge = 2 ** (level - 1)
     for child in range(8):
         corner = tuple(low[a] + edge * (child >> a & 1) for a in range(3))
         inside = {key for key in keys if all(0 <= key[a] - corner[a] < edge for a in range(3))}

@@ -74,12 +74,15 @@ def test_distances_are_those_of_the_shapes() -> None:
 
 
 def test_turned_scenes_have_turned_distances() -> None:
-    scenes, rng = PackedScenes.pack(some_scenes(6), 12, floor=True), np.random.default_rng(1)
+    scenes = PackedScenes.pack(some_scenes(6), 12, floor=True)
+    rng = np.random.default_rng(1)
     angle = rng.uniform(-np.pi, np.pi, 6).astype(np.float32)
-    turned, at = scenes.turned(angle), rng.uniform(-1, 1, (20, 3))
+    turned = scenes.turned(angle)
+    at = rng.uniform(-1, 1, (20, 3))
     for i, (c, s) in enumerate(zip(np.cos(angle), np.sin(angle), strict=True)):
         moved = at @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-        near, far = scenes[i : i + 1].distances(at), turned[i : i + 1].distances(moved)
+        near = scenes[i : i + 1].distances(at)
+        far = turned[i : i + 1].distances(moved)
         np.testing.assert_allclose(far, near, atol=1e-5)
     assert turned.floors is scenes.floors
 

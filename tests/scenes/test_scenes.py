@@ -52,7 +52,8 @@ def surface_distance(shape: Shape, points: ndarray) -> ndarray:
     local = local @ shape.rotation
     if isinstance(shape, Box):
         return np.abs((np.abs(local) - shape.size / 2).max(axis=1))
-    radial, along = np.linalg.norm(local[:, :2], axis=1), np.abs(local[:, 2]) - shape.height / 2
+    radial = np.linalg.norm(local[:, :2], axis=1)
+    along = np.abs(local[:, 2]) - shape.height / 2
     if isinstance(shape, Cylinder):
         return np.abs(np.maximum(radial - shape.radius, along))
     return np.abs(np.hypot(radial, np.maximum(0, along)) - shape.radius)
@@ -288,7 +289,8 @@ def test_point_files(form: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("form", FORMS)
 def test_points_that_are_not_finite_are_removed_and_said(form: str, tmp_path: Path) -> None:
     spoilt = POINTS.copy()
-    spoilt[3], spoilt[9, 1] = np.nan, np.nan
+    spoilt[3] = np.nan
+    spoilt[9, 1] = np.nan
     points, notes = read_points(write_points(tmp_path, form, spoilt))
     assert (points == np.delete(POINTS, [3, 9], axis=0)).all()
     assert len(notes) == 1 and "2 of 50 points are not finite" in notes[0]

@@ -30,7 +30,8 @@ def answer(server: httpx.Client, sent: bytes) -> tuple[int, Any]:
     with socket.create_connection((server.base_url.host, server.base_url.port or 0), 10) as client:
         client.sendall(sent)
         stream = client.makefile("rb")
-        code, headers = int(stream.readline().split()[1]), {}
+        code = int(stream.readline().split()[1])
+        headers = {}
         while line := stream.readline().strip():
             name, _, value = line.partition(b": ")
             headers[name.lower()] = value
@@ -74,7 +75,9 @@ class Transport(asyncio.Transport):
 
     def __init__(self, connection: Connection) -> None:
         super().__init__()
-        self.connection, self.written, self.closed = connection, b"", False
+        self.connection = connection
+        self.written = b""
+        self.closed = False
 
     def write(self, data: Any) -> None:
         assert not self.closed

@@ -35,7 +35,8 @@ from robotdiffuse.server import worker
 LEFT = [0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
 RIGHT = [-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
-JSON, LINES = {"Content-Type": "application/json"}, {"Content-Type": "application/x-ndjson"}
+JSON = {"Content-Type": "application/json"}
+LINES = {"Content-Type": "application/x-ndjson"}
 PROMPT = 10.0
 """For an answer that must not wait for other requests [s]."""
 TRAJECTORY = ("joint_names", "times", "positions", "velocities", "accelerations")

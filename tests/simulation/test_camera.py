@@ -80,7 +80,8 @@ def test_points_lie_on_what_the_camera_sees_of_a_shape(kind: str) -> None:
 
 
 def test_the_arm_is_not_in_the_cloud_but_hides_what_is_behind() -> None:
-    robot, scene = box_arm(), Scene([Box([0.6, 0, -0.2], [1.5, 1, 0.02])])
+    robot = box_arm()
+    scene = Scene([Box([0.6, 0, -0.2], [1.5, 1, 0.02])])
     above = DepthCamera((0.6, 0.0, 1.5), (0.6, 0.0, 0.0), up=(1.0, 0.0, 0.0))
     with World(robot, scene, visuals=True) as world:
         world.place(np.zeros(3))

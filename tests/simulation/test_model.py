@@ -14,7 +14,8 @@ pytestmark = pytest.mark.sim
 
 
 def test_the_model_s_masses_are_those_of_boxes() -> None:
-    low, high = np.array([0.1, -0.1, 0.0]), np.array([0.5, 0.1, 0.3])
+    low = np.array([0.1, -0.1, 0.0])
+    high = np.array([0.5, 0.1, 0.3])
     whole = box_mesh(low, high)
     inside_out = ConvexMesh(whole.vertices, whole.faces[:, ::-1].copy())
     halves = (box_mesh(low, np.array([0.3, 0.1, 0.3])), box_mesh(np.array([0.3, -0.1, 0.0]), high))

@@ -84,7 +84,8 @@ def test_weak_motors_sag_under_gravity() -> None:
 
 
 def test_contact_is_reported_where_the_motion_runs_into_an_obstacle() -> None:
-    robot, scene = box_arm(), Scene([Sphere([0.9, 0.55, 0], 0.15), Box([-0.9, 0, 0], [0.1, 0.1, 0.1])])
+    robot = box_arm()
+    scene = Scene([Sphere([0.9, 0.55, 0], 0.15), Box([-0.9, 0, 0], [0.1, 0.1, 0.1])])
     trajectory = motion(robot, np.zeros(3), np.array([1.2, 0.0, 0.0]))
     run = replay(robot, scene, trajectory)
     with PyBulletOracle(robot, scene) as oracle:

@@ -68,8 +68,10 @@ def solids(scene: Scene) -> Scene:
 
 @pytest.mark.parametrize("name", ["panda", "xarm7"])
 def test_distances_agree_with_coal(name: str) -> None:
-    robot, scene = far_pairs_only(example_robot(name)), solids(every_shape())
-    exact, rng = ExactCollision(robot, scene), np.random.default_rng(0)
+    robot = far_pairs_only(example_robot(name))
+    scene = solids(every_shape())
+    exact = ExactCollision(robot, scene)
+    rng = np.random.default_rng(0)
     with PyBulletOracle(robot, scene) as oracle:
         for q in rng.uniform(robot.lower, robot.upper, (60, robot.dof)):
             right = min(d.distance for d in (*exact.link_distances(q), *exact.pair_distances(q)))
@@ -77,8 +79,10 @@ def test_distances_agree_with_coal(name: str) -> None:
 
 
 def test_collisions_agree_with_coal_meshes_included() -> None:
-    robot, scene = far_pairs_only(example_robot("panda")), every_shape()
-    exact, rng = ExactCollision(robot, scene), np.random.default_rng(1)
+    robot = far_pairs_only(example_robot("panda"))
+    scene = every_shape()
+    exact = ExactCollision(robot, scene)
+    rng = np.random.default_rng(1)
     q = rng.uniform(robot.lower, robot.upper, (150, robot.dof))
     hits = exact.collides(q)
     assert 0.2 < hits.mean() < 0.8
@@ -90,7 +94,8 @@ def test_collisions_agree_with_coal_meshes_included() -> None:
 
 def test_locked_joints_reach_pybullet() -> None:
     robot = example_robot("panda").with_locked({"panda_joint2": 0.7, "panda_finger_joint1": 0.065})
-    robot, scene = far_pairs_only(robot), solids(every_shape())
+    robot = far_pairs_only(robot)
+    scene = solids(every_shape())
     q = np.random.default_rng(2).uniform(robot.lower, robot.upper, (20, robot.dof))
     exact = ExactCollision(robot, scene)
     with PyBulletOracle(robot, scene) as oracle:
@@ -100,7 +105,8 @@ def test_locked_joints_reach_pybullet() -> None:
 
 
 def test_paths_that_the_validator_accepts_or_refuses() -> None:
-    robot, rng = box_arm(), np.random.default_rng(5)
+    robot = box_arm()
+    rng = np.random.default_rng(5)
     scene = Scene([Sphere(vector(0.7, 0.5, 0), 0.15), Box(vector(-0.5, -0.4, 0), vector(0.1, 0.2, 0.3))])
     verdicts = []
     with PyBulletOracle(robot, scene) as oracle:
@@ -133,7 +139,8 @@ def test_a_single_waypoint_is_checked() -> None:
 
 
 def test_frames_give_what_single_configurations_give() -> None:
-    robot, scene = far_pairs_only(example_robot("panda")), every_shape()
+    robot = far_pairs_only(example_robot("panda"))
+    scene = every_shape()
     rng = np.random.default_rng(1)
     ends = rng.uniform(robot.lower, robot.upper, (12, robot.dof))
     hits = 0
@@ -151,8 +158,10 @@ def test_frames_give_what_single_configurations_give() -> None:
 
 
 def test_scenes_are_replaced_and_the_robot_stays() -> None:
-    robot, q = box_arm(), np.zeros((1, 3))
-    blocked, clear = Scene([Sphere(vector(1.2, 0, 0), 0.1)]), Scene([Box(vector(0, 1, 0), vector(1, 0.1, 1))])
+    robot = box_arm()
+    q = np.zeros((1, 3))
+    blocked = Scene([Sphere(vector(1.2, 0, 0), 0.1)])
+    clear = Scene([Box(vector(0, 1, 0), vector(1, 0.1, 1))])
     with PyBulletOracle(robot, clear) as oracle:
         for _ in range(3):
             assert oracle.check_frames(q) is None
@@ -182,7 +191,8 @@ def test_a_tolerance_is_not_negative() -> None:
 
 
 def test_point_clouds_agree_with_coal() -> None:
-    robot, rng = far_pairs_only(example_robot("panda")), np.random.default_rng(4)
+    robot = far_pairs_only(example_robot("panda"))
+    rng = np.random.default_rng(4)
     ball = rng.normal(size=(400, 3))
     points = vector(0.4, 0.2, 0.5) + 0.25 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     scene = Scene([PointCloud(points, 0.02)])
@@ -200,7 +210,8 @@ def test_point_clouds_agree_with_coal() -> None:
 def test_a_mesh_that_comes_again_takes_no_memory_again() -> None:
     """PyBullet keeps what it was given of a mesh, 0.15 kB a triangle, after its body is removed too."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
-    panda, home = load_robot("panda"), np.zeros(7)
+    panda = load_robot("panda")
+    home = np.zeros(7)
     with World(panda, Scene([])) as world, PyBulletOracle(panda, Scene([])) as oracle:
         for x in (0.6, 0.8, 0.6):
             scene = Scene([Mesh(ball.vertices, ball.faces, xyz=(x, 0.0, 0.4))])

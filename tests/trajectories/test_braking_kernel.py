@@ -16,9 +16,11 @@ def test_steps_keep_limits_and_end_at_rest(seed: int) -> None:
     rng = np.random.default_rng(seed)
     waypoints = np.cumsum(rng.normal(size=(6, 7)) * 0.4, axis=0)
     line = BlendedPolyline(waypoints, half_widths(waypoints, np.full(4, 0.1)))
-    course, left = TimedPath(PANDA, LIMITS, line, True), SpeedProfile(np.zeros(2), np.zeros(2))
+    course = TimedPath(PANDA, LIMITS, line, True)
+    left = SpeedProfile(np.zeros(2), np.zeros(2))
     for k in range(400):
-        s, speed = float(left.s[0]), float(left.speeds[0])
+        s = float(left.s[0])
+        speed = float(left.speeds[0])
         if s >= course.end:
             break
         if k % 7 < 5:  # else the arm brakes for a while

@@ -54,7 +54,8 @@ def test_along_a_line_as_toppra_times_it():
     toppra: Any = pytest.importorskip("toppra")
     from toppra import algorithm, constraint
 
-    v, a = np.array([1.0, 0.7]), np.array([2.0, 3.0])
+    v = np.array([1.0, 0.7])
+    a = np.array([2.0, 3.0])
     for goal in (FAR, NEAR):
         path = toppra.SplineInterpolator([0.0, 1.0], np.stack([START, goal]))
         limits = [

@@ -184,7 +184,9 @@ def test_rows_of_the_shortest_pieces_agree(size: float) -> None:
     """Regression: between two close stops, rows at sample times did not show the acceleration."""
     robot = arm()
     q = np.zeros((4, 7))
-    q[1:, 0], q[2:, 2], q[3, 1] = 1.0, size, 1.0
+    q[1:, 0] = 1.0
+    q[2:, 2] = size
+    q[3, 1] = 1.0
     for accept in (never, always):
         t = time_parameterize(robot, path(robot, q), accept, accept)
         assert rate_violations(robot, t, VALIDATOR) == []
@@ -261,7 +263,9 @@ def test_a_limit_of_jerk_is_kept_with_the_others(
     assert np.array_equal(t.positions[0], q[0]) and np.array_equal(t.positions[-1], q[-1])
     assert not t.velocities[[0, -1]].any() and np.abs(t.accelerations[[0, -1]]).max() < 1e-9
     # the jerk is constant between rows, so that limits hold at every time
-    q, v, a = t.positions, t.velocities, t.accelerations
+    q = t.positions
+    v = t.velocities
+    a = t.accelerations
     assert np.abs(v[:-1] + steps / 2 * (a[1:] + a[:-1]) - v[1:]).max() < 1e-9
     assert np.abs(q[:-1] + steps * v[:-1] + steps**2 / 6 * (2 * a[:-1] + a[1:]) - q[1:]).max() < 1e-9
     if stops:
@@ -278,7 +282,8 @@ def test_a_motion_from_a_start_velocity_keeps_all_limits_and_need_not_stop(
     seed: int, jerk: float, scale: float, ratio: float
 ) -> None:
     """Velocities, accelerations and jerks every 0.5 ms, on the way straight on and then around a corner."""
-    robot, rng = arm(), np.random.default_rng(seed)
+    robot = arm()
+    rng = np.random.default_rng(seed)
     settings = TimingSettings(jerk=jerk, velocity_scale=scale, acceleration_scale=scale)
     direction = rng.normal(size=7)
     direction /= np.linalg.norm(direction)
@@ -358,7 +363,8 @@ def toppra_duration(robot: Robot, line: BlendedPolyline, settings: TimingSetting
 
 @given(seed=st.integers(0, 2**32 - 1), deviation=st.sampled_from([0.0, 0.02, 0.1]))
 def test_durations_are_those_of_toppra(seed: int, deviation: float) -> None:
-    rng, robot = np.random.default_rng(seed), arm()
+    rng = np.random.default_rng(seed)
+    robot = arm()
     q = np.cumsum(rng.normal(0, 0.4, (rng.integers(2, 8), 7)), axis=0)
     settings = replace(NO_JERK_LIMIT, corner_deviation=deviation)
     ours = time_parameterize(robot, path(robot, q), always, always, settings).duration
@@ -376,7 +382,8 @@ def test_the_estimated_time_is_near_the_exact_one(seed: int, narrow: float) -> N
     deviations = 10 ** rng.uniform(-2, 0, len(q) - 2)
     line = rounded_line(q, deviations)
     line[3][0] *= 1 - narrow
-    velocity, acceleration = rng.uniform(1, 3, 7), rng.uniform(5, 20, 7)
+    velocity = rng.uniform(1, 3, 7)
+    acceleration = rng.uniform(5, 20, 7)
     ratio = estimated_time(line, velocity, acceleration) / least_time(line, velocity, acceleration, 16, 128)
     assert 0.97 < ratio < 1.1
 
@@ -421,7 +428,8 @@ def test_every_path_has_a_timing(
         q = np.cumsum(10 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(0, 1, (count, dof)), axis=0)
     line = BlendedPolyline(q, half_widths(q, 10 ** rng.uniform(-4, 0, count - 2)))
     grid = timing_grid(line, TimingSettings())
-    first, second = line(grid, 1), line(grid, 2)
+    first = line(grid, 1)
+    second = line(grid, 2)
     found = fastest_speeds(first, second, grid, velocity, *symmetric_bounds(acceleration, len(grid)))
     assert (found[1:-1] > 0).all() and np.isfinite(found).all()
     assert (np.abs(first) * found[:, None] <= velocity * (1 + 1e-9)).all()
@@ -469,7 +477,8 @@ def test_rows_of_a_motion_without_end_are_counted(jerk: float | None) -> None:
 @pytest.mark.parametrize("jerk", [2e3, 7.5e3, 1e5, 1e300])
 def test_rows_tell_the_acceleration_under_a_high_limit_of_jerk(jerk: float) -> None:
     """It rose to its most between two rows, whose rates then did not agree: no motion was valid."""
-    robot, q = arm(), np.cumsum(np.random.default_rng(0).normal(0, 0.5, (5, 7)), axis=0)
+    robot = arm()
+    q = np.cumsum(np.random.default_rng(0).normal(0, 0.5, (5, 7)), axis=0)
     t = time_parameterize(robot, path(robot, q), always, always, TimingSettings(jerk=jerk))
     assert rate_violations(robot, t, VALIDATOR) == []
 
@@ -484,7 +493,8 @@ def test_the_least_limit_of_jerk_costs_little_more_than_it_must() -> None:
 
 def test_a_dense_path_is_driven_without_stops() -> None:
     """46 of 46 waypoints of a sampled path were stops: its rows did not tell its accelerations."""
-    rng, robot = np.random.default_rng(3), arm()
+    rng = np.random.default_rng(3)
+    robot = arm()
     along = np.linspace(0, 1, 48)[:, None]
     q = (
         along * rng.normal(0, 1, 7)
@@ -517,7 +527,8 @@ def test_a_corner_in_a_narrow_passage_is_no_stop() -> None:
 @pytest.mark.parametrize("accepted", [6, 7, 8])
 def test_lower_accelerations_that_did_not_help_are_given_up(accepted: int) -> None:
     """They stayed when the corners were tightened: such motions took 2.8 times as long as with stops."""
-    robot, calls = arm(), []
+    robot = arm()
+    calls = []
 
     def valid(_motion: Trajectory) -> bool:
         calls.append(1)
@@ -539,8 +550,11 @@ def test_joints_without_a_jerk_limit_have_the_stated_default() -> None:
 
 def test_a_corner_that_its_neighbour_leaves_more_room_is_checked_again() -> None:
     """The second corner, accepted beside a wide neighbour, grew when that shrank, and left the clearance."""
-    robot, q = arm(), np.zeros((4, 7))
-    q[1:, 0], q[2:, 1], q[3, 2] = 1.0, 1.0, 1.0
+    robot = arm()
+    q = np.zeros((4, 7))
+    q[1:, 0] = 1.0
+    q[2:, 1] = 1.0
+    q[3, 2] = 1.0
     p = path(robot, q)
 
     def keeps(corner: np.ndarray) -> bool:

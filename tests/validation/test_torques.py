@@ -30,7 +30,8 @@ def farthest_off(dynamics: Dynamics, pieces: Pieces) -> tuple[np.ndarray, np.nda
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("step", [0.3, 0.03, 0.01])
 def test_no_torque_leaves_its_chord_by_more_than_its_bound(name: str, step: float) -> None:
-    robot, rng = ROBOTS[name](), np.random.default_rng(0)
+    robot = ROBOTS[name]()
+    rng = np.random.default_rng(0)
     dynamics = Dynamics(robot, Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03]), TURNED)
     for _ in range(20):
         motion = wild(robot, rng, step)
@@ -74,7 +75,8 @@ def test_a_peak_between_two_times_is_found() -> None:
 
 def test_torques_are_those_of_the_cubics() -> None:
     """Two rows at rest: 12 rad/s² at both ends, whatever is written; gravity alone needs 2.4 N m."""
-    rows, still = np.array([[-0.25], [0.25]]), np.zeros((2, 1))
+    rows = np.array([[-0.25], [0.25]])
+    still = np.zeros((2, 1))
     motion = Trajectory(("hinge",), np.array([0.0, 0.5]), rows, still, still)
     assert first_excess(Dynamics(pendulum(5.3), Payload(0.0)), trajectory_pieces(motion), 0.01) is not None
     assert first_excess(Dynamics(pendulum(6.0), Payload(0.0)), trajectory_pieces(motion), 0.01) is None
@@ -88,7 +90,8 @@ def test_a_motion_that_winds_on_and_on_is_refused_in_bounded_time() -> None:
 
 
 def test_a_motion_of_one_row_is_held() -> None:
-    row, still = np.array([[1.5]]), np.zeros((1, 1))
+    row = np.array([[1.5]])
+    still = np.zeros((1, 1))
     for pieces in (
         static_pieces(row),
         trajectory_pieces(Trajectory(("hinge",), np.zeros(1), row, still, still)),
@@ -106,13 +109,17 @@ def test_a_torque_that_touches_its_limit_is_settled() -> None:
 
 
 def test_what_is_proved_holds_at_every_look() -> None:
-    panda, payload = rd.load_robot("panda"), Payload(3.0, [0.0, 0.0, 0.1])
-    low, far = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2], [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
+    panda = rd.load_robot("panda")
+    payload = Payload(3.0, [0.0, 0.0, 0.1])
+    low = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]
+    far = [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
     problem = Problem(panda, rd.Scene(), low, far, payload=payload)
     motion = rd.plan(problem, time_limit=10.0).trajectory
     assert motion is not None
-    dynamics, pieces = Dynamics(panda, payload), trajectory_pieces(motion)
-    rng, count = np.random.default_rng(0), len(motion.times) - 1
+    dynamics = Dynamics(panda, payload)
+    pieces = trajectory_pieces(motion)
+    rng = np.random.default_rng(0)
+    count = len(motion.times) - 1
     torques = np.abs(dynamics.torques(*pieces.states(rng.integers(count, size=4000), rng.random(4000))))
     for share in (1.1, 1.003, 0.999, 0.95):
         dynamics.limits = share * torques.max(axis=0)

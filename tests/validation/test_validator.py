@@ -138,7 +138,8 @@ def scenes(draw: st.DrawFn) -> list[Shape]:
 
 @given(scenes(), st.integers(0, 2**31), st.integers(2, 5))
 def test_the_certificate_agrees_with_dense_sampling(shapes: list[Shape], seed: int, count: int) -> None:
-    rng, robot = np.random.default_rng(seed), box_arm()
+    rng = np.random.default_rng(seed)
+    robot = box_arm()
     rows = rng.uniform(-2, 2, (1, 3)) + rng.uniform(-0.8, 0.8, (count, 3))
     report = validator(rows, *shapes)
     exact = ExactCollision(robot, Scene(shapes))
@@ -171,7 +172,8 @@ def test_the_first_of_two_collisions_is_reported() -> None:
         Sphere(1.1 * vector(np.cos(a), np.sin(a), 0), 0.05, name) for a, name in ((0.1, "b"), (0.5, "a"))
     )
     rows = np.array([[-0.6, 0, 0], [0.2, 0, 0], [1.0, 0, 0]])
-    forward, backward = validator(rows, early, late), validator(rows[::-1].copy(), early, late)
+    forward = validator(rows, early, late)
+    backward = validator(rows[::-1].copy(), early, late)
     assert refused(forward, "scene_collision").other == "b"
     assert refused(backward, "scene_collision").other == "a"
     found = refused(forward, "scene_collision")
@@ -184,7 +186,8 @@ def test_the_first_of_two_collisions_is_reported() -> None:
 
 def test_a_contact_with_two_obstacles_at_once_has_a_depth() -> None:
     """The arm starts inside two obstacles: the deeper contact is reported in either order."""
-    deep, shallow = Sphere(vector(1.1, 0.02, 0), 0.1, "deep"), Sphere(vector(1.15, 0.12, 0), 0.1, "shallow")
+    deep = Sphere(vector(1.1, 0.02, 0), 0.1, "deep")
+    shallow = Sphere(vector(1.15, 0.12, 0), 0.1, "shallow")
     for shapes in ((deep, shallow), (shallow, deep)):
         found = refused(validator(np.array([[0, 0, 0], [-0.5, 0, 0]]), *shapes), "scene_collision")
         assert (found.time, found.subject, found.other) == (0, "l3", "deep")
@@ -318,7 +321,8 @@ def test_twitching(spacing: float) -> None:
 def trajectory(duration: float) -> Trajectory:
     """The swing in a smooth motion from rest to rest, of this duration."""
     s = np.linspace(0, 1, 101)
-    way, span = 3 * s**2 - 2 * s**3, SWING[1] - SWING[0]
+    way = 3 * s**2 - 2 * s**3
+    span = SWING[1] - SWING[0]
     return Trajectory(
         box_arm().joint_names,
         s * duration,
@@ -442,7 +446,8 @@ def test_motions_begin_and_end_at_rest(end: int) -> None:
 def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     """Full acceleration, coasting and braking in random turns, from rest to rest, at random rows and where
     the acceleration jumps: the cubics are the motion."""
-    rng, robot = np.random.default_rng(seed), box_arm()
+    rng = np.random.default_rng(seed)
+    robot = box_arm()
     limit = robot.acceleration[0]
     count = 800 if most < 1e-3 else 40
     fine = np.repeat(rng.choice([-1.0, 0.0, 1.0], (12, 3)), count, axis=0) * limit
@@ -593,7 +598,8 @@ def test_accelerations_between_rows_are_those_of_the_cubic(factor: float, kind: 
 def test_limits_hold_between_rows() -> None:
     """Two rows just below a limit, between which the cubic goes 1.25 mrad beyond it."""
     high = box_arm().upper[1] - 0.5e-3
-    rows, v = np.array([[0, 2.5, 0], [0, high, 0], [0, high, 0], [0, 2.5, 0]]), np.zeros((4, 3))
+    rows = np.array([[0, 2.5, 0], [0, high, 0], [0, high, 0], [0, 2.5, 0]])
+    v = np.zeros((4, 3))
     v[1:3, 1] = 0.01, -0.01
     motion = between_rest(rows, [0.0, 2.0, 2.7, 4.7], v)
     found = refused(verified(motion), "limits")
@@ -608,9 +614,11 @@ def test_limits_hold_between_rows() -> None:
 def test_clearance_is_that_of_the_cubic(bulge: float, gap: float) -> None:
     """The cubic comes nearer to a wall than the straight lines between the rows: certified are 0.35 mm, and
     the arm was 0.29 mm inside."""
-    rows, v = np.zeros((4, 3)), np.zeros((4, 3))
+    rows = np.zeros((4, 3))
+    v = np.zeros((4, 3))
     rows[0, 0] = rows[-1, 0] = -0.5
-    v[1, 0], v[2, 0] = 4 * bulge, -4 * bulge
+    v[1, 0] = 4 * bulge
+    v[2, 0] = -4 * bulge
     motion = between_rest(rows, [0.0, 2.0, 3.0, 5.0], v)
     wall = Box(vector(1.1, 0.03 + 0.1 + gap, 0), vector(0.5, 0.2, 1.0))
     report = verified(motion, wall)

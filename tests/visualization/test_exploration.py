@@ -48,7 +48,8 @@ def test_a_cube_has_six_faces_around_it() -> None:
     inside = np.zeros((4, 5, 6), np.bool_)
     inside[1, 2, 3] = True
     numbers, first = faces_between(inside, ~inside)
-    size, at = inside.size, (1 * 5 + 2) * 6 + 3
+    size = inside.size
+    at = (1 * 5 + 2) * 6 + 3
     assert numbers.tolist() == [at - 30, at, size + at - 6, size + at, 2 * size + at - 1, 2 * size + at]
     assert first.tolist() == [False, True] * 3
     surface = faces_surface(inside, ~inside, (255, 0, 0))
@@ -61,7 +62,8 @@ def test_a_cube_has_six_faces_around_it() -> None:
 
 def test_faces_lie_between_the_two_sets_alone() -> None:
     unknown, free = np.zeros((2, 3, 3, 3), np.bool_)
-    unknown[0], free[1, 0, 0] = True, True
+    unknown[0] = True
+    free[1, 0, 0] = True
     numbers, first = faces_between(unknown, free)
     assert numbers.tolist() == [0] and first.tolist() == [True]
 
@@ -75,7 +77,8 @@ def test_each_moment_has_a_picture(tmp_path: Path) -> None:
     count = len(moments(explorer))
     columns = min(count, 3 if count > 4 else 2)
     with Image.open(tmp_path / "explore.png") as image:
-        width, height = columns * (240 + GAP) - GAP, -(-count // columns) * (150 + GAP) - GAP
+        width = columns * (240 + GAP) - GAP
+        height = -(-count // columns) * (150 + GAP) - GAP
         assert image.size == (width, height)
         first = np.asarray(image)[:100, :240].astype(int)
     blue = (first[..., 2] > first[..., 0] + 25).sum()
@@ -101,9 +104,13 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def numbers(text: str) -> list[int]:
     """What the page decodes: differences in groups of 7 bits, the lowest first."""
-    out, last, value, shift = [], 0, 0, 0
+    out = []
+    last = 0
+    value = 0
+    shift = 0
     for byte in base64.b64decode(text):
-        value, shift = value + ((byte & 127) << shift), shift + 7
+        value = value + ((byte & 127) << shift)
+        shift = shift + 7
         if byte < 128:
             last += value
             out.append(last)

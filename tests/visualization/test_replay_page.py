@@ -117,7 +117,8 @@ def test_bad_output_is_one_line(arm, motion, write, ending, name, tmp_path):
 
 
 def test_names_of_obstacles_stay_text_in_a_replay(tmp_path) -> None:
-    panda, name = rd.load_robot("panda"), "</script><script>alert(1)</script>"
+    panda = rd.load_robot("panda")
+    name = "</script><script>alert(1)</script>"
     q = np.zeros((2, panda.dof))
     motion = rd.Trajectory(panda.joint_names, np.array([0.0, 1.0]), q, 0 * q, 0 * q)
     file = tmp_path / "replay.html"

@@ -101,7 +101,8 @@ class Prover:
     ) -> None:
         """`off`: how far the motion leaves the straight line from each configuration to the next; 0 if it is
         None."""
-        self.robot, self.q = robot, q
+        self.robot = robot
+        self.q = q
         self.off = np.zeros_like(q[1:]) if off is None else off
         self.linkage, self.obstacles = Linkage(robot), Obstacles(scene)
         self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
@@ -148,7 +149,8 @@ class Prover:
         """Largest distance of each joint from the middle of a stretch to anywhere on it [rad] or [m]."""
         q = self.at(middle)
         spans = np.maximum(np.abs(self.at(start) - q), np.abs(self.at(stop) - q))
-        first, last = np.floor(start).astype(int) + 1, np.ceil(stop).astype(int) - 1
+        first = np.floor(start).astype(int) + 1
+        last = np.ceil(stop).astype(int) - 1
         within = np.flatnonzero(first <= last)
         if len(within):
             edges = np.column_stack([first[within], last[within] + 1]).ravel()
@@ -215,7 +217,8 @@ class Prover:
         distances: from each ball's row in `links`, its posture and its centre; None: only displacement.
         """
         row, ball, begin = self._expand(links)
-        at, radius = posture[row], self._balls[ball, 3]
+        at = posture[row]
+        radius = self._balls[ball, 3]
         T = postures.T[at, links[row]]
         centers = _placed_points(T, self._balls[ball, :3])
         went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
@@ -229,7 +232,8 @@ class Prover:
         self, claim: ndarray, posture: ndarray, postures: Postures, spans: ndarray, pairs: bool
     ) -> tuple[ndarray, ndarray]:
         further = np.array([self._of[c.link] for c in self.claims])[claim]
-        moved, others = self._moved[further], np.zeros(len(claim))
+        moved = self._moved[further]
+        others = np.zeros(len(claim))
         if not pairs:
 
             def to_scene(row: ndarray, at: ndarray, centers: ndarray) -> ndarray:
@@ -285,18 +289,21 @@ class Prover:
         normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
         for plane in planes:
             normals.setdefault(plane[:3], []).append(plane.normal)
-        least, left = np.full(len(marked), CLEARANCE_CAP), np.full(len(marked), CLEARANCE_CAP)
+        least = np.full(len(marked), CLEARANCE_CAP)
+        left = np.full(len(marked), CLEARANCE_CAP)
         places = [(self.claims[stretches.claim[i]], postures.T[which[i]]) for i in marked]
         standing = [placed(self.parts[claim.link], T[self._of[claim.link]]) for claim, T in places]
         in_scene = [k for k, (claim, _) in enumerate(places) if claim.against == SCENE]
         centers = [part.center for k in in_scene for part in standing[k]]
         to_scene = iter(self.obstacles.distances(np.array(centers).reshape(-1, 3)))
         for k, (claim, T) in enumerate(places):
-            mine, theirs = self._moved[self._of[claim.link]], np.zeros(len(self.linkage.slides), bool)
+            mine = self._moved[self._of[claim.link]]
+            theirs = np.zeros(len(self.linkage.slides), bool)
             if claim.against != SCENE:
                 other = self._moved[self._of[claim.against]]
                 mine, theirs = mine & ~other, other & ~mine
-            mine, theirs = np.flatnonzero(mine), np.flatnonzero(theirs)
+            mine = np.flatnonzero(mine)
+            theirs = np.flatnonzero(theirs)
             at, (way, off) = which[marked[k]], ways[k]
             for p, part in enumerate(standing[k]):
                 bodies = self.others(claim, T, part)
@@ -321,7 +328,8 @@ class Prover:
                             against = (heights + comes).max(axis=1) - heights.max(axis=1)
                         widest = gaps(part, body, n).max(axis=-1)
                         remaining = (gaps(part, body, n, nearer) - against).max(axis=-1)
-                        least_of, left_of = np.maximum(apart[o], widest), np.maximum(along[o], remaining)
+                        least_of = np.maximum(apart[o], widest)
+                        left_of = np.maximum(along[o], remaining)
                         beyond = PLANE_RANGE if isinstance(body, Surface) else CLEARANCE_CAP
                         apart[o] = max(apart[o], least_of.min(initial=beyond))
                         along[o] = max(along[o], left_of.min(initial=beyond - displacement[k]))
@@ -342,7 +350,8 @@ class Prover:
         others = [body for body in bodies if isinstance(body, Part)]
         if not others:
             return self.obstacles.distances(part.center[None])[0] - part.radius
-        centers, radii = np.array([other.center for other in others]), [other.radius for other in others]
+        centers = np.array([other.center for other in others])
+        radii = [other.radius for other in others]
         return np.sqrt(((part.center - centers) ** 2).sum(axis=1)) - part.radius - radii
 
 
@@ -373,7 +382,8 @@ def gaps(
 
 def placed(parts: tuple[Part, ...], T: Pose) -> list[Part]:
     """Parts in the base frame, T being the pose of their link."""
-    R, t = T[:3, :3], T[:3, 3]
+    R = T[:3, :3]
+    t = T[:3, 3]
     return [part._replace(vertices=part.vertices @ R.T + t, center=R @ part.center + t) for part in parts]
 
 
@@ -397,7 +407,8 @@ def _balls(robot: Robot, link: str) -> Float[ndarray, "n 4"]:
 
 
 def _parts(robot: Robot, link: str) -> tuple[Part, ...]:
-    meshes, none = robot.meshes.get(link, ()), np.zeros((0, 3), int)
+    meshes = robot.meshes.get(link, ())
+    none = np.zeros((0, 3), int)
     if meshes:
         return tuple(Part(mesh.vertices, mesh.faces, 0.0, *_ball(mesh.vertices)) for mesh in meshes)
     return tuple(Part(s[None, :3], none, float(s[3]), s[:3], float(s[3])) for s in robot.spheres[link])
@@ -466,6 +477,7 @@ class MovingProver(Prover):
                 found[balls] = self._shapes[i].distances(local @ stands[:3, :3].T + stands[:3, 3])[:, 0]
             return found
 
-        posture, moved = np.arange(len(which)), self._moved[further]
+        posture = np.arange(len(which))
+        moved = self._moved[further]
         clearance, went = self._ball_bounds(further, moved, posture, postures, spans, distances)
         return Bounds(clearance, went + obstacle)

@@ -20,7 +20,8 @@ from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.types import Path, Trajectory, check_motion_arrays
 from robotdiffuse.problems.problem import Problem
 
-FILE_MARK, VERSION = "robotdiffuse certificate", 1
+FILE_MARK = "robotdiffuse certificate"
+VERSION = 1
 RATE_ROWS = ("times", "velocities", "accelerations")
 STRETCH_FIELDS = ("start", "stop", "by_planes", "clearance", "displacement")
 
@@ -112,7 +113,9 @@ def _motion(_: str, record: dict[str, Any]) -> Path | Trajectory:
 def _proof(_: str, record: list[dict[str, Any]] | None) -> StretchProof | None:
     if record is None:
         return None
-    claims, columns, planes = [], {name: [np.zeros(0)] for name in ("claim", *STRETCH_FIELDS)}, []
+    claims = []
+    columns = {name: [np.zeros(0)] for name in ("claim", *STRETCH_FIELDS)}
+    planes = []
     begin = 0
     for k, entry in enumerate(record):
         claims.append(Claim(str(entry["link"]), str(entry["against"])))

@@ -119,8 +119,10 @@ def hash_of(motion: Path | Trajectory) -> str:
 
 def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Differences in the proof in the scene and between links."""
-    motion, proof = certificate.motion, certificate.proof
-    q, off = configurations(motion, certificate.between), deviations(motion, certificate.between)
+    motion = certificate.motion
+    proof = certificate.proof
+    q = configurations(motion, certificate.between)
+    off = deviations(motion, certificate.between)
     prover = Prover(problem.robot, problem.scene, q, off)
     stated = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
     of_pairs = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
@@ -129,7 +131,8 @@ def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
 
 def _moving_proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Differences in the proof among moving obstacles."""
-    motion, proof = certificate.motion, certificate.moving
+    motion = certificate.motion
+    proof = certificate.moving
     if not problem.moving:
         if proof is not None:
             yield "proof: there is one among moving obstacles, which the problem has not"
@@ -140,9 +143,11 @@ def _moving_proof_errors(problem: Problem, certificate: MotionProof) -> Iterator
         yield "proof: there is none among moving obstacles"
         return
     times = places_of(motion, certificate.between)
-    q, off = configurations(motion, certificate.between), deviations(motion, certificate.between)
+    q = configurations(motion, certificate.between)
+    off = deviations(motion, certificate.between)
     prover = MovingProver(problem.robot, problem.moving, q, times, off)
-    every, stated = np.ones(len(proof.stretches.claim), bool), {"scene": certificate.scene_clearance}
+    every = np.ones(len(proof.stretches.claim), bool)
+    stated = {"scene": certificate.scene_clearance}
     yield from _bound_errors(prover, proof, {"scene": every}, stated)
 
 
@@ -151,7 +156,8 @@ def _bound_errors(
 ) -> Iterator[str]:
     """Differences in stretches and bounds. `kinds` marks the stretches of each kind of clearance; `stated`
     holds the clearance that the proof states for each kind [m]."""
-    stretches, known = proof.stretches, {claim: k for k, claim in enumerate(prover.claims)}
+    stretches = proof.stretches
+    known = {claim: k for k, claim in enumerate(prover.claims)}
     for claim in proof.claims:
         if claim not in known:
             yield f"proof: {describe_claim(claim)} needs no proof"
@@ -179,7 +185,8 @@ def _bound_errors(
     own = np.array([known[claim] for claim in proof.claims])[stretches.claim]
     bounds = prover.bounds(stretches._replace(claim=own), proof.by_planes, list(proof.planes))
     for what in ("clearance", "displacement"):
-        written, right = getattr(proof, what), getattr(bounds, what)
+        written = getattr(proof, what)
+        right = getattr(bounds, what)
         off = np.flatnonzero(~(np.abs(written - right) <= BOUND_TOLERANCE))
         if len(off):
             i = int(off[0])
@@ -206,7 +213,8 @@ def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
     stretches = proof.stretches
     for k, claim in enumerate(proof.claims):
         rows = np.flatnonzero(stretches.claim == k)
-        start, stop = stretches.start[rows], stretches.stop[rows]
+        start = stretches.start[rows]
+        stop = stretches.stop[rows]
         edges = np.concatenate([[0.0], stop]), np.concatenate([start, [last]])
         # A motion of one row has no gap even without stretches, but then its row is not proved.
         empty = not len(rows)

@@ -58,20 +58,26 @@ class Linkage:
     def place(self, q: Configurations, link: str | None = None) -> Postures:
         """Poses at configurations. With `link`, only the links between the base and that link; the rest is
         0."""
-        n, dof = len(q), len(self._planned)
-        T, origins, axes = np.zeros((n, len(self.links), 4, 4)), np.zeros((n, dof, 3)), np.zeros((n, dof, 3))
+        n = len(q)
+        dof = len(self._planned)
+        T = np.zeros((n, len(self.links), 4, 4))
+        origins = np.zeros((n, dof, 3))
+        axes = np.zeros((n, dof, 3))
         T[:, :, 3, 3], sines, rests = 1.0, np.sin(q).T[:, :, None, None], 1 - np.cos(q).T[:, :, None, None]
         at = {self.robot.base: (np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)))}
         for joint in self.robot.joints if link is None else self._up_to(link):
             R, p = at[joint.parent]
-            turn, along = joint.T_parent_joint[:3, :3], joint.axis
+            turn = joint.T_parent_joint[:3, :3]
+            along = joint.axis
             p = p + R @ joint.T_parent_joint[:3, 3]
             j = self._planned.get(joint.name)
             if j is None and joint.kind != "fixed":
                 held = _motion(joint.kind, along, self.robot.locked.get(joint.name, 0.0))
-                p, turn = p + R @ (turn @ held[:3, 3]), turn @ held[:3, :3]
+                p = p + R @ (turn @ held[:3, 3])
+                turn = turn @ held[:3, :3]
             if j is not None:
-                origins[:, j], axes[:, j] = p, R @ (turn @ along)
+                origins[:, j] = p
+                axes[:, j] = R @ (turn @ along)
             if j is not None and not self.slides[j]:
                 K = cross_matrix(along)  # for Rodrigues' formula
                 R = _times(R, turn) + sines[j] * _times(R, turn @ K) + rests[j] * _times(R, turn @ K @ K)
@@ -86,7 +92,8 @@ class Linkage:
 
     def _up_to(self, link: str) -> list[Joint]:
         """Joints from the base to a link, parents first."""
-        found, above = list[Joint](), {joint.child: joint for joint in self.robot.joints}
+        found = list[Joint]()
+        above = {joint.child: joint for joint in self.robot.joints}
         while link in above:
             found.append(above[link])
             link = above[link].parent
@@ -95,7 +102,8 @@ class Linkage:
     def levers(self, link: str, q: Configurations) -> Float[ndarray, "joints"]:
         """Upper bounds on the distance of a link's origin from the axes of the planned joints that move it,
         in order [m]; 1 for a joint that slides. `q` holds the extreme positions of a motion."""
-        found, length = list[float](), 0.0
+        found = list[float]()
+        length = 0.0
         for joint in reversed(self._up_to(link)):
             j = self._planned.get(joint.name)
             if j is not None:
@@ -112,7 +120,8 @@ class Linkage:
         """The planned joints that move a link, and the derivatives of its origin by each of them [m]."""
         k = self.links.index(link)
         joints = np.flatnonzero(self.moved[k])
-        arms, axes = postures.T[:, k, None, :3, 3] - postures.origins[:, joints], postures.axes[:, joints]
+        arms = postures.T[:, k, None, :3, 3] - postures.origins[:, joints]
+        axes = postures.axes[:, joints]
         return joints, np.where(self.slides[joints][:, None], axes, np.cross(axes, arms))
 
     def displacement(
@@ -160,7 +169,8 @@ class Linkage:
         sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), because the second derivative of the point by joints j <= k
         is at most its greatest distance L_k from axis k.
         """
-        which, off = moved_by.tolist(), np.broadcast_to(off, steps.shape[1])
+        which = moved_by.tolist()
+        off = np.broadcast_to(off, steps.shape[1])
         spans = np.abs(steps).max(axis=0) + off
         rates = np.cross(axes[which, None], points[None] - origins[which, None])
         rates[self.slides[which]] = axes[which, None][self.slides[which]]
@@ -168,7 +178,8 @@ class Linkage:
         along = np.moveaxis(rates @ normals.T, 2, 1).reshape(len(which), -1)
         towards = off[which] @ np.abs(along) - (steps[:, which] @ along).min(axis=0)
         towards = towards.reshape(len(normals), len(points))
-        went, rest = np.zeros(len(points)), np.zeros(len(points))
+        went = np.zeros(len(points))
+        rest = np.zeros(len(points))
         for i in reversed(range(len(which))):
             j = which[i]
             arm = lengths[i] if self.slides[j] else lengths[i] + went
@@ -188,7 +199,8 @@ def cross_matrix(axis: Vector) -> Rotation:
 
 
 def _motion(kind: str, axis: Vector, q: float) -> Pose:
-    T, K = np.eye(4), cross_matrix(axis)
+    T = np.eye(4)
+    K = cross_matrix(axis)
     if kind == "prismatic":
         T[:3, 3] = q * axis
     else:
@@ -212,9 +224,11 @@ class Cubics(NamedTuple):
 
     def at(self, row: Int[ndarray, "n"], time: Values) -> tuple[Configurations, JointRows, JointRows]:
         """Positions, velocities and accelerations of cubics `time` seconds after they begin."""
-        t, a = time[:, None], self.start[row]
+        t = time[:, None]
+        a = self.start[row]
         jerk = (self.end[row] - a) / self.steps[row]
-        v, q = self.velocities[row], self.positions[row]
+        v = self.velocities[row]
+        q = self.positions[row]
         return (
             q + t * (v + t * (a / 2 + t * jerk / 6)),
             v + t * (a + t * jerk / 2),
@@ -242,7 +256,8 @@ class Cubics(NamedTuple):
     @property
     def turns(self) -> Configurations:
         """Positions of each joint where a cubic has its extremes, or elsewhere on it if it has none."""
-        v, curve = self.velocities / self.steps, self.end - self.start
+        v = self.velocities / self.steps
+        curve = self.end - self.start
         root = np.sqrt(np.maximum(self.start**2 - 2 * curve * v, 0.0))
         far = -self.start - np.where(self.start < 0, -root, root)
         shares = [
@@ -259,7 +274,8 @@ class Cubics(NamedTuple):
         """Upper bounds on how far each joint leaves the straight lines between its positions at these times,
         among which are those of all rows: an eighth of its greatest acceleration times the square of the
         time."""
-        row, most = self.rows(times[:-1]), 0.0
+        row = self.rows(times[:-1])
+        most = 0.0
         for end in (times[:-1], times[1:]):
             most = np.maximum(most, np.abs(self.at(row, end - self.times[row])[2]))
         return most * np.diff(times)[:, None] ** 2 / 8
@@ -284,7 +300,10 @@ def cubics_of(motion: Path | Trajectory) -> Cubics | None:
     """The cubics of a trajectory whose times increase; None for a path or a single row."""
     if not isinstance(motion, Trajectory) or len(motion.times) < 2:
         return None
-    steps, q, v = np.diff(motion.times)[:, None], motion.positions, motion.velocities
+    steps = np.diff(motion.times)[:, None]
+    q = motion.positions
+    v = motion.velocities
     mean = (q[1:] - q[:-1]) / steps
-    start, end = (6 * mean - 4 * v[:-1] - 2 * v[1:]) / steps, (2 * v[:-1] + 4 * v[1:] - 6 * mean) / steps
+    start = (6 * mean - 4 * v[:-1] - 2 * v[1:]) / steps
+    end = (2 * v[:-1] + 4 * v[1:] - 6 * mean) / steps
     return Cubics(motion.times[:-1], steps, q[:-1], v[:-1], start, end)

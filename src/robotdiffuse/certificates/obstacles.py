@@ -98,14 +98,16 @@ class Obstacles:
 
 
 def _body(shape: Shape) -> Rounded | Surface:
-    zero, eye = np.zeros(3), np.eye(3)
+    zero = np.zeros(3)
+    eye = np.eye(3)
     match shape:
         case Sphere():
             return Rounded(shape.center, eye, zero, 0.0, shape.radius)
         case Box():
             return Rounded(shape.center, rotation_from_quaternion(shape.wxyz), shape.size / 2, 0.0, 0.0)
         case Cylinder() | Capsule():
-            half, R = np.array([0.0, 0.0, shape.height / 2]), rotation_from_quaternion(shape.wxyz)
+            half = np.array([0.0, 0.0, shape.height / 2])
+            R = rotation_from_quaternion(shape.wxyz)
             round_ends = isinstance(shape, Capsule)
             disc, rounding = (0.0, shape.radius) if round_ends else (shape.radius, 0.0)
             return Rounded(shape.center, R, half, disc, rounding)
@@ -171,9 +173,11 @@ def _to_triangles(p: Points, triangles: Float[ndarray, "n 3 3"]) -> Values:
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     area = np.sqrt((normal**2).sum(axis=1))
-    within, distance = area > 0, np.full(len(p), np.inf)
+    within = area > 0
+    distance = np.full(len(p), np.inf)
     for start, stop in ((a, b), (b, c), (c, a)):
-        edge, out = stop - start, p - start
+        edge = stop - start
+        out = p - start
         within &= (np.cross(edge, out) * normal).sum(axis=1) >= 0
         length2 = np.maximum((edge**2).sum(axis=1), 1e-300)
         share = np.clip((edge * out).sum(axis=1) / length2, 0.0, 1.0)

@@ -143,10 +143,12 @@ def request_parts(problem: Problem) -> dict[str, str]:
     torques depend on: inertias, effort limits and the base's pose."""
     parts = {}
     if problem.payload is not None:
-        robot, carried = problem.robot, problem.payload
+        robot = problem.robot
+        carried = problem.payload
         links = sorted(robot.inertias)
         rows = [robot.inertias[link].values for link in links]
-        own, T_world_base = [carried.mass, *carried.com, *carried.moments], problem.T_world_base
+        own = [carried.mass, *carried.com, *carried.moments]
+        T_world_base = problem.T_world_base
         stands = np.eye(4) if T_world_base is None else T_world_base
         parts["payload"] = _hash([carried.link, *links], own, stands, robot.effort, rows)
     for one in problem.moving:

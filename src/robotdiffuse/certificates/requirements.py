@@ -49,8 +49,9 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.inertias import Inertia
 from robotdiffuse.robots.robot import Joint, Robot
 
-MAX_HALVINGS, MAX_OPEN = 24, 100_000
-"""Halvings of a step at most, and stretches at a time, to show that a frame keeps its speed."""
+# Halvings of a step at most, and stretches at a time, to show that a frame keeps its speed.
+MAX_HALVINGS = 24
+MAX_OPEN = 100_000
 SAME_POSE = 1e-3
 """Poses at several goals may differ by this for a Cartesian line to end there [m] and in entries of R."""
 
@@ -134,7 +135,9 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
     A velocity leaves its chord by at most an eighth of its second derivative times the square of the time.
     The derivatives of a position by several joints are at most the lever of the last of them.
     """
-    linkage, lines, cubics = Linkage(problem.robot), [], cubics_of(motion)
+    linkage = Linkage(problem.robot)
+    lines = []
+    cubics = cubics_of(motion)
     if cubics is None:
         return lines
     far = np.concatenate([motion.positions, cubics.turns])
@@ -142,19 +145,26 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
     for one in problem.constraints:
         if not isinstance(one, CartesianLine) or one.speed is None:
             continue
-        joints, levers = np.flatnonzero(linkage.moved[linkage.links.index(one.frame)]), linkage.levers
-        speed, pull = np.cumsum(cubics.speeds[:, joints], axis=1), np.cumsum(cubics.pulls[:, joints], axis=1)
+        joints = np.flatnonzero(linkage.moved[linkage.links.index(one.frame)])
+        levers = linkage.levers
+        speed = np.cumsum(cubics.speeds[:, joints], axis=1)
+        pull = np.cumsum(cubics.pulls[:, joints], axis=1)
         products = np.diff(3 * pull * speed + speed**3, axis=1, prepend=0.0)
         bends = (jerks[:, joints] + products) @ levers(one.frame, far)
-        row, start, stop = np.arange(len(bends)), np.zeros(len(bends)), cubics.steps[:, 0]
+        row = np.arange(len(bends))
+        start = np.zeros(len(bends))
+        stop = cubics.steps[:, 0]
         allowed = one.speed * (1 + slack)
         for _ in range(MAX_HALVINGS):
             most = np.maximum(*(_frame_speeds(linkage, cubics, one.frame, row, at) for at in (start, stop)))
             open_ = ~(most + bends[row] * (stop - start) ** 2 / 8 <= allowed)
             if not open_.any() or not (most <= allowed).all() or open_.sum() > MAX_OPEN:
                 break
-            row, low, high = row[open_], start[open_], stop[open_]
-            start, stop = np.append(low, (low + high) / 2), np.append((low + high) / 2, high)
+            row = row[open_]
+            low = start[open_]
+            high = stop[open_]
+            start = np.append(low, (low + high) / 2)
+            stop = np.append((low + high) / 2, high)
             row = np.tile(row, 2)
         if open_.any():
             how = (
@@ -176,7 +186,8 @@ def _frame_motion(linkage: Linkage, postures: Postures, q: ndarray, frame: str) 
     T, (joints, rates) = postures.T[:, linkage.links.index(frame)], linkage.rates(postures, frame)
     step = np.abs(np.diff(q, axis=0))[:, joints]
     lengths = np.linalg.norm(rates[:-1], axis=2)
-    went, sag = np.zeros(len(step)), np.zeros(len(step))
+    went = np.zeros(len(step))
+    sag = np.zeros(len(step))
     for j in reversed(range(len(joints))):
         if not linkage.slides[joints[j]]:
             lengths[:, j] += went  # later joints may have moved it away by so much
@@ -191,7 +202,8 @@ def _body(constraint: Constraint) -> _Body:
     if isinstance(constraint, PositionBox):
         T = constraint.T_base_box
         assert T is not None  # the constructor sees to it
-        middle, half = (constraint.low + constraint.high) / 2, (constraint.high - constraint.low) / 2
+        middle = (constraint.low + constraint.high) / 2
+        half = (constraint.high - constraint.low) / 2
         return _Body(T[:3, :3] @ middle + T[:3, 3], T[:3, :3], half)
     assert not isinstance(constraint, AxisCone | CartesianLine)
     flat = isinstance(constraint, OnPlane)
@@ -215,7 +227,8 @@ def _with_z(z: ndarray) -> Rotation:
 def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndarray, ndarray]:
     """T_base_frame at start and goal."""
     k = linkage.links.index(line.frame)
-    start, goal = linkage.place(problem.start[None]).T[0], problem.goal
+    start = linkage.place(problem.start[None]).T[0]
+    goal = problem.goal
     if isinstance(goal, JointGoal):
         ends = linkage.place(goal.positions).T[:, k]
         if not (np.abs(ends - ends[0]) <= SAME_POSE).all():
@@ -319,10 +332,13 @@ def _states(motion: Path | Trajectory, samples: Values) -> States:
     row = cubics.rows(at[:-1])
     ends = [cubics.at(row, time - cubics.times[row]) for time in (at[:-1], at[1:])]
     q, v, a = (np.stack(both) for both in zip(*ends, strict=True))
-    speed, pull = cubics.speeds, cubics.pulls
+    speed = cubics.speeds
+    pull = cubics.pulls
     jerk = np.abs(cubics.end - cubics.start) / cubics.steps
     far = np.abs(cubics.positions) + speed * cubics.steps
-    places, speeds, pulls = (far, speed, pull), (speed, pull, jerk), (pull, jerk, 0 * jerk)
+    places = (far, speed, pull)
+    speeds = (speed, pull, jerk)
+    pulls = (pull, jerk, 0 * jerk)
     bounds = (Bound(*(part[row] for part in of)) for of in (places, speeds, pulls))
     return States(q, v, a, np.diff(at), *bounds)
 
@@ -391,11 +407,15 @@ def _newton_euler(
         of the child.
     of_body: the arm to a body's centre of mass, and the product with its inertia.
     """
-    robot, number = problem.robot, {joint.name: j for j, joint in enumerate(problem.robot.planned_joints)}
-    slides, turning = Linkage(robot).slides, {robot.base: at_base}
-    arms, axes = dict[str, Any](), dict[str, Any]()
+    robot = problem.robot
+    number = {joint.name: j for j, joint in enumerate(problem.robot.planned_joints)}
+    slides = Linkage(robot).slides
+    turning = {robot.base: at_base}
+    arms = dict[str, Any]()
+    axes = dict[str, Any]()
     for joint in robot.joints:
-        j, link = number.get(joint.name), joint.child
+        j = number.get(joint.name)
+        link = joint.child
         needed, w, dw, pull = turning[joint.parent]
         arms[link], axes[link], along, bent, needed = of_joint(joint, j, needed)
         pull = pull + dw * arms[link] + w * (w * arms[link])
@@ -408,7 +428,8 @@ def _newton_euler(
     force, moment = ({link: at_base[1] for link in turning} for _ in range(2))
     loads = dict[int, tuple[Any, Any]]()
     for joint in reversed(robot.joints):
-        j, link = number.get(joint.name), joint.child
+        j = number.get(joint.name)
+        link = joint.child
         needed, w, dw, pull = turning[link]
         for body in carried.get(link, ()):
             arm, inertia = of_body(body, link, needed)
@@ -425,8 +446,10 @@ def _newton_euler(
 def _second_derivative_bounds(problem: Problem, states: States) -> JointRows:
     """Upper bounds on the second derivatives of torques from each sample to the next: the same equations on
     bounds. Of a link, bounds of its rotation are needed."""
-    robot, none = problem.robot, np.zeros(len(states.durations))
-    still, slides = Bound(none, none, none), Linkage(robot).slides
+    robot = problem.robot
+    none = np.zeros(len(states.durations))
+    still = Bound(none, none, none)
+    slides = Linkage(robot).slides
 
     def of_joint(joint: Joint, j: int | None, seen: Bound) -> tuple[Any, ...]:
         held = joint.motion(robot.locked.get(joint.name, 0.0)) if j is None else np.eye(4)
@@ -458,7 +481,8 @@ def _rotating(length: float, seen: Bound) -> Bound:
 
 def _masses(problem: Problem) -> dict[str, list[Inertia]]:
     """The inertias of each link, with the payload's."""
-    payload, found = problem.payload, {link: [of] for link, of in problem.robot.inertias.items()}
+    payload = problem.payload
+    found = {link: [of] for link, of in problem.robot.inertias.items()}
     assert payload is not None
     if payload.mass > MIN_MASS:
         link = payload.link or problem.robot.tip
@@ -478,8 +502,9 @@ JUMP = 1e-6
 """Where a jerk is stated, share of a joint's acceleration limit by which its acceleration may jump."""
 MIN_JERK = 1e-6
 """Jerks below this are rounding errors [rad/s³] or [m/s³]."""
-BLEND_SHARE, MAX_LOOKS = 0.25, 10_000
-"""A blend is looked for at configurations at most this share of its radius apart, at most so many a step."""
+# A blend is looked for at configurations at most this share of its radius apart, at most so many a step.
+BLEND_SHARE = 0.25
+MAX_LOOKS = 10_000
 MIN_TIME = 1e-12
 """Shorter times are taken as this [s], so that rates over them are finite."""
 
@@ -494,7 +519,8 @@ def configurations(motion: Path | Trajectory, between: Values) -> Configurations
         return motion.positions
     cubics = cubics_of(motion)
     if cubics is None:
-        places, rows = places_of(motion, between), clock(motion)
+        places = places_of(motion, between)
+        rows = clock(motion)
         return np.column_stack([np.interp(places, rows, joint) for joint in motion.positions.T])
     times = np.concatenate([clock(motion), between])
     rows = cubics.rows(between)
@@ -526,10 +552,13 @@ def not_checked(problem: Problem, motion: Path | Trajectory) -> list[str]:
 
 def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """A line for each requirement that the motion fails, or is not shown to meet."""
-    robot, motion, tolerances = problem.robot, certificate.motion, certificate.tolerances
+    robot = problem.robot
+    motion = certificate.motion
+    tolerances = certificate.tolerances
     for name in not_covered(problem, motion):
         yield f"problem: certificates do not prove anything about {name}"
-    q, cubics = configurations(motion, certificate.between), cubics_of(motion)
+    q = configurations(motion, certificate.between)
+    cubics = cubics_of(motion)
     every = motion.positions if cubics is None else np.concatenate([motion.positions, cubics.turns])
     beyond = np.maximum(robot.lower - every, every - robot.upper)
     beyond[:, robot.continuous] = 0.0
@@ -553,7 +582,8 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
 def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
     """What would make the other tests meaningless: joints that are not the robot's, times that do not begin
     at 0 or do not increase, and places of the proof that are not on the motion."""
-    motion, robot = certificate.motion, problem.robot
+    motion = certificate.motion
+    robot = problem.robot
     if tuple(motion.joint_names) != robot.joint_names:
         return [f"motion: its joints are {joined(motion.joint_names)}, not {joined(robot.joint_names)}"]
     times = clock(motion)
@@ -603,7 +633,8 @@ def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> 
 def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: Tolerances) -> Iterator[str]:
     """The first waypoint at which the motion does not stop, or that it does not pass within its blend, after
     those before it."""
-    robot, after = problem.robot, 0.0
+    robot = problem.robot
+    after = 0.0
     for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
         rows = np.arange(len(motion.positions))
         if isinstance(motion, Trajectory):
@@ -630,7 +661,8 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
 def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Torque limits that are not shown to be kept with the payload, and torques that differ from the
     proof."""
-    motion, stated = certificate.motion, certificate.torques
+    motion = certificate.motion
+    stated = certificate.torques
     if problem.payload is None:
         if stated:
             yield "torques: the problem has no payload"
@@ -651,7 +683,8 @@ def _constraint_errors(problem: Problem, certificate: MotionProof, q: Configurat
     if [one.name for one in shown] != [name for name, _ in certificate.constraints]:
         yield "constraints: they are not those of the problem"
         return
-    most, limits = [float(one.bounds.max()) for one in shown], [one.limit for one in shown]
+    most = [float(one.bounds.max()) for one in shown]
+    limits = [one.limit for one in shown]
     yield from _stated_errors("constraints", certificate.constraints, most, limits)
 
 
@@ -669,12 +702,17 @@ def _stated_errors(
 def _rate_errors(
     robot: Robot, motion: Trajectory, certificate: MotionProof, begins: JointValues
 ) -> Iterator[str]:
-    tolerances, step = certificate.tolerances, np.diff(motion.times)[:, None]
-    cubics, off = cubics_of(motion), deviations(motion, certificate.between)
+    tolerances = certificate.tolerances
+    step = np.diff(motion.times)[:, None]
+    cubics = cubics_of(motion)
+    off = deviations(motion, certificate.between)
     if off is not None and not off.max() <= tolerances.chord * (1 + 1e-6) + 1e-12:
         yield "motion: its cubics leave the straight lines that were certified"
-    v, a, share = motion.velocities, motion.accelerations, 1 + tolerances.rate_slack
-    mean, change = np.diff(motion.positions, axis=0) / step, np.diff(v, axis=0) / step
+    v = motion.velocities
+    a = motion.accelerations
+    share = 1 + tolerances.rate_slack
+    mean = np.diff(motion.positions, axis=0) / step
+    change = np.diff(v, axis=0) / step
     rates = (
         ("velocity", v, robot.velocity),
         ("mean velocity between rows", mean, robot.velocity),
@@ -685,7 +723,8 @@ def _rate_errors(
     blur = {"mean velocity between rows": unsure / np.maximum(step, MIN_TIME)}
     if cubics is not None:
         # velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step
-        along, bent = "velocity along its cubics", "acceleration along its cubics"
+        along = "velocity along its cubics"
+        bent = "acceleration along its cubics"
         rates += (along, cubics.speeds, robot.velocity), (bent, cubics.pulls, robot.acceleration)
         blur |= {along: 1.5 * unsure / step, bent: 6 * unsure / step**2}
         yield from _agreement_errors(robot, motion, cubics, begins, unsure)
@@ -709,7 +748,8 @@ def _position_errors(robot: Robot, motion: Trajectory, share: float, unsure: flo
     Positions have a tolerance of `unsure`: once for the two rows and, for rows far apart, once for each step
     between them.
     """
-    step, q = np.diff(motion.times)[:, None], motion.positions
+    step = np.diff(motion.times)[:, None]
+    q = motion.positions
     allowed = np.zeros_like(q)
     most = share * robot.velocity * step + unsure * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
     np.cumsum(most, axis=0, out=allowed[1:])
@@ -719,7 +759,8 @@ def _position_errors(robot: Robot, motion: Trajectory, share: float, unsure: flo
         least = np.minimum.accumulate(way - allowed, axis=0)
         furthest = np.maximum(furthest, (way - allowed - least).max(axis=0))
     for j in np.flatnonzero((furthest > unsure) & (robot.velocity > 0)):
-        name, limit = robot.joint_names[j], robot.velocity[j]
+        name = robot.joint_names[j]
+        limit = robot.velocity[j]
         how = f"it gets {furthest[j]:.3g} further than {limit:.4g} allows"
         yield f"motion: {name} exceeds its limit of mean velocity from one row to another: {how}"
 
@@ -738,21 +779,25 @@ def _acceleration_errors(
     still. The mean acceleration, from the mean velocity before a row to that after it, is a value that the
     joint must have reached.
     """
-    times, q, limit = motion.times, motion.positions, robot.acceleration
+    times = motion.times
+    q = motion.positions
+    limit = robot.acceleration
     fine = np.diff(times).min(initial=np.inf) < AVERAGING_WINDOWS[0]
     for window in AVERAGING_WINDOWS if fine else AVERAGING_WINDOWS[:1]:
         at = np.concatenate([[times[0] - window], times, [times[-1] + window]])
         rows = np.concatenate([q[:1] - window * begins, q, q[-1:]])
         first = np.searchsorted(at, times - window, side="right") - 1
         last = np.searchsorted(at, times + window, side="left")
-        before, after = (times - at[first])[:, None], (at[last] - times)[:, None]
+        before = (times - at[first])[:, None]
+        after = (at[last] - times)[:, None]
         apart = (before + after) / 2
         bent = np.abs((rows[last] - q) / after - (q - rows[first]) / before) / apart
         outside = ((first == 0) * 1.0 + (last == len(at) - 1))[:, None]
         room = unsure / before + unsure / after + outside * rest_slack * robot.velocity
         over = ~(bent <= share * limit + room / apart) & (limit > 0)
         for j in np.flatnonzero(over.any(axis=0)):
-            name, most = robot.joint_names[j], bent[over[:, j], j].max()
+            name = robot.joint_names[j]
+            most = bent[over[:, j], j].max()
             what = "mean acceleration by its positions"
             yield f"motion: {name} exceeds its limit of {what}: {most:.4g} > {limit[j]:.4g}"
         if over.any():
@@ -792,9 +837,11 @@ def at_goal(
         off = np.where(robot.continuous, np.arctan2(np.sin(off), np.cos(off)), off)
         there = (np.abs(off) <= tolerances.goal_tolerance).all(axis=2)
         return (there | (np.linalg.norm(off, axis=2) <= blend)).any(axis=1)
-    linkage, T_goal = Linkage(robot), goal.T_base_frame
+    linkage = Linkage(robot)
+    T_goal = goal.T_base_frame
     T = linkage.place(q).T[:, linkage.links.index(goal.frame)]
-    xyz, turn = (T[:, :3, 3] - T_goal[:3, 3]) @ T_goal[:3, :3], T_goal[:3, :3].T @ T[:, :3, :3]
+    xyz = (T[:, :3, 3] - T_goal[:3, 3]) @ T_goal[:3, :3]
+    turn = T_goal[:3, :3].T @ T[:, :3, :3]
     if goal.xyz_tolerance is None:
         there = np.linalg.norm(xyz, axis=1) <= max(tolerances.goal_distance, blend)
     else:
@@ -803,7 +850,8 @@ def at_goal(
     if goal.rpy_tolerance is None:
         angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1.0, 1.0))
         return there & (angle <= tolerances.goal_angle + tolerances.goal_slack)
-    roll, pitch = np.arctan2(turn[:, 2, 1], turn[:, 2, 2]), np.arcsin(np.clip(-turn[:, 2, 0], -1.0, 1.0))
+    roll = np.arctan2(turn[:, 2, 1], turn[:, 2, 2])
+    pitch = np.arcsin(np.clip(-turn[:, 2, 0], -1.0, 1.0))
     yaw = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
     ways = np.stack([(roll, pitch, yaw), (roll + np.pi, np.pi - pitch, yaw + np.pi)])
     ways = (ways + np.pi) % (2 * np.pi) - np.pi

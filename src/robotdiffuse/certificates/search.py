@@ -94,7 +94,8 @@ class PlaneFinder:
         ]
 
     def _of(self, claim: Claim, T: ndarray, needed: float) -> Iterator[tuple[int, int, Normal]]:
-        prover, links = self.prover, self.prover.linkage.links
+        prover = self.prover
+        links = self.prover.linkage.links
         T_base_link = T[links.index(claim.link)]
         for p, part in enumerate(placed(prover.parts[claim.link], T_base_link)):
             bodies = prover.others(claim, T, part)
@@ -146,7 +147,8 @@ def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterat
 
 def _normal(first: _Body, second: _Body) -> Normal | None:
     """Unit vector from the nearest point of the second body to that of the first; None if they touch."""
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request = coal.DistanceRequest()
+    result = coal.DistanceResult()
     coal.distance(first.geometry, coal_pose(first.T), second.geometry, coal_pose(second.T), request, result)
     between = np.asarray(result.getNearestPoint1()) - np.asarray(result.getNearestPoint2())
     distance = float(np.linalg.norm(between))
@@ -222,8 +224,10 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     clearances = [c for c in (report.scene_clearance, report.self_clearance) if c]
     reach = float(motion_radii(problem.robot).max(axis=0, initial=0.0).sum())
     chord = min(tolerances.chord, CHORD_SHARE * min(clearances, default=np.inf) / max(reach, 1e-3))
-    between, bounds = _between(motion, chord), ()
-    samples, torques = np.zeros(0), ()
+    between = _between(motion, chord)
+    bounds = ()
+    samples = np.zeros(0)
+    torques = ()
     if problem.constraints:
 
         def of_constraints(places: Values) -> tuple[Sequence[str], ndarray, Sequence[float]]:
@@ -240,7 +244,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
             lambda places: (problem.robot.joint_names, torque_bounds(problem, motion, places), allowed),
             "torques",
         )
-    q, off = configurations(motion, between), deviations(motion, between)
+    q = configurations(motion, between)
+    off = deviations(motion, between)
     proof, left = _prove(Prover(problem.robot, problem.scene, q, off), least)
     moving = None
     if problem.moving and isinstance(motion, Trajectory):
@@ -328,7 +333,8 @@ class _Found(NamedTuple):
 def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[str, float]]:
     """A proof of all claims, and the clearance that it shows by kind (SCENE or ""); `least` is asked for
     [m]."""
-    count, last = len(prover.claims), float(len(prover.q) - 1)
+    count = len(prover.claims)
+    last = float(len(prover.q) - 1)
     todo = Stretches(np.arange(count), np.zeros(count), np.full(count, last))
     against_scene = np.array([claim.against == SCENE for claim in prover.claims], bool)
     targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + ROUNDING_RESERVE
@@ -339,8 +345,11 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
     while len(todo.claim) or not done:  # robots without bodies have nothing to prove
         n = len(todo.claim)
         found = prover.bounds(todo, np.zeros(n, bool), [])
-        clearance, displacement = _down(found.clearance), _up(found.displacement)
-        by_planes, planes, target = np.zeros(n, bool), list[Plane](), targets[todo.claim]
+        clearance = _down(found.clearance)
+        displacement = _up(found.displacement)
+        by_planes = np.zeros(n, bool)
+        planes = list[Plane]()
+        target = targets[todo.claim]
         close = (
             (clearance - displacement < target)
             & (clearance < PLANES_BELOW)
@@ -352,10 +361,12 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
             number = {row: k for k, row in enumerate(rows.tolist())}
             own = [plane._replace(stretch=number[plane.stretch]) for plane in planes]
             again = prover.bounds(todo.some(rows), np.ones(len(rows), bool), own)
-            better, less = _down(again.clearance), _up(again.displacement)
+            better = _down(again.clearance)
+            less = _up(again.displacement)
             by_planes[rows] = better - less > clearance[rows] - displacement[rows]
             chosen = by_planes[rows]
-            clearance[rows[chosen]], displacement[rows[chosen]] = better[chosen], less[chosen]
+            clearance[rows[chosen]] = better[chosen]
+            displacement[rows[chosen]] = less[chosen]
             _check_parts_are_apart(prover, todo.some(rows[better <= 0]))
         proved = clearance - displacement >= target
         done.append(_proved_part(todo, proved, by_planes, clearance, displacement, planes))
@@ -402,11 +413,16 @@ def _cut(
     # where spheres are too coarse, parts are made short enough for planes
     asked = np.where(clearance < PLANES_BELOW, displacement / PLANES_DISPLACEMENT, 1.2 * displacement / spare)
     parts = np.clip(np.ceil(asked), 2, MAX_SPLIT).astype(int)
-    claims, starts, stops = [], [], []
+    claims = []
+    starts = []
+    stops = []
     for i in np.flatnonzero(which).tolist():
-        low, high, n = float(todo.start[i]), float(todo.stop[i]), int(parts[i])
+        low = float(todo.start[i])
+        high = float(todo.stop[i])
+        n = int(parts[i])
         edges = np.round(low + (high - low) * np.arange(n + 1) / n, PLACE_DECIMALS)
-        edges[0], edges[-1] = low, high
+        edges[0] = low
+        edges[-1] = high
         if not (np.diff(edges) > 0).all():
             raise InputError("no proof was found for the motion: it is too near to contact")
         claims.append(np.full(n, todo.claim[i]))

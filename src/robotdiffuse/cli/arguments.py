@@ -5,8 +5,12 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-SOLVED, NO_PLAN, BAD_INPUT, WRITE_FAILED, STOPPED = 0, 1, 2, 3, 130
-"""Exit statuses: done; no valid motion; bad input; the output could not be written; stopped by the user."""
+# Exit statuses: done; no valid motion; bad input; the output could not be written; stopped by the user.
+SOLVED = 0
+NO_PLAN = 1
+BAD_INPUT = 2
+WRITE_FAILED = 3
+STOPPED = 130
 IGNORE_JOINTS = "ignore joints of MoveIt files that the robot does not have, with a note, instead of failing"
 
 

@@ -132,7 +132,8 @@ def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
 
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers sets the processes on this machine; --cluster always uses all its cores")
-    out, workers = Path(arguments.out), arguments.workers or max(1, (os.cpu_count() or 1) // 2)
+    out = Path(arguments.out)
+    workers = arguments.workers or max(1, (os.cpu_count() or 1) // 2)
     problems = () if arguments.problems is None else tuple(arguments.problems.split(","))
     if arguments.preset is not None:
         fixed = ("planners", "time_limit", "seeds", "equal_time")

@@ -51,7 +51,8 @@ def steps(robot: Robot, picture: bool) -> Iterator[Callable[[], object]]:
     """Calls that compile the end of a plan, for any robot, what takes longest first."""
     middle = 0.5 * (robot.lower + robot.upper)
     rows = np.stack([middle, middle + 0.01, middle])
-    path, scene = Path(robot.joint_names, rows), Scene([BALL])
+    path = Path(robot.joint_names, rows)
+    scene = Scene([BALL])
     yield lambda: _measure(robot, scene, rows)
     yield lambda: _certify(robot, scene, rows)
     yield lambda: _time(robot, path)

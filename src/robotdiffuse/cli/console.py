@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 SPINNER_DELAY = 2.0
 """Time until the spinner appears [s]."""
-STATUS_INTERVAL, LOG_INTERVAL = 0.2, 5.0
-"""Time between two updates of the spinner, and between two lines where there is no terminal [s]."""
+# Time between two updates of the spinner, and between two lines where there is no terminal [s].
+STATUS_INTERVAL = 0.2
+LOG_INTERVAL = 5.0
 CAP_TOLERANCE = 1e-4
 """A clearance this close to the largest one that is measured is printed as larger [m]."""
 COUNT_INTERVAL = 60.0

@@ -218,10 +218,12 @@ def simulate(
     from robotdiffuse.planning.exploration.steps import DONE
 
     explorer = simulated_explorer(problem, settings, noise, seed)
-    reached, free = False, True
+    reached = False
+    free = True
     for number, event in enumerate(explore(problem, explorer, noise, seed), 1):
         print_event(number, event, explorer)
-        reached, free = event.step.kind == DONE, free and event.free
+        reached = event.step.kind == DONE
+        free = free and event.free
     return explorer, reached and free
 
 

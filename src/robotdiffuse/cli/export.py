@@ -90,7 +90,8 @@ def address(text: str) -> tuple[str, int]:
     """HOST or HOST:PORT."""
     host, colon, port = text.rpartition(":")
     if not colon:
-        host, port = text, str(PORT)
+        host = text
+        port = str(PORT)
     if not host or not (port.isascii() and port.isdecimal() and 0 < int(port) < 65536):
         raise argparse.ArgumentTypeError(f"{text!r} is not HOST or HOST:PORT")
     return host, int(port)

@@ -240,19 +240,23 @@ def load_and_plan(
         return load_planner(planner, settings, weights).plan(problem, **request)
 
 
-PROBLEM_FILE, FAMILY = "shelf.yaml", "shelf"
+PROBLEM_FILE = "shelf.yaml"
+FAMILY = "shelf"
 TIME_LIMIT = 10.0
 """Time limit for planning [s]."""
 READY = "ready"
 """Where the arm of `demo --explore` starts, if it has such a pose."""
 EXPLORE_TIME_LIMIT = 2.0
 """Time limit of each of its searches [s]."""
-MAX_DRAWS, DRAW_TIME_LIMIT = 50, 1.0
-"""Problems that are drawn for another arm, and the time limit of the search that tries each [s]."""
-CAMERA_POSITION, CAMERA_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
-"""Position and target of the camera of `demo --camera` [m]."""
-IMAGE_SIZE, FOCAL_LENGTH = (640, 480), 460.0
-"""Width, height and focal length of its images [pixels]."""
+# Problems that are drawn for another arm, and the time limit of the search that tries each [s].
+MAX_DRAWS = 50
+DRAW_TIME_LIMIT = 1.0
+# Position and target of the camera of `demo --camera` [m].
+CAMERA_POSITION = (-0.5, 1.1, 1.2)
+CAMERA_TARGET = (0.6, 0.0, 0.5)
+# Width, height and focal length of its images [pixels].
+IMAGE_SIZE = (640, 480)
+FOCAL_LENGTH = 460.0
 
 
 def add_demo(commands: argparse._SubParsersAction) -> None:
@@ -352,7 +356,9 @@ def shelf_problem(robot: str) -> "Problem":
     from robotdiffuse.problems.families.scaled import family_for
     from robotdiffuse.robots import load_robot
 
-    arm, rng, search = load_robot(robot), np.random.default_rng(0), load_planner("aorrtc")
+    arm = load_robot(robot)
+    rng = np.random.default_rng(0)
+    search = load_planner("aorrtc")
     family = family_for(FAMILY, arm)
     with Spinner(f"drawing a problem for {arm.name}"):
         for _ in range(MAX_DRAWS):

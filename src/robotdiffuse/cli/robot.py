@@ -107,7 +107,8 @@ def run_list(arguments: argparse.Namespace) -> int:
             continue
         spheres = sum(len(part) for part in robot.spheres.values())
         weights = "no" if weights_for("model", robot) is None else "yes"
-        refused, pairs = read_source(place).get("refused"), len(robot.checked_pairs())
+        refused = read_source(place).get("refused")
+        pairs = len(robot.checked_pairs())
         rows.append((name, robot.dof, spheres, pairs, refused, weights, str(place)))
     refused = Column("false collisions", "%", ".1f", scale=100.0)
     columns = ("robot", "joints", "spheres", "checked pairs", refused, "weights", Column("folder", left=True))
@@ -242,5 +243,6 @@ def _range(joint: "Joint") -> tuple[float | None, float | None]:
 def _place(T: "Float[ndarray, '4 4']") -> str:
     from robotdiffuse.core.transforms import quaternion_from_rotation
 
-    xyz, wxyz = T[:3, 3], quaternion_from_rotation(T[:3, :3])
+    xyz = T[:3, 3]
+    wxyz = quaternion_from_rotation(T[:3, :3])
     return " ".join(["xyz", *(f"{value:g}" for value in xyz), "wxyz", *(f"{value:.4g}" for value in wxyz)])

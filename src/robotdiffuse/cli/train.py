@@ -382,7 +382,8 @@ def _check_disk(work: Path, motions: int) -> None:
     """Raises InputError if the disk has too little space."""
     there = next(folder for folder in (work, *work.absolute().parents) if folder.exists())
     made = sum(file.stat().st_size for file in work.rglob("*") if file.is_file()) if work.is_dir() else 0
-    free, needed = shutil.disk_usage(there).free, motions * BYTES_PER_MOTION + BYTES_PER_TRAINING - made
+    free = shutil.disk_usage(there).free
+    needed = motions * BYTES_PER_MOTION + BYTES_PER_TRAINING - made
     if free < needed:
         raise InputError(
             f"{motions:,} motions and the training need {needed / 1e6:,.0f} MB more, and {there} has "

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
     from robotdiffuse.robots.robot import Robot
 
-VALID, NOT_VALID = 0, 1
+VALID = 0
+NOT_VALID = 1
 
 
 def add_verify(commands: argparse._SubParsersAction) -> None:
@@ -129,7 +130,8 @@ def _read(
         result, problem = read_solved(arguments.motion)
         both = {"path": result.path, "trajectory": result.trajectory}
         return problem, {what: motion for what, motion in both.items() if motion is not None}, ()
-    recorded, more = read_motion(arguments.motion, arguments.topic), ()
+    recorded = read_motion(arguments.motion, arguments.topic)
+    more = ()
     if alone:
         problem = _stored_problem(arguments.motion)
     elif arguments.problem is not None:
@@ -149,7 +151,8 @@ def _read(
     return problem, {what: fit.motion}, (*more, *fit.notes)
 
 
-HOLDS, FAILS = 0, 1
+HOLDS = 0
+FAILS = 1
 MAX_CHANGES = 4
 """Differences from the bundled robot in a line at most."""
 
@@ -181,7 +184,8 @@ def run_check(arguments: argparse.Namespace) -> int:
     from robotdiffuse.problems.files import load_problem, problem_from_record
     from robotdiffuse.scenes.scene import contact_notes
 
-    certificate, problem = load_certificate(arguments.file), None
+    certificate = load_certificate(arguments.file)
+    problem = None
     if arguments.problem is not None:
         problem = load_problem(arguments.problem)
     elif certificate.problem is not None:

@@ -40,7 +40,8 @@ def _scene(empty, floors, floor, kinds, params, solids, around):
             # the inverse of the rotation
             write_rotation(p[6], -p[7], -p[8], -p[9], solid[3:12].reshape(3, 3))
         n += 1
-    around[:, : 3 * W], around[:, 3 * W :] = _NO_BOX_CORNER, -_NO_BOX_CORNER
+    around[:, : 3 * W] = _NO_BOX_CORNER
+    around[:, 3 * W :] = -_NO_BOX_CORNER
     for k in range(n):
         solid = solids[k]
         for i in range(3):
@@ -65,7 +66,8 @@ def _scene(empty, floors, floor, kinds, params, solids, around):
 
 @kernel(nogil=True)
 def _packed_gradients(robot, empty, floors, floor, kinds, params, q, limit, margin):
-    first, obstacles = np.searchsorted(robot.frame, 1), kinds.shape[1] + 1
+    first = np.searchsorted(robot.frame, 1)
+    obstacles = kinds.shape[1] + 1
     out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
     gradients = np.empty(q.shape, np.float32)
     solids = np.empty((obstacles, 17), np.float32)

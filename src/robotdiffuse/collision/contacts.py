@@ -23,9 +23,12 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
     A contact begins where two bodies come nearer than `contact` [m] and lasts until they separate. The motion
     certificate finds the next contact; while there is one, distances are computed every 1 cm of motion.
     """
-    validator, exact = ContinuousCollision(robot, scene, contact, 0.5), ExactCollision(robot, scene)
+    validator = ContinuousCollision(robot, scene, contact, 0.5)
+    exact = ExactCollision(robot, scene)
     motion = Motion(for_kernels(q), motion_pieces.travel_along(q, validator.checks.motion_radii))
-    end, at, found = float(motion.travel[-1]), 0.0, list[Contact]()
+    end = float(motion.travel[-1])
+    at = 0.0
+    found = list[Contact]()
     for _ in range(MAX_CONFIGURATIONS):
         low = motion_pieces.segment_at(motion.travel, at)[0]
         here = motion_pieces.configurations(motion, np.array([at]))
@@ -34,7 +37,8 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
         if first is None:
             break
         # converts the place in `rest`, a row plus a share, to a place on the whole motion
-        row, part = int(first.at), first.at - int(first.at)
+        row = int(first.at)
+        part = first.at - int(first.at)
         ways = np.concatenate([[at], motion.travel[low + 1 :]])
         at = float(ways[row] + part * (ways[min(row + 1, len(ways) - 1)] - ways[row]))
         at = _follow(exact, motion, at, contact, first, found)

@@ -63,7 +63,8 @@ def parts_of(robot: Robot) -> dict[str, tuple[Part, ...]]:
     """Convex parts of every link that has geometry."""
     parts: dict[str, tuple[Part, ...]] = {}
     for link in robot.link_names:
-        frame, T = robot.link_frame(link), robot.T_frame_link(link)
+        frame = robot.link_frame(link)
+        T = robot.T_frame_link(link)
         found: list[Part] = []
         for mesh in robot.meshes.get(link, ()):
             vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
@@ -101,7 +102,8 @@ def surfaces_decide(robot: Robot, check: Check) -> bool:
 @once_per_robot
 def hulls_of(robot: Robot) -> tuple[Hulls, dict[str, range]]:
     """The arrays of all parts for compiled code, and the range of each link's parts."""
-    of_links, every = {}, list[Part]()
+    of_links = {}
+    every = list[Part]()
     for link, parts in parts_of(robot).items():
         of_links[link] = range(len(every), len(every) + len(parts))
         every += parts
@@ -162,7 +164,8 @@ def _solid(shape: Shape) -> Solid | None:
 
 
 def _bounded(shape: Shape, points: Float[ndarray, "n 3"], inflation: float) -> Solid:
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     return Solid(shape, transform((low + high) / 2), (high - low) / 2, 0.0, inflation, True)
 
 

@@ -135,10 +135,13 @@ def _tree(shape: Triangulated | PointCloud) -> coal.BVHModelOBBRSS:
     100,000 points takes half a second."""
     if isinstance(shape, PointCloud):
         # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
-        vertices, what = shape.distinct_points, "points"
+        vertices = shape.distinct_points
+        what = "points"
         faces = np.repeat(np.arange(len(vertices))[:, None], 3, axis=1)
     else:
-        vertices, faces, what = shape.mesh.world_vertices, shape.mesh.faces, "triangles"
+        vertices = shape.mesh.world_vertices
+        faces = shape.mesh.faces
+        what = "triangles"
     check_time(
         f"the validator's tree over the {len(faces):,} {what} of {shape.name}",
         TREE_SECONDS_PER_ELEMENT * len(faces),
@@ -209,7 +212,8 @@ class ExactCollision:
         firsts = self._pieces[check.link]
         balls = _balls(self.robot)[check.link]
         if check.other is not None:
-            others, other_balls = self._pieces[check.other], _balls(self.robot)[check.other]
+            others = self._pieces[check.other]
+            other_balls = _balls(self.robot)[check.other]
             return _Candidates(
                 firsts,
                 others,
@@ -244,7 +248,8 @@ class ExactCollision:
             return coal.distance(piece.geometry, T_piece, other.geometry, other.T, self._request, result)
         # Coal's distance to a surface that is penetrated is slow and uses any one triangle, so contacts come
         # first.
-        request, hits = self._contacts if depth else self._first_contact, coal.CollisionResult()
+        request = self._contacts if depth else self._first_contact
+        hits = coal.CollisionResult()
         coal.collide(piece.geometry, T_piece, other.geometry, other.T, request, hits)
         if hits.isCollision():
             depths = [hits.getContact(i).penetration_depth for i in range(hits.numContacts())]
@@ -302,7 +307,8 @@ class ExactCollision:
         Without `depth`, the penetration may be too small, but the sign is right.
         """
         assert candidates.surfaces is not None
-        best, lower = cutoff, candidates.lower(frames[None])[0]
+        best = cutoff
+        lower = candidates.lower(frames[None])[0]
         for candidate in lower.argsort().tolist():
             if lower[candidate] >= best or (best < -MAX_OVERLAP and not depth):
                 break
@@ -349,7 +355,8 @@ class ExactCollision:
 
     def _chunk(self, q: ndarray) -> ndarray:
         frames = forward_frames(self.robot, q)
-        hit, result = np.zeros(len(q), bool), coal.CollisionResult()
+        hit = np.zeros(len(q), bool)
+        result = coal.CollisionResult()
         for candidates in self._candidates:
             undecided = np.flatnonzero(~hit)
             lower = candidates.lower(frames[undecided])

@@ -113,7 +113,8 @@ def compile_robot(robot: Robot) -> RobotArrays:
     """The arrays of a robot, with its locked joints at their values."""
     groups = robot_groups(robot)
     placed = [_placed_groups(robot)[link] for link in groups]
-    spheres, clusters = [group.spheres for group in placed], [group.rows for group in placed]
+    spheres = [group.spheres for group in placed]
+    clusters = [group.rows for group in placed]
     rows = [row for of_group in clusters for row in of_group]
     index = {link: i for i, link in enumerate(groups)}
     T = robot.frame_offsets
@@ -172,9 +173,11 @@ def _placed_groups(robot: Robot) -> dict[str, _Group]:
     """The groups by link. A robot that holds something reuses those of the bare arm."""
     placed = {} if robot.bare is None else dict(_placed_groups(robot.bare))
     links = [link for link in robot_groups(robot) if link not in placed]
-    whole, parts = [], []
+    whole = []
+    parts = []
     for link in links:
-        T, local = robot.T_frame_link(link), np.asarray(robot.spheres[link], np.float64)
+        T = robot.T_frame_link(link)
+        local = np.asarray(robot.spheres[link], np.float64)
         centres = local[:, :3] @ T[:3, :3].T + T[:3, 3]
         whole.append(np.column_stack([centres, local[:, 3]]))
         parts.append(_clusters(whole[-1]))
@@ -200,7 +203,8 @@ def reach_bound(robot: Robot) -> float:
 def reach_ball(robot: Robot) -> tuple[ndarray, float]:
     """Centre [3] and radius of a ball around all spheres of moving links [m]. It is about the first joint if
     that moves them all, and then smaller than the one about the base's origin."""
-    first, reach = robot.frame_offsets[0, :3, 3], reach_bound(robot)
+    first = robot.frame_offsets[0, :3, 3]
+    reach = reach_bound(robot)
     return (
         (first, reach - float(np.linalg.norm(first))) if robot.moved_by[1:, 0].all() else (0 * first, reach)
     )
@@ -221,10 +225,12 @@ def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
     towards the farthest one)."""
     if not sets:
         return []
-    most, each = max(map(len, sets)), np.arange(len(sets))
+    most = max(map(len, sets))
+    each = np.arange(len(sets))
     spheres = np.full((len(sets), most, 4), -np.inf)
     for padded, real in zip(spheres, sets, strict=True):
-        padded[: len(real)], padded[len(real) :, :3] = real, 0.0
+        padded[: len(real)] = real
+        padded[len(real) :, :3] = 0.0
     centres = np.array([real[:, :3].mean(axis=0) for real in sets])
     for i in range(1, 200):
         reach = np.linalg.norm(spheres[..., :3] - centres[:, None], axis=-1) + spheres[..., 3]
@@ -254,7 +260,8 @@ def compile_scene(
     links with spheres, for allowed contacts.
     """
     touched = {name for name, _ in scene.allowed_contacts}
-    solids, points = list[Solid](), list[PointCloud | Triangulated]()
+    solids = list[Solid]()
+    points = list[PointCloud | Triangulated]()
     for solid in solids_of(scene):
         shape = solid.shape
         if not isinstance(shape, PointCloud | Triangulated):
@@ -290,9 +297,12 @@ def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
     """
     T = np.array([solid.T_base_box for solid in solids]).reshape(-1, 4, 4)
     sizes = np.array([[*solid.half, solid.disc, solid.rounding] for solid in solids]).reshape(-1, 5)
-    R, half, far = T[:, :3, :3], sizes[:, :3], 2 * reach + 1
+    R = T[:, :3, :3]
+    half = sizes[:, :3]
+    far = 2 * reach + 1
     base = -np.einsum("nij,ni->nj", R, T[:, :3, 3])
-    low, high = np.maximum(-half, base - far), np.minimum(half, base + far)
+    low = np.maximum(-half, base - far)
+    high = np.minimum(half, base + far)
     kept = low < high
     half[kept] = ((high - low) / 2)[kept]
     centre = T[:, :3, 3] + np.einsum("nij,nj->ni", R, np.where(kept, (low + high) / 2, 0.0))
@@ -305,7 +315,9 @@ def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
 
 def _boxes_around(rows: ndarray) -> ndarray:
     """`SceneArrays.solid_boxes`."""
-    middle, rotation, half = rows[:, :3], np.abs(rows[:, 3:12].reshape(-1, 3, 3)), rows[:, 12:15]
+    middle = rows[:, :3]
+    rotation = np.abs(rows[:, 3:12].reshape(-1, 3, 3))
+    half = rows[:, 12:15]
     extent = np.einsum("nij,ni->nj", rotation, half) + rows[:, 15:16]
     extent += BOX_SLACK * (1 + np.abs(middle) + extent)
     return by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), EMPTY_BOX)

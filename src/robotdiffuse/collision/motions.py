@@ -57,8 +57,9 @@ INITIAL_TRAVEL = 0.16
 fast."""
 CONTACT_TRAVEL_TOLERANCE = 1e-3
 """The first contact is located to within this motion bound [m]."""
-DEPTH_SAMPLE_TRAVEL, DEPTH_SAMPLES = 0.01, 64
-"""Step [m] and number of the configurations at which the depth of a contact is computed."""
+# Step [m] and number of the configurations at which the depth of a contact is computed.
+DEPTH_SAMPLE_TRAVEL = 0.01
+DEPTH_SAMPLES = 64
 
 
 def search_space(
@@ -124,7 +125,10 @@ class ContinuousCollision:
         """Meshes nearer than `contact` [m] count as touching. Pieces are split until each certified clearance
         is at least the share `tightness`, in (0, 1), of the smallest measured one of its kind: to the scene,
         or between links."""
-        self.robot, self.scene, self.contact, self.tightness = robot, scene, contact, tightness
+        self.robot = robot
+        self.scene = scene
+        self.contact = contact
+        self.tightness = tightness
         self.arm, self.checks = _arm(robot), _checks(robot)
         self.scene_arrays = compile_scene_for(robot, scene)
         self.solids = solid_arrays(robot, scene)
@@ -134,7 +138,8 @@ class ContinuousCollision:
         q = for_kernels(q)
         motion = Motion(q, motion_pieces.travel_along(q, self.checks.motion_radii))
         todo = motion_pieces.first_pieces(motion, self.checks, INITIAL_TRAVEL)
-        best, certified = np.full(2, CLEARANCE_CAP), np.full(2, CLEARANCE_CAP)
+        best = np.full(2, CLEARANCE_CAP)
+        certified = np.full(2, CLEARANCE_CAP)
         hit: tuple[float, int] | None = None
         while len(todo.start):
             found, rows, columns = kernel.rounds(
@@ -167,7 +172,9 @@ class ContinuousCollision:
         If there is a contact, returns its place and check, and the part of the round before it: an earlier
         contact may still be found there, and what follows no longer matters. Else returns None.
         """
-        todo, clearance, lower = found.pieces, found.clearance, found.lower
+        todo = found.pieces
+        clearance = found.clearance
+        lower = found.lower
         kinds = self.checks.kind[columns]
         travel = found.travel[rows, columns]
         middle = (todo.start + todo.stop) / 2
@@ -205,7 +212,8 @@ class ContinuousCollision:
         obstacle."""
         steps = at + DEPTH_SAMPLE_TRAVEL * np.arange(DEPTH_SAMPLES)
         steps = steps[steps <= max(motion.travel[-1], at)]
-        checks, cutoffs = np.full(len(steps), check), np.full(len(steps), 2 * self.contact)
+        checks = np.full(len(steps), check)
+        cutoffs = np.full(len(steps), 2 * self.contact)
         distances, names = self._exact.nearest(motion_pieces.configurations(motion, steps), checks, cutoffs)
         other = names[0]
         left = [i for i, name in enumerate(names) if name != other or distances[i] > self.contact]
@@ -240,17 +248,25 @@ def _checks(robot: Robot) -> Checks:
     """The checks as arrays for compiled code. Motion radii of a pair are seen from the frame where the chains
     of both links part, which is the nearer link if both are on one chain."""
     groups, pairs = _groups(robot)
-    whole, parts = with_covering_spheres(robot), hulls_of(robot)[1]
+    whole = with_covering_spheres(robot)
+    parts = hulls_of(robot)[1]
     links = [link for link in whole.link_names if link in whole.spheres]
-    radii, checks = motion_radii(whole), checks_of(robot)
-    kind, where, of_parts, base, common, second = [], [], [], [], [], []
+    radii = motion_radii(whole)
+    checks = checks_of(robot)
+    kind = []
+    where = []
+    of_parts = []
+    base = []
+    common = []
+    second = []
     of_checks = np.zeros((len(checks), robot.dof))
     for k, (link, other) in enumerate(checks):
         kind.append(SCENE if other is None else PAIR)
         known = groups.get(link, -1) if other is None else pairs.get(frozenset((link, other)), -1)
         where.append(known)
         nearer, further = sorted((other or robot.base, link), key=robot.link_frame)
-        low, high = robot.link_frame(nearer), robot.link_frame(further)
+        low = robot.link_frame(nearer)
+        high = robot.link_frame(further)
         shared = robot.moved_by[low] & robot.moved_by[high]
         for one, joints in (
             (nearer, robot.moved_by[low] & ~shared),

@@ -37,8 +37,9 @@ CONTACT_TIME_TOLERANCE = 1e-3
 """The first contact is located to within this time [s]."""
 MIN_INTERVAL = 1e-7
 """Intervals are halved down to this length [s]; what is not proved then counts as contact."""
-DEPTH_SAMPLE_TIME, DEPTH_SAMPLES = 0.005, 200
-"""Step [s] and number of the times at which the depth of a contact is computed."""
+# Step [s] and number of the times at which the depth of a contact is computed.
+DEPTH_SAMPLE_TIME = 0.005
+DEPTH_SAMPLES = 200
 
 
 class TimedContact(NamedTuple):
@@ -75,11 +76,14 @@ class MovingCollision:
 
     def sweep(self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> TimedSweep:
         """Certify the motion on straight lines between rows q at increasing times [s]."""
-        times, q = for_kernels(times), for_kernels(q)
-        best, certified = np.array([CLEARANCE_CAP]), CLEARANCE_CAP
+        times = for_kernels(times)
+        q = for_kernels(q)
+        best = np.array([CLEARANCE_CAP])
+        certified = CLEARANCE_CAP
         every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
         ends = times[[0, -1]]
-        tasks, hit = Tasks(ends[:1], ends[1:], every), None
+        tasks = Tasks(ends[:1], ends[1:], every)
+        hit = None
         while len(tasks.start):
             bound, left = kernel.settle_tasks(
                 self.links, self.tracks, times, q, tasks, self.contact, self.tightness, best
@@ -121,7 +125,8 @@ class MovingCollision:
         they prove it all along. It is fast, for searches and control loops, because it never uses the exact
         meshes."""
         every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
-        times, q = for_kernels(times), for_kernels(q)
+        times = for_kernels(times)
+        q = for_kernels(q)
         tasks = Tasks(times[:1], times[-1:], every)
         left = kernel.settle_tasks(
             self.links, self.tracks, times, q, tasks, least, 0.0, np.array([CLEARANCE_CAP])
@@ -191,7 +196,8 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
     rows = [link for link in whole.link_names if link in whole.spheres]
     spheres = []
     for link in names:
-        T, local = whole.T_frame_link(link), np.asarray(whole.spheres[link], np.float64)
+        T = whole.T_frame_link(link)
+        local = np.asarray(whole.spheres[link], np.float64)
         spheres.append(np.column_stack([local[:, :3] @ T[:3, :3].T + T[:3, 3], local[:, 3]]))
     bounds = np.zeros((len(names), 4))
     for i, of_link in enumerate(spheres):
@@ -215,7 +221,11 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
 
 def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
     """The arrays of moving obstacles for compiled code; a mesh is represented by the box around it."""
-    times, xyz, wxyz, speeds, solids = [], [], [], [], list[Solid]()
+    times = []
+    xyz = []
+    wxyz = []
+    speeds = []
+    solids = list[Solid]()
     for obstacle in moving:
         at, poses = obstacle.track
         quaternions = np.stack([quaternion_from_rotation(T[:3, :3]) for T in poses])

@@ -18,9 +18,10 @@ THINNING = 0.5
 MAX_POINTS = 400_000
 """Spheres of a mesh obstacle at most, about; larger meshes are divided more coarsely, or their pieces
 merged."""
-JOIN_VOXEL, MAX_SOLIDS = 0.004, 1000
-"""Edge of the voxels by which spheres of surfaces that links may touch are first joined [m], and the number
-that is left at most: these spheres are not in the grid, but checked one by one."""
+# Edge of the voxels by which spheres of surfaces that links may touch are first joined [m], and the number
+# that is left at most: these spheres are not in the grid, but checked one by one.
+JOIN_VOXEL = 0.004
+MAX_SOLIDS = 1000
 EXACT_RANGE = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
 VOXELS_PER_RANGE = 10
@@ -102,14 +103,17 @@ def _divide(triangles: Float[ndarray, "n 3 3"], spacing: float, reach: float) ->
     while len(triangles):
         edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
         near = np.linalg.norm(triangles.mean(axis=1), axis=1) <= reach + POINT_RANGE + edges.max(axis=1)
-        triangles, edges = triangles[near], edges[near]
+        triangles = triangles[near]
+        edges = edges[near]
         small = edges.max(axis=1) <= spacing
         done.append(triangles[small])
-        triangles, edges = triangles[~small], edges[~small]
+        triangles = triangles[~small]
+        edges = edges[~small]
         # edge i joins corners i - 1 and i; split the longest one
         longest = edges.argmax(axis=1)
         rows = np.arange(len(triangles))
-        a, b = triangles[rows, longest - 1], triangles[rows, longest]
+        a = triangles[rows, longest - 1]
+        b = triangles[rows, longest]
         c = triangles[rows, (longest + 1) % 3]
         middle = (a + b) / 2
         triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
@@ -143,7 +147,9 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     index = ((cloud[:, :3] - low) / voxel).astype(np.int64)
     cell = _flat(index // 2, cells)
     order = np.argsort(cell * 8 + (index % 2) @ np.array([4, 2, 1]))
-    points, index, cell = np.ascontiguousarray(cloud[order]), index[order], cell[order]
+    points = np.ascontiguousarray(cloud[order])
+    index = index[order]
+    cell = cell[order]
     first = np.asarray(np.searchsorted(cell, np.arange(int(np.prod(cells)) + 1)), np.int32)
     # The band is wide enough to decide about the robot's largest sphere.
     band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))

@@ -46,7 +46,8 @@ def build_pair_tables(
     of convex parts for some of the pairs, by index.
     """
     parents = np.arange(len(lower)) if arrays.parents is None else arrays.parents
-    pairs_found, tables = arrays.pairs.copy(), [no_tables()]
+    pairs_found = arrays.pairs.copy()
+    tables = [no_tables()]
     by_joint: dict[int, list[int]] = {}
     for p, (a, b) in enumerate(arrays.pairs[:, :2].tolist()):
         near, far = sorted((int(arrays.frame[a]), int(arrays.frame[b])))

@@ -40,7 +40,8 @@ class _Body:
     def inside(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
         """Whether each point may be inside a component: one of several rays crosses it an odd number of
         times. Points in front of an open component can count as inside."""
-        low, high = self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
+        low = self.triangles.min(axis=(0, 1))
+        high = self.triangles.max(axis=(0, 1))
         found = ((points >= low) & (points <= high)).all(axis=1)
         for i in np.flatnonzero(found):
             found[i] = any((np.bincount(self._crossed(points[i], ray)) % 2).any() for ray in RAYS)
@@ -67,8 +68,10 @@ class SurfacePair:
     def distance(self, frames: Float[ndarray, "frames 4 4"], cutoff: float = np.inf) -> float | None:
         """Distance of the surfaces [m]; any value of at least `cutoff` beyond it. None if they touch, or a
         piece of one is inside the other."""
-        a, b = self.first, self.second
-        T_a, T_b = frames[a.frame], frames[b.frame]
+        a = self.first
+        b = self.second
+        T_a = frames[a.frame]
+        T_b = frames[b.frame]
         places = a.tree, coal_pose(T_a), b.tree, coal_pose(T_b)
         if coal.collide(*places, coal.CollisionRequest(), coal.CollisionResult()):
             return None
@@ -101,8 +104,10 @@ def _body(robot: Robot, link: str) -> _Body:
     from scipy.sparse import coo_array  # few robots need it
     from scipy.sparse.csgraph import connected_components
 
-    T, surface = robot.T_frame_link(link), robot.surfaces[link]
-    vertices, faces = surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces
+    T = robot.T_frame_link(link)
+    surface = robot.surfaces[link]
+    vertices = surface.vertices @ T[:3, :3].T + T[:3, 3]
+    faces = surface.faces
     ends = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     edges = coo_array((np.ones(len(ends[0]), bool), ends), (len(vertices),) * 2)
     _, of_vertices = connected_components(edges, directed=False)

@@ -14,8 +14,9 @@ MAX_COORDINATE = 1e4
 resolves about a millimetre, and compiled code adds a margin for it."""
 MIN_SIZE = 1e-9
 """Smallest size [m]; float32 cannot resolve smaller ones beside coordinates."""
-MIN_RATE, MAX_RATE = 1e-6, 1e6
-"""Smallest limit of a joint's velocity or acceleration, and largest rate, in their own units."""
+# Smallest limit of a joint's velocity or acceleration, and largest rate, in their own units.
+MIN_RATE = 1e-6
+MAX_RATE = 1e6
 MAX_DURATION = 1e6
 """Longest motion in files and requests [s]."""
 RIGID_SLACK = 1e-4
@@ -165,7 +166,8 @@ def points(owner: str, name: str, value: object) -> ndarray:
         raise InputError(f"{owner}.{name} is {form(array)}; it must be n x 3 finite numbers")
     bad = np.flatnonzero(~(np.abs(array) <= MAX_COORDINATE).all(axis=1))
     if len(bad):
-        row, more = array[bad[0]], "" if len(bad) == 1 else f" and {len(bad) - 1} more"
+        row = array[bad[0]]
+        more = "" if len(bad) == 1 else f" and {len(bad) - 1} more"
         rule = f"finite numbers within ±{MAX_COORDINATE:g} m"
         raise InputError(f"{owner}.{name}[{bad[0]}]{more} is {shown(row)}; it must be {rule}")
     array.setflags(write=False)  # so that large ones are not copied once more

@@ -9,8 +9,9 @@ LONG = 0.2
 """Steps shorter than this start whenever any time is left [s]."""
 _remaining: ContextVar[Callable[[], float] | None] = ContextVar("remaining", default=None)
 _cancel_check: ContextVar[Callable[[], None] | None] = ContextVar("cancel_check", default=None)
-PREPARING, TIMING = "to prepare the scene", "for timing"
-"""What a time limit may be too short for."""
+# What a time limit may be too short for.
+PREPARING = "to prepare the scene"
+TIMING = "for timing"
 
 
 class OutOfTimeError(Exception):

@@ -134,7 +134,8 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
             with path.open("rb") as stream:  # np.load would open an archive of this name
                 return {"": np.lib.format.read_array(stream, allow_pickle=False)}
         with zipfile.ZipFile(path) as archive:
-            size, most = sum(member.file_size for member in archive.infolist()), MAX_FILE_SIZE
+            size = sum(member.file_size for member in archive.infolist())
+            most = MAX_FILE_SIZE
         if size > most:
             raise InputError(
                 f"{file} unpacks to {size // MEGABYTE} MB; at most {most // MEGABYTE} MB are read"
@@ -196,7 +197,8 @@ def parse_yaml(text: str, where: str) -> Any:
 def parse_xml(text: bytes, where: str) -> ET.Element:
     """The root of an XML text. Raises InputError, naming `where`, if it is not well-formed, too deeply nested
     or in an unknown encoding."""
-    depth, parser = 0, ET.XMLPullParser(("start", "end"))
+    depth = 0
+    parser = ET.XMLPullParser(("start", "end"))
     try:
         parser.feed(text)
         parser.close()
@@ -227,12 +229,15 @@ class _Composer:
     """Builds values from parser events, because libyaml's own composer recurses without bounds."""
 
     def __init__(self, loader: _Loader, where: str) -> None:
-        self.loader, self.where, self.count = loader, where, 0
+        self.loader = loader
+        self.where = where
+        self.count = 0
         self.anchors: dict[str, tuple[Any, int]] = {}
         """Value of each anchor, and the number of values within it."""
 
     def document(self) -> Any:
-        loader, value = self.loader, None
+        loader = self.loader
+        value = None
         loader.get_event()  # of the stream
         if not loader.check_event(yaml.StreamEndEvent):
             loader.get_event()
@@ -243,7 +248,8 @@ class _Composer:
         return value
 
     def _node(self, depth: int) -> Any:
-        event, begun = self._event(), self.count
+        event = self._event()
+        begun = self.count
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self.anchors:
                 self._refuse(event, f"alias {shown(event.anchor)} has no anchor before it")

@@ -220,8 +220,9 @@ class _Listener(event.Listener):
             loading.end()
 
 
-LOCK, COMPILE = "numba:compiler_lock", "numba:compile"
-"""Events of Numba: it holds its lock while it reads from the cache too, and compiles within that."""
+# Events of Numba: it holds its lock while it reads from the cache too, and compiles within that.
+LOCK = "numba:compiler_lock"
+COMPILE = "numba:compile"
 for kind in (LOCK, COMPILE):
     event.register(kind, _Listener())
 

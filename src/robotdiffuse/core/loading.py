@@ -39,7 +39,8 @@ def loading() -> Iterator[None]:
 def begin() -> None:
     """Begin a block of `loading`."""
     if _clock.depth == 0:
-        _clock.began, _clock.compiles = time.perf_counter(), False
+        _clock.began = time.perf_counter()
+        _clock.compiles = False
     _clock.depth += 1
 
 
@@ -58,7 +59,8 @@ def compiles(name: str) -> None:
     _clock.compiles = True
     compiled.append(name)
     if on_first_compilation is not None:
-        call, on_first_compilation = on_first_compilation, None
+        call = on_first_compilation
+        on_first_compilation = None
         call()
 
 

@@ -76,7 +76,8 @@ def read_triangles(
     if content.startswith(LFS_POINTER):
         raise InputError(f"mesh file {file} is a pointer of Git LFS; get the file itself: git lfs pull")
     options: dict[str, Any] = {}
-    up, metres = "Z_UP", 1.0
+    up = "Z_UP"
+    metres = 1.0
     try:
         if ending == ".dae":
             content, up, metres = _collada(content)

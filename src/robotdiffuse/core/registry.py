@@ -78,7 +78,9 @@ class Registry(dict[str, Entry]):
             "robotdiffuse.planners"; empty for none.
         """
         super().__init__(entries | _adopted.get(what, {}))
-        self.what, self.own, self.group = what, entries, group
+        self.what = what
+        self.own = entries
+        self.group = group
         _tables[what] = self
 
     @cached_property

@@ -154,7 +154,9 @@ class Settings:
         """
         if not isinstance(values, dict):
             raise InputError(f"{where} is {shown(values)}; it must be a table of settings")
-        hints, fields = _hints(cls), {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+        # type: ignore[arg-type]
+        hints = _hints(cls)
+        fields = {f.name: f for f in dataclasses.fields(cls)}
         for name in values:
             if name not in fields:
                 raise InputError(
@@ -206,7 +208,9 @@ class Settings:
         return self._replaced(values, self.settings_name or type(self).__name__, known)
 
     def _replaced(self: Given, values: Mapping[str, Any], where: str, known: list[str]) -> Given:
-        hints, found, within = _hints(type(self)), {}, dict[str, dict[str, Any]]()
+        hints = _hints(type(self))
+        found = {}
+        within = dict[str, dict[str, Any]]()
         for name, value in values.items():
             first, dot, rest = str(name).partition(".")
             nested = first in hints and isinstance(getattr(self, first), Settings)
@@ -223,7 +227,8 @@ class Settings:
 
     def describe(self) -> list[Setting]:
         """All settings with their values, including nested ones."""
-        hints, documents = _hints(type(self)), field_docstrings(type(self))
+        hints = _hints(type(self))
+        documents = field_docstrings(type(self))
         found: list[Setting] = []
         for name, hint in hints.items():
             value = getattr(self, name)
@@ -279,7 +284,8 @@ def _converted(where: str, hint: Any, value: Any, owner: object = None) -> Any:
     if not _fits(hint, value):
         raise InputError(f"{where} is {shown(value)}; it takes {_rule(hint)}")
     bare, marks = _split(hint)
-    kind, kinds = get_origin(bare), get_args(bare)
+    kind = get_origin(bare)
+    kinds = get_args(bare)
     if kind in (Union, UnionType):
         fitting = next(option for option in kinds if _fits(option, value))
         value = _converted(where, fitting, value, owner)

@@ -83,7 +83,8 @@ def rotation_about(axis: Vector, angle: float) -> Rotation:
 def rotation_z_to(axis: Vector) -> Rotation:
     """A rotation R with R @ [0, 0, 1] = axis (a unit vector); the identity for +z."""
     z = np.array([0.0, 0.0, 1.0])
-    sine, cosine = np.linalg.norm(np.cross(z, axis)), float(axis[2])
+    sine = np.linalg.norm(np.cross(z, axis))
+    cosine = float(axis[2])
     if sine < 1e-12:
         return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
     return rotation_about(np.cross(z, axis) / sine, float(np.arctan2(sine, cosine)))

@@ -52,8 +52,11 @@ if TYPE_CHECKING:  # fields of values, whose constructors take all that NumPy re
     VectorOrNone = _GivenOrNone
     PoseOrNone = _GivenOrNone
 else:
-    GivenVector, GivenPose, GivenConfigurations = Vector, Pose, Configurations
-    VectorOrNone, PoseOrNone = Vector | None, Pose | None
+    GivenVector = Vector
+    GivenPose = Pose
+    GivenConfigurations = Configurations
+    VectorOrNone = Vector | None
+    PoseOrNone = Pose | None
 ROWS = ("positions", "velocities", "accelerations")
 """Arrays of a trajectory with a row for each time."""
 REST = 1e-3
@@ -87,11 +90,16 @@ class Status(Enum):
     """`plan_many` only: planning this problem raised an error, or killed its process."""
 
 
-FIRST, CONVERGED, TIME_LIMIT = UNTIL = ("first", "converged", "time_limit")
-"""When planning ends: at the first verified motion, when more time hardly helps, or at the time limit."""
+# When planning ends: at the first verified motion, when more time hardly helps, or at the time limit.
+FIRST = "first"
+CONVERGED = "converged"
+TIME_LIMIT = "time_limit"
+UNTIL = (FIRST, CONVERGED, TIME_LIMIT)
 
-LENGTH, TIME = OBJECTIVES = ("length", "time")
-"""What anytime planners minimize: the length of the path in joint space, or the duration of the motion."""
+# What anytime planners minimize: the length of the path in joint space, or the duration of the motion.
+LENGTH = "length"
+TIME = "time"
+OBJECTIVES = (LENGTH, TIME)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +188,8 @@ class Trajectory(Value):
         """
         speed = np.linalg.norm(self.velocities, axis=1)
         edges = np.diff((speed <= REST * speed.max()).astype(int), prepend=0, append=0)
-        first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+        first = np.flatnonzero(edges == 1)
+        last = np.flatnonzero(edges == -1) - 1
         inside = (first > 0) & (last < len(speed) - 1)
         return (self.times[first[inside]] + self.times[last[inside]]) / 2
 
@@ -219,7 +228,8 @@ class Trajectory(Value):
         u = np.clip(np.asarray(asked - self.times[row])[..., None] / h, 0.0, 1.0)
         (q0, v0, a0), (q1, v1, a1) = (tuple(getattr(self, name)[i] for name in ROWS) for i in (row, row + 1))
         # Hermite's basis and its derivative
-        rise, slope = u * u * (3 - 2 * u), 6 * u * (1 - u) / h
+        rise = u * u * (3 - 2 * u)
+        slope = 6 * u * (1 - u) / h
         positions = (1 - rise) * q0 + rise * q1 + h * u * (1 - u) * ((1 - u) * v0 - u * v1)
         velocities = slope * (q1 - q0) + (1 - u) * (1 - 3 * u) * v0 + u * (3 * u - 2) * v1
         return State(positions, velocities, (1 - u) * a0 + u * a1, (a1 - a0) / h + 0 * u)
@@ -228,7 +238,8 @@ class Trajectory(Value):
     def cubic_accelerations(self) -> tuple[Float[ndarray, "m dof"], Float[ndarray, "m dof"]]:
         """Accelerations of the cubic from each row to the next, at its start and at its end; in between they
         are linear in time."""
-        steps, v = np.diff(self.times)[:, None], self.velocities
+        steps = np.diff(self.times)[:, None]
+        v = self.velocities
         mean = np.diff(self.positions, axis=0) / steps
         return (6 * mean - 4 * v[:-1] - 2 * v[1:]) / steps, (2 * v[:-1] + 4 * v[1:] - 6 * mean) / steps
 
@@ -317,11 +328,16 @@ def spline_rows(
     )
     total = np.cumsum(moved, axis=0)
     points = (total[window:] - total[:-window]) / window
-    before, at, after = points[:-2], points[1:-1], points[2:]
+    before = points[:-2]
+    at = points[1:-1]
+    after = points[2:]
     q = controls[0] + (before + 4 * at + after) / 6
-    v, a = (after - before) / (2 * step), (after - 2 * at + before) / step**2
+    v = (after - before) / (2 * step)
+    a = (after - 2 * at + before) / step**2
     q[-1] = controls[-1]
-    v[0], v[-1], a[[0, -1]] = velocity, 0.0, 0.0
+    v[0] = velocity
+    v[-1] = 0.0
+    a[[0, -1]] = 0.0
     return step * np.arange(len(q)), q, v, a
 
 

@@ -214,13 +214,15 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
     Raises InputError if there is no data set, it has no such scene, other numbers of waypoints or joints, or
     the file cannot be written.
     """
-    manifest, file = read_manifest(folder), FilePath(file)
+    manifest = read_manifest(folder)
+    file = FilePath(file)
     if (manifest.waypoints, manifest.dof) != (WAYPOINTS, DOF):
         raise InputError(
             f"{folder} has {manifest.waypoints} waypoints of {manifest.dof} joints; "
             f"robot.npz holds {WAYPOINTS} waypoints of {DOF} joints"
         )
-    x, y = [np.zeros((0, WAYPOINTS, DOF), np.float32)], [np.zeros((0, CONDITION_NUMBERS), np.float32)]
+    x = [np.zeros((0, WAYPOINTS, DOF), np.float32)]
+    y = [np.zeros((0, CONDITION_NUMBERS), np.float32)]
     total = 0
     for index in shard_indices(folder):
         shard = read_shard(folder, index, ARRAYS_READ)
@@ -228,11 +230,13 @@ def export_npz(folder: str | FilePath, file: str | FilePath) -> tuple[int, int]:
         total += len(shard["trajectories"])
         kinds = shard["obstacle_kinds"]
         rows = np.flatnonzero(((kinds == SPHERE).sum(1) == 2) & ((kinds != NONE).sum(1) == 2))
-        q, kinds = shard["trajectories"][rows], kinds[rows]
+        q = shard["trajectories"][rows]
+        kinds = kinds[rows]
         centers = shard["obstacle_params"][rows][kinds == SPHERE, :3].reshape(-1, 6)
         x.append(q)
         y.append(np.concatenate([shard["start"][rows], q[:, -1], centers, shard["target_pose"][rows, 4:]], 1))
-    x_train, y_train = np.concatenate(x), np.concatenate(y)
+    x_train = np.concatenate(x)
+    y_train = np.concatenate(y)
     if not len(x_train):
         raise InputError(f"{folder} has no scene of exactly two spheres, all that robot.npz can hold")
     write_atomically(file, lambda stream: np.savez(stream, x_train=x_train, y_train=y_train))
@@ -256,7 +260,8 @@ def import_npz(
 
     Raises InputError if the file is no robot.npz, or the folder holds data or cannot be written.
     """
-    arm, folder = load_robot(robot), FilePath(folder)
+    arm = load_robot(robot)
+    folder = FilePath(folder)
     if arm.dof != DOF:
         raise InputError(f"{arm.name} has {arm.dof} joints; robot.npz holds {DOF}")
     if not radius > 0:

@@ -109,8 +109,11 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         self._arguments = (folder, split, points, sort_points, view, device, seed, robot, waypoints)
         self.manifest = read_manifest(folder)
         self.waypoints = waypoints or self.manifest.waypoints
-        self.points, self.sort_points, self.view = points, sort_points, view
-        self.device, self.seed = torch.device(device), seed
+        self.points = points
+        self.sort_points = sort_points
+        self.view = view
+        self.device = torch.device(device)
+        self.seed = seed
         self._generators: dict[int, torch.Generator] = {}
         self.normalizer = JointNormalizer(np.array(self.manifest.lower), np.array(self.manifest.upper))
         middle, half_range = (
@@ -122,7 +125,9 @@ class RopDataset(Dataset[dict[str, Tensor]]):
             for a in (1 / half_range, -middle / half_range)
         )
         self._trajectories: list[ndarray] = []
-        places, poses, scenes = [], [], []
+        places = []
+        poses = []
+        scenes = []
         for i, rows in enumerate(read_rows(folder, robot, waypoints)):
             mine = np.flatnonzero(rows.split == SPLITS.index(split))
             self._trajectories.append(rows.q)
@@ -209,7 +214,8 @@ class RopDataset(Dataset[dict[str, Tensor]]):
 
     def _batch(self, indices: ndarray, generator: torch.Generator) -> RopBatch:
         shard, row = self._places[indices].T
-        waypoints, dof = self.waypoints, self.manifest.dof
+        waypoints = self.waypoints
+        dof = self.manifest.dof
         q = np.empty((len(indices), waypoints, dof), np.float32)
         for s in np.unique(shard):
             mine = np.flatnonzero(shard == s)

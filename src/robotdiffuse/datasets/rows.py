@@ -93,7 +93,8 @@ def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> Pa
 
     Raises InputError for a family that the manifest does not have.
     """
-    family, names = shard["family"][rows], list(manifest.families)
+    family = shard["family"][rows]
+    names = list(manifest.families)
     if len(family) and not 0 <= family.min() <= family.max() < len(names):
         wrong = family[(family < 0) | (family >= len(names))][0]
         raise InputError(f"family is {wrong}; the manifest has {len(names)}: {', '.join(names)}")
@@ -173,7 +174,8 @@ def read_rows(
             check_shapes(folder, shard, manifest)
         else:
             shard = check_shard(folder, index, manifest)
-        stored, scenes = shard["trajectories"].view(ndarray), scenes_of(manifest, shard)
+        stored = shard["trajectories"].view(ndarray)
+        scenes = scenes_of(manifest, shard)
         split = split_of(scenes)
         yield Rows(shard, 0, stored if waypoints is None else resample(stored, waypoints), scenes, split)
         for turn in range(1, turns + 1):
@@ -205,12 +207,14 @@ def resample(
     after = np.clip(after.reshape(n, waypoints) - np.arange(n)[:, None] * stored, 1, stored - 1)
     low, high = (np.take_along_axis(at, i, 1)[..., None] for i in (after - 1, after))
     below, above = (np.take_along_axis(q, i[..., None], 1) for i in (after - 1, after))
-    into, long = wanted[..., None] - low, np.maximum(high - low, np.finfo(np.float64).tiny)
+    into = wanted[..., None] - low
+    long = np.maximum(high - low, np.finfo(np.float64).tiny)
     if exact:
         even = ((above.astype(np.float64) - below) / long * into + below).astype(q.dtype)
     else:
         even = below + (into / long).clip(0, 1).astype(q.dtype) * (above - below)
-    even[:, 0], even[:, -1] = q[:, 0], q[:, -1]
+    even[:, 0] = q[:, 0]
+    even[:, -1] = q[:, -1]
     return even
 
 

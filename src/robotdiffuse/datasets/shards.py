@@ -255,7 +255,8 @@ def write_shard(
     `arrays` are all of ARRAYS, without `times` if the timing is "arc". Raises InputError if the arrays do not
     match, or the shard cannot be written: OutputError if the disk is full.
     """
-    zarr, target = _zarr(), shard_path(folder, index)
+    zarr = _zarr()
+    target = shard_path(folder, index)
     wrong = {*arrays, "times"} ^ ARRAYS.keys()
     rows = {name: len(array) for name, array in arrays.items()}
     if wrong or len(set(rows.values())) != 1:
@@ -275,7 +276,8 @@ def write_shard(
     try:
         FilePath(folder).mkdir(parents=True, exist_ok=True)
         beside = tempfile.mkdtemp(prefix=f".{target.name}.", dir=folder)
-        fresh, old = FilePath(beside, "new"), FilePath(beside, "old")
+        fresh = FilePath(beside, "new")
+        old = FilePath(beside, "old")
         group = zarr.open_group(fresh, mode="w", zarr_format=3, attributes=attributes)
         for name, array in ready.items():
             group.create_array(
@@ -351,7 +353,8 @@ def _read_array(path: FilePath, group: Any, name: str) -> ndarray:
         raise InputError(f"{where}: missing")
     with reading(where):
         array = group[name]
-        found, wanted = (array.dtype.str, array.ndim), (dtype, 1 + len(row))
+        found = (array.dtype.str, array.ndim)
+        wanted = (dtype, 1 + len(row))
         if found != wanted:
             raise InputError(
                 f"{where} is {found[0]} with {found[1]} axes; it must be {dtype} with {wanted[1]}"
@@ -384,11 +387,13 @@ def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard
 
     Raises InputError, naming shard and array, for the first defect.
     """
-    shard, path = read_shard(folder, index), shard_path(folder, index)
+    shard = read_shard(folder, index)
+    path = shard_path(folder, index)
     if ("times" in shard.arrays) != (manifest.timing == "time"):
         raise InputError(f"shard {path}, array times: it must be there only where timing is time")
     check_shapes(folder, shard, manifest)
-    group, fingerprints = _open(path), {}
+    group = _open(path)
+    fingerprints = {}
     for name, array in shard.arrays.items():
         where = f"shard {path}, array {name}"
         fingerprints[name] = _array_fingerprint(array)

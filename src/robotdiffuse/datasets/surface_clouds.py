@@ -166,11 +166,17 @@ def fill_clouds(kinds, params, seeds, region, eyes, out):
                 offset = pick - (ends[j - 1] if j > 0 else _ZERO)
                 side = _HALF if x & np.uint64(1) else -_HALF
                 if offset < faces[j, 0]:
-                    a, b, c = side, u, v
+                    a = side
+                    b = u
+                    c = v
                 elif offset < faces[j, 1]:
-                    a, b, c = u, side, v
+                    a = u
+                    b = side
+                    c = v
                 else:
-                    a, b, c = u, v, side
+                    a = u
+                    b = v
+                    c = side
                 for r in range(3):
                     out[i, found, r] = (
                         params[i, j, r] + axes[j, r, 0] * a + axes[j, r, 1] * b + axes[j, r, 2] * c
@@ -199,12 +205,17 @@ def _prepare(kind, row, faces, axes, into):
         for r in range(3):
             axes[r, r] = _TWO * row[3]
     else:
-        a, b, c = row[3], row[4], row[5]
+        a = row[3]
+        b = row[4]
+        c = row[5]
         faces[0] = _TWO * b * c
         faces[1] = faces[0] + _TWO * c * a
         area = faces[1] + _TWO * a * b
         norm = np.sqrt(row[6] * row[6] + row[7] * row[7] + row[8] * row[8] + row[9] * row[9])
-        w, x, y, z = row[6] / norm, row[7] / norm, row[8] / norm, row[9] / norm
+        w = row[6] / norm
+        x = row[7] / norm
+        y = row[8] / norm
+        z = row[9] / norm
         axes[0, 0] = a * (_ONE - _TWO * (y * y + z * z))
         axes[0, 1] = b * _TWO * (x * y - w * z)
         axes[0, 2] = c * _TWO * (x * z + w * y)

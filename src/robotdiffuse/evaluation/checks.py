@@ -257,7 +257,8 @@ class _Task:
                 path = path_of(self.robot, shard, row)
                 contact = oracle.check_path(path, PYBULLET_STEP, PYBULLET_TOLERANCE)
                 if contact is not None:
-                    depth, at = -1e3 * contact.distance, contact.at
+                    depth = -1e3 * contact.distance
+                    at = contact.at
                     text = f"{contact.link} is {depth:.1f} mm inside {contact.other} at waypoint {at:.2f}"
                     yield Finding("pybullet", shard.index, row, text)
 

@@ -169,11 +169,13 @@ class Validated(NamedTuple):
 
 def validated(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Validated:
     """Validate trajectories as they are, except that their ends are made exact."""
-    validator, exact = verifier(problem, VerifySettings()), q.astype(np.float64)
+    validator = verifier(problem, VerifySettings())
+    exact = q.astype(np.float64)
     exact[:, 0], exact[:, -1] = problem.start, goal_of(problem)
     reports = [validator.path(Path(problem.robot.joint_names, waypoints)) for waypoints in exact]
     kinds = ["" if report.violation is None else report.violation.kind for report in reports]
-    passed, hit = [not kind for kind in kinds], [kind.endswith("collision") for kind in kinds]
+    passed = [not kind for kind in kinds]
+    hit = [kind.endswith("collision") for kind in kinds]
     return Validated(np.array(passed), np.array(hit), reports, exact)
 
 
@@ -190,7 +192,8 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
         checker = CollisionChecker(problem.robot, problem.scene)
         with Clock() as clock:
             q = draw(run, checker)
-        verdict, found = validated(problem, q), {}
+        verdict = validated(problem, q)
+        found = {}
         if verdict.passed.any():
             best = int(np.where(verdict.passed, lengths(verdict.waypoints), np.inf).argmin())
             path = Path(problem.robot.joint_names, verdict.waypoints[best])
@@ -249,7 +252,8 @@ def without_network(settings: RobotDiffuseSettings, waypoints: int, steps: int |
         steps = settings.guidance_steps * ceil(settings.guided_share * sampling_steps)
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:
-        start, goals = run.problem.start, goal_of(run.problem)[None]
+        start = run.problem.start
+        goals = goal_of(run.problem)[None]
         q = smooth_noise(start, goals, settings.samples, waypoints, run.problem.robot, run.rng())
         return CollisionGuidance(checker, settings.guidance)(q, steps)[0] if steps else q
 

@@ -63,12 +63,14 @@ class Kinematics:
 
     def tip_speed(self, motion: Trajectory) -> Float[ndarray, "n"]:
         """Speed of the origin of the robot's tip at each row [m/s]."""
-        robot, q = self.robot, motion.positions
+        robot = self.robot
+        q = motion.positions
         joints = list(robot.chain(robot.tip))
         T = forward_frames(robot, q)[:, [j + 1 for j in joints]]
         tip = link_origins(robot, q, robot.tip)
         slides = np.array(robot.prismatic)[joints][:, None]
-        axes, arms = T[..., :3, 2], tip[:, None] - T[..., :3, 3]
+        axes = T[..., :3, 2]
+        arms = tip[:, None] - T[..., :3, 3]
         rates = np.where(slides, axes, np.cross(axes, arms))
         return np.linalg.norm((rates * motion.velocities[:, joints, None]).sum(axis=1), axis=1)
 
@@ -201,7 +203,8 @@ def bending(positions: Float[ndarray, "n dof"]) -> float:
     length = float(steps.sum())
     if length < STANDSTILL:
         return 0.0
-    at, u = np.concatenate([[0.0], np.cumsum(steps) / length]), np.linspace(0.0, 1.0, BENDING_SAMPLES)
+    at = np.concatenate([[0.0], np.cumsum(steps) / length])
+    u = np.linspace(0.0, 1.0, BENDING_SAMPLES)
     even = np.stack([np.interp(u, at, column) for column in positions.T], axis=1)
     second = np.diff(even, 2, axis=0) * (BENDING_SAMPLES - 1) ** 2
     return float((second**2).sum() / (BENDING_SAMPLES - 1) / length**2)

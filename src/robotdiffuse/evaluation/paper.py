@@ -71,7 +71,8 @@ STREAM = 1_000
 
 def draw_problem(number: int) -> dict[str, Problem]:
     """The Panda's problem of this number, by problem set."""
-    robot, rng = load_robot("panda"), np.random.default_rng([SEED, STREAM, number])
+    robot = load_robot("panda")
+    rng = np.random.default_rng([SEED, STREAM, number])
     drawn = ROP.draw(robot, rng, 1, POSITION)
     return {
         POSE: Problem(robot, drawn.scene, drawn.start, PoseGoal(robot.tip, drawn.T_base_tip)),
@@ -428,12 +429,15 @@ class Noisy(NamedTuple):
 
 def denoising(problem: Problem, seed: int = 0) -> list[Noisy]:
     """One motion of the bundled network at several noise levels, without guidance, the noisiest first."""
-    planner, rng, robot = RobotDiffuse(), np.random.default_rng(seed), problem.robot
+    planner = RobotDiffuse()
+    rng = np.random.default_rng(seed)
+    robot = problem.robot
     model = planner.model(robot)
     assert model is not None
     checker = CollisionChecker(robot, problem.scene)
     code = encode(model, checker, planner.settings.points, rng)
-    start, goal = problem.start, goal_of(problem)
+    start = problem.start
+    goal = goal_of(problem)
     reference = model.reference(start[None], goal[None])
     predict = model.predictor(
         reference, model.condition(code, start, goal), link_clearances(checker, model.settings)

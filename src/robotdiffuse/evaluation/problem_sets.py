@@ -88,12 +88,15 @@ def read_cases(out: FilePath, problem_set: str) -> list[Case]:
 
 
 def _set(text: str, count: int | None, folder: FilePath, report: Report) -> list[Case]:
-    name, family = problem_set_name(text), text.removesuffix(NONTRIVIAL_SUFFIX)
+    name = problem_set_name(text)
+    family = text.removesuffix(NONTRIVIAL_SUFFIX)
     if family in FAMILIES:
         finder = search if text.endswith(NONTRIVIAL_SUFFIX) else None
         wanted = 100 if count is None else count
         return _of_set(case_file(folder, family).held_out(family, wanted, validator, finder, report), name)
-    kept, place, source = case_file(folder, name), FilePath(text), folder / f"{name}.source.json"
+    kept = case_file(folder, name)
+    place = FilePath(text)
+    source = folder / f"{name}.source.json"
     about = {"source": str(place.resolve()), "sha256": _content_hash(place)}
     if not len(kept):
         cases = _read_place(place, name, report)

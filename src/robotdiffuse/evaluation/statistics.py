@@ -126,7 +126,8 @@ def normalized(rows: Sequence[Indicators]) -> Float[ndarray, "n 4"]:
     if not len(rows):
         return values
     gains = np.where(HIGHER_IS_BETTER, values, -values)
-    worst, best = np.fmin.reduce(gains, axis=0), np.fmax.reduce(gains, axis=0)
+    worst = np.fmin.reduce(gains, axis=0)
+    best = np.fmax.reduce(gains, axis=0)
     span = best - worst
     with np.errstate(invalid="ignore"):
         share = np.where(span > 0, (gains - worst) / np.where(span > 0, span, 1.0), 1.0)

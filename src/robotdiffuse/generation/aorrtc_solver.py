@@ -72,7 +72,8 @@ class AORRTCSearch:
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Search until no path can be shorter, more iterations do not pay, there seems to be no path, or
         `stop` returns True."""
-        settings, search = self.settings, self._search
+        settings = self.settings
+        search = self._search
         most = settings.tries * (len(self._distances) + 2)
         while search.best is None and search.work < most and not stop():
             search.first(work=ITERATIONS_PER_STEP)

@@ -158,7 +158,8 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
     `unsolved` the search found no path; the validator rejected the motions of `refused`. Raises InputError if
     hardly any problem can be solved.
     """
-    robot, rows = load_robot(settings.robot), settings.rows(index)
+    robot = load_robot(settings.robot)
+    rows = settings.rows(index)
     kept: list[Row] = []
     counts: Counts = dict.fromkeys(("tried", "solved", "thinned", "unsolved", "refused"), 0)
     while len(kept) < rows:
@@ -198,7 +199,8 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     path = search.path()
     if path is None:
         return "unsolved"
-    goal, line_free = search.goals[search.best_goal], lines_free[search.best_goal]
+    goal = search.goals[search.best_goal]
+    line_free = lines_free[search.best_goal]
     if thinned and line_free:
         return "thinned"
     validator = Verifier(drawn.problem(robot), VerifySettings())
@@ -206,7 +208,8 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     if motion is None:
         return "refused"
     times, q = motion
-    q[0], q[-1] = drawn.start, goal
+    q[0] = drawn.start
+    q[-1] = goal
     if not validator.path(Path(robot.joint_names, q.astype(np.float64))).valid:
         return "refused"
     floor = list(settings.families.values())[family].floor

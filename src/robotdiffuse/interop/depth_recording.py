@@ -143,7 +143,9 @@ def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> 
         check_chunks(stream, reader, str(path))
         kinds = topics_in(reader, str(path))
         images = _image_topics(kinds, topics)
-        states, transforms, infos = _States(robot), TransformHistory(), {}
+        states = _States(robot)
+        transforms = TransformHistory()
+        infos = {}
         others = [
             name for name, schema in kinds.items() if schema.name in (JOINT_STATE, TRANSFORMS, CAMERA_INFO)
         ]
@@ -160,7 +162,8 @@ def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> 
         for topic, at, message in messages_in(reader, kinds, images):
             if message.encoding not in ENCODINGS and topics is None:
                 continue
-            found, stamp = True, _seconds(message, at)
+            found = True
+            stamp = _seconds(message, at)
             where = f"the image of {topic} at {stamp:.3f} s"
             T = transforms.at(base, message.header.frame_id, stamp, MAX_GAP, where)
             intrinsics = _intrinsics(topic, infos.get(_folder(topic)), message)
@@ -201,7 +204,8 @@ def _intrinsics(topic: str, info: Any, image: Any) -> tuple[float, float, float,
         )
     if np.any(np.asarray(info.d) != 0) and "rect" not in topic.rpartition("/")[2]:
         raise InputError(f"images of {topic} are distorted; record the rectified ones (image_rect)")
-    p, k = np.asarray(info.p).reshape(3, 4), np.asarray(info.k).reshape(3, 3)
+    p = np.asarray(info.p).reshape(3, 4)
+    k = np.asarray(info.k).reshape(3, 3)
     used = p if p[0, 0] else k
     return float(used[0, 0]), float(used[1, 1]), float(used[0, 2]), float(used[1, 2])
 
@@ -241,7 +245,8 @@ class TransformHistory:
     def add(self, message: Mapping[str, Any], static: bool) -> None:
         """Take a geometry_msgs/TransformStamped, in plain data, into account."""
         child = message["child_frame_id"].lstrip("/")
-        place, turn = message["transform"]["translation"], message["transform"]["rotation"]
+        place = message["transform"]["translation"]
+        turn = message["transform"]["rotation"]
         quaternion = np.array([turn[axis] for axis in "wxyz"])
         length = np.linalg.norm(quaternion)
         if not length > 0:
@@ -260,7 +265,8 @@ class TransformHistory:
         Raises InputError, naming `where`, if no chain of transforms leads from the base to the frame, or if
         one of them is not near in time.
         """
-        T, at = np.eye(4), frame.lstrip("/")
+        T = np.eye(4)
+        at = frame.lstrip("/")
         passed = [at]
         while at != base.lstrip("/"):
             if at not in self._parent or len(passed) > len(self._parent) + 1:

@@ -95,7 +95,8 @@ class McapWriter:
 
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     """Write the scene and the motion; see `interop.write_motion` and this module's description."""
-    robot, stream = problem.robot, io.BytesIO()
+    robot = problem.robot
+    stream = io.BytesIO()
     out = McapWriter(stream)
     obstacles = drawables(problem.scene, problem.moving)
     out.protobuf("/scene", _scene(robot, obstacles), 0)
@@ -218,7 +219,8 @@ def _cloud(cloud: PointCloud, frame: str) -> PointCloudMessage:
 
 def _transforms(problem: Problem, poses: dict[str, Pose], at: int) -> FrameTransforms:
     """poses: in the base frame, of all links but the base and of moving obstacles."""
-    update, robot = FrameTransforms(), problem.robot
+    update = FrameTransforms()
+    robot = problem.robot
     frames = {frame: (robot.base, T) for frame, T in poses.items()}
     if problem.T_world_base is not None:
         frames[robot.base] = ("world", problem.T_world_base)
@@ -300,7 +302,8 @@ def messages_in(
         allowed -= len(found.data)
         if allowed < 0:
             raise InputError(f"the messages of {', '.join(topics)} take more than {MAX_UNPACKED:,} bytes")
-        store, kind = stores[channel.topic], kinds[channel.topic].name
+        store = stores[channel.topic]
+        kind = kinds[channel.topic].name
         yield channel.topic, found.log_time, store.deserialize_cdr(found.data, kind)
 
 

@@ -146,7 +146,8 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
 
 def _check_locked(values: Values, name: str, robot: Robot) -> None:
     held = robot.locked.get(name, 0.0)
-    low, high = float(values.min()), float(values.max())
+    low = float(values.min())
+    high = float(values.max())
     if high - low > STATIONARY_TOLERANCE + LOCKED_TOLERANCE:
         raise InputError(
             f"the motion moves {name} from {low:.6g} to {high:.6g}, which the problem locks at {held:.6g}"

@@ -27,12 +27,14 @@ FPS = 60.0
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     """Write the entities scene/NAME, robot/LINK with its meshes, and joints/NAME/positions and velocities
     over time, in the world's frame if the problem has one; see `interop.write_motion`."""
-    robot, recording = problem.robot, rr.RecordingStream("robotdiffuse", recording_id=file.stem)
+    robot = problem.robot
+    recording = rr.RecordingStream("robotdiffuse", recording_id=file.stem)
     # in memory: what Rerun cannot write to a disk ends a thread of its own, with messages of several lines
     content = recording.memory_recording()
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if problem.T_world_base is not None:
-        T, turn = problem.T_world_base, _quaternion(problem.T_world_base)
+        T = problem.T_world_base
+        turn = _quaternion(problem.T_world_base)
         for part in ("scene", "robot"):
             recording.log(part, rr.Transform3D(translation=T[:3, 3], quaternion=turn), static=True)
     for obstacle in drawables(problem.scene, problem.moving):
@@ -44,7 +46,8 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
 
 
 def _motion(recording: rr.RecordingStream, problem: Problem, trajectory: Trajectory) -> None:
-    robot, times = problem.robot, trajectory.times
+    robot = problem.robot
+    times = trajectory.times
     frames = max(int(np.ceil(times[-1] * FPS)), 1) + 1
     shown = np.unique(np.searchsorted(times, np.linspace(0, times[-1], frames)).clip(0, len(times) - 1))
     at = rr.TimeColumn(TIMELINE, duration=times[shown])
@@ -78,7 +81,8 @@ def _archetype(obstacle: Drawable) -> rr.AsComponents:
         return rr.Points3D(shape.points, radii=shape.point_radius, colors=[obstacle.color])
     if not isinstance(shape, Box | Sphere | Cylinder | Capsule):
         return _mesh(obstacle.surface)
-    T, solid = shape.T_base_shape, rr.components.FillMode.Solid
+    T = shape.T_base_shape
+    solid = rr.components.FillMode.Solid
     placed = {"quaternions": [_quaternion(T)], "colors": [obstacle.color], "fill_mode": solid}
     match shape:
         case Box():

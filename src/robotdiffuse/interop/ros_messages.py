@@ -75,7 +75,8 @@ def to_message(kind: str, record: Mapping[str, Any]) -> Any:
 
 
 def _value(definition: Any, value: Any) -> Any:
-    node, of = int(definition[0]), definition[1]
+    node = int(definition[0])
+    of = definition[1]
     if node == 1:  # a base type
         kind = of[0]
         if kind == "string":
@@ -155,7 +156,8 @@ def motion_from_messages(kind: str, messages: list[tuple[int, Any]], where: str)
             raise InputError(f"{where} holds {len(messages)} motions; one is validated at a time")
         return motion_from_record(to_plain(messages[0][1]), where)
     states = [to_plain(message) for _, message in messages]
-    names, logged = states[0]["name"], messages[0][0]
+    names = states[0]["name"]
+    logged = messages[0][0]
     stamps = [header_seconds(state["header"]["stamp"]) for state in states]
     if not any(stamps):
         stamps = [1e-9 * (at - logged) for at, _ in messages]

@@ -45,7 +45,8 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     }
     try:
         with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent, ignore_cleanup_errors=True) as part:
-            new, old = Path(part, file.name), Path(part, "old")
+            new = Path(part, file.name)
+            old = Path(part, "old")
             with Writer(new, version=VERSION) as writer:  # it names the database after the folder
                 for topic, (kind, content) in topics.items():
                     connection = writer.add_connection(topic, kind, typestore=typestore())

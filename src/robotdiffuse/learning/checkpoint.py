@@ -120,7 +120,8 @@ def _load(name: str, folder: FilePath) -> Any:
     settings: Any = CompletionSettings
     if name != "completion":
         table, entry = (ENCODERS, about.get("network", "")) if name == "encoder" else (NETWORKS, name)
-        kind, settings = table.load(entry), table.settings(entry)
+        kind = table.load(entry)
+        settings = table.settings(entry)
         if table is NETWORKS:
             robots = [RobotIdentity.from_json(about.get("robot"), f"{where}: robot")]
     made = settings.from_json(about.get("settings"), f"{where}: settings")
@@ -186,7 +187,8 @@ def export_weights(folder: str | FilePath) -> list[str]:
 
     Raises InputError if the folder holds none, or one is damaged.
     """
-    place, written = FilePath(folder), list[str]()
+    place = FilePath(folder)
+    written = list[str]()
     for name in ("completion", *NETWORKS):
         if not (place / f"{name}.json").is_file():
             continue

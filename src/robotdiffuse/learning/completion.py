@@ -91,7 +91,10 @@ def covers(robot: Robot) -> bool:
 
 DEPTH_STEP = 0.01
 """Depths behind surfaces are stored in whole steps of this [m]."""
-OCCUPIED, FREE, SHADOW, OUT_OF_VIEW = 1, 2, 4, 8
+OCCUPIED = 1
+FREE = 2
+SHADOW = 4
+OUT_OF_VIEW = 8
 BITS = (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW)
 """The bits of `Sample.seen`."""
 
@@ -221,7 +224,8 @@ def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> Sample
     q = random_configuration(CollisionChecker(robot, scene), robot, rng)
     views = [camera_view(scene, robot, q, rng) for _ in range(rng.choice(VIEW_COUNTS))]
     if rng.random() < NOISE_SHARE:
-        strength, hide_far = 2 * rng.random(), rng.random() < OUT_OF_RANGE_SHARE
+        strength = 2 * rng.random()
+        hide_far = rng.random() < OUT_OF_RANGE_SHARE
         usual = DepthNoise()
         noise = DepthNoise(
             strength * usual.spread,

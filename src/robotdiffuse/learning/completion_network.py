@@ -97,7 +97,8 @@ class CompletionNetwork(SavedModule):
     def features(self, seen: Packed, behind: Packed) -> Float[Tensor, "n 56 28 28 16"]:
         """The input channels of volumes packed by `completion.pack`."""
         kind = torch.bfloat16 if torch.is_autocast_enabled(seen.device.type) else torch.float32
-        seen, behind = folded(seen), folded(behind)
+        seen = folded(seen)
+        behind = folded(behind)
         out = seen.new_empty((*seen.shape[:4], 8 * CHANNELS), dtype=kind)
         parts = out.split(8, dim=-1)
         for part, bit in zip(parts[: len(BITS)], BITS, strict=True):

@@ -66,7 +66,8 @@ class ExportedModel(MotionModel):
 
     def __init__(self, folder: FilePath, name: str) -> None:
         """name: in NETWORKS. Raises InputError, naming the file, if one is missing or damaged."""
-        about, where = read_description(folder, name), str(folder / f"{name}.json")
+        about = read_description(folder, name)
+        where = str(folder / f"{name}.json")
         robot = RobotIdentity.from_json(about.get("robot"), f"{where}: robot")
         super().__init__(robot, MotionModelSettings.from_json(about.get("settings"), f"{where}: settings"))
         parts = exported_files(folder, name, about)

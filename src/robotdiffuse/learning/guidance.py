@@ -77,7 +77,8 @@ class CollisionGuidance:
         between them is within a margin, or none was before the last step. Such a trajectory is left as it is;
         the cost of length acts on every trajectory only where no margin is enabled.
         """
-        settings, checker = self.settings, self.checker
+        settings = self.settings
+        checker = self.checker
         index = np.arange(q.shape[1])
         spread = np.exp(-0.5 * ((index[:, None] - index) / settings.width) ** 2).astype(np.float32)
         moved = np.array(q, np.float32)

@@ -39,9 +39,11 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
     unless no margin is enabled.
     """
     batch, n, dof = q.shape
-    first, last = 1, n - 1
+    first = 1
+    last = n - 1
     scratch = make_cost_workspace(dof)
-    pushes, active = np.empty((n, dof), np.float32), np.empty(n, np.float32)
+    pushes = np.empty((n, dof), np.float32)
+    active = np.empty(n, np.float32)
     gradient = np.empty(dof, np.float32)
     costs = np.zeros(batch, np.float32)
     work = make_clearance_workspace(robot, 1)

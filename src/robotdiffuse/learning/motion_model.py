@@ -262,7 +262,8 @@ class MotionModel(ABC):
 
     def hold_ends(self, x: Trajectories, reference: Reference) -> Trajectories:
         """Write start and goal over the ends of x, in place (noise interpolation). Returns x."""
-        x[..., :1, :], x[..., -1:, :] = reference.start, reference.goal
+        x[..., :1, :] = reference.start
+        x[..., -1:, :] = reference.goal
         return x
 
     def draw_noise(self, count: int, rng: np.random.Generator) -> Float[ndarray, "count waypoints dof"]:
@@ -329,7 +330,8 @@ class MotionModel(ABC):
         parts = [x] if self.is_unit_joints else [x, unit]
         if not self.settings.clearance_features:
             return np.concatenate(parts, axis=-1)
-        low, high = MIN_CLEARANCE, MAX_CLEARANCE
+        low = MIN_CLEARANCE
+        high = MAX_CLEARANCE
         inputs = clearances(self.normalizer.from_unit(unit))
         near = np.clip(inputs[..., : len(self.robot.links)], low, high)
         near = (near - (low + high) / 2) * (2 / (high - low))
@@ -396,7 +398,8 @@ class MotionModel(ABC):
         settings = settings or SamplingSettings()
         scale = settings.guidance_scale
         if code is None:
-            code, scale = np.zeros(self.settings.code, np.float32), 0.0
+            code = np.zeros(self.settings.code, np.float32)
+            scale = 0.0
         if scale != 1.0 and not self.settings.null_condition:
             raise InputError(
                 f"guidance_scale is {scale}; it must be 1, for this model was trained with "
@@ -419,7 +422,8 @@ class MotionModel(ABC):
         x = draw(predict, self.schedule, lambda: self.draw_noise(settings.samples, rng), steps, settings.eta)
         q = self.joints(x, reference).astype(np.float64)
         np.clip(q, self.robot.lower, self.robot.upper, out=q)
-        q[:, 0], q[:, -1] = start, goal
+        q[:, 0] = start
+        q[:, -1] = goal
         return q
 
     def predictor(

@@ -228,7 +228,8 @@ class MPiNetsNetwork(BaselineNetwork):
 
     def __init__(self, robot: RobotIdentity, settings: MPiNetsNetworkSettings) -> None:
         super().__init__(robot, settings)
-        s, kinematics = settings, ForwardKinematics(load_robot(robot.source))
+        s = settings
+        kinematics = ForwardKinematics(load_robot(robot.source))
         # the same points every time, so that a checkpoint need not store them
         self._surface = SurfacePoints(kinematics, s.robot_points, np.random.default_rng(0))
         self._distance = ArmDistance(kinematics)
@@ -344,7 +345,9 @@ class RollOuts:
         goal: Joints,
     ) -> None:
         """clouds of the scenes [m]; start and goal in [rad]."""
-        self.network, self._clouds, self._goal = network, clouds, goal
+        self.network = network
+        self._clouds = clouds
+        self._goal = goal
         self.waypoints = [start]
         """[n, dof] before the first and after each step [rad]; stopped roll-outs stay where they are."""
         self.running = np.ones(len(start), bool)
@@ -365,7 +368,8 @@ class RollOuts:
         normalizer = self.network.normalizer
         q = normalizer.from_unit(normalizer.to_unit(input_q[rows]).clip(-1, 1))
         with torch.inference_mode():
-            at, goal = torch.from_numpy(q), torch.from_numpy(self._goal[rows])
+            at = torch.from_numpy(q)
+            goal = torch.from_numpy(self._goal[rows])
             moved = self.network(self._clouds[torch.from_numpy(rows)], at, goal).numpy()
         after = self.waypoints[-1].copy()
         after[rows] = moved

@@ -144,7 +144,8 @@ class MPNetNetwork(BaselineNetwork):
 
         Dropout is drawn from the generator, in training and evaluation mode alike; None: without dropout.
         """
-        x, target = self.to_unit(q), self.to_unit(goal)
+        x = self.to_unit(q)
+        target = self.to_unit(goal)
         step = self.policy(torch.cat([z, x, target], 1), generator)
         return self.from_unit((x + self.step_scale * step).clamp(-1, 1))
 
@@ -187,7 +188,8 @@ class MPNetNetwork(BaselineNetwork):
                 return self.autoencoder_loss(cloud, generator)
             z = self.encode(cloud).repeat_interleave(of.waypoints, 0)
             q, following, goal = (torch.from_numpy(a) for a in self.training_samples(data.q[rows], rng))
-            x, target = self.to_unit(q), self.to_unit(goal)
+            x = self.to_unit(q)
+            target = self.to_unit(goal)
             step = self.policy(torch.cat([z, x.to(z), target.to(z)], 1), generator)
         wanted = (self.to_unit(following) - x) / self.step_scale
         return (step.float() - wanted).square().mean()
@@ -215,7 +217,8 @@ class MPNetNetwork(BaselineNetwork):
     ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
         """Configurations, the waypoints after them, and goals [rad], along trajectories in a random
         direction."""
-        of, last = self.settings, q.shape[1] - 1
+        of = self.settings
+        last = q.shape[1] - 1
         spacing = np.linalg.norm(np.diff(q, axis=1), axis=2).mean(1)
         stride = np.clip(np.rint(of.step / np.maximum(spacing, 1e-6)), 1, last).astype(np.int64)
         rows = np.repeat(np.arange(len(q)), of.waypoints)
@@ -236,7 +239,8 @@ class Perceptron(nn.Module):
     def __init__(self, sizes: Sequence[int], dropout: float = 0.0, dropped_layers: int = 0) -> None:
         """Dropout follows the first `dropped_layers` activations."""
         super().__init__()
-        self.dropout, self.dropped_layers = dropout, dropped_layers
+        self.dropout = dropout
+        self.dropped_layers = dropped_layers
         linear = [nn.Linear(a, b) for a, b in pairwise(sizes)]
         activations = [nn.PReLU() for _ in sizes[1:-1]]
         self.linear, self.activations = nn.ModuleList(linear), nn.ModuleList(activations)

@@ -95,7 +95,8 @@ def depth_spread(depth: Float32[ndarray, "h w"]) -> float:
     seen = np.isfinite(some) & (some > 0)
     differences = np.divide(1.0, some, out=np.zeros_like(some), where=seen)
     for _ in range(ORDER):
-        differences, seen = np.diff(differences, axis=1), seen[:, 1:] & seen[:, :-1]
+        differences = np.diff(differences, axis=1)
+        seen = seen[:, 1:] & seen[:, :-1]
     found = np.abs(differences[seen])
     return float(np.median(found)) / DIFFERENCE_PER_SPREAD if len(found) >= MIN_DIFFERENCES else 0.0
 

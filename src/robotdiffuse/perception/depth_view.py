@@ -26,8 +26,9 @@ MIN_FOCAL_LENGTH = 1e-3
 MIN_RETURNS = 1e-3
 """Share of the pixels with a return below which an image measures nothing."""
 INTRINSICS = ("fx", "fy", "cx", "cy")
-MAX_CLOUD_WIDTH, MAX_CLOUD_HEIGHT = 320, 240
-"""Maximum size of the image that is made of a point cloud; sparse clouds get coarser images [pixels]."""
+# Maximum size of the image that is made of a point cloud; sparse clouds get coarser images [pixels].
+MAX_CLOUD_WIDTH = 320
+MAX_CLOUD_HEIGHT = 240
 
 
 @no_type_check
@@ -200,7 +201,8 @@ class DepthNoise(Settings, name="depth_noise"):
 
     def applied(self, view: DepthView, rng: Generator) -> DepthView:
         """The view with noise."""
-        clean, depth = view.depth, view.depth.astype(np.float64)
+        clean = view.depth
+        depth = view.depth.astype(np.float64)
         lost = self._grazed(view)
         for axis in (0, 1):
             # of two neighbours with an edge between them, the first becomes a flying pixel

@@ -137,7 +137,8 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     values = check_fields(where, entry, required, ("configuration",) if cloud else ("scale", "configuration"))
     camera = check_fields(f"{where}.camera", values["camera"], ("xyz", "wxyz"))
     rotation = rotation_from_quaternion(unit_quaternion("camera", camera["wxyz"]))
-    T_base_camera, configuration = transform(vector("camera", "xyz", camera["xyz"], 3), rotation), None
+    T_base_camera = transform(vector("camera", "xyz", camera["xyz"], 3), rotation)
+    configuration = None
     if values.get("configuration") is not None:
         configuration = np.asarray(values["configuration"])
     if cloud:
@@ -152,7 +153,8 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
     scale = positive("view", "scale", values["scale"]) if "scale" in values else None
     if isinstance(image, str):
         file = str(folder / image)
-        image, source = read_depth(file, scale), {"depth": file} | ({} if scale is None else {"scale": scale})
+        image = read_depth(file, scale)
+        source = {"depth": file} | ({} if scale is None else {"scale": scale})
     elif scale is not None:
         raise InputError(
             "view.scale cannot be combined with an image in the problem file, which is in metres"

@@ -22,9 +22,13 @@ from robotdiffuse.perception.voxel_grid import COARSE, SHAPE, VoxelGrid
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
-HIDDEN, FREE, BEHIND, SHADOW, OUT = 0, 1, 2, 3, 4
-"""States of a voxel in a view: not observed, entirely free, behind a surface, behind the arm, outside the
-image."""
+# States of a voxel in a view: not observed, entirely free, behind a surface, behind the arm, outside the
+# image.
+HIDDEN = 0
+FREE = 1
+BEHIND = 2
+SHADOW = 3
+OUT = 4
 NO_RETURN = np.float32(-1.0)
 """Depth of a pixel without a return."""
 MAX_DEPTH = np.float32(1e6)
@@ -65,7 +69,10 @@ def usable_depth(depth, focal):
         for u in range(1, w - 1):
             d = out[v, u]
             step = max(FLYING_PIXEL_STEP, FLYING_PIXEL_WIDTHS * d / focal)
-            a, b, c, e = out[v, u - 1], out[v, u + 1], out[v - 1, u], out[v + 1, u]
+            a = out[v, u - 1]
+            b = out[v, u + 1]
+            c = out[v - 1, u]
+            e = out[v + 1, u]
             across = (a > _ZERO) & (b > _ZERO) & (min(a, b) < d - step) & (max(a, b) > d + step)
             along = (c > _ZERO) & (e > _ZERO) & (min(c, e) < d - step) & (max(c, e) > d + step)
             flying[v, u] = across | along
@@ -89,7 +96,9 @@ def _arm_pixels(depth, intrinsics, spheres):
             ry = (np.float32(v) - cy) / fy
             for u in range(u0, u1 + 1):
                 d = depth[v, u]
-                dx, dy, dz = (np.float32(u) - cx) / fx * d - x, ry * d - y, d - z
+                dx = (np.float32(u) - cx) / fx * d - x
+                dy = ry * d - y
+                dz = d - z
                 if dx * dx + dy * dy + dz * dz < r * r:
                     mask[v, u] = True
     return mask
@@ -98,12 +107,15 @@ def _arm_pixels(depth, intrinsics, spheres):
 @kernel(fastmath=FASTMATH)
 def _min_pooled(depth, factor):
     """Minimum depth of blocks of pixels, and the summed-area table of missing returns."""
-    h, w = (depth.shape[0] + factor - 1) // factor, (depth.shape[1] + factor - 1) // factor
+    h = (depth.shape[0] + factor - 1) // factor
+    w = (depth.shape[1] + factor - 1) // factor
     least = np.full((h, w), MAX_DEPTH, np.float32)
     missing = np.zeros((h + 1, w + 1), np.int32)
-    nearest, lost = np.empty(depth.shape[1], np.float32), np.empty(depth.shape[1], np.int32)
+    nearest = np.empty(depth.shape[1], np.float32)
+    lost = np.empty(depth.shape[1], np.int32)
     for block in range(h):
-        nearest[:], lost[:] = MAX_DEPTH, 0
+        nearest[:] = MAX_DEPTH
+        lost[:] = 0
         for v in range(block * factor, min((block + 1) * factor, depth.shape[0])):
             row = depth[v]
             for u in range(depth.shape[1]):
@@ -128,9 +140,11 @@ def _minimum_table(least, levels):
     table[0] = least
     for k in range(1, levels):
         step = 1 << (k - 1)
-        before, now = table[k - 1], table[k]
+        before = table[k - 1]
+        now = table[k]
         for v in range(h):
-            a, b = before[v], before[min(v + step, h - 1)]
+            a = before[v]
+            b = before[min(v + step, h - 1)]
             for u in range(w - step):
                 now[v, u] = min(min(a[u], a[u + step]), min(b[u], b[u + step]))
             for u in range(w - step, w):
@@ -144,7 +158,8 @@ def _rectangle_minimum(table, v0, v1, u0, u1):
     k = 0
     while 2 << k <= min(v1 - v0, u1 - u0) + 1 and k + 1 < len(table):
         k += 1
-    step, least = 1 << k, MAX_DEPTH
+    step = 1 << k
+    least = MAX_DEPTH
     for v in range(v0, v1 + step, step):
         row = table[k, max(v0, min(v, v1 - step + 1))]
         for u in range(u0, u1 + step, step):
@@ -159,20 +174,32 @@ def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
     h, w = depth.shape
     nx, ny, nz = counts.shape
     flat = counts.ravel()
-    fnx, fny, fnz = np.float32(nx), np.float32(ny), np.float32(nz)
+    fnx = np.float32(nx)
+    fny = np.float32(ny)
+    fnz = np.float32(nz)
     scale = _ONE / voxel
-    ox, oy, oz = (T[0, 3] - low[0]) * scale, (T[1, 3] - low[1]) * scale, (T[2, 3] - low[2]) * scale
+    ox = (T[0, 3] - low[0]) * scale
+    oy = (T[1, 3] - low[1]) * scale
+    oz = (T[2, 3] - low[2]) * scale
     at = np.empty(w, np.int32)
     for v in range(h):
         b = (np.float32(v) - cy) / fy
-        rx, ry, rz = T[0, 1] * b + T[0, 2], T[1, 1] * b + T[1, 2], T[2, 1] * b + T[2, 2]
-        row, hidden = depth[v], arm[v]
+        rx = T[0, 1] * b + T[0, 2]
+        ry = T[1, 1] * b + T[1, 2]
+        rz = T[2, 1] * b + T[2, 2]
+        row = depth[v]
+        hidden = arm[v]
         for u in range(w):
-            a, d = (np.float32(u) - cx) / fx, row[u] * scale
-            x, y, z = ox + (rx + T[0, 0] * a) * d, oy + (ry + T[1, 0] * a) * d, oz + (rz + T[2, 0] * a) * d
+            a = (np.float32(u) - cx) / fx
+            d = row[u] * scale
+            x = ox + (rx + T[0, 0] * a) * d
+            y = oy + (ry + T[1, 0] * a) * d
+            z = oz + (rz + T[2, 0] * a) * d
             inside = (x >= _ZERO) & (y >= _ZERO) & (z >= _ZERO) & (x < fnx) & (y < fny) & (z < fnz)
             inside &= (d > _ZERO) & ~hidden[u]
-            x, y, z = min(max(x, _ZERO), fnx), min(max(y, _ZERO), fny), min(max(z, _ZERO), fnz)
+            x = min(max(x, _ZERO), fnx)
+            y = min(max(y, _ZERO), fny)
+            z = min(max(z, _ZERO), fnz)
             index = (np.int32(x) * np.int32(ny) + np.int32(y)) * np.int32(nz) + np.int32(z)
             at[u] = index if inside else np.int32(-1)
         for u in range(w):
@@ -199,7 +226,8 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
     for i in range(0, nx, BLOCK):
         for j in range(0, ny, BLOCK):
             for k in range(0, nz, BLOCK):
-                first, end = (i, j, k), (min(i + BLOCK, nx), min(j + BLOCK, ny), min(k + BLOCK, nz))
+                first = (i, j, k)
+                end = (min(i + BLOCK, nx), min(j + BLOCK, ny), min(k + BLOCK, nz))
                 whole = _state_of_block(first, intrinsics, T, low, voxel, raw.shape, factor, table, missing)
                 if whole >= 0:
                     state[i : end[0], j : end[1], k : end[2]] = whole
@@ -236,19 +264,25 @@ def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missi
     pz = low[2] + (np.float32(first[2]) + middle) * voxel - T[2, 3]
     x, y, z = in_camera(T, px, py, pz)
     ez = _HALF * voxel * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
-    near, far = z - np.float32(BLOCK) * ez, z + np.float32(BLOCK) * ez
+    near = z - np.float32(BLOCK) * ez
+    far = z + np.float32(BLOCK) * ez
     if far <= ez:
         return OUT
     if near <= voxel:
         return -1
-    x, y = x / z, y / z
-    du, dv = _ZERO, _ZERO
+    x = x / z
+    y = y / z
+    du = _ZERO
+    dv = _ZERO
     for c in range(3):
         du += abs(T[c, 0] - x * T[c, 2])
         dv += abs(T[c, 1] - y * T[c, 2])
     # no rectangle of a voxel, which is a little larger than the voxel in the image, reaches beyond this
     wide = middle * voxel / near * (_ONE + ez / near)
-    u, v, du, dv = fx * x + cx, fy * y + cy, fx * wide * du + PIXEL_SLACK, fy * wide * dv + PIXEL_SLACK
+    u = fx * x + cx
+    v = fy * y + cy
+    du = fx * wide * du + PIXEL_SLACK
+    dv = fy * wide * dv + PIXEL_SLACK
     h, w = size
     if (
         u + du < -_HALF
@@ -258,8 +292,10 @@ def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missi
     ):
         return OUT
     share = _ONE / np.float32(factor)
-    u0, u1 = int((u - du + _HALF) * share), int((u + du + _HALF) * share)
-    v0, v1 = int((v - dv + _HALF) * share), int((v + dv + _HALF) * share)
+    u0 = int((u - du + _HALF) * share)
+    u1 = int((u + du + _HALF) * share)
+    v0 = int((v - dv + _HALF) * share)
+    v1 = int((v + dv + _HALF) * share)
     if u - du < -_HALF or v - dv < -_HALF or u1 >= table.shape[2] or v1 >= table.shape[1]:
         return -1
     if missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]:
@@ -288,9 +324,12 @@ def _carve_block(
                 state[i, j, k] = OUT
                 if z <= ez:
                     continue
-                x, y = x / z, y / z
-                u, v = fx * x + cx, fy * y + cy
-                column, row = int(np.floor(u + _HALF)), int(np.floor(v + _HALF))
+                x = x / z
+                y = y / z
+                u = fx * x + cx
+                v = fy * y + cy
+                column = int(np.floor(u + _HALF))
+                row = int(np.floor(v + _HALF))
                 if column < 0 or row < 0 or column >= raw.shape[1] or row >= raw.shape[0]:
                     continue
                 if counts[i, j, k] > 0:
@@ -299,15 +338,22 @@ def _carve_block(
                 front = raw[row, column]
                 if front > z + ez or front <= _ZERO:
                     # half the width and height of the rectangle that the voxel covers in the image
-                    du, dv = _ZERO, _ZERO
+                    du = _ZERO
+                    dv = _ZERO
                     for c in range(3):
                         du += abs(T[c, 0] - x * T[c, 2])
                         dv += abs(T[c, 1] - y * T[c, 2])
-                    du, dv = fx * half * du / (z - ez), fy * half * dv / (z - ez)
-                    u0, u1 = int((u - du + _HALF) * share), int((u + du + _HALF) * share)
-                    v0, v1 = int((v - dv + _HALF) * share), int((v + dv + _HALF) * share)
+                    du = fx * half * du / (z - ez)
+                    dv = fy * half * dv / (z - ez)
+                    u0 = int((u - du + _HALF) * share)
+                    u1 = int((u + du + _HALF) * share)
+                    v0 = int((v - dv + _HALF) * share)
+                    v1 = int((v + dv + _HALF) * share)
                     inside = u - du >= -_HALF and v - dv >= -_HALF and u1 < w and v1 < h
-                    u0, v0, u1, v1 = max(0, u0), max(0, v0), min(w - 1, u1), min(h - 1, v1)
+                    u0 = max(0, u0)
+                    v0 = max(0, v0)
+                    u1 = min(w - 1, u1)
+                    v1 = min(h - 1, v1)
                     lost = (
                         missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]
                     )
@@ -333,9 +379,14 @@ def _carve_block(
 def add_evidence(state, counts, evidence, hit, miss, largest):
     """Add what a view shows to the evidence for each voxel [nx ny nz]; returns for how many there was none:
     `hit` for voxels with points, else -`miss` for those that are free. It stays within `largest`."""
-    state, counts, evidence, new = state.ravel(), counts.ravel(), evidence.ravel(), 0
+    state = state.ravel()
+    counts = counts.ravel()
+    evidence = evidence.ravel()
+    new = 0
     for v in range(len(evidence)):
-        points, free, before = counts[v] > 0, state[v] == FREE, evidence[v]
+        points = counts[v] > 0
+        free = state[v] == FREE
+        before = evidence[v]
         gain = hit if points else (-miss if free else _ZERO)
         new += (points | free) & (before == _ZERO)
         evidence[v] = min(max(before + gain, -largest), largest)
@@ -382,7 +433,8 @@ def observe(views: Sequence[DepthView], robot: Robot, start: Configuration) -> O
 def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
     """What several volumes tell together: a voxel is occupied, or else free, if any of them says so."""
     occupied, free, shadow = (np.zeros(SHAPE, np.bool_) for _ in range(3))
-    out, behind = np.ones(SHAPE, np.bool_), np.full(SHAPE, np.inf, np.float32)
+    out = np.ones(SHAPE, np.bool_)
+    behind = np.full(SHAPE, np.inf, np.float32)
     for volume in volumes:
         occupied |= volume.occupied
         free |= volume.free
@@ -425,7 +477,8 @@ def carve_view(
     spheres = grown_for_noise(placed_spheres(robot, q), T, spread)
     spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
     spheres[:, 3] += arm_margin
-    state, behind = np.empty(grid.shape, np.uint8), np.empty(grid.shape, np.float32)
+    state = np.empty(grid.shape, np.uint8)
+    behind = np.empty(grid.shape, np.float32)
     counts = np.empty(grid.shape, np.int32)
     carve(
         depth,

@@ -51,7 +51,8 @@ class OccupancyMap:
 
     def __init__(self, robot: Robot, max_age: float | None = None) -> None:
         """max_age: evidence older than this is forgotten [s]; None: never."""
-        self.robot, self.max_age = robot, max_age
+        self.robot = robot
+        self.max_age = max_age
         self._evidence = np.zeros(MAP.shape, np.float32)
         """Above 0 occupied, below free, 0 unknown."""
         self._seen_at = np.full(MAP.shape, -np.inf, np.float64)
@@ -119,9 +120,11 @@ class OccupancyMap:
     def _of_evidence(self) -> tuple[Voxels, ...]:
         """Occupied, free and unknown voxels, computed once after each change; read-only."""
         if self._known is None:
-            occupied, free = self._evidence > 0, self._evidence < 0
+            occupied = self._evidence > 0
+            free = self._evidence < 0
             if self.max_age is not None:
-                occupied, free = occupied & self._fresh, free & self._fresh
+                occupied = occupied & self._fresh
+                free = free & self._fresh
             free |= self._declared & ~occupied
             self._known = occupied, free, ~(free | occupied)
             for voxels in self._known:
@@ -157,7 +160,9 @@ class _Kept:
     """A view, and what it shows, computed when it is first needed."""
 
     def __init__(self, view: DepthView, robot: Robot, new_voxels: int) -> None:
-        self.view, self._robot, self.new_voxels = view, robot, new_voxels
+        self.view = view
+        self._robot = robot
+        self.new_voxels = new_voxels
 
     @cached_property
     def volume(self) -> ObservedVolume:
@@ -177,7 +182,8 @@ class ViewMemory:
     """Keeps a number of views: a new one takes the place of the kept one that showed least."""
 
     def __init__(self, robot: Robot, most: int = MAX_VIEWS) -> None:
-        self._robot, self._most = robot, most
+        self._robot = robot
+        self._most = most
         self._kept = list[_Kept]()
 
     def __len__(self) -> int:

@@ -18,7 +18,10 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
 
-SPHERE, BOX, CYLINDER, CAPSULE = 0, 1, 2, 3
+SPHERE = 0
+BOX = 1
+CYLINDER = 2
+CAPSULE = 3
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _NEAR = np.float32(0.02)
 _MISS = np.float32(1e9)
@@ -41,11 +44,16 @@ def rectangle(x, y, z, r, intrinsics, h, w):
     fx, fy, cx, cy = intrinsics
     if z + r <= _ZERO:
         return 0, -1, 0, -1
-    near, far = max(z - r, _NEAR), z + r
-    left, right = (x - r) / (near if x < r else far), (x + r) / (near if x > -r else far)
-    top, bottom = (y - r) / (near if y < r else far), (y + r) / (near if y > -r else far)
-    u0, u1 = max(np.floor(left * fx + cx), _ZERO), min(np.ceil(right * fx + cx), np.float32(w - 1))
-    v0, v1 = max(np.floor(top * fy + cy), _ZERO), min(np.ceil(bottom * fy + cy), np.float32(h - 1))
+    near = max(z - r, _NEAR)
+    far = z + r
+    left = (x - r) / (near if x < r else far)
+    right = (x + r) / (near if x > -r else far)
+    top = (y - r) / (near if y < r else far)
+    bottom = (y + r) / (near if y > -r else far)
+    u0 = max(np.floor(left * fx + cx), _ZERO)
+    u1 = min(np.ceil(right * fx + cx), np.float32(w - 1))
+    v0 = max(np.floor(top * fy + cy), _ZERO)
+    v1 = min(np.ceil(bottom * fy + cy), np.float32(h - 1))
     return int(v0), int(v1), int(u0), int(u1)
 
 
@@ -70,7 +78,8 @@ def _slab(o, d, half):
     """The parameters at which a ray enters and leaves |x| < half."""
     if abs(d) < np.float32(1e-9):
         return (-_MISS, _MISS) if abs(o) < half else (_MISS, -_MISS)
-    a, b = (-half - o) / d, (half - o) / d
+    a = (-half - o) / d
+    b = (half - o) / d
     return min(a, b), max(a, b)
 
 
@@ -85,12 +94,15 @@ def _intersect(kind, ox, oy, oz, dx, dy, dz, a, b, c):
         z0, z1 = _slab(oz, dz, c)
         enter = max(x0, y0, z0)
         return enter if enter < min(x1, y1, z1) else _MISS
-    square, mixed, offset = dx * dx + dy * dy, ox * dx + oy * dy, ox * ox + oy * oy - a * a
+    square = dx * dx + dy * dy
+    mixed = ox * dx + oy * dy
+    offset = ox * ox + oy * oy - a * a
     if kind == CYLINDER:
         z0, z1 = _slab(oz, dz, b)
         if square < np.float32(1e-12):
             return z0 if offset < _ZERO else _MISS
-        enter, leave = _quadratic(square, mixed, offset, False), _quadratic(square, mixed, offset, True)
+        enter = _quadratic(square, mixed, offset, False)
+        leave = _quadratic(square, mixed, offset, True)
         enter = max(enter, z0)
         return enter if enter < min(leave, z1) else _MISS
     side = _quadratic(square, mixed, offset, False)
@@ -109,22 +121,29 @@ def render_depth(kinds, rows, intrinsics, T, depth):
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
-    M, o = np.empty((3, 3), np.float32), np.empty(3, np.float32)
+    M = np.empty((3, 3), np.float32)
+    o = np.empty(3, np.float32)
     for s in range(len(kinds)):
         row = rows[s]
-        px, py, pz = row[0] - T[0, 3], row[1] - T[1, 3], row[2] - T[2, 3]
+        px = row[0] - T[0, 3]
+        py = row[1] - T[1, 3]
+        pz = row[2] - T[2, 3]
         x, y, z = in_camera(T, px, py, pz)
         v0, v1, u0, u1 = rectangle(x, y, z, row[15], intrinsics, h, w)
         if v1 < v0 or u1 < u0:
             continue
         for i in range(3):
-            a, b, c = row[3 + 3 * i], row[4 + 3 * i], row[5 + 3 * i]
+            a = row[3 + 3 * i]
+            b = row[4 + 3 * i]
+            c = row[5 + 3 * i]
             o[i] = -(a * px + b * py + c * pz)
             for j in range(3):
                 M[i, j] = a * T[0, j] + b * T[1, j] + c * T[2, j]
         for v in range(v0, v1 + 1):
             q = (np.float32(v) - cy) / fy
-            dx, dy, dz = M[0, 1] * q + M[0, 2], M[1, 1] * q + M[1, 2], M[2, 1] * q + M[2, 2]
+            dx = M[0, 1] * q + M[0, 2]
+            dy = M[1, 1] * q + M[1, 2]
+            dz = M[2, 1] * q + M[2, 2]
             for u in range(u0, u1 + 1):
                 p = (np.float32(u) - cx) / fx
                 t = _intersect(
@@ -146,7 +165,9 @@ def _squared_distance(kind, x, y, z, a, b, c):
         out = max(np.sqrt(x * x + y * y + z * z) - a, _ZERO)
         return out * out
     if kind == BOX:
-        x, y, z = max(abs(x) - a, _ZERO), max(abs(y) - b, _ZERO), max(abs(z) - c, _ZERO)
+        x = max(abs(x) - a, _ZERO)
+        y = max(abs(y) - b, _ZERO)
+        z = max(abs(z) - c, _ZERO)
         return x * x + y * y + z * z
     along = max(abs(z) - b, _ZERO)
     if kind == CYLINDER:
@@ -165,19 +186,14 @@ def fill_voxels(kinds, rows, low, voxel, margin, out):
     """
     nx, ny, nz = out.shape
     for s in range(len(kinds)):
-        row, reach = rows[s], rows[s, 15] + margin
-        i0, i1 = (
-            int(max((row[0] - reach - low[0]) / voxel, _ZERO)),
-            int((row[0] + reach - low[0]) / voxel + 1),
-        )
-        j0, j1 = (
-            int(max((row[1] - reach - low[1]) / voxel, _ZERO)),
-            int((row[1] + reach - low[1]) / voxel + 1),
-        )
-        k0, k1 = (
-            int(max((row[2] - reach - low[2]) / voxel, _ZERO)),
-            int((row[2] + reach - low[2]) / voxel + 1),
-        )
+        row = rows[s]
+        reach = rows[s, 15] + margin
+        i0 = int(max((row[0] - reach - low[0]) / voxel, _ZERO))
+        i1 = int((row[0] + reach - low[0]) / voxel + 1)
+        j0 = int(max((row[1] - reach - low[1]) / voxel, _ZERO))
+        j1 = int((row[1] + reach - low[1]) / voxel + 1)
+        k0 = int(max((row[2] - reach - low[2]) / voxel, _ZERO))
+        k1 = int((row[2] + reach - low[2]) / voxel + 1)
         for i in range(i0, min(i1, nx)):
             px = low[0] + (np.float32(i) + _HALF) * voxel - row[0]
             for j in range(j0, min(j1, ny)):
@@ -205,7 +221,8 @@ def looking_at(position: Float[ndarray, "3"], target: Float[ndarray, "3"], roll:
     right = np.array([z[1], -z[0], 0.0])
     x = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([0.0, -1.0, 0.0])
     y = np.cross(z, x)
-    c, s = np.cos(roll), np.sin(roll)
+    c = np.cos(roll)
+    s = np.sin(roll)
     return transform(np.asarray(position, np.float64), np.stack([c * x + s * y, c * y - s * x, z], axis=1))
 
 
@@ -268,7 +285,8 @@ def _row(shape: Shape) -> ndarray:
         return _sphere_row(np.append(shape.center, shape.radius))
     assert isinstance(shape, Box | Cylinder | Capsule)  # by _kind
     if isinstance(shape, Box):
-        half, around = shape.size / 2, float(np.linalg.norm(shape.size)) / 2
+        half = shape.size / 2
+        around = float(np.linalg.norm(shape.size)) / 2
     else:
         half = np.array([shape.radius, shape.height / 2, 0.0])
         around = float(np.hypot(*half[:2]) if isinstance(shape, Cylinder) else half[:2].sum())

@@ -40,7 +40,9 @@ def _within(x, y, z, xs, ys, zs, radii):
     """Whether a point is inside one of the spheres."""
     inside = np.int32(0)
     for s in range(len(xs)):
-        dx, dy, dz = x - xs[s], y - ys[s], z - zs[s]
+        dx = x - xs[s]
+        dy = y - ys[s]
+        dz = z - zs[s]
         inside |= np.int32(dx * dx + dy * dy + dz * dz < radii[s] * radii[s])
     return inside != 0
 
@@ -49,7 +51,9 @@ def _within(x, y, z, xs, ys, zs, radii):
 def _key(x, y, z, voxel):
     """The key of a point's cell."""
     span = np.int64(1) << 20
-    i, j, k = np.int64(np.floor(x / voxel)), np.int64(np.floor(y / voxel)), np.int64(np.floor(z / voxel))
+    i = np.int64(np.floor(x / voxel))
+    j = np.int64(np.floor(y / voxel))
+    k = np.int64(np.floor(z / voxel))
     return ((i + span) << 42) | ((j + span) << 21) | (k + span)
 
 
@@ -58,7 +62,8 @@ def _row(keys, cells, count, key):
     """The row of a cell in the sums, and the number of rows; a new cell gets a new row."""
     at = _slot(keys, key)
     if keys[at] == -1:
-        keys[at], cells[at] = key, count
+        keys[at] = key
+        cells[at] = count
         count += 1
     return cells[at], count
 
@@ -74,12 +79,16 @@ def _add(sums, row, x, y, z):
 @kernel(nogil=True)
 def gather_cloud(points, reach, spheres, voxel, keys, cells, sums, count):
     """Adds a point cloud to the cells; arguments and result as in `gather_image`."""
-    box, columns = _box(spheres), _columns(spheres)
-    before, row = np.int64(-1), np.int32(0)
+    box = _box(spheres)
+    columns = _columns(spheres)
+    before = np.int64(-1)
+    row = np.int32(0)
     for p in range(len(points)):
         if count >= len(sums):
             return -1
-        x, y, z = np.float32(points[p, 0]), np.float32(points[p, 1]), np.float32(points[p, 2])
+        x = np.float32(points[p, 0])
+        y = np.float32(points[p, 1])
+        z = np.float32(points[p, 2])
         if not x * x + y * y + z * z <= reach * reach:
             continue
         if _in_box(box, x, y, z) and _within(x, y, z, *columns):
@@ -103,13 +112,18 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
-    box, columns = _box(spheres), _columns(spheres)
+    box = _box(spheres)
+    columns = _columns(spheres)
     around = np.full((h + 2, w + 2), np.nan, np.float32)
     around[1:-1, 1:-1] = depth
-    x, y, z = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
-    kept, cell = np.empty(w, np.bool_), np.empty(w, np.int64)
+    x = np.empty(w, np.float32)
+    y = np.empty(w, np.float32)
+    z = np.empty(w, np.float32)
+    kept = np.empty(w, np.bool_)
+    cell = np.empty(w, np.int64)
     # cells of the row of pixels above: most points are in the cell of a neighbouring pixel
-    known, rows = np.full(w + 1, -1, np.int64), np.zeros(w + 1, np.int32)
+    known = np.full(w + 1, -1, np.int64)
+    rows = np.zeros(w + 1, np.int32)
     for v in range(h):
         b = (np.float32(v) - cy) / fy
         _place_row(around[v : v + 3], b, fx, cx, T, reach, voxel, x, y, z, kept, cell)
@@ -137,11 +151,17 @@ def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
     the same surface. At edges, sensors mix the depths of the near and the far surface.
     around [3, w + 2]: the row above, the row and the row below, with one more pixel at either end.
     """
-    above, middle, below = around[0], around[1], around[2]
-    rx, ry, rz = T[0, 1] * b + T[0, 2], T[1, 1] * b + T[1, 2], T[2, 1] * b + T[2, 2]
-    pixel, most = SAME_SURFACE_PIXELS / fx, reach * reach
+    above = around[0]
+    middle = around[1]
+    below = around[2]
+    rx = T[0, 1] * b + T[0, 2]
+    ry = T[1, 1] * b + T[1, 2]
+    rz = T[2, 1] * b + T[2, 2]
+    pixel = SAME_SURFACE_PIXELS / fx
+    most = reach * reach
     for u in range(len(x)):
-        d, a = middle[u + 1], (np.float32(u) - cx) / fx
+        d = middle[u + 1]
+        a = (np.float32(u) - cx) / fx
         px = (T[0, 0] * a + rx) * d + T[0, 3]
         py = (T[1, 0] * a + ry) * d + T[1, 3]
         pz = (T[2, 0] * a + rz) * d + T[2, 3]
@@ -180,7 +200,8 @@ def _box(spheres):
     box = np.zeros(6, np.float32)
     for axis in range(3):
         for s in range(len(spheres)):
-            low, high = spheres[s, axis] - spheres[s, 3], spheres[s, axis] + spheres[s, 3]
+            low = spheres[s, axis] - spheres[s, 3]
+            high = spheres[s, axis] + spheres[s, 3]
             box[axis] = low if s == 0 else min(box[axis], low)
             box[3 + axis] = high if s == 0 else max(box[3 + axis], high)
     return box
@@ -212,7 +233,9 @@ def sphere_distances(points, spheres):
 def _nearest(at, x, y, z, radii):
     least = np.float32(np.inf)
     for s in range(len(x)):
-        dx, dy, dz = at[0] - x[s], at[1] - y[s], at[2] - z[s]
+        dx = at[0] - x[s]
+        dy = at[1] - y[s]
+        dz = at[2] - z[s]
         least = min(least, np.sqrt(dx * dx + dy * dy + dz * dz) - radii[s])
     return least
 
@@ -222,7 +245,9 @@ def near_scene(scene, points, limit):
     """Whether each point [n, 3] is inside an obstacle of SceneArrays, or nearer to one than `limit` [m]."""
     out = np.empty(len(points), np.bool_)
     for p in range(len(points)):
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        x = points[p, 0]
+        y = points[p, 1]
+        z = points[p, 2]
         out[p] = scene_distance(scene, x, y, z, limit)[0] < limit
     return out
 
@@ -259,7 +284,8 @@ def seen_points(
     capacity = INITIAL_CELLS
     while True:
         keys = np.full(4 * capacity, -1, np.int64)
-        cells, sums = np.zeros(4 * capacity, np.int32), np.zeros((capacity, 4), np.float32)
+        cells = np.zeros(4 * capacity, np.int32)
+        sums = np.zeros((capacity, 4), np.float32)
         count = 0
         for view in views:
             spheres = placed_spheres(robot, start if view.configuration is None else view.configuration)

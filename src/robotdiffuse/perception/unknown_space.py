@@ -46,9 +46,10 @@ from robotdiffuse.scenes.scene import Scene
 
 PADDINGS = (0.09, 0.06, 0.04)
 """Paddings of observed points, the largest first [m]."""
-PADDING_FACTOR, PADDING_MARGIN = 1.3, 0.01
-"""Points nearer to the arm's covering spheres than this factor of their padding and this margin [m] are not
-padded: thinning may enlarge them by so much."""
+# Points nearer to the arm's covering spheres than this factor of their padding and this margin [m] are not
+# padded: thinning may enlarge them by so much.
+PADDING_FACTOR = 1.3
+PADDING_MARGIN = 0.01
 THINNING_CELL = 1 / 3
 """One point is kept of each cell of this size, as a fraction of the padding."""
 THRESHOLDS = (0.1, 0.2, 0.35, 0.5)
@@ -126,7 +127,8 @@ def without_known(centers: Points, edge: float, robot: Robot, known_scene: Scene
     """The centres of voxels with this edge, without those of voxels in the known scene [m]."""
     if not known_scene.shapes:
         return centers
-    scene, inside = compile_scene_for(robot, known_scene), np.float32(edge / 2 - 1e-3)
+    scene = compile_scene_for(robot, known_scene)
+    inside = np.float32(edge / 2 - 1e-3)
     return centers[~near_scene(scene, centers.astype(np.float32), inside)]
 
 
@@ -183,7 +185,9 @@ def count_free(field, shifts, cells, values):
     for s in range(len(shifts)):
         blocked = False
         for n in range(len(cells)):
-            i, j, k = (cells[n, 0] + shifts[s, 0], cells[n, 1] + shifts[s, 1], cells[n, 2] + shifts[s, 2])
+            i = cells[n, 0] + shifts[s, 0]
+            j = cells[n, 1] + shifts[s, 1]
+            k = cells[n, 2] + shifts[s, 2]
             if field[i & (TILE - 1), j & (TILE - 1), k & (TILE - 1)] < values[n]:
                 blocked = True
                 break
@@ -248,7 +252,8 @@ class UnknownSpace:
         predicted: the probability that each voxel is occupied; None without a prediction.
         margin: voxels nearer than this to the arm at those configurations count as occupied by it [m].
         """
-        self._robot, self._grid = robot, grid
+        self._robot = robot
+        self._grid = grid
         self.unknown = unknown & ~grid.filled(robot, occupied_by_arm, margin)
         self.probability = None if predicted is None else np.where(self.unknown, predicted, np.float32(0))
 

@@ -33,35 +33,44 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
     what is behind; low corner of the grid and edge of a voxel [m].
     """
     fx, fy, cx, cy = intrinsics
-    half, one = np.float32(0.5), np.float32(1.0)
+    half = np.float32(0.5)
+    one = np.float32(1.0)
     nx, ny, nz = filled.shape
     out = np.zeros(len(poses))
     arm = np.empty((-(-size[0] // ARM_CELL), -(-size[1] // ARM_CELL)), np.float32)
     for c in range(len(poses)):
         T = poses[c]
         _arm_ahead(robot, configurations[c], T, intrinsics, half * edge, arm)
-        ox, oy, oz = (T[0, 3] - low[0]) / edge, (T[1, 3] - low[1]) / edge, (T[2, 3] - low[2]) / edge
+        ox = (T[0, 3] - low[0]) / edge
+        oy = (T[1, 3] - low[1]) / edge
+        oz = (T[2, 3] - low[2]) / edge
         for n in range(len(voxels)):
-            x, y, z = voxels[n, 0] + half, voxels[n, 1] + half, voxels[n, 2] + half
-            dx, dy, dz = ox - x, oy - y, oz - z
+            x = voxels[n, 0] + half
+            y = voxels[n, 1] + half
+            z = voxels[n, 2] + half
+            dx = ox - x
+            dy = oy - y
+            dz = oz - z
             x_away, y_away, z_away = in_camera(T, dx, dy, dz)
             ahead = -z_away
             if ahead <= one or ahead * edge > reach:
                 continue
-            u, v = -fx * x_away / ahead + cx, -fy * y_away / ahead + cy
+            u = -fx * x_away / ahead + cx
+            v = -fy * y_away / ahead + cy
             if not (-half <= u < size[1] - half and -half <= v < size[0] - half):
                 continue
             if arm[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < ahead * edge:
                 continue
             far = np.sqrt(dx * dx + dy * dy + dz * dz)
-            dx, dy, dz = dx / far, dy / far, dz / far
-            chance, way = one, OCCLUSION_START
+            dx = dx / far
+            dy = dy / far
+            dz = dz / far
+            chance = one
+            way = OCCLUSION_START
             while way < far and chance > MIN_VISIBILITY:
-                i, j, k = (
-                    int(np.floor(x + way * dx)),
-                    int(np.floor(y + way * dy)),
-                    int(np.floor(z + way * dz)),
-                )
+                i = int(np.floor(x + way * dx))
+                j = int(np.floor(y + way * dy))
+                k = int(np.floor(z + way * dz))
                 if not (0 <= i < nx and 0 <= j < ny and 0 <= k < nz):
                     break
                 chance *= one - filled[i, j, k]
@@ -83,7 +92,10 @@ def _arm_ahead(robot, q, T, intrinsics, margin, depth):
         for s in range(robot.first[g], robot.first[g + 1]):
             sphere = robot.spheres[s]
             x, y, z = placed(frames[robot.frame[g]], sphere[0], sphere[1], sphere[2])
-            x, y, z, r = x - T[0, 3], y - T[1, 3], z - T[2, 3], sphere[3] + margin
+            x = x - T[0, 3]
+            y = y - T[1, 3]
+            z = z - T[2, 3]
+            r = sphere[3] + margin
             square = x * x + y * y + z * z - r * r
             u, v, w = in_camera(T, x, y, z)
             if square <= 0 or w <= -r:
@@ -118,9 +130,12 @@ def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
     for n in range(len(balls)):
         if seen[n]:
             continue
-        dx, dy, dz = balls[n, 0] - T[0, 3], balls[n, 1] - T[1, 3], balls[n, 2] - T[2, 3]
+        dx = balls[n, 0] - T[0, 3]
+        dy = balls[n, 1] - T[1, 3]
+        dz = balls[n, 2] - T[2, 3]
         x, y, z = in_camera(T, dx, dy, dz)
-        near, far = z - radius, z + radius
+        near = z - radius
+        far = z + radius
         if near <= _ZERO:
             continue
         u0 = np.floor(fx * (x - radius) / (near if x < radius else far) + cx) - border
@@ -137,7 +152,8 @@ def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
 def _all_behind(depth, v0, v1, u0, u1, least):
     """Whether all returns of a rectangle of pixels, whose bounds are inclusive, are deeper than `least`, and
     no more pixels than may are without one."""
-    lost, most = 0, MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
+    lost = 0
+    most = MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
     for v in range(v0, v1 + 1):
         for u in range(u0, u1 + 1):
             if depth[v, u] > least:
@@ -153,10 +169,15 @@ def within_voxels(balls, radius, marked, low, edge, within):
     """Mark the balls all of whose voxels are marked; arguments as above, marked bool[nx, ny, nz]."""
     nx, ny, nz = marked.shape
     for n in range(len(balls)):
-        x, y, z = balls[n, 0] - low[0], balls[n, 1] - low[1], balls[n, 2] - low[2]
-        i0, i1 = int(np.floor((x - radius) / edge)), int(np.floor((x + radius) / edge))
-        j0, j1 = int(np.floor((y - radius) / edge)), int(np.floor((y + radius) / edge))
-        k0, k1 = int(np.floor((z - radius) / edge)), int(np.floor((z + radius) / edge))
+        x = balls[n, 0] - low[0]
+        y = balls[n, 1] - low[1]
+        z = balls[n, 2] - low[2]
+        i0 = int(np.floor((x - radius) / edge))
+        i1 = int(np.floor((x + radius) / edge))
+        j0 = int(np.floor((y - radius) / edge))
+        j1 = int(np.floor((y + radius) / edge))
+        k0 = int(np.floor((z - radius) / edge))
+        k1 = int(np.floor((z + radius) / edge))
         if i0 < 0 or j0 < 0 or k0 < 0 or i1 >= nx or j1 >= ny or k1 >= nz:
             continue
         all_marked = True
@@ -167,9 +188,10 @@ def within_voxels(balls, radius, marked, low, edge, within):
         within[n] |= all_marked
 
 
-BALL_CELL, SAMPLE_DISTANCE = 0.005, 0.0012
-"""Edge of the cells of a grid of which those on the surface are kept; largest distance of a point of the
-surface from a sample of it [m]."""
+# Edge of the cells of a grid of which those on the surface are kept; largest distance of a point of the
+# surface from a sample of it [m].
+BALL_CELL = 0.005
+SAMPLE_DISTANCE = 0.0012
 BALL_RADIUS = BALL_CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
 """Radius of a ball around a cell that covers the samples in it, and what is near them [m]."""
 

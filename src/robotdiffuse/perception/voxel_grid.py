@@ -110,10 +110,13 @@ def sweep(robot, path, margin, low, voxel, swept):
     robot: RobotArrays; path float32[n, dof]; low [3] corner of the voxels and `voxel`, their edge [m].
     """
     dof = path.shape[1]
-    frames, q = np.zeros((dof + 1, 12), np.float32), np.empty(dof, np.float32)
-    last, still = np.full((len(robot.spheres), 3), np.inf, np.float32), (MIN_MOVE * voxel) ** 2
+    frames = np.zeros((dof + 1, 12), np.float32)
+    q = np.empty(dof, np.float32)
+    last = np.full((len(robot.spheres), 3), np.inf, np.float32)
+    still = (MIN_MOVE * voxel) ** 2
     for i in range(max(len(path) - 1, 1)):
-        a, b = path[i], path[min(i + 1, len(path) - 1)]
+        a = path[i]
+        b = path[min(i + 1, len(path) - 1)]
         steps = max(int(np.ceil(np.abs(b - a).max() / JOINT_STEP)), 1)
         for step in range(steps + 1):
             for j in range(dof):
@@ -128,7 +131,9 @@ def sweep(robot, path, margin, low, voxel, swept):
                     at = last[s]
                     if (x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2 <= still:
                         continue
-                    at[0], at[1], at[2] = x, y, z
+                    at[0] = x
+                    at[1] = y
+                    at[2] = z
                     _mark(x, y, z, sphere[3] + margin, low, voxel, swept)
 
 
@@ -143,7 +148,8 @@ def mark(spheres, low, voxel, marked):
 def surface(marked):
     """Indices int64[n, 3] of the marked voxels that share a face with one that is not, in order."""
     nx, ny, nz = marked.shape
-    out, count = np.empty((marked.sum(), 3), np.int64), 0
+    out = np.empty((marked.sum(), 3), np.int64)
+    count = 0
     for i in range(nx):
         for j in range(ny):
             for k in range(nz):
@@ -153,7 +159,9 @@ def surface(marked):
                 within = within and (j == 0 or marked[i, j - 1, k]) and (j == ny - 1 or marked[i, j + 1, k])
                 within = within and (k == 0 or marked[i, j, k - 1]) and (k == nz - 1 or marked[i, j, k + 1])
                 if not within:
-                    out[count, 0], out[count, 1], out[count, 2] = i, j, k
+                    out[count, 0] = i
+                    out[count, 1] = j
+                    out[count, 2] = k
                     count += 1
     return out[:count]
 
@@ -161,8 +169,11 @@ def surface(marked):
 @kernel(nogil=True)
 def _mark(x, y, z, radius, low, voxel, marked):
     nx, ny, nz = marked.shape
-    half, one = np.float32(0.5), np.float32(1.0)
-    x, y, z = (x - low[0]) / voxel - half, (y - low[1]) / voxel - half, (z - low[2]) / voxel - half
+    half = np.float32(0.5)
+    one = np.float32(1.0)
+    x = (x - low[0]) / voxel - half
+    y = (y - low[1]) / voxel - half
+    z = (z - low[2]) / voxel - half
     r = radius / voxel
     for i in range(max(int(np.ceil(x - r)), 0), min(int(np.floor(x + r)), nx - 1) + 1):
         dx = np.float32(i) - x
@@ -172,7 +183,8 @@ def _mark(x, y, z, radius, low, voxel, marked):
             if rest < 0:
                 continue
             reach = np.sqrt(rest)
-            first, beyond = max(int(np.ceil(z - reach)), 0), min(int(np.floor(z + reach + one)), nz)
+            first = max(int(np.ceil(z - reach)), 0)
+            beyond = min(int(np.floor(z + reach + one)), nz)
             for k in range(first, beyond):
                 marked[i, j, k] = True
 
@@ -180,7 +192,9 @@ def _mark(x, y, z, radius, low, voxel, marked):
 @kernel(nogil=True, fastmath=True)
 def summed(weights, marked):
     """The sum of the weights of the marked voxels; both [nx, ny, nz]."""
-    total, weight, mark = 0.0, weights.ravel(), marked.ravel()
+    total = 0.0
+    weight = weights.ravel()
+    mark = marked.ravel()
     for i in range(len(mark)):
         total += weight[i] if mark[i] else np.float32(0.0)
     return total
@@ -190,12 +204,18 @@ def summed(weights, marked):
 def heaviest_part(marked, weights):
     """Bounding box int64[2, 3] of the connected part of the marked voxels with the largest sum of weights:
     first voxel and one beyond the last. Voxels that share a face are connected."""
-    todo, left = np.empty((marked.sum(), 3), np.int64), marked.copy()
-    best, most = np.zeros((2, 3), np.int64), -1.0
+    todo = np.empty((marked.sum(), 3), np.int64)
+    left = marked.copy()
+    best = np.zeros((2, 3), np.int64)
+    most = -1.0
     for i, j, k in np.argwhere(marked):
-        count, done, weight = _push(i, j, k, left, todo, 0), 0, 0.0
+        count = _push(i, j, k, left, todo, 0)
+        done = 0
+        weight = 0.0
         while done < count:
-            x, y, z = todo[done, 0], todo[done, 1], todo[done, 2]
+            x = todo[done, 0]
+            y = todo[done, 1]
+            z = todo[done, 2]
             done += 1
             weight += weights[x, y, z]
             for way in (-1, 1):
@@ -215,6 +235,8 @@ def _push(i, j, k, left, todo, count):
     nx, ny, nz = left.shape
     if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and left[i, j, k]:
         left[i, j, k] = False
-        todo[count, 0], todo[count, 1], todo[count, 2] = i, j, k
+        todo[count, 0] = i
+        todo[count, 1] = j
+        todo[count, 2] = k
         count += 1
     return count

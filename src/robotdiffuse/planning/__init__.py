@@ -15,10 +15,13 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
 
 
-SEARCH, LEARNED, HYBRID = "search", "learned", "hybrid"
-"""Kinds of planners: without a network; only a network's motions, with or without guidance; both."""
-PATH_CONSTRAINTS, CLEARANCE = "path constraints", "a requested clearance"
-"""What not every planner supports."""
+# Kinds of planners: without a network; only a network's motions, with or without guidance; both.
+SEARCH = "search"
+LEARNED = "learned"
+HYBRID = "hybrid"
+# What not every planner supports.
+PATH_CONSTRAINTS = "path constraints"
+CLEARANCE = "a requested clearance"
 
 
 def _entry(location: str, settings: str, kind: str, description: str, *supports: str) -> Entry:

@@ -108,7 +108,9 @@ class PlanningContext:
         """
         self.started = time.perf_counter() - loading_seconds()
         check_problem(problem)
-        self.planner_name, self.problem, self.request = planner_name, problem, request
+        self.planner_name = planner_name
+        self.problem = problem
+        self.request = request
         self.clearance = requested_clearance(problem, request.clearance)
         """Distance to obstacles that paths keep where they can [m]."""
         scalings = request.velocity_scaling, request.acceleration_scaling
@@ -317,7 +319,8 @@ class PlanningContext:
     def beside(self) -> ExtraLimits:
         """Limits on timing besides the joint limits: speeds that constraints bound, torques with a
         payload."""
-        constraints, pace = self.validator.constraints, None
+        constraints = self.validator.constraints
+        pace = None
         if constraints is not None and len(constraints.speed_limited):
             pace = FrameSpeedLimits(constraints.speeds, constraints.speed_limits)
         if pace is None and self.validator.dynamics is None:

@@ -150,11 +150,15 @@ class Diffusion(ModelSampler[DiffusionSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        model, rng = self.network(context.problem.robot), context.rng
+        model = self.network(context.problem.robot)
+        rng = context.rng
         start, goals = start_goal.rows()
         code = encode(model, start_goal.checker, self.settings.points, rng)
-        names, constraints = context.problem.robot.joint_names, context.validator.constraints
-        every, valid, until = list[Path](), list[Path](), context.request.time_limit
+        names = context.problem.robot.joint_names
+        constraints = context.validator.constraints
+        every = list[Path]()
+        valid = list[Path]()
+        until = context.request.time_limit
         while not every or (context.elapsed < until and (valid or self.settings.repeat)):
             batch = self.draw(model, start_goal.checker, code, start, goals, rng, constraints=constraints)
             if constraints is not None:
@@ -165,7 +169,8 @@ class Diffusion(ModelSampler[DiffusionSettings]):
                 context.improved(path.length)
             if passed and not valid:
                 until = min(context.elapsed + self.settings.optimize_time, context.request.time_limit)
-            every, valid = every + paths, valid + passed
+            every = every + paths
+            valid = valid + passed
         reason = f"{len(valid)} of {len(every)} samples of the network are valid"
         # where none is, the validator is asked about one once more, so that the result says what is wrong
         # with it

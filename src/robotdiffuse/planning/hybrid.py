@@ -90,7 +90,8 @@ def smooth_noise(
     lines = start + t[:, None] * (goals[np.arange(count) % len(goals), None] - start)
     q = lines + half * (basis @ rng.normal(size=(count, WAVES, len(start))))
     q = np.clip(q, robot.lower, robot.upper).astype(np.float32)
-    q[:, 0], q[:, -1] = lines[:, 0], lines[:, -1]
+    q[:, 0] = lines[:, 0]
+    q[:, -1] = lines[:, -1]
     return q
 
 
@@ -137,7 +138,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        settings, robot = self.settings, context.problem.robot
+        settings = self.settings
+        robot = context.problem.robot
         if context.problem.constraints:
             return plan_constrained(context, start_goal, settings.search)
         search = AnytimeSearch.of(context, start_goal, settings.search, AORRTC.name)
@@ -200,7 +202,10 @@ class _Batches:
         search: AnytimeSearch,
         model: "MotionModel | None",
     ) -> None:
-        self.planner, self.context, self.start_goal, self.search = planner, context, start_goal, search
+        self.planner = planner
+        self.context = context
+        self.start_goal = start_goal
+        self.search = search
         self.model = model
         self._spent = 0
         self._seconds = {"batch": BATCH_SECONDS, "refinement": BATCH_SECONDS}
@@ -209,7 +214,8 @@ class _Batches:
     @property
     def due(self) -> bool:
         """Whether the batches had less than their part of the work, and there is time for another one."""
-        batches, share = self._spent + BATCH_WORK, self.planner.settings.network_share
+        batches = self._spent + BATCH_WORK
+        share = self.planner.settings.network_share
         return batches <= share * (self.search.work + batches) and self._time_for("batch")
 
     @property
@@ -226,8 +232,11 @@ class _Batches:
         """Draw a batch and offer its shortest free trajectories to the search, if there is time."""
         if not self._time_for("batch"):
             return
-        planner, model, checker = self.planner, self.model, self.start_goal.checker
-        ends, rng = self.start_goal.rows(), self.context.rng
+        planner = self.planner
+        model = self.model
+        checker = self.start_goal.checker
+        ends = self.start_goal.rows()
+        rng = self.context.rng
         with self._timed("batch"):
             if model is None:
                 q = planner.noise(checker, *ends, rng)
@@ -247,7 +256,8 @@ class _Batches:
         """Count a batch or its refinement as work, and update its expected time."""
         began = self.context.elapsed
         yield
-        took, self._spent = self.context.elapsed - began, self._spent + BATCH_WORK
+        took = self.context.elapsed - began
+        self._spent = self._spent + BATCH_WORK
         self._seconds[part] = max(took, 0.5 * (self._seconds[part] + took))
 
     def _take(self, q: Trajectories, stage: str) -> bool:

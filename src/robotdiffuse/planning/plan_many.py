@@ -139,7 +139,9 @@ def _planned_on_cluster(
 def _plan_on_node(
     loaded: PlannerArguments, request: PlanRequest, problems: list[Problem]
 ) -> list[PlanResult]:
-    planner, warm, found = load_planner(*loaded), set[Robot](), []
+    planner = load_planner(*loaded)
+    warm = set[Robot]()
+    found = []
     for problem in problems:
         try:
             if problem.robot not in warm:

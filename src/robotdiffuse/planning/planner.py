@@ -24,8 +24,9 @@ from robotdiffuse.scenes.shapes import PointCloud, Shape, Sphere
 from robotdiffuse.validation.tolerances import goal_index
 
 PlannerSettings = TypeVar("PlannerSettings", bound=Settings)
-EASY_TIME_LIMIT, SHORT_TIME_LIMIT = 1.0, 0.02
-"""Time limits of the calls of `warm_up`: of the easy ones, and of the one that only begins a search [s]."""
+# Time limits of the calls of `warm_up`: of the easy ones, and of the one that only begins a search [s].
+EASY_TIME_LIMIT = 1.0
+SHORT_TIME_LIMIT = 0.02
 WARM_UP_RADIUS = 0.08
 """Radius of the balls of `warm_up` [m]."""
 
@@ -65,7 +66,8 @@ class Planner(ABC, Generic[PlannerSettings]):
         not support, and where `prepare` does.
         """
         check_problem(problem)
-        result, note = self._plan(problem, PlanRequest(*values, **request)), compile_note()
+        result = self._plan(problem, PlanRequest(*values, **request))
+        note = compile_note()
         if result.path is not None:
             reached = goal_index(problem.robot, problem.goal, result.path.positions[-1])
             result = replace(result, goal_index=reached)
@@ -94,7 +96,9 @@ class Planner(ABC, Generic[PlannerSettings]):
         def call(task: Problem, seconds: float) -> PlanResult:
             return self._plan(task, PlanRequest(seconds, until=until))
 
-        robot, start, goal = problem.robot, problem.start, problem.goal
+        robot = problem.robot
+        start = problem.start
+        goal = problem.goal
         load_coal(robot)
         results = [call(Problem(robot, Scene(), start, goal), EASY_TIME_LIMIT)]
         # around a ball in the way there are corners, whose timing has code of its own

@@ -24,16 +24,20 @@ SEEDS = 64
 """Seeds of a round."""
 ROUND = InverseKinematicsSettings(seeds_per_round=SEEDS, max_rounds=1)
 """For a pose without tolerances."""
-MAX_ROUNDS, PATIENCE, REACH_ROUNDS = 64, 2, 16
-"""Most rounds, most rounds in a row without a new configuration once there is one, and rounds after which a
-pose that none reached is given up."""
+# Most rounds, most rounds in a row without a new configuration once there is one, and rounds after which a
+# pose that none reached is given up.
+MAX_ROUNDS = 64
+PATIENCE = 2
+REACH_ROUNDS = 16
 TOLERANCE_FRACTION = 0.9
 """Part of the tolerances of path constraints that goals keep."""
 MIN_DIFFERENCE = 0.1
 """Configurations differ by more than this in at least one joint [rad] or [m]."""
-PULL, MAX_PULLS, MIN_PULL_GAIN = 0.5, 12, 0.01
-"""Part of the way to the start that a configuration is moved before it is projected onto the goal again; how
-often; and the part of its distance by which this must bring it nearer."""
+# Part of the way to the start that a configuration is moved before it is projected onto the goal again; how
+# often; and the part of its distance by which this must bring it nearer.
+PULL = 0.5
+MAX_PULLS = 12
+MIN_PULL_GAIN = 0.01
 EXACT = POSE_TOLERANCE, POSE_TOLERANCE
 """Tolerances of poses that give none [m], [rad]."""
 
@@ -60,7 +64,9 @@ def pose_configurations(
     rounds: most rounds of seeds.
     exact: tolerances of poses that give none [m], [rad].
     """
-    robot, start, poses = problem.robot, problem.start, poses_of(goal)
+    robot = problem.robot
+    start = problem.start
+    poses = poses_of(goal)
     together = PathConstraints(problem, poses, exact)
     solutions = [np.zeros((0, robot.dof))] * len(poses)
     found = np.zeros((0, robot.dof))
@@ -96,7 +102,8 @@ def at_pose(
 ) -> Configurations:
     """At most `count` configurations for one pose from a round of seeds, of which the first is the start;
     without path constraints."""
-    robot, start = problem.robot, problem.start
+    robot = problem.robot
+    start = problem.start
     if not pose.tolerant and exact == EXACT:
         return inverse_kinematics(
             robot, pose.frame, pose.T_base_frame, count, rng=rng, settings=ROUND, near=start, rest=start
@@ -110,7 +117,8 @@ def at_pose(
 
 def _within(pose: PoseGoal, part: float) -> PoseGoal:
     """The pose with a part of its tolerances; angles that are free stay so."""
-    xyz, rpy = pose.xyz_tolerance, pose.rpy_tolerance
+    xyz = pose.xyz_tolerance
+    rpy = pose.rpy_tolerance
     return replace(
         pose,
         xyz_tolerance=None if xyz is None else part * xyz,

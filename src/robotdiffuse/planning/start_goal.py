@@ -29,11 +29,13 @@ GOAL_TIME_FRACTION = 0.5
 first try."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
 """Where a pose cannot be reached exactly, parts of the validator's tolerances to reach it within, in turn."""
-NEAR_POSE_ROUNDS, FIRST_TRY_COUNT = 2, 3
-"""Rounds of seeds for that, and number of configurations for each of several poses."""
-MAX_EXACT_GOALS, MAX_GRAZING_GOALS = 20, 3
-"""Number of configurations of a pose whose exact meshes are checked where the covering spheres collide, and
-number of those that become goals."""
+# Rounds of seeds for that, and number of configurations for each of several poses.
+NEAR_POSE_ROUNDS = 2
+FIRST_TRY_COUNT = 3
+# Number of configurations of a pose whose exact meshes are checked where the covering spheres collide, and
+# number of those that become goals.
+MAX_EXACT_GOALS = 20
+MAX_GRAZING_GOALS = 3
 END_MARGIN = 0.0005
 """Near a start or goal with less than the requested clearance, paths keep its clearance less this margin
 [m]."""
@@ -186,7 +188,8 @@ def retreat(
     configuration was found within 1 rad, or it does not keep the constraints. The motion to it is left to the
     validator.
     """
-    robot, at = checker.robot, q.copy()
+    robot = checker.robot
+    at = q.copy()
     for _ in range(RETREAT_STEPS):
         if checker.free(at[None])[0]:
             return at if constraints is None or constraints.satisfied(at[None])[0] else None
@@ -218,7 +221,9 @@ def closeness(checker: CollisionChecker, q: Configuration) -> str:
 
 
 def _usable_goals(context: PlanningContext, checker: CollisionChecker) -> Configurations | PlanResult:
-    robot, scene, start = context.problem.robot, context.problem.scene, context.problem.start
+    robot = context.problem.robot
+    scene = context.problem.scene
+    start = context.problem.start
     if not checker.free(start[None])[0]:
         collision = _explained(robot, scene, start)
         if collision is not None:
@@ -302,7 +307,8 @@ def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecke
 def _free_goals(
     context: PlanningContext, goal: JointGoal, checker: CollisionChecker
 ) -> Configurations | PlanResult:
-    positions, constraints = goal.positions, context.validator.constraints
+    positions = goal.positions
+    constraints = context.validator.constraints
     if constraints is not None:
         kept = constraints.satisfied(positions)
         if not kept.any():
@@ -327,8 +333,11 @@ def _pose_goals(
     context: PlanningContext, goal: PoseGoal | PosesGoal, checker: CollisionChecker
 ) -> Configurations | PlanResult:
     pose_configurations = _pose_configurations()
-    problem, rng = context.problem, context.rng
-    robot, scene, start = problem.robot, problem.scene, problem.start
+    problem = context.problem
+    rng = context.rng
+    robot = problem.robot
+    scene = problem.scene
+    start = problem.start
     rejected = np.zeros((0, robot.dof))
 
     def free(q: Configurations) -> Bool[ndarray, "n"]:
@@ -398,7 +407,8 @@ def _pose_configurations() -> "Callable[..., Float[ndarray, 'k dof']]":
 def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Configurations:
     """The goals and their copies with whole turns: a pose does not say how often a continuous joint has
     turned."""
-    robot, start = context.problem.robot, context.problem.start
+    robot = context.problem.robot
+    start = context.problem.start
     return np.concatenate([robot.equivalent_configurations(q, start) for q in goals])
 
 

@@ -45,15 +45,17 @@ from robotdiffuse.robots.robot import Robot
 
 MIN_SEGMENT_FRACTION = 1e-7
 """Fraction of a segment down to which a proof splits it."""
-VIOLATION_STEP, VIOLATION_STEPS = 0.01, 1000
-"""Step [rad] and number of the configurations at which the maximum of a violation is searched for."""
+# Step [rad] and number of the configurations at which the maximum of a violation is searched for.
+VIOLATION_STEP = 0.01
+VIOLATION_STEPS = 1000
 PROJECTION_FRACTION = 0.5
 """Fraction of a tolerance that projection aims for."""
 POSE_TOLERANCE = 2e-6
 """Tolerance of the pose of a projected link [m], [rad]."""
-GOAL_MARGIN, INNER_GOAL_FRACTION = 1e-3, 0.9
-"""Part of the tolerances of a goal that projected configurations leave free, and the part of them that
-projection aims for."""
+# Part of the tolerances of a goal that projected configurations leave free, and the part of them that
+# projection aims for.
+GOAL_MARGIN = 1e-3
+INNER_GOAL_FRACTION = 0.9
 MIN_LINE_LENGTH = 1e-3
 """Minimum length of a Cartesian line [m]."""
 SAME_POSE_TOLERANCE = 1e-3
@@ -176,7 +178,8 @@ class PathConstraints:
         chord: bound of the motion's deviation from the segments in each joint [rad] or [m]; limits are
         tightened to cover it. tolerance_fraction: the fraction of the tolerances that must suffice.
         """
-        q, rows = for_kernels(q), self.rows
+        q = for_kernels(q)
+        rows = self.rows
         around = np.where(rows.row_kind == DISTANCE, rows.lever_bounds.sum(axis=1), rows.chain_length)
         turning = (rows.row_kind == TURN) * np.linalg.norm(rows.a, axis=1) * np.linalg.norm(rows.b, axis=1)
         slack = chord * (around + turning * rows.lever_bounds.sum(axis=1))
@@ -202,7 +205,8 @@ class PathConstraints:
         for k, (m, _) in enumerate(self._paced):
             count = self.rows.chain_length[m]
             first, second, third = way[:, :, self.rows.chain[m, :count]]
-            speed, bend = np.cumsum(first, axis=1), np.cumsum(second, axis=1)
+            speed = np.cumsum(first, axis=1)
+            bend = np.cumsum(second, axis=1)
             products = np.diff(3 * bend * speed + speed**3, axis=1, prepend=0.0)
             bends[:, k] = (third + products) @ self.rows.lever_bounds[m, :count]
         return bends
@@ -235,7 +239,8 @@ class PathConstraints:
         return float(values[: start + (end[0] if len(end) and over[start] else len(values))].max())
 
     def _violation(self, row: int, at: float, value: float) -> ConstraintViolation:
-        limit, angular = float(self.rows.limit[row]), bool(self.rows.row_kind[row] != DISTANCE)
+        limit = float(self.rows.limit[row])
+        angular = bool(self.rows.row_kind[row] != DISTANCE)
         return ConstraintViolation(self.owners[row], at, value, limit, angular)
 
 
@@ -244,7 +249,8 @@ def _rows(problem: Problem, constraint: Constraint) -> list[_Row]:
         angle = constraint.angle
         return [_Row(CONE, angle, angle, a=constraint.axis, b=constraint.direction)]
     if isinstance(constraint, PositionBox):
-        half, T = (constraint.high - constraint.low) / 2, constraint.T_base_box
+        half = (constraint.high - constraint.low) / 2
+        T = constraint.T_base_box
         assert T is not None  # set by the constructor
         place = T @ transform((constraint.high + constraint.low) / 2)
         tolerance = float(half.min())
@@ -254,12 +260,14 @@ def _rows(problem: Problem, constraint: Constraint) -> list[_Row]:
         return _line_rows(problem, constraint)
     along = constraint.normal if isinstance(constraint, OnPlane) else constraint.direction
     flat = [np.inf, np.inf, 0.0] if isinstance(constraint, OnPlane) else [0.0, 0.0, np.inf]
-    place, half = transform(constraint.point, rotation_z_to(along)), np.array(flat)
+    place = transform(constraint.point, rotation_z_to(along))
+    half = np.array(flat)
     return [_Row(DISTANCE, tolerance, tolerance, place, half, half)]
 
 
 def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
-    T_start, T_goal = link_pose(problem.robot, problem.start, line.frame), line_end(problem, line)
+    T_start = link_pose(problem.robot, problem.start, line.frame)
+    T_goal = line_end(problem, line)
     way = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(way))
     if length < MIN_LINE_LENGTH:
@@ -279,7 +287,8 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
 
 def line_end(problem: Problem, line: CartesianLine) -> Pose:
     """T_base_frame of the link of a line at the goal. Raises InputError if the goal does not determine it."""
-    robot, goal = problem.robot, problem.goal
+    robot = problem.robot
+    goal = problem.goal
     if isinstance(goal, JointGoal):
         poses = [link_pose(robot, q, line.frame) for q in goal.positions]
         off = [inverse(poses[0]) @ T for T in poses[1:]]
@@ -368,7 +377,8 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
 def _lever_bounds(robot: Robot, frame: str) -> JointValues:
     """For each joint that moves a frame, in order, a bound of the distance from its axis to the frame's
     origin [m]; 1 for prismatic joints, 0 after the last joint."""
-    out, length = np.zeros(robot.dof), float(np.linalg.norm(robot.T_frame_link(frame)[:3, 3]))
+    out = np.zeros(robot.dof)
+    length = float(np.linalg.norm(robot.T_frame_link(frame)[:3, 3]))
     for i, k in reversed([*enumerate(robot.chain(frame))]):
         joint = robot.planned_joints[k]
         if robot.prismatic[k]:

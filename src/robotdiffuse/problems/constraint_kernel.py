@@ -26,7 +26,10 @@ import numpy as np
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.robots.ik_kernel import PRISMATIC, forward, pose_error
 
-DISTANCE, CONE, TURN, ROLL_PITCH_YAW = 0, 1, 2, 3
+DISTANCE = 0
+CONE = 1
+TURN = 2
+ROLL_PITCH_YAW = 3
 
 
 class Rows(NamedTuple):
@@ -141,7 +144,8 @@ def pose_frame(rows, m, q, work):
 @inner_kernel()
 def in_box(rows, m, T, r):
     """Coordinate r of the frame's origin in the frame of the box."""
-    place, out = rows.reference_pose[m], 0.0
+    place = rows.reference_pose[m]
+    out = 0.0
     for i in range(3):
         out += place[i, r] * (T[i, 3] - place[i, 3])
     return out
@@ -150,11 +154,14 @@ def in_box(rows, m, T, r):
 @inner_kernel()
 def _cone(rows, m, T, normal):
     """The angle of a CONE; writes to normal[3] the rotation axis that reduces it, of length sin(angle)."""
-    a, b = rows.a[m], rows.b[m]
+    a = rows.a[m]
+    b = rows.b[m]
     x = T[0, 0] * a[0] + T[0, 1] * a[1] + T[0, 2] * a[2]
     y = T[1, 0] * a[0] + T[1, 1] * a[1] + T[1, 2] * a[2]
     z = T[2, 0] * a[0] + T[2, 1] * a[1] + T[2, 2] * a[2]
-    normal[0], normal[1], normal[2] = y * b[2] - z * b[1], z * b[0] - x * b[2], x * b[1] - y * b[0]
+    normal[0] = y * b[2] - z * b[1]
+    normal[1] = z * b[0] - x * b[2]
+    normal[2] = x * b[1] - y * b[0]
     sine = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
     return np.arctan2(sine, x * b[0] + y * b[1] + z * b[2])
 
@@ -162,17 +169,25 @@ def _cone(rows, m, T, normal):
 @inner_kernel()
 def _turn(rows, m, T, target, error):
     """The angle of a TURN; writes to error[3:6] the rotation vector to the interpolated orientation."""
-    place, fraction = rows.reference_pose[m], 0.0
+    place = rows.reference_pose[m]
+    fraction = 0.0
     for i in range(3):
         fraction += rows.b[m, i] * (T[i, 3] - place[i, 3])
     fraction = min(max(fraction, 0.0), 1.0)
-    x, y, z = fraction * rows.a[m, 0], fraction * rows.a[m, 1], fraction * rows.a[m, 2]
+    x = fraction * rows.a[m, 0]
+    y = fraction * rows.a[m, 1]
+    z = fraction * rows.a[m, 2]
     angle = np.sqrt(x * x + y * y + z * z)
-    c, s, v = np.cos(angle), 1.0, 0.5
+    c = np.cos(angle)
+    s = 1.0
+    v = 0.5
     if angle > 1e-9:
-        s, v = np.sin(angle) / angle, (1 - c) / (angle * angle)
+        s = np.sin(angle) / angle
+        v = (1 - c) / (angle * angle)
     for k in range(3):  # Rodrigues' formula, times the orientation at the start
-        p, q, r = place[0, k], place[1, k], place[2, k]
+        p = place[0, k]
+        q = place[1, k]
+        r = place[2, k]
         along = v * (x * p + y * q + z * r)
         target[0, k] = c * p + s * (y * r - z * q) + along * x
         target[1, k] = c * q + s * (z * p - x * r) + along * y
@@ -194,7 +209,8 @@ def _roll_pitch_yaw(rows, m, T, angles):
         r20 += R[i, 2] * T[i, 0]
         r21 += R[i, 2] * T[i, 1]
         r22 += R[i, 2] * T[i, 2]
-    roll, yaw = np.arctan2(r21, r22), np.arctan2(r10, r00)
+    roll = np.arctan2(r21, r22)
+    yaw = np.arctan2(r10, r00)
     pitch = np.arctan2(-r20, np.sqrt(r21 * r21 + r22 * r22))
     half = rows.half_size[m]
     value = max(abs(roll) - half[0], abs(pitch) - half[1], abs(yaw) - half[2])
@@ -203,7 +219,9 @@ def _roll_pitch_yaw(rows, m, T, angles):
     if other_value < value:
         angles[0], angles[1], angles[2] = other
         return other_value
-    angles[0], angles[1], angles[2] = roll, pitch, yaw
+    angles[0] = roll
+    angles[1] = pitch
+    angles[2] = yaw
     return value
 
 
@@ -216,7 +234,8 @@ def row_value(rows, m, work):
         return _turn(rows, m, work.T, work.target, work.error)
     if rows.row_kind[m] == ROLL_PITCH_YAW:
         return _roll_pitch_yaw(rows, m, work.T, work.error)
-    outside, deepest = 0.0, -np.inf
+    outside = 0.0
+    deepest = -np.inf
     for r in range(3):
         d = abs(in_box(rows, m, work.T, r)) - rows.half_size[m, r]
         outside += max(d, 0.0) ** 2
@@ -268,13 +287,20 @@ def speeds(rows, m, q, rates):
 @inner_kernel()
 def add_velocity(rows, m, k, rate, work, total):
     """Adds to `total` the velocity of the frame's origin of row m that joint k of its chain causes."""
-    a, b, c = work.axes[k, 0], work.axes[k, 1], work.axes[k, 2]
+    a = work.axes[k, 0]
+    b = work.axes[k, 1]
+    c = work.axes[k, 2]
     if rows.joint_kinds[m, k] == PRISMATIC:
-        x, y, z = a, b, c
+        x = a
+        y = b
+        z = c
     else:
-        dx, dy = work.T[0, 3] - work.origins[k, 0], work.T[1, 3] - work.origins[k, 1]
+        dx = work.T[0, 3] - work.origins[k, 0]
+        dy = work.T[1, 3] - work.origins[k, 1]
         dz = work.T[2, 3] - work.origins[k, 2]
-        x, y, z = b * dz - c * dy, c * dx - a * dz, a * dy - b * dx
+        x = b * dz - c * dy
+        y = c * dx - a * dz
+        z = a * dy - b * dx
     total[0] += rate * x
     total[1] += rate * y
     total[2] += rate * z
@@ -287,7 +313,8 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
     The piece is `fraction` of the motion, and its ends are evaluated as `first` and `second`.
     """
     for m in range(len(rows.row_kind)):
-        u, v = work.values[first, m], work.values[second, m]
+        u = work.values[first, m]
+        v = work.values[second, m]
         turn = 0.0
         for k in range(rows.chain_length[m]):
             if rows.joint_kinds[m, k] != PRISMATIC:
@@ -297,7 +324,10 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
             if limits[m] < np.pi and min(np.cos(u), np.cos(v)) - turn * turn / 8 < np.cos(limits[m]):
                 return m
             continue
-        beyond, before, travel, bend = 0.0, 0.0, 0.0, 0.0
+        beyond = 0.0
+        before = 0.0
+        travel = 0.0
+        bend = 0.0
         for k in range(rows.chain_length[m]):
             j = rows.chain[m, k]
             beyond += rows.lever_bounds[m, k] * fraction * abs(b[j] - a[j])
@@ -326,7 +356,9 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
 def proved(rows, limits, a, b, min_fraction, work):
     """The fraction of the straight motion from a to b up to which the limits are proved, and the row that is
     not proved there; 1.0 and -1 if all are proved. Pieces are split down to the fraction `min_fraction`."""
-    done, fraction, end = 0.0, 1.0, 0
+    done = 0.0
+    fraction = 1.0
+    end = 0
     evaluate(rows, a, 0, work)
     while done < 1.0:
         fraction = min(fraction, 1.0 - done)
@@ -335,7 +367,9 @@ def proved(rows, limits, a, b, min_fraction, work):
         evaluate(rows, work.trial, 1 - end, work)
         row = _unproved(rows, limits, a, b, fraction, end, 1 - end, work)
         if row < 0:
-            done, end, fraction = done + fraction, 1 - end, 2 * fraction
+            done = done + fraction
+            end = 1 - end
+            fraction = 2 * fraction
         elif fraction <= min_fraction:
             return done, row
         else:

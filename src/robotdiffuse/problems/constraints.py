@@ -15,8 +15,9 @@ from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.types import GivenVector, Pose, PoseOrNone
 
-MIN_TOLERANCE, MIN_ANGLE = 1e-4, 1e-3
-"""Tolerances of the tightest constraints [m], [rad]."""
+# Tolerances of the tightest constraints [m], [rad].
+MIN_TOLERANCE = 1e-4
+MIN_ANGLE = 1e-3
 SCALAR_BOUNDS = {
     "angle": (MIN_ANGLE, np.pi, "rad"),
     "tolerance": (MIN_TOLERANCE, MAX_COORDINATE, "m"),

@@ -163,7 +163,8 @@ def _text(where: str, value: object) -> str:
 
 
 def _touch_links(where: str, entry: dict[str, Any]) -> tuple[str, ...]:
-    where, value = f"{where}.touch_links", entry.get("touch_links", [])
+    where = f"{where}.touch_links"
+    value = entry.get("touch_links", [])
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
         raise InputError(f"{where} is {shown(value)}; it must be a list of link names")
     return tuple(value)
@@ -188,7 +189,8 @@ def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str
         tool = check_fields("tool", values["tool"], ("link",), TOOL_FIELDS)
         shapes, more = read_scene(tool.get("shapes", []), folder, field="tool.shapes")
         notes += more
-        link, name = _text("tool.link", tool["link"]), _text("tool.name", tool.get("name", TOOL))
+        link = _text("tool.link", tool["link"])
+        name = _text("tool.name", tool.get("name", TOOL))
         robot = robot.with_tool(link, pose_of("tool", tool), shapes.shapes, _touch_links("tool", tool), name)
     attached = values.get("attached")
     for where, entry in entries_of("attached", attached or [], "objects, each with a link"):
@@ -199,7 +201,8 @@ def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str
             )
         shape = {key: value for key, value in entry.items() if key not in ("link", "touch_links")}
         with located(where):
-            held, touch = _one_shape(where, shape, folder, notes), _touch_links(where, entry)
+            held = _one_shape(where, shape, folder, notes)
+            touch = _touch_links(where, entry)
             robot = robot.attach(held, _text(f"{where}.link", entry["link"]), touch)
     return robot
 
@@ -277,7 +280,8 @@ def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) ->
     pose = {"frame": frame, **check_fields(where, value, required, known)}
     T = pose_of(where, pose)
     if "relative_to" in pose:
-        shapes, name = {shape.name: shape for shape in scene.shapes}, pose["relative_to"]
+        shapes = {shape.name: shape for shape in scene.shapes}
+        name = pose["relative_to"]
         if name not in shapes:
             raise unknown_name(f"object in {where}.relative_to:", str(name), shapes)
         with located(f"{where}.relative_to"):

@@ -129,7 +129,8 @@ def problem_record(
                 "robot"
             )
     folder = None if folder is None else Path(folder)
-    T, scene = problem.T_world_base, problem.known_scene
+    T = problem.T_world_base
+    scene = problem.known_scene
     record: dict[str, object] = {"robot": robot, "locked": problem.robot.locked}
     if T is not None:
         record["base"] = rounded(pose_entry(T))
@@ -251,7 +252,8 @@ def _requested(
     robot = robot.with_locked({name: value for name, value in request.start.items() if name in unplanned})
     notes = [*request.notes, *notes]
     for joint in robot.joints:
-        given, locked = request.start.get(joint.name), robot.locked.get(joint.name)
+        given = request.start.get(joint.name)
+        locked = robot.locked.get(joint.name)
         if joint.mimic is None or given is None or locked is None or abs(locked - given) <= MIMIC_SLACK:
             continue
         implied = f"planned at {locked:g}, which {joint.mimic.joint} implies"
@@ -290,7 +292,8 @@ def _problem(
         requested = isinstance(data, dict) and "request" in data
         required = ("robot", "scene", *(("request",) if requested else ("start", "goal")))
         values = check_fields("problem", data, required, SETUP | FIELDS)
-        robot, notes = _robot(values["robot"], values.get("locked", {}), folder, robots), list[str]()
+        robot = _robot(values["robot"], values.get("locked", {}), folder, robots)
+        notes = list[str]()
         robot = equipped(robot, values, folder, notes)
         base = read_pose("base", values["base"]) if "base" in values else None
         from_moveit = isinstance(values["scene"], str)
@@ -298,7 +301,9 @@ def _problem(
             raise InputError(
                 "base cannot be combined with MoveIt files, which contain the pose of their robot's base"
             )
-        content, request, contacts = {}, None, values.get("allowed_contacts", {})
+        content = {}
+        request = None
+        contacts = values.get("allowed_contacts", {})
         if from_moveit:
             content = read_yaml(folder / values["scene"])
             notes += scene_robot_notes(content, robot, ignore_joints)

@@ -34,13 +34,16 @@ from robotdiffuse.scenes.octomap import cover_radius, occupied_voxels
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
 
-SCENE, REQUEST = "a planning scene", "a motion plan request"
-MATRIX, OCTOMAP = "allowed_collision_matrix", "<octomap>"
-"""Names in planning scenes: of the matrix, and in it of the octomap."""
+SCENE = "a planning scene"
+REQUEST = "a motion plan request"
+# Names in planning scenes: of the matrix, and in it of the octomap.
+MATRIX = "allowed_collision_matrix"
+OCTOMAP = "<octomap>"
 CONE_SIDES = 32
 """Sides of the pyramid around a cone, which is 0.5 % wider than the cone."""
-PLANE_EXTENT, PLANE_THICKNESS = 20.0, 0.01
-"""Edge and thickness of the box below a plane [m]."""
+# Edge and thickness of the box below a plane [m].
+PLANE_EXTENT = 20.0
+PLANE_THICKNESS = 0.01
 MAX_PLANES = 1000
 """Most planes of a collision object; each is a box of its own."""
 NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
@@ -322,7 +325,8 @@ def _cone(size: Float[ndarray, "2"], xyz: Vector, wxyz: Float[ndarray, "4"], nam
     ring = radius / np.cos(np.pi / CONE_SIDES) * np.column_stack([np.cos(angles), np.sin(angles)])
     bottom = np.column_stack([ring, np.full(CONE_SIDES, -height / 2)])
     vertices = np.concatenate([bottom, [[0, 0, -height / 2], [0, 0, height / 2]]])
-    one, following = np.arange(CONE_SIDES), np.roll(np.arange(CONE_SIDES), -1)
+    one = np.arange(CONE_SIDES)
+    following = np.roll(np.arange(CONE_SIDES), -1)
     base = np.column_stack([following, one, np.full(CONE_SIDES, CONE_SIDES)])
     side = np.column_stack([one, following, np.full(CONE_SIDES, CONE_SIDES + 1)])
     return Mesh(vertices, np.concatenate([base, side]), xyz, wxyz, name=name)
@@ -485,7 +489,8 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     goals = mappings_of("", data, "goal_constraints")
     if not goals:
         raise InputError("goal_constraints is empty; it must hold at least one goal")
-    joint_goals, pose_goal = (), None
+    joint_goals = ()
+    pose_goal = None
     if len(goals) == 1 and goals[0][1].get("position_constraints"):
         pose_goal = _pose_goal(*goals[0], frames)
     else:

@@ -34,8 +34,9 @@ LIMIT_SLACK = 1e-3
 """Configurations beyond a joint limit by at most this are clamped to it, with a note [rad] or [m]."""
 VELOCITY_SLACK = 1e-6
 """The same of start velocities, as a share of the limit: float32 rounds by up to 6e-8."""
-MIN_BLEND, MAX_BLEND = 1e-3, 10.0
-"""Bounds of a `Problem.blend` that is not 0 [rad] or [m]."""
+# Bounds of a `Problem.blend` that is not 0 [rad] or [m].
+MIN_BLEND = 1e-3
+MAX_BLEND = 10.0
 
 
 def base_pose(T_world_base: object) -> Pose | None:
@@ -142,7 +143,8 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointVal
         )
     within = np.clip(velocity, -robot.velocity, robot.velocity)
     for j in np.flatnonzero((velocity != within) & (robot.velocity > 0)):
-        name, limit = robot.joint_names[j], robot.velocity[j]
+        name = robot.joint_names[j]
+        limit = robot.velocity[j]
         if abs(velocity[j] - within[j]) > VELOCITY_SLACK * limit:
             given, _, most = distinct(velocity[j], -limit, limit)
             raise InputError(f"start_velocity: {name} is {given}; its velocity limit is {most}")
@@ -229,7 +231,10 @@ def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float
 
 MAX_CLEARANCE = 0.5
 """Largest clearance that can be requested [m]: hardly any motion of an arm keeps more."""
-OPTIMISTIC, PADDED, PREDICTED, OCCUPIED = "optimistic", "padded", "predicted", "occupied"
+OPTIMISTIC = "optimistic"
+PADDED = "padded"
+PREDICTED = "predicted"
+OCCUPIED = "occupied"
 UNKNOWN_POLICIES = (OPTIMISTIC, PADDED, PREDICTED, OCCUPIED)
 """Policies for space that no view observed. It is assumed to be: free; free, except near observed surfaces;
 occupied where the occupancy completion network predicts obstacles; occupied. See
@@ -354,7 +359,8 @@ class Problem(Value):
         if checked["views"]:
             from robotdiffuse.perception.seen_points import seen_shapes  # compiled code
 
-            goal, known = checked["goal"], self.known_scene
+            goal = checked["goal"]
+            known = self.known_scene
             goals = goal.positions if isinstance(goal, JointGoal) else checked["start"][None]
             seen = seen_shapes(checked["views"], self.robot, known, checked["start"], goals)
             checked["scene"] = known.with_shapes([*known.shapes, *seen])
@@ -399,7 +405,8 @@ class Problem(Value):
         T = rigid_transform("T_world_base", T_world_base)
         T_base_world = inverse(T)
         given = {name: moved(value, T_base_world) for name, value in options.items()}
-        scene, goal = moved(scene, T_base_world), moved(goal, T_base_world)
+        scene = moved(scene, T_base_world)
+        goal = moved(goal, T_base_world)
         return cls(robot, scene, start, goal, T_world_base=T, **given)  # type: ignore[arg-type]
 
     def standing(self) -> tuple[Robot, Scene]:

@@ -23,16 +23,19 @@ ANGLE_WEIGHT = 0.3
 """Metres that correspond to one radian in projection."""
 MIN_COSINE = 0.05
 """Smallest cosine of a pitch with which rates of roll and yaw are computed."""
-DAMPING, MAX_STEP, MAX_ITERATIONS = 1e-5, 1.0, 30
-"""For projection: damping (squared singular values well above it are inverted), longest step [rad], and
-number of steps."""
+# For projection: damping (squared singular values well above it are inverted), longest step [rad], and
+# number of steps.
+DAMPING = 1e-5
+MAX_STEP = 1.0
+MAX_ITERATIONS = 30
 
 
 @inner_kernel()
 def _angle_rate(reference, axis, angles, r):
     """Rate of roll (r = 0), pitch (1) or yaw (2) relative to a reference orientation, at these angles, while
     the frame turns about an axis at 1 rad/s."""
-    sine, cosine = np.sin(angles[2]), np.cos(angles[2])
+    sine = np.sin(angles[2])
+    cosine = np.cos(angles[2])
     x = y = z = 0.0
     for i in range(3):
         x += axis[i] * (cosine * reference[i, 0] + sine * reference[i, 1])
@@ -50,7 +53,8 @@ def _residuals(rows, limits, q, work):
 
     Writes to work.e the residuals to the values that projection aims for, and to work.J their Jacobian.
     """
-    count, dof = 0, len(q)
+    count = 0
+    dof = len(q)
     for m in range(len(rows.row_kind)):
         if not rows.same_frame[m]:
             pose_frame(rows, m, q, work)
@@ -70,7 +74,8 @@ def _residuals(rows, limits, q, work):
             elif rows.row_kind[m] == CONE:
                 work.e[count] = ANGLE_WEIGHT * (value - rows.inner_limit[m])
             elif rows.row_kind[m] == ROLL_PITCH_YAW:
-                angle, inner = work.error[r], rows.inner_half_size[m, r]
+                angle = work.error[r]
+                inner = rows.inner_half_size[m, r]
                 if abs(angle) <= rows.half_size[m, r]:
                     continue
                 work.e[count] = ANGLE_WEIGHT * (min(max(angle, -inner), inner) - angle)
@@ -117,7 +122,8 @@ def step(rows, limits, q, most, work):
     damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
     again = False
     for k in range(dof):
-        low, high = q[k] <= rows.lower[k], q[k] >= rows.upper[k]
+        low = q[k] <= rows.lower[k]
+        high = q[k] >= rows.upper[k]
         if not rows.continuous[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
             work.held[k] = again = True
     if again:
@@ -150,7 +156,8 @@ def project(rows, limits, q, work):
 def project_each(rows, limits, q, most):
     """Projects configurations q[n, dof] in place, until `most` of them satisfy the limits; returns which of
     them do [n]."""
-    work, satisfied = make_work(rows), np.zeros(len(q), np.bool_)
+    work = make_work(rows)
+    satisfied = np.zeros(len(q), np.bool_)
     count = 0
     for i in range(len(q)):
         satisfied[i] = project(rows, limits, q[i], work)

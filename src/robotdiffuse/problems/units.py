@@ -71,7 +71,8 @@ def _view_note(i: int, view: DepthView, reach: float) -> str:
     depths = depths[np.isfinite(depths) & (depths > 0)]
     if not len(depths):
         return ""
-    nearest, middle = float(depths.min()), float(np.median(depths))
+    nearest = float(depths.min())
+    middle = float(np.median(depths))
     if middle <= MAX_EXTENT and nearest <= reach + float(np.linalg.norm(view.T_base_camera[:3, 3])):
         return ""
     depths_are = f"depths of views[{i}] begin at {nearest:.4g} m, and half of them exceed {middle:.4g} m"

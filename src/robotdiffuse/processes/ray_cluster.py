@@ -23,7 +23,8 @@ def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
 
     See `ray_cluster`. The nodes need this package, and files under the same paths.
     """
-    left, running = list(enumerate(calls))[::-1], {}
+    left = list(enumerate(calls))[::-1]
+    running = {}
     with ray_cluster() as ray:
         task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_on_node)
         while left or running:

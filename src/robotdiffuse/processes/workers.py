@@ -101,7 +101,8 @@ class Worker:
     def __init__(self, prepare: Callable[..., object] = _nothing, arguments: tuple = ()) -> None:
         """`prepare(*arguments)` runs once in each new process. If it returns True, the process is replaced
         once, for example by one that loads what the first has compiled."""
-        self._prepare, self._arguments = prepare, arguments
+        self._prepare = prepare
+        self._arguments = arguments
         self._running: tuple[BaseProcess, Connection] | None = None
         self._number = 0
         """Of the last call in the process."""
@@ -127,7 +128,8 @@ class Worker:
         with block_interrupts_in_children():
             process.start()
         theirs.close()
-        self._running, self._number = (process, connection), 0
+        self._running = (process, connection)
+        self._number = 0
         _started.add(self)
         if self._closed:  # meanwhile, by another thread
             self.end(0.0)
@@ -163,7 +165,8 @@ class Worker:
         if self._running is None:
             raise EndedError("closed")
         process, connection = self._running
-        due, told = time.monotonic() + timeout, False
+        due = time.monotonic() + timeout
+        told = False
         self._number += 1
         try:
             connection.send((self._number, given))
@@ -173,7 +176,8 @@ class Worker:
                     self.end(0.0)
                     raise OverrunError("because its call took too long")
                 if not told and stop():
-                    told, due = True, min(due, time.monotonic() + CANCEL_TIMEOUT)
+                    told = True
+                    due = min(due, time.monotonic() + CANCEL_TIMEOUT)
                     connection.send((self._number, None))
                 if connection.poll(min(left, CHECK_INTERVAL)):
                     answer, renew = connection.recv()
@@ -212,7 +216,9 @@ def end_workers(workers: Iterable[Worker], patience: float) -> None:
     """End the processes of workers together; see `Worker.end`."""
     processes = []
     for worker in workers:
-        running, worker._running, worker.ready = worker._running, None, False
+        running = worker._running
+        worker._running = None
+        worker.ready = False
         processes += [] if running is None else [running[0]]
     for process in processes:
         if patience > 0:
@@ -234,7 +240,9 @@ class Call(Future):
 
     def __init__(self, call: Callable[..., Any], arguments: tuple, timeout: float) -> None:
         super().__init__()
-        self._call, self._arguments, self._timeout = call, arguments, timeout
+        self._call = call
+        self._arguments = arguments
+        self._timeout = timeout
         self._stop = False
 
     def cancel(self) -> bool:
@@ -274,7 +282,8 @@ class Workers:
         if count:
             check_not_importing()
         self.workers = [Worker(prepare, arguments) for _ in range(count)]
-        self._patience, self._keep_ready = patience, keep_ready
+        self._patience = patience
+        self._keep_ready = keep_ready
         self._calls: queue.SimpleQueue[Call | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
         self._closed = False
@@ -351,7 +360,8 @@ class Workers:
         At most one call more than there are processes is running or queued. Raises InputError if a process is
         killed from outside, e.g. when memory runs out.
         """
-        left, running = list(enumerate(calls))[::-1], {}
+        left = list(enumerate(calls))[::-1]
+        running = {}
         while left and not self.workers:
             number, arguments = left.pop()
             yield number, call(*arguments)

@@ -111,7 +111,8 @@ def _from_urdf(urdf: Path) -> Robot:
     from robotdiffuse.robots.fitting.add import add_robot
     from robotdiffuse.robots.parsing.urdf import UrdfTree
 
-    tree, source = UrdfTree(urdf, {}), str(urdf.resolve())
+    tree = UrdfTree(urdf, {})
+    source = str(urdf.resolve())
     digest = tree.digest
     made: dict[str, Robot] = {}
     for name, folder in _added().items():

@@ -16,7 +16,8 @@ def coal_pose(T: Float[ndarray, "4 4"]) -> coal.Transform3s:
 
 def coal_convex(vertices: Float[ndarray, "v 3"], faces: Integer[ndarray, "f 3"]) -> coal.Convex:
     """A convex solid from the vertices and triangles of its hull."""
-    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    points = coal.StdVec_Vec3s()
+    triangles = coal.StdVec_Triangle()
     for vertex in vertices:
         points.append(vertex)
     for a, b, c in faces.tolist():

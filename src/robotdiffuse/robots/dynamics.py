@@ -35,7 +35,8 @@ class Dynamics:
         pinocchio: Any = installed  # compiled, without types
         check_dynamics(robot)
         link = payload.link or robot.tip
-        self.robot, self.limits = robot, robot.effort
+        self.robot = robot
+        self.limits = robot.effort
         self._rnea, model = pinocchio.rnea, pinocchio.Model()
         for j, T in enumerate(robot.frame_offsets):
             kind = pinocchio.JointModelPZ() if robot.prismatic[j] else pinocchio.JointModelRZ()
@@ -44,7 +45,8 @@ class Dynamics:
         moments = np.diag(payload.moments)
         carried = [(link, Inertia(payload.mass, payload.com, moments))] if payload.mass > MIN_MASS else []
         for name, inertia in (*robot.inertias.items(), *carried):
-            T, frame = robot.T_frame_link(name), robot.link_frame(name)
+            T = robot.T_frame_link(name)
+            frame = robot.link_frame(name)
             body = pinocchio.Inertia(inertia.mass, inertia.com, inertia.moments)
             model.appendBodyToJoint(frame, body, pinocchio.SE3(T[:3, :3], T[:3, 3]))
         up = np.array([0.0, 0.0, 1.0]) if T_world_base is None else T_world_base[2, :3]

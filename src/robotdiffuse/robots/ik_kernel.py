@@ -11,13 +11,18 @@ from numpy import ndarray
 
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
-REVOLUTE, PRISMATIC, CONTINUOUS = 0, 1, 2
+REVOLUTE = 0
+PRISMATIC = 1
+CONTINUOUS = 2
 TURN = 2 * np.pi
 
-INITIAL_DAMPING, MIN_DAMPING, MAX_DAMPING = 1.0, 1e-9, 1e3
-"""Levenberg-Marquardt damping, relative to the squared error; a seed is given up above the maximum."""
-DAMPING_DECREASE, DAMPING_INCREASE = 0.3, 4.0
-"""Factors on the damping after a step that reduced the error, and after one that did not."""
+# Levenberg-Marquardt damping, relative to the squared error; a seed is given up above the maximum.
+INITIAL_DAMPING = 1.0
+MIN_DAMPING = 1e-9
+MAX_DAMPING = 1e3
+# Factors on the damping after a step that reduced the error, and after one that did not.
+DAMPING_DECREASE = 0.3
+DAMPING_INCREASE = 4.0
 CHECK_EVERY = 8
 """Iterations between checks of the progress."""
 REQUIRED_PROGRESS = 0.5
@@ -36,9 +41,13 @@ def forward(q, offsets, tool, kinds, frame, T, axes, origins):
             T[i, k] = 1.0 if i == k else 0.0
     for j in range(frame):
         offset = offsets[j]
-        cosine, sine = np.cos(q[j]), np.sin(q[j])
+        cosine = np.cos(q[j])
+        sine = np.sin(q[j])
         for i in range(3):
-            a, b, c, d = T[i, 0], T[i, 1], T[i, 2], T[i, 3]
+            a = T[i, 0]
+            b = T[i, 1]
+            c = T[i, 2]
+            d = T[i, 3]
             x = a * offset[0, 0] + b * offset[1, 0] + c * offset[2, 0]
             y = a * offset[0, 1] + b * offset[1, 1] + c * offset[2, 1]
             z = a * offset[0, 2] + b * offset[1, 2] + c * offset[2, 2]
@@ -47,11 +56,18 @@ def forward(q, offsets, tool, kinds, frame, T, axes, origins):
             origins[j, i] = p
             T[i, 2] = z
             if kinds[j] == PRISMATIC:
-                T[i, 0], T[i, 1], T[i, 3] = x, y, p + z * q[j]
+                T[i, 0] = x
+                T[i, 1] = y
+                T[i, 3] = p + z * q[j]
             else:
-                T[i, 0], T[i, 1], T[i, 3] = x * cosine + y * sine, y * cosine - x * sine, p
+                T[i, 0] = x * cosine + y * sine
+                T[i, 1] = y * cosine - x * sine
+                T[i, 3] = p
     for i in range(3):
-        a, b, c, d = T[i, 0], T[i, 1], T[i, 2], T[i, 3]
+        a = T[i, 0]
+        b = T[i, 1]
+        c = T[i, 2]
+        d = T[i, 3]
         for k in range(3):
             T[i, k] = a * tool[0, k] + b * tool[1, k] + c * tool[2, k]
         T[i, 3] = a * tool[0, 3] + b * tool[1, 3] + c * tool[2, 3] + d
@@ -79,17 +95,23 @@ def pose_error(T, target, rows, rotation_weight, error):
             r20 += target[2, k] * T[0, k]
             r21 += target[2, k] * T[1, k]
             r22 += target[2, k] * T[2, k]
-        x, y, z = 0.5 * (r21 - r12), 0.5 * (r02 - r20), 0.5 * (r10 - r01)
+        x = 0.5 * (r21 - r12)
+        y = 0.5 * (r02 - r20)
+        z = 0.5 * (r10 - r01)
         sine = np.sqrt(x * x + y * y + z * z)
         cosine = 0.5 * (r00 + r11 + r22 - 1.0)
         scale = 1.0
         if sine > 1e-12:
             scale = np.arctan2(sine, cosine) / sine
         elif cosine < 0.0:  # half a turn: an axis close to the right one suffices as a descent direction
-            x, y, z = np.sqrt(max(r00 + 1, 0.0)), np.sqrt(max(r11 + 1, 0.0)), np.sqrt(max(r22 + 1, 0.0))
+            x = np.sqrt(max(r00 + 1, 0.0))
+            y = np.sqrt(max(r11 + 1, 0.0))
+            z = np.sqrt(max(r22 + 1, 0.0))
             scale = np.pi / np.sqrt(x * x + y * y + z * z)
         scale *= rotation_weight
-        error[3], error[4], error[5] = x * scale, y * scale, z * scale
+        error[3] = x * scale
+        error[4] = y * scale
+        error[5] = z * scale
     total = 0.0
     for i in range(rows):
         total += error[i] * error[i]
@@ -100,16 +122,26 @@ def pose_error(T, target, rows, rotation_weight, error):
 def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
     """Write the geometric Jacobian of the tool, rotations weighted, into J [6, dof]."""
     for j in range(frame):
-        ax, ay, az = axes[j, 0], axes[j, 1], axes[j, 2]
+        ax = axes[j, 0]
+        ay = axes[j, 1]
+        az = axes[j, 2]
         if kinds[j] == PRISMATIC:
-            J[0, j], J[1, j], J[2, j] = ax, ay, az
+            J[0, j] = ax
+            J[1, j] = ay
+            J[2, j] = az
             for i in range(3, rows):
                 J[i, j] = 0.0
         else:
-            dx, dy, dz = T[0, 3] - origins[j, 0], T[1, 3] - origins[j, 1], T[2, 3] - origins[j, 2]
-            J[0, j], J[1, j], J[2, j] = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
+            dx = T[0, 3] - origins[j, 0]
+            dy = T[1, 3] - origins[j, 1]
+            dz = T[2, 3] - origins[j, 2]
+            J[0, j] = ay * dz - az * dy
+            J[1, j] = az * dx - ax * dz
+            J[2, j] = ax * dy - ay * dx
             if rows == 6:
-                J[3, j], J[4, j], J[5, j] = rotation_weight * ax, rotation_weight * ay, rotation_weight * az
+                J[3, j] = rotation_weight * ax
+                J[4, j] = rotation_weight * ay
+                J[5, j] = rotation_weight * az
 
 
 @inner_kernel()
@@ -206,19 +238,30 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     )
     dof = seeds.shape[1]
     rows = 3 if position_only else 6
-    T, axes, origins = np.empty((3, 4)), np.empty((dof, 3)), np.empty((dof, 3))
-    error, trial_error, J = np.zeros(6), np.zeros(6), np.zeros((6, dof))
-    A, y, step, held = np.zeros((6, 6)), np.zeros(6), np.zeros(dof), np.zeros(dof, dtype=np.bool_)
+    T = np.empty((3, 4))
+    axes = np.empty((dof, 3))
+    origins = np.empty((dof, 3))
+    error = np.zeros(6)
+    trial_error = np.zeros(6)
+    J = np.zeros((6, dof))
+    A = np.zeros((6, 6))
+    y = np.zeros(6)
+    step = np.zeros(dof)
+    held = np.zeros(dof, dtype=np.bool_)
     trial = np.empty(dof)
     found = np.empty((len(known) + wanted, dof))
     found[: len(known)] = known
-    count, used = len(known), 0
+    count = len(known)
+    used = 0
     for s in range(len(seeds)):
         used = s + 1
         q = seeds[s].copy()
         forward(q, offsets, tool, kinds, frame, T, axes, origins)
         cost = pose_error(T, target, rows, rotation_weight, error)
-        damping, checked, solved, fresh = INITIAL_DAMPING, cost, False, True
+        damping = INITIAL_DAMPING
+        checked = cost
+        solved = False
+        fresh = True
         for iteration in range(max_iterations):
             position = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
             rotation = np.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2) / rotation_weight

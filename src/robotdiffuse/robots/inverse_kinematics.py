@@ -99,7 +99,8 @@ def inverse_kinematics(
     if count < 1:
         raise InputError(f"inverse kinematics: count is {count}; it must be at least 1")
     T_base_frame = rigid_transform("inverse kinematics: T_base_frame", T_base_frame)
-    lower, upper = robot.lower + settings.limit_margin, robot.upper - settings.limit_margin
+    lower = robot.lower + settings.limit_margin
+    upper = robot.upper - settings.limit_margin
     tool = for_kernels(robot.T_frame_link(frame))
     accepted = np.zeros((0, robot.dof))
     chain = list(robot.chain(frame))
@@ -123,13 +124,15 @@ def inverse_kinematics(
         seeds = random_seeds(robot, lower, upper, settings.seeds_per_round, rng, near)
         if i == 0 and near is not None:
             seeds[0] = np.clip(near - robot.whole_turns(near), lower, upper)
-        seeds, before = np.ascontiguousarray(seeds[:, arm]), len(accepted)
+        seeds = np.ascontiguousarray(seeds[:, arm])
+        before = len(accepted)
         while len(seeds) and len(accepted) < count:
             known = np.ascontiguousarray(accepted[:, arm])
             new, used = solve_seeds(seeds, known, count - len(accepted), ik_chain, target, parameters)
             seeds = seeds[used:]
             if len(arm) < robot.dof:
-                found, shape = new, (len(new), robot.dof)
+                found = new
+                shape = (len(new), robot.dof)
                 new = rng.uniform(lower, upper, shape) if rest is None else np.tile(rest, (len(new), 1))
                 new[:, arm] = found
             if len(new):

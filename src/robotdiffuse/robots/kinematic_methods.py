@@ -58,7 +58,8 @@ def ik(
     """
     from robotdiffuse.robots.inverse_kinematics import inverse_kinematics  # compiled code
 
-    rng, frame = np.random.default_rng(seed), robot.tip if link is None else link
+    rng = np.random.default_rng(seed)
+    frame = robot.tip if link is None else link
     seeded = None if near is None else configurations(robot, near)
     return inverse_kinematics(robot, frame, cast(ndarray, pose), count, rng=rng, near=seeded)
 

@@ -178,7 +178,8 @@ class KinematicTree(Value):
     @cached_property
     def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], ndarray, ndarray]:
         links: dict[str, tuple[int, ndarray]] = {self.base: (0, np.eye(4))}
-        offsets, parents = np.zeros((self.dof, 4, 4)), np.zeros(self.dof, np.int64)
+        offsets = np.zeros((self.dof, 4, 4))
+        parents = np.zeros(self.dof, np.int64)
         planned = {joint.name: j for j, joint in enumerate(self.planned_joints)}
         for joint in self.joints:
             frame, T_frame_parent = links[joint.parent]

@@ -37,7 +37,8 @@ def link_jacobians(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float
 
     Rows are linear, then angular, in the axes of the base frame; the linear ones are of the link's origin.
     """
-    origins, J = link_origins(robot, q, link), np.zeros((len(q), 6, robot.dof))
+    origins = link_origins(robot, q, link)
+    J = np.zeros((len(q), 6, robot.dof))
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for j in robot.chain(link):
         T = T @ robot.frame_offsets[j] @ _motions(robot, j, q)
@@ -68,7 +69,8 @@ def _spheres_by_frame(robot: Robot) -> list[Float[ndarray, "n 4"]]:
 
 def placed_spheres(robot: Robot, q: Float[ndarray, "dof"]) -> Float[ndarray, "n 4"]:
     """All collision spheres at one configuration, x y z radius in the base frame [m]."""
-    parts, frames = [], [np.eye(4)]
+    parts = []
+    frames = [np.eye(4)]
     for j, parent in enumerate(robot.parents):
         frames.append(frames[parent] @ robot.frame_offsets[j] @ _motions(robot, j, q[None])[0])
     for T, spheres in zip(frames, _spheres_by_frame(robot), strict=True):

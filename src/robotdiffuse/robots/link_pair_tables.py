@@ -29,7 +29,8 @@ class LinkPairTable(Value):
 
     def at(self, *values: Float[ndarray, "n"]) -> Bool[ndarray, "n"]:
         """Whether the links are known to be apart at joint values, one array per joint."""
-        known, index = np.ones(len(values[0]), dtype=bool), []
+        known = np.ones(len(values[0]), dtype=bool)
+        index = []
         for axis, value in enumerate(values):
             cell = np.floor((value - self.lower[axis]) / self._edge(axis)).astype(int)
             count = self.apart.shape[axis]

@@ -57,8 +57,10 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
         if not len(moved):
             continue
         joint = robot.planned_joints[j]
-        lower, upper = joint.lower - LIMIT_SLACK, joint.upper + LIMIT_SLACK
-        h, r = support[moved], farthest[moved]
+        lower = joint.lower - LIMIT_SLACK
+        upper = joint.upper + LIMIT_SLACK
+        h = support[moved]
+        r = farthest[moved]
         if robot.prismatic[j]:
             radii[moved, j] = 1.0
             h = h + np.maximum(directions[..., 2] * lower, directions[..., 2] * upper)
@@ -123,8 +125,10 @@ def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Interpolati
     u = directions.reshape(-1, 3)
     row = (np.arcsin(np.clip(u[:, 2], -1, 1)) + np.pi / 2) / STEP
     column = np.arctan2(u[:, 1], u[:, 0]) % (2 * np.pi) / STEP
-    i, k = np.minimum(row.astype(int), ROWS - 2), column.astype(int)
-    a, b = row - i, column - k
+    i = np.minimum(row.astype(int), ROWS - 2)
+    k = column.astype(int)
+    a = row - i
+    b = column - k
     k, k_next = k % COLUMNS, (k + 1) % COLUMNS
     corners = np.stack(
         [i * COLUMNS + k, i * COLUMNS + k_next, (i + 1) * COLUMNS + k, (i + 1) * COLUMNS + k_next]

@@ -12,7 +12,9 @@ from robotdiffuse.core.kernels import kernel
 def sliding_maximum(support, first, width):
     """Largest value [n, rows, columns] among `width` longitudes, beginning `first` after each longitude."""
     n, rows, columns = support.shape
-    out, wide, next_wide = np.empty_like(support), np.empty(columns), np.empty(columns)
+    out = np.empty_like(support)
+    wide = np.empty(columns)
+    next_wide = np.empty(columns)
     for i in range(n):
         for row in range(rows):
             for k in range(columns):

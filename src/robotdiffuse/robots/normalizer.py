@@ -18,7 +18,8 @@ class JointNormalizer:
                 raise InputError(
                     f"limits of joint {i} are {low} and {high}; they must be finite, lower below upper"
                 )
-        self.middle, self.half_range = (upper + lower) / 2, (upper - lower) / 2
+        self.middle = (upper + lower) / 2
+        self.half_range = (upper - lower) / 2
 
     def to_unit(self, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch dof"]:
         """Joint values [rad] or [m] mapped to [-1, 1], of the same dtype."""

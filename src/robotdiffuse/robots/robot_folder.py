@@ -27,7 +27,8 @@ FORMAT = 2
 """Version of the format."""
 AXIS_LENGTH_TOLERANCE = 1e-3
 """Largest difference between the length of a joint axis and 1."""
-ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
+ROBOT_FILE = "robot.json"
+MESH_FILE = "meshes.npz"
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
@@ -229,7 +230,8 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
 
 
 def _joint_from_json(data: dict) -> Joint:
-    name, kind = str(data["name"]), str(data["kind"])
+    name = str(data["name"])
+    kind = str(data["kind"])
     T = _pose_from_json(data, f"joint {name}")
     if kind == "fixed":
         return Joint(name, kind, str(data["parent"]), str(data["child"]), T, np.array([0.0, 0.0, 1.0]))
@@ -247,7 +249,8 @@ def _joint_from_json(data: dict) -> Joint:
     if not abs(np.linalg.norm(axis) - 1) < AXIS_LENGTH_TOLERANCE:
         raise ValueError(f"joint {name}: an axis of length 1 expected")
     if kind == "continuous":
-        lower, upper = -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT
+        lower = -CONTINUOUS_LIMIT
+        upper = CONTINUOUS_LIMIT
     mimic = None
     if "mimic" in data:
         master, multiplier, offset = data["mimic"]
@@ -255,7 +258,8 @@ def _joint_from_json(data: dict) -> Joint:
     effort = float(data.get("effort", 0.0))
     if not 0 <= effort <= MAX_COORDINATE:
         raise ValueError(f"joint {name}: effort")
-    ends, limits = (str(data["parent"]), str(data["child"])), (lower, upper, velocity, acceleration, jerk)
+    ends = (str(data["parent"]), str(data["child"]))
+    limits = (lower, upper, velocity, acceleration, jerk)
     return Joint(name, kind, *ends, T, axis, *limits, mimic, effort)
 
 

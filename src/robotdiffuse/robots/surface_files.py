@@ -62,7 +62,8 @@ def read_surfaces(file: Path, meshes: Meshes) -> tuple[Surfaces, Grazing]:
 
 
 def _surface(vertices: ndarray, faces: ndarray) -> Surface:
-    vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
+    vertices = vertices.astype(np.float64)
+    faces = faces.astype(np.int64)
     if faces.shape[1:] != (3,) or not ((faces >= 0) & (faces < len(vertices))).all() or not within(vertices):
         raise ValueError("triangles of finite vertices expected")
     return Surface(vertices, faces)

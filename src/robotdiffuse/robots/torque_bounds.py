@@ -66,8 +66,11 @@ def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretche
         turn, spin, angular, linear = (
             frames[body.parent] if body.parent >= 0 else (still, still, still, weight)
         )
-        axis, arm = _fixed(1.0, turn), _fixed(body.offset, turn)
-        v, speed, pull = along.v[:, :, j], along.speed[:, :, j], along.pull[:, :, j]
+        axis = _fixed(1.0, turn)
+        arm = _fixed(body.offset, turn)
+        v = along.v[:, :, j]
+        speed = along.speed[:, :, j]
+        pull = along.pull[:, :, j]
         along_axis = product(speed, axis)
         if body.slides:
             arm = arm + product(np.stack([along.q[:, j], v[0], v[1]]), axis)
@@ -81,7 +84,8 @@ def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretche
         frames.append((turn, spin, angular, linear))
         axes.append(axis)
         arms.append(arm)
-    forces, moments = [still] * len(bodies), [still] * len(bodies)
+    forces = [still] * len(bodies)
+    moments = [still] * len(bodies)
     found = np.empty(along.q.shape)
     for j in reversed(range(len(bodies))):
         body, (turn, spin, angular, linear) = bodies[j], frames[j]
@@ -89,7 +93,8 @@ def second_derivative_bounds(bodies: list[Body], gravity: float, along: Stretche
         own = body.mass * (linear + product(angular, lever) + product(spin, product(spin, lever)))
         inertia = body.moment * np.stack([np.ones_like(turn[0]), 2 * turn[0], 2 * turn[1] + 4 * turn[0] ** 2])
         moment = product(inertia, angular) + product(spin, product(inertia, spin)) + product(lever, own)
-        forces[j], moments[j] = forces[j] + own, moments[j] + moment
+        forces[j] = forces[j] + own
+        moments[j] = moments[j] + moment
         found[:, j] = product(axes[j], forces[j] if body.slides else moments[j])[2]
         if body.parent >= 0:
             forces[body.parent] = forces[body.parent] + forces[j]

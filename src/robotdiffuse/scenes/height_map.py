@@ -74,7 +74,9 @@ class HeightMap(PosedTriangles):
         whole = ~np.isnan(self.heights)
         whole = (whole[:-1, :-1] & whole[1:, :-1] & whole[:-1, 1:] & whole[1:, 1:]).ravel()
         a = corner[whole]
-        b, c, d = a + 1, a + columns, a + columns + 1
+        b = a + 1
+        c = a + columns
+        d = a + columns + 1
         return np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
 
     @cached_property

@@ -73,7 +73,8 @@ class Mesh(PosedTriangles):
     kind: ClassVar[str] = "mesh"
 
     def __post_init__(self) -> None:
-        vertices, faces = points("mesh", "vertices", self.vertices), numbers(self.faces)
+        vertices = points("mesh", "vertices", self.vertices)
+        faces = numbers(self.faces)
         if faces is None or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
             raise InputError(f"mesh.faces is {form(faces)}; it must be n x 3 indices, at least one row")
         if not (faces == np.floor(faces)).all() or faces.min() < 0 or faces.max() >= len(vertices):

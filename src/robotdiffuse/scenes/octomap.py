@@ -18,8 +18,9 @@ from robotdiffuse.core.input_files import read_bytes
 FIRST_LINE = b"# Octomap OcTree binary file"
 TREE_DEPTH = 16
 """Levels below the root; the root's edge is 2^16 voxels."""
-OCCUPIED, INNER = 2, 3
-"""Values of a child's two bits."""
+# Values of a child's two bits.
+OCCUPIED = 2
+INNER = 3
 MAX_VOXELS = 5_000_000
 
 
@@ -61,7 +62,8 @@ def occupied_voxels(data: bytes, edge: float) -> Float[ndarray, "n 3"]:
     if not (np.isfinite(edge) and edge > 0):
         raise InputError(f"the resolution is {edge}; it must be a positive number [m]")
     centers: list[ndarray] = []
-    count, at = 0, 0
+    count = 0
+    at = 0
     waiting = [(np.zeros(3), TREE_DEPTH)]  # inner nodes to read: centre and level, the next one last
     while waiting and data:
         center, level = waiting.pop()
@@ -94,6 +96,7 @@ def _shell(level: int) -> Float[ndarray, "n 3"]:
     if 6 * n**2 > MAX_VOXELS:
         raise InputError(f"the tree has more than {MAX_VOXELS:,} occupied voxels")
     at = np.arange(n) - (n - 1) / 2
-    ends, inner = np.unique(at[[0, -1]]), at[1:-1]
+    ends = np.unique(at[[0, -1]])
+    inner = at[1:-1]
     blocks = [(ends, at, at), (inner, ends, at), (inner, inner, ends)]
     return np.concatenate([np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3) for axes in blocks])

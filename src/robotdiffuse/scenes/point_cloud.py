@@ -136,7 +136,8 @@ def _read_pcd(file: Path) -> ndarray:
         at = end + 1
         if words and not words[0].startswith("#"):
             header[words[0]] = words[1:]
-    names, storage = header["FIELDS"], header["DATA"][0]
+    names = header["FIELDS"]
+    storage = header["DATA"][0]
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
     if not {"x", "y", "z"} <= {*names}:
         raise InputError(f"point cloud file {file} has the fields {shown(names)}; it must have x, y and z")

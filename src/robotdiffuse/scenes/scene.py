@@ -48,7 +48,9 @@ class Scene(Value):
         allowed_contacts: Mapping[str, Sequence[str] | str] | Iterable[tuple[str, Sequence[str] | str]] = (),
     ) -> None:
         named: list[Shape] = []
-        taken, last, given = set[str](), dict[str, int](), dict[str, list[str]]()
+        taken = set[str]()
+        last = dict[str, int]()
+        given = dict[str, list[str]]()
         if not isinstance(shapes, Iterable):
             raise InputError(f"scene is {shown(shapes)}; it must be a list of shapes, e.g. [rd.Sphere(...)]")
         for i, shape in enumerate(shapes):
@@ -56,7 +58,8 @@ class Scene(Value):
                 raise InputError(
                     f"scene[{i}] is a {type(shape).__name__}; it must be a shape, e.g. rd.Sphere"
                 )
-            name, number = shape.name, last.get(shape.name, 1)
+            name = shape.name
+            number = last.get(shape.name, 1)
             while name in taken:
                 number += 1
                 name = f"{shape.name}_{number}"

@@ -12,8 +12,10 @@ from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
-NONE, SPHERE, BOX = 0, 1, 2
-"""Kinds of packed shapes; NONE is an empty row."""
+# Kinds of packed shapes; NONE is an empty row.
+NONE = 0
+SPHERE = 1
+BOX = 2
 PARAMETERS = 10
 """Parameters of a shape: see `PackedScenes.params`."""
 
@@ -79,11 +81,15 @@ class PackedScenes:
     def turned(self, angle: Float32[ndarray, "n"]) -> "PackedScenes":
         """The scenes, each turned about the z axis by its angle [rad]; floors are not turned."""
         params = self.params.copy()
-        c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
-        x, y = params[..., 0].copy(), params[..., 1].copy()
-        params[..., 0], params[..., 1] = c * x - s * y, s * x + c * y
+        c = np.cos(angle)[:, None]
+        s = np.sin(angle)[:, None]
+        x = params[..., 0].copy()
+        y = params[..., 1].copy()
+        params[..., 0] = c * x - s * y
+        params[..., 1] = s * x + c * y
         # quaternion of the rotation, (cos, 0, 0, sin) of half the angle, times that of the obstacle
-        c, s = np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None]
+        c = np.cos(angle / 2)[:, None]
+        s = np.sin(angle / 2)[:, None]
         w, i, j, k = np.moveaxis(params[..., 6:].copy(), -1, 0)
         params[..., 6:] = np.stack([c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w], -1)
         return PackedScenes(self.kinds, params, self.floors)
@@ -92,7 +98,8 @@ class PackedScenes:
         """Signed distance [m] of points to the nearest obstacle of each scene; infinite if it has none."""
         nearest = np.full((len(self), len(at)), np.inf)
         for kind, p in zip(self.kinds.T, self.params.transpose(1, 0, 2).astype(np.float64), strict=True):
-            box, some = kind == BOX, kind != NONE
+            box = kind == BOX
+            some = kind != NONE
             away = at - p[:, None, :3]
             distance = np.linalg.norm(away, axis=-1) - p[:, 3, None]
             local = np.abs(away[box] @ rotation_from_quaternion(p[box, 6:])) - p[box, None, 3:6] / 2
@@ -117,8 +124,11 @@ def _pack(shapes: Sequence[Shape], kinds: Int8[ndarray, "k"], params: Float32[nd
     for i, shape in enumerate(shapes):
         params[i, :3] = getattr(shape, "center", 0)
         if isinstance(shape, Sphere):
-            kinds[i], params[i, 3] = SPHERE, shape.radius
+            kinds[i] = SPHERE
+            params[i, 3] = shape.radius
         elif isinstance(shape, Box):
-            kinds[i], params[i, 3:6], params[i, 6:] = BOX, shape.size, shape.wxyz
+            kinds[i] = BOX
+            params[i, 3:6] = shape.size
+            params[i, 6:] = shape.wxyz
         else:
             raise InputError(f"{shape.name} is a {shape.kind}; only spheres and boxes can be packed")

@@ -381,7 +381,8 @@ class PointCloud(Shape):
     def bounds(self) -> Float[ndarray, "2 3"]:
         if len(self.points) == 0:
             return read_only(np.zeros((2, 3)))
-        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        low = self.points.min(axis=0)
+        high = self.points.max(axis=0)
         return read_only(np.stack([low - self.point_radius, high + self.point_radius]))
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":

@@ -92,7 +92,8 @@ def _triangles(shape: Triangulated, n: int, rng: Generator) -> ndarray:
     face = np.searchsorted(edges[:-1], rng.random(n) * edges[-1], side="right")
     u, v = rng.random((2, n, 1))
     outside = u + v > 1
-    u, v = np.where(outside, 1 - u, u), np.where(outside, 1 - v, v)
+    u = np.where(outside, 1 - u, u)
+    v = np.where(outside, 1 - v, v)
     a, b, c = np.moveaxis(mesh.world_vertices[mesh.faces[face]], 1, 0)
     return a + u * (b - a) + v * (c - a)
 
@@ -131,7 +132,8 @@ def sample_surface(
     areas = np.array([shape.area for shape in shapes])
     shares = areas / areas.sum()
     found: list[ndarray] = []
-    missing, draw = count, 2 * count
+    missing = count
+    draw = 2 * count
     for _ in range(MAX_SAMPLING_ROUNDS):
         parts = rng.multinomial(draw, shares)
         draws = [_draw_of(shape) for shape in shapes]

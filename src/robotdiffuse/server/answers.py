@@ -64,7 +64,8 @@ class StreamedResponse(Response):
     """A response that `write` sends piece by piece; errors before the first piece still get a status code."""
 
     def __init__(self, write: Callable[[Send], Awaitable[None]]) -> None:
-        self.write, self.background = write, None
+        self.write = write
+        self.background = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         await self.write(send)

@@ -92,7 +92,8 @@ class RequestError(Exception):
 
     def __init__(self, code: int, message: str, **headers: str) -> None:
         super().__init__(message)
-        self.code, self.headers = code, headers
+        self.code = code
+        self.headers = headers
 
 
 class AccessLog:
@@ -102,7 +103,8 @@ class AccessLog:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        began, code = time.monotonic(), CLIENT_GONE
+        began = time.monotonic()
+        code = CLIENT_GONE
 
         async def noting(message: Message) -> None:
             nonlocal code
@@ -127,7 +129,8 @@ class AccessControl:
     """
 
     def __init__(self, app: ASGIApp, settings: ServeSettings) -> None:
-        self.app, self.settings = app, settings
+        self.app = app
+        self.settings = settings
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         refusal = self._refusal(Request(scope)) if scope["type"] == "http" else None
@@ -137,7 +140,8 @@ class AccessControl:
         host = request.headers.get("host", "")
         if self.settings.on_loopback and not _is_local(host):
             return _error(421, f"the host is {shown(host)}; this server is known as localhost")
-        given, token = request.headers.get("authorization", ""), self.settings.token
+        given = request.headers.get("authorization", "")
+        token = self.settings.token
         if token and not secrets.compare_digest(given.encode(), f"Bearer {token}".encode()):
             return _error(
                 401, "the header Authorization must be: Bearer TOKEN", **{"WWW-Authenticate": "Bearer"}

@@ -7,8 +7,9 @@ from typing import Annotated
 
 from robotdiffuse.core.settings import Bound, Count, Natural, Positive, Settings
 
-COMPILE_TIMEOUT, WARM_UP_TIMEOUT = 300.0, 60.0
-"""Time for a worker to compile code for a request, and to load code and weights, until it is killed [s]."""
+# Time for a worker to compile code for a request, and to load code and weights, until it is killed [s].
+COMPILE_TIMEOUT = 300.0
+WARM_UP_TIMEOUT = 60.0
 GRACE_TIME = 5.0
 """Time that a call may take beyond its time limit, for reading the request, validation and timing, until its
 worker is killed [s]."""
@@ -30,8 +31,9 @@ MAX_ENTRIES = {
     "attached": 50,
 }
 """Most entries of the lists of a problem."""
-MAX_ROWS, MAX_ANSWER_ROWS = 100_000, 20_000
-"""Most rows of a motion in a request, and in an answer at its rate."""
+# Most rows of a motion in a request, and in an answer at its rate.
+MAX_ROWS = 100_000
+MAX_ANSWER_ROWS = 20_000
 MAX_SEED = 2**32 - 1
 """Largest seed that all random generators accept."""
 

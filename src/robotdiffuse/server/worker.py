@@ -43,7 +43,8 @@ from robotdiffuse.server.settings import (
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import Verifier
 
-PLAN, VERIFY = "plan", "verify"
+PLAN = "plan"
+VERIFY = "verify"
 TOO_LARGE = 413
 
 
@@ -114,7 +115,8 @@ def respond(endpoint: str, body: bytes) -> Answer:
     assert state is not None
     began = time.monotonic()
     loading.on_first_compilation = lambda: allow(COMPILE_TIMEOUT)
-    answer, renewed = _answer_of(state, endpoint, body), False
+    answer = _answer_of(state, endpoint, body)
+    renewed = False
     if answer.code == TOO_LARGE or _memory() > state.settings.max_worker_memory / 2:
         renew()
         renewed = True

@@ -29,8 +29,9 @@ from robotdiffuse.simulation.world import World
 SOLVER_ITERATIONS = 500
 """Iterations of Bullet's constraint solver in a time step. With its default of 50, motors miss their targets
 by up to 0.6 mm at the tip, whatever the motion; with 500 by a few micrometres."""
-POSITION_GAIN, VELOCITY_GAIN = 0.3, 1.0
-"""Fractions of a position and a velocity error that a motor corrects in one time step."""
+# Fractions of a position and a velocity error that a motor corrects in one time step.
+POSITION_GAIN = 0.3
+VELOCITY_GAIN = 1.0
 REST_TIME = 0.25
 """Time for which the motors hold the last configuration after the motion [s]."""
 
@@ -131,7 +132,9 @@ def _simulate(
     reference: Float[ndarray, "n dof"],
     settings: ReplaySettings,
 ) -> tuple[Float[ndarray, "n dof"], tuple[ReplayContact, ...]]:
-    bullet, body, dof = world.bullet, world.body, len(world.joints)
+    bullet = world.bullet
+    body = world.body
+    dof = len(world.joints)
     bullet.setPhysicsEngineParameter(fixedTimeStep=settings.time_step, numSolverIterations=SOLVER_ITERATIONS)
     bullet.setGravity(0, 0, -settings.gravity)
     world.place(reference[0])
@@ -169,7 +172,8 @@ def _simulate(
 
 def _tips(world: World, positions: Float[ndarray, "n dof"]) -> Float[ndarray, "n 3"]:
     """Positions of the tip link [m]."""
-    tip, at = world.links[world.robot.tip], []
+    tip = world.links[world.robot.tip]
+    at = []
     for q in positions:
         world.place(q)
         at.append(world.bullet.getLinkState(world.body, tip, computeForwardKinematics=1)[4])

@@ -30,10 +30,15 @@ COLLISION_MARGIN = 0.001
 DENSITY = 1000.0
 """Density of all links [kg/m^3]; the masses of a robot's file are not used. A Panda gets 19.7 kg; a real one
 has 18."""
-OTHER, LINK, OTHER_LINK, DISTANCE, FORCE = 2, 3, 4, 8, 9
-"""Columns of PyBullet's contact points: second body, link of each body, distance, normal force."""
-MIN_MASS, MIN_INERTIA = 0.01, 1e-4
-"""Smallest mass and inertia of a link [kg], [kg m^2]; PyBullet cannot move a link without mass."""
+# Columns of PyBullet's contact points: second body, link of each body, distance, normal force.
+OTHER = 2
+LINK = 3
+OTHER_LINK = 4
+DISTANCE = 8
+FORCE = 9
+# Smallest mass and inertia of a link [kg], [kg m^2]; PyBullet cannot move a link without mass.
+MIN_MASS = 0.01
+MIN_INERTIA = 1e-4
 SAMPLE_OFFSET = (0.0, 1.0)
 """Position within a pixel, in columns and rows from its upper left corner, that PyBullet's renderer samples.
 
@@ -80,7 +85,8 @@ class World:
             raise
 
     def _load(self) -> None:
-        robot, bullet = self.robot, self.bullet
+        robot = self.robot
+        bullet = self.bullet
         # otherwise Bullet takes a file of the same name for the same mesh
         bullet.setPhysicsEngineParameter(enableFileCaching=0)
         flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
@@ -175,7 +181,9 @@ class World:
 
     def _add(self, drawn: Drawable) -> int:
         """PyBullet's body of an obstacle."""
-        shape, folder, bullet = drawn.shape, Path(self._folder.name), self.bullet
+        shape = drawn.shape
+        folder = Path(self._folder.name)
+        bullet = self.bullet
         if isinstance(shape, PointCloud):
             # loaded from a URDF because PyBullet otherwise allows only 16 spheres
             urdf = write_points_urdf(shape, drawn.surface if self.visuals else None, folder)
@@ -412,7 +420,8 @@ def _capture(
     if not world.visuals:
         raise InputError("this world has no visuals for cameras; create it with World(..., visuals=True)")
     view = pybullet.computeViewMatrix(camera.position, camera.target, camera.up)
-    near, far = camera.near, camera.far
+    near = camera.near
+    far = camera.far
     projection = pybullet.computeProjectionMatrixFOV(
         np.degrees(camera.field_of_view), camera.width / camera.height, near, far
     )

@@ -20,14 +20,17 @@ STILL_SPEED_SQUARED = 1e-12
 def _acceleration_bounds(one, two, grid, i, s, x, most, acceleration):
     """Bounds of s̈ in interval i from s on, where ṡ² is x, such that ṡ² is at most `most` at the interval's
     end."""
-    low, high = -np.inf, (most - x) / (2 * (grid[i + 1] - s))
+    low = -np.inf
+    high = (most - x) / (2 * (grid[i + 1] - s))
     for k in range(i, i + 2):
         for j in range(one.shape[1]):
             a = one[k, j] + 2 * (grid[k] - s) * two[k, j]
             if abs(a) < NEGLIGIBLE_DERIVATIVE:
                 continue
-            limit, middle = acceleration[j] / abs(a), -two[k, j] * x / a
-            low, high = max(low, middle - limit), min(high, middle + limit)
+            limit = acceleration[j] / abs(a)
+            middle = -two[k, j] * x / a
+            low = max(low, middle - limit)
+            high = min(high, middle + limit)
     return low, max(high, low)
 
 
@@ -44,11 +47,15 @@ def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
     i = max(np.searchsorted(grid, s + MIN_INTERVAL, side="right") - 1, 0)
     if i >= n - 1:
         return np.array([s, s]), np.zeros(2)
-    x, left, count = speed * speed, time, 0
-    out[0, 0], out[1, 0] = s, speed
+    x = speed * speed
+    left = time
+    count = 0
+    out[0, 0] = s
+    out[1, 0] = speed
     while i < n - 1 and (x >= STILL_SPEED_SQUARED or left > 0):
         low, high = _acceleration_bounds(one, two, grid, i, s, x, most[i + 1], acceleration)
-        pull, width = high if left > 0 else low, grid[i + 1] - s
+        pull = high if left > 0 else low
+        width = grid[i + 1] - s
         beyond = max(x + 2 * pull * width, 0.0)
         both = np.sqrt(x) + np.sqrt(beyond)
         lasts = 2 * width / both if both > 0 else np.inf
@@ -57,7 +64,8 @@ def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
             x = max((np.sqrt(x) + pull * left) ** 2, 0.0)
             left = 0.0
         elif left <= 0 and x + 2 * pull * width < 0:
-            s, x = s - x / (2 * pull), 0.0
+            s = s - x / (2 * pull)
+            x = 0.0
         else:
             left -= lasts
             i, s, x = i + 1, grid[i + 1], beyond
@@ -72,7 +80,8 @@ def state_after(ahead, speeds, time):
     """s and speed some time [s] after the beginning; at rest at the end once the motion is over."""
     left = time
     for i in range(len(ahead) - 1):
-        width, both = ahead[i + 1] - ahead[i], speeds[i] + speeds[i + 1]
+        width = ahead[i + 1] - ahead[i]
+        both = speeds[i] + speeds[i + 1]
         if both <= 0:
             return ahead[i], 0.0
         lasts = 2 * width / both

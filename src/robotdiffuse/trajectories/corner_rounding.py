@@ -50,7 +50,8 @@ def half_widths(waypoints: Configurations, deviations: Values) -> Values:
 
 def corner_middle(path: Configurations, row: int, deviation: float) -> Configuration:
     """The middle of the rounded corner at an inner row, for a deviation [rad, joint-space L2]."""
-    e, f = path[row] - path[row - 1], path[row + 1] - path[row]
+    e = path[row] - path[row - 1]
+    f = path[row + 1] - path[row]
     lengths = np.linalg.norm(e), np.linalg.norm(f)
     if min(lengths) == 0:
         return path[row]

@@ -58,9 +58,12 @@ class Cubics:
 
     def states(self, step: Int[ndarray, "n"], share: Values) -> CubicStates:
         """States at shares of steps."""
-        u, h = share[:, None], self.steps[step]
-        start, end = self.extremes.start[step], self.extremes.end[step]
-        q, v = self.trajectory.positions[step], self.trajectory.velocities[step]
+        u = share[:, None]
+        h = self.steps[step]
+        start = self.extremes.start[step]
+        end = self.extremes.end[step]
+        q = self.trajectory.positions[step]
+        v = self.trajectory.velocities[step]
         jerk = end - start
         return CubicStates(
             q + u * h * (v + u * h * (start / 2 + u * jerk / 6)),
@@ -71,24 +74,29 @@ class Cubics:
     def turns(self) -> tuple[Values, Configurations]:
         """Times at which any joint turns round within a step, where its position is extreme, and positions of
         all joints there."""
-        start, v = self.extremes.start, self.trajectory.velocities[:-1] / self.steps
+        start = self.extremes.start
+        v = self.trajectory.velocities[:-1] / self.steps
         curve = self.extremes.end - start
         root = np.sqrt(np.maximum(start**2 - 2 * curve * v, 0.0))
         far = -start - np.copysign(root, start)
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.stack([2 * v / far, far / curve])
         within = (shares > 0) & (shares < 1)
-        steps, shares = np.nonzero(within)[1], shares[within]
+        steps = np.nonzero(within)[1]
+        shares = shares[within]
         order = np.argsort(steps + shares)
-        steps, shares = steps[order], shares[order]
+        steps = steps[order]
+        shares = shares[order]
         times = self.trajectory.times[steps] + shares * self.steps[steps, 0]
         return times, self.states(steps, shares).positions
 
     def sampled(self, chord: float) -> tuple[Values, Configurations, JointValues]:
         """Times and positions of the rows and of added rows on the cubics, such that straight lines between
         them leave the cubics by at most `chord`; and by how much they do, for each joint [rad] or [m]."""
-        times, q = self.trajectory.times, self.trajectory.positions
-        bends, off = self.extremes.chord, self.extremes.chords
+        times = self.trajectory.times
+        q = self.trajectory.positions
+        bends = self.extremes.chord
+        off = self.extremes.chords
         if bends.max(initial=0.0) <= chord:
             return times, q, off
         counts = np.ceil(np.sqrt(bends / chord)).astype(int)
@@ -107,10 +115,16 @@ def _extremes(times, q, v):
     """The fields of `Extremes`."""
     rows, dof = q.shape
     shape = rows - 1, dof
-    mean, start, end = np.empty(shape), np.empty(shape), np.empty(shape)
-    velocity, acceleration = np.empty(shape), np.empty(shape)
-    jerk, chord, chords = np.zeros(dof), np.zeros(rows - 1), np.zeros(dof)
-    lower, upper = q[0].copy(), q[0].copy()
+    mean = np.empty(shape)
+    start = np.empty(shape)
+    end = np.empty(shape)
+    velocity = np.empty(shape)
+    acceleration = np.empty(shape)
+    jerk = np.zeros(dof)
+    chord = np.zeros(rows - 1)
+    chords = np.zeros(dof)
+    lower = q[0].copy()
+    upper = q[0].copy()
     for i in range(rows - 1):
         h = times[i + 1] - times[i]
         per = 1 / h
@@ -122,12 +136,15 @@ def _extremes(times, q, v):
             most = max(abs(speed), abs(v[i + 1, j]))
             if a * b < 0:
                 most = max(most, abs(speed + h * a * a / (2 * (a - b))))
-            mean[i, j], start[i, j], end[i, j] = m, a, b
+            mean[i, j] = m
+            start[i, j] = a
+            end[i, j] = b
             velocity[i, j], acceleration[i, j] = most, max(abs(a), abs(b))
             jerk[j] = max(jerk[j], abs(b - a) * per)
             off = acceleration[i, j] * h * h / 8
             chord[i], chords[j] = max(chord[i], off), max(chords[j], off)
-            low, high = min(q[i, j], q[i + 1, j]), max(q[i, j], q[i + 1, j])
+            low = min(q[i, j], q[i + 1, j])
+            high = max(q[i, j], q[i + 1, j])
             if low - off < lower[j] or high + off > upper[j]:
                 low, high = _range(q[i, j], speed, a, b, h, low, high)
                 lower[j], upper[j] = min(lower[j], low), max(upper[j], high)
@@ -145,5 +162,6 @@ def _range(q, v, a, b, h, low, high):
     for u in (2 * v / (h * far), far / (b - a)):
         if 0 < u < 1:
             at = q + u * h * (v + u * h * (a / 2 + u * (b - a) / 6))
-            low, high = min(low, at), max(high, at)
+            low = min(low, at)
+            high = max(high, at)
     return low, high

@@ -74,7 +74,8 @@ def tighten(space, path, tries, state):
     would slow the motion down.
     """
     work, block, a, _ = _make_scratch(space, path)
-    points, n = path.copy(), len(path)
+    points = path.copy()
+    n = len(path)
     for _ in range(tries):
         if n <= 2:
             break
@@ -93,7 +94,8 @@ def tighten(space, path, tries, state):
 def _make_scratch(space, path):
     """Scratch memory of the motion checks, and two configurations."""
     dof = path.shape[1]
-    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
+    work = make_workspace(space.robot, space.scene)
+    block = np.empty((dof, W), np.float32)
     return work, block, np.empty(dof, np.float32), np.empty(dof, np.float32)
 
 
@@ -109,7 +111,8 @@ def _free(space, path, block, work):
 def _skipped(space, path, block, work):
     """The path without the waypoints that straight lines can skip; the farthest reachable one comes next."""
     out = np.empty(path.shape, np.float32)
-    n, i = 0, 0
+    n = 0
+    i = 0
     while True:
         out[n] = path[i]
         n += 1
@@ -126,7 +129,8 @@ def _skipped(space, path, block, work):
 @inner_kernel(inline="always")
 def _smoothed(space, path, trial, block, work):
     """The path after repeated subdivision: segment middles become waypoints, corners move towards them."""
-    points, dof = path, path.shape[1]
+    points = path
+    dof = path.shape[1]
     for _ in range(MAX_SUBDIVISIONS):
         finer = np.empty((2 * len(points) - 1, dof), np.float32)
         for i in range(len(points)):
@@ -155,8 +159,10 @@ def _smoothed(space, path, trial, block, work):
 
 @inner_kernel()
 def _shortcuts(space, path, tries, a, b, block, work, state):
-    capacity, dof = len(path) + tries + 2, path.shape[1]
-    points, n = np.empty((capacity, dof), np.float32), len(path)
+    capacity = len(path) + tries + 2
+    dof = path.shape[1]
+    points = np.empty((capacity, dof), np.float32)
+    n = len(path)
     points[:n] = path
     for attempt in range(tries):
         if n <= 2:
@@ -165,7 +171,8 @@ def _shortcuts(space, path, tries, a, b, block, work, state):
             _pull_in(space, points, n, a, block, work, state)
             continue
         total = path_length(points[:n])
-        s, t = random(state) * total, random(state) * total
+        s = random(state) * total
+        t = random(state) * total
         if t < s:
             s, t = t, s
         i = _place_at(points, n, s, a)
@@ -188,7 +195,8 @@ def _shortcuts(space, path, tries, a, b, block, work, state):
         elif shift < 0:
             for m in range(k + 1, n):
                 points[m + shift] = points[m]
-        points[i + 1], points[i + 2] = a, b
+        points[i + 1] = a
+        points[i + 2] = b
         n += shift
     return _skipped(space, points[:n], block, work)
 
@@ -212,8 +220,10 @@ def _pull_in(space, points, n, trial, block, work, state):
     """Moves a random inner waypoint towards the chord of its neighbours, by less after each failed check."""
     i = 1 + int(random(state) * np.float32(n - 2))
     i = min(i, n - 2)
-    before, after = points[i - 1], points[i + 1]
-    d1, d2 = distance(before, points[i]), distance(points[i], after)
+    before = points[i - 1]
+    after = points[i + 1]
+    d1 = distance(before, points[i])
+    d2 = distance(points[i], after)
     share = d1 / max(d1 + d2, np.float32(1e-9))
     pull = np.float32(0.5) + np.float32(0.5) * random(state)
     for _ in range(4):
@@ -230,8 +240,11 @@ def _pull_in(space, points, n, trial, block, work, state):
 def _move(space, points, i, anywhere, trial, block, work, state):
     """Moves waypoint i towards the chord of its neighbours, and at random with `anywhere`, if that is free
     and shorter."""
-    before, at, after = points[i - 1], points[i], points[i + 1]
-    d1, d2 = distance(before, at), distance(at, after)
+    before = points[i - 1]
+    at = points[i]
+    after = points[i + 1]
+    d1 = distance(before, at)
+    d2 = distance(at, after)
     share = d1 / max(d1 + d2, np.float32(1e-9))
     pull = random(state) ** 2
     far = MAX_RANDOM_MOVE * np.exp(-RANDOM_MOVE_LOG_RANGE * random(state)) if anywhere else np.float32(0.0)
@@ -239,7 +252,8 @@ def _move(space, points, i, anywhere, trial, block, work, state):
         chord = before[j] + share * (after[j] - before[j])
         aside = far * (np.float32(2.0) * random(state) - _ONE)
         trial[j] = min(max(at[j] + pull * (chord - at[j]) + aside, space.lower[j]), space.upper[j])
-    new1, new2 = distance(before, trial), distance(trial, after)
+    new1 = distance(before, trial)
+    new2 = distance(trial, after)
     if (
         new1 + new2 < d1 + d2
         and min(new1, new2) >= MIN_MOVE

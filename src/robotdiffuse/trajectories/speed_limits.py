@@ -130,7 +130,9 @@ def time_line(
     if start_speed > 0:
         return _moving_start(robot, line, settings, start_speed)
     grid, (velocity, acceleration) = timing_grid(line, settings), scaled_limits(robot, settings)
-    jerk, best, share = jerk_limits(robot, settings), None, 1.0
+    jerk = jerk_limits(robot, settings)
+    best = None
+    share = 1.0
     while True:
         limits = velocity, share * acceleration
         speeds = _fastest_speeds(line, grid, *limits, extra=extra)
@@ -150,7 +152,8 @@ def time_line(
                 break
         if best is not None and rows[0][-1] >= best[0][-1]:
             break
-        best, share = rows, ACCELERATION_FACTOR * share
+        best = rows
+        share = ACCELERATION_FACTOR * share
         if window == 1:
             break
     times, q, v, a = best
@@ -171,10 +174,14 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
     """See `time_line`. The motion keeps its start speed for a while before it is averaged, so that the mean
     begins at the start with that velocity and without acceleration."""
     velocity, acceleration = scaled_limits(robot, settings)
-    jerk, step, best = jerk_limits(robot, settings), settings.sample_time, None
-    direction, first = line.directions[0], line.knots[1]
+    jerk = jerk_limits(robot, settings)
+    step = settings.sample_time
+    best = None
+    direction = line.directions[0]
+    first = line.knots[1]
     for share in START_SHARES:
-        found, windows = None, _windows(step, share * acceleration, jerk)
+        found = None
+        windows = _windows(step, share * acceleration, jerk)
         for window in windows:
             lead = 0.5 * (window + 1) * step * start_speed
             if lead >= first:
@@ -206,7 +213,8 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
 
 def stopping_distance(robot: Robot, settings: TimingSettings, velocity: JointValues) -> float:
     """Length of a straight line on which a motion with a start velocity can stop [rad, joint-space L2]."""
-    acceleration, speed = scaled_limits(robot, settings)[1], float(np.linalg.norm(velocity))
+    acceleration = scaled_limits(robot, settings)[1]
+    speed = float(np.linalg.norm(velocity))
     moving = velocity != 0
     most = float((acceleration[moving] * speed / np.abs(velocity[moving])).min())
     window = 2 * float((acceleration / jerk_limits(robot, settings)).max())
@@ -258,7 +266,8 @@ def _fastest_speeds(
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Values:
     """ṡ at each value of s in the grid, such that limits hold between grid points too."""
-    share, at_start = 1.0, start_speed * np.abs(line(grid[:1], 1)[0])
+    share = 1.0
+    at_start = start_speed * np.abs(line(grid[:1], 1)[0])
     for _ in range(MAX_SHARES):
         check_timing("the fastest speeds")
         # at the start the velocity is given: less than it cannot be asked for
@@ -288,7 +297,8 @@ def _derivatives_and_limits(
     their limits, which have no velocity limits: s̈ acts on them through q' and ṡ² through q'', and gravity's
     share is taken from their limits.
     """
-    first, second = line(grid, 1), line(grid, 2)
+    first = line(grid, 1)
+    second = line(grid, 2)
     least, most = symmetric_bounds(acceleration, len(grid))
     if extra is NO_EXTRA_LIMITS:
         return first, second, grid, velocity, least, most
@@ -298,11 +308,17 @@ def _derivatives_and_limits(
         endless = np.full_like(speeds, np.inf)
         columns.append((speeds, np.zeros_like(speeds), extra.frame_speeds.limits, -endless, endless))
     if extra.dynamics is not None:
-        torques, limits, q, still = extra.dynamics.torques, extra.dynamics.limits, line(grid, 0), 0 * first
+        torques = extra.dynamics.torques
+        limits = extra.dynamics.limits
+        q = line(grid, 0)
+        still = 0 * first
         gravity = torques(q, still, still)
-        low, high = -limits - gravity, limits - gravity
-        low, high = np.minimum(low, -MIN_TORQUE_SHARE * limits), np.maximum(high, MIN_TORQUE_SHARE * limits)
-        pull, bend = torques(q, still, first) - gravity, torques(q, first, second) - gravity
+        low = -limits - gravity
+        high = limits - gravity
+        low = np.minimum(low, -MIN_TORQUE_SHARE * limits)
+        high = np.maximum(high, MIN_TORQUE_SHARE * limits)
+        pull = torques(q, still, first) - gravity
+        bend = torques(q, first, second) - gravity
         endless = np.full(len(limits), np.inf)
         columns.append((pull / limits, bend / limits, endless, low / limits, high / limits))
     first, second, velocity, least, most = (
@@ -319,7 +335,8 @@ def _slow_to_extra_limits(line: BlendedPolyline, grid: Values, speeds: Values, e
     share = np.tile(np.linspace(0.0, 1.0, CHECKS_PER_INTERVAL + 1), len(grid) - 1)
     s = grid[intervals] + share * np.diff(grid)[intervals]
     squared = speeds[intervals] ** 2 + share * np.diff(speeds**2)[intervals]
-    q, first = line(s, 0), line(s, 1)
+    q = line(s, 0)
+    first = line(s, 1)
     rates = first * np.sqrt(squared)[:, None]
     pull = (np.diff(speeds**2) / (2 * np.diff(grid)))[intervals]
     accelerations = first * pull[:, None] + line(s, 2) * squared[:, None]
@@ -334,7 +351,8 @@ def _extra_slowdown(extra: ExtraLimits, q: Configurations, v: JointRows, a: Join
         slower = max(slower, float((speeds / extra.frame_speeds.limits).max(initial=0.0)))
     if extra.dynamics is not None:
         # all torque but gravity's grows with the square of the speed
-        gravity, limits = extra.dynamics.holding_torques(q), extra.dynamics.limits
+        gravity = extra.dynamics.holding_torques(q)
+        limits = extra.dynamics.limits
         own = extra.dynamics.torques(q, v, a) - gravity
         room = np.maximum(limits - np.sign(own) * gravity, MIN_TORQUE_SHARE * limits)
         slower = max(slower, float(np.sqrt((np.abs(own) / room).max(initial=1.0))))

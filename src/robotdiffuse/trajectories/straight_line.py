@@ -27,7 +27,8 @@ def straight_line_time(
             raise InputError(f"{name} is {limit}; it must be positive for each joint")
     distance = np.abs(goal - start)
     # Along the line the share of the way done goes from 0 to 1: these are one over the limits of its rates.
-    v, a = (distance / velocity).max(axis=-1), (distance / acceleration).max(axis=-1)
+    v = (distance / velocity).max(axis=-1)
+    a = (distance / acceleration).max(axis=-1)
     if jerk is None:
         j = np.zeros_like(v)
     else:

@@ -150,7 +150,8 @@ def _round_and_time(
             scale = max(SHRINK_FACTOR * slower.acceleration_scale, MIN_SCALING)
             slower = replace(slower, acceleration_scale=scale)
         else:  # the motion as a whole is refused: every corner is in doubt
-            deviations, slower = _smaller(deviations), settings
+            deviations = _smaller(deviations)
+            slower = settings
     deviations = np.zeros(len(waypoints) - 2)
     return deviations, _time_segments(robot, path, waypoints, deviations, settings, start_speed, extra)
 
@@ -239,7 +240,8 @@ def _time_segments(
 
 def _joined(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
     """Motions one after the other, each of which begins with the last row of the one before."""
-    start, parts = 0.0, []
+    start = 0.0
+    parts = []
     for times, *more in pieces:
         first = min(len(parts), 1)
         parts.append((start + times[first:], *(column[first:] for column in more)))
@@ -287,7 +289,9 @@ class StopGraph:
         Corners are rounded as in `time_parameterize`, with its arguments `valid`, `free`, `keeps`, `extra`
         and `deviations`. Every motion ends at the path's rows `required_stops`; none passes through them.
         """
-        self.joint_names, self.step, self._extra = path.joint_names, step, extra
+        self.joint_names = path.joint_names
+        self.step = step
+        self._extra = extra
         waypoints, rounded = rounded_corners(
             robot, path, valid, free, settings, keeps, extra, deviations, required_stops
         )
@@ -302,8 +306,10 @@ class StopGraph:
 
     def _find_stops(self, deviations: Values) -> Values:
         """Values of s of all stops: none within a rounded corner, and every corner that is not rounded."""
-        line, length = self.line, self.line.length
-        corners, widths = line.knots[1:-1], line.half_widths
+        line = self.line
+        length = self.line.length
+        corners = line.knots[1:-1]
+        widths = line.half_widths
         found = [0.0, *corners[deviations == 0], length]
         for s in np.linspace(0.0, length, PATH_PARTS + 1)[1:-1]:
             within = np.flatnonzero(np.abs(s - corners) < widths)

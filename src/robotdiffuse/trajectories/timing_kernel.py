@@ -14,9 +14,10 @@ from robotdiffuse.core.kernels import inner_kernel, kernel
 
 SLOWDOWN_CHECKS_PER_INTERVAL = 16
 """Parts of a grid interval at whose ends `slowdown` checks limits; with 4, a reversal was 1.8 % too fast."""
-CURVE_MARGIN, ROUNDING_MARGIN = 1.0002, 1 + 1e-9
-"""Factors on rates before they are compared with limits: on curves, where rates between the checked places
-were up to 0.025 % greater, and on straight lines."""
+# Factors on rates before they are compared with limits: on curves, where rates between the checked places
+# were up to 0.025 % greater, and on straight lines.
+CURVE_MARGIN = 1.0002
+ROUNDING_MARGIN = 1 + 1e-9
 NEGLIGIBLE_DERIVATIVE = 1e-7
 """Smaller components of the first derivative by s, whose norm is one on straight lines, count as zero."""
 NEGLIGIBLE_SHARE = 1e-8
@@ -25,8 +26,9 @@ ignored."""
 BLEND_DEVIATION = 3.0 / 16.0
 """b(0) of `BlendedPolyline`: the distance from corner to blend, divided by the half width times the change of
 direction."""
-CORNER_INTERVALS, LINE_INTERVALS = 8, 32
-"""The grid of `estimated_time`."""
+# The grid of `estimated_time`.
+CORNER_INTERVALS = 8
+LINE_INTERVALS = 32
 MIN_SPEED_RATIO = 0.01
 """Each ṡ² is at least this share of the previous one and of the greatest possible one. Where a joint's q'
 changes sign, the limits would otherwise allow a speed that only a stop can follow."""
@@ -36,14 +38,16 @@ changes sign, the limits would otherwise allow a speed that only a stop can foll
 def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
     """Writes the path (order 0) or its first or second derivative at s to out[dof]; see `BlendedPolyline`."""
     segments = len(directions)
-    low, high = 0, segments
+    low = 0
+    high = segments
     while high - low > 1:
         middle = (low + high) // 2
         if knots[middle] <= s:
             low = middle
         else:
             high = middle
-    segment, dof = low, waypoints.shape[1]
+    segment = low
+    dof = waypoints.shape[1]
     corner = -1
     if segment > 0 and s - knots[segment] < half_widths[segment - 1]:
         corner = segment - 1
@@ -92,20 +96,24 @@ def rounded_line(waypoints, deviations):
     """The polyline through waypoints [n, dof] with the widest blends that leave it by at most the deviations
     [n - 2] and do not overlap, as the arguments of `evaluate`."""
     n, dof = waypoints.shape
-    lengths, knots, directions = np.empty(n - 1), np.zeros(n), np.empty((n - 1, dof))
+    lengths = np.empty(n - 1)
+    knots = np.zeros(n)
+    directions = np.empty((n - 1, dof))
     for i in range(n - 1):
         directions[i] = waypoints[i + 1] - waypoints[i]
         lengths[i] = np.sqrt((directions[i] ** 2).sum())
         directions[i] /= lengths[i]
         knots[i + 1] = knots[i] + lengths[i]
-    wanted, widths = np.empty(n - 2), np.empty(n - 2)
+    wanted = np.empty(n - 2)
+    widths = np.empty(n - 2)
     for i in range(n - 2):
         turn = np.sqrt(((directions[i + 1] - directions[i]) ** 2).sum())
         wanted[i] = deviations[i] / max(BLEND_DEVIATION * turn, 1e-12)
     # A segment between two corners is shared: each gets half, or what the other does not want. A segment at
     # an end belongs to its only corner.
     for i in range(n - 2):
-        before, after = lengths[i], lengths[i + 1]
+        before = lengths[i]
+        after = lengths[i + 1]
         if i > 0:
             before = max(0.5 * before, before - wanted[i - 1])
         if i < n - 3:
@@ -121,9 +129,11 @@ def timing_grid(knots, half_widths, corner_intervals, line_intervals):
     Along a straight line s̈ is piecewise constant, which any grid represents exactly except at the switching
     points. Rounded corners need points of their own because the limits on ṡ change along them.
     """
-    length, corners = knots[-1], len(half_widths)
+    length = knots[-1]
+    corners = len(half_widths)
     grid = np.zeros(1 + line_intervals + (2 + corner_intervals) * (corners + 1) + corners + 1)
-    count, s = 0, 0.0
+    count = 0
+    s = 0.0
     for i in range(corners + 1):
         low = knots[i + 1] - half_widths[i] if i < corners else length
         high = knots[i + 1] + half_widths[i] if i < corners else length
@@ -144,7 +154,8 @@ def timing_grid(knots, half_widths, corner_intervals, line_intervals):
 def least_time(line, velocity, acceleration, corner_intervals, line_intervals):
     """Duration of the fastest motion along a line from rest to rest, without limits of jerk [s]."""
     grid = timing_grid(line[1], line[3], corner_intervals, line_intervals)
-    first, second = evaluate(line, grid, 1), evaluate(line, grid, 2)
+    first = evaluate(line, grid, 1)
+    second = evaluate(line, grid, 2)
     highest = np.empty_like(first)
     highest[:] = acceleration
     speeds = fastest_speeds(first, second, grid, velocity, -highest, highest)
@@ -164,7 +175,8 @@ def estimated_time(line, velocity, acceleration):
     `fastest_speeds`.
     """
     grid = timing_grid(line[1], line[3], CORNER_INTERVALS, LINE_INTERVALS)
-    first, second = evaluate(line, grid, 1), evaluate(line, grid, 2)
+    first = evaluate(line, grid, 1)
+    second = evaluate(line, grid, 2)
     n, dof = first.shape
     x = np.empty(n)
     for i in range(n):
@@ -185,7 +197,8 @@ def estimated_time(line, velocity, acceleration):
     duration = 0.0
     for i in range(n - 1):
         width = grid[i + 1] - grid[i]
-        pull, worst = (x[i + 1] - x[i]) / (2 * width), 1.0
+        pull = (x[i + 1] - x[i]) / (2 * width)
+        worst = 1.0
         for j in range(dof):
             for k in range(2):
                 rate = abs(first[i + k, j] * pull + second[i + k, j] * x[i + k])
@@ -200,7 +213,8 @@ def _greatest_pull(first, second, i, x, sign, acceleration):
     most = np.inf
     for j in range(first.shape[1]):
         if first[i, j] != 0:
-            pull, curve = sign * first[i, j], second[i, j] * x
+            pull = sign * first[i, j]
+            curve = second[i, j] * x
             most = min(most, (acceleration[j] - (curve if pull > 0 else -curve)) / abs(pull))
     return most
 
@@ -213,25 +227,32 @@ def _bounds_of_next(first, second, i, width, x, most, weakest, strongest):
     may cancel), and the greatest x that those limits allow which do not depend on the next x. With u = (y -
     x) / (2 width), the acceleration of a joint is alpha x + beta y at both ends of the interval.
     """
-    high, high_slope = most, 0.0
+    high = most
+    high_slope = 0.0
     low, low_slope = (0.0, MIN_SPEED_RATIO) if x < most else (MIN_SPEED_RATIO * most, 0.0)
     greatest = np.inf
     for j in range(first.shape[1]):
         for k in range(2):
-            pull, curve = first[i + k, j] / (2 * width), second[i + k, j]
+            pull = first[i + k, j] / (2 * width)
+            curve = second[i + k, j]
             alpha, beta = (-pull, pull + curve) if k else (curve - pull, pull)
-            weak, strong = weakest[i + k, j], strongest[i + k, j]
+            weak = weakest[i + k, j]
+            strong = strongest[i + k, j]
             if abs(beta) * most <= NEGLIGIBLE_SHARE * min(strong, -weak):
                 if alpha != 0:
                     greatest = min(greatest, (strong if alpha > 0 else weak) / alpha)
                 continue
-            up, down, slope = strong / beta, weak / beta, -alpha / beta
+            up = strong / beta
+            down = weak / beta
+            slope = -alpha / beta
             if beta < 0:
                 up, down = down, up
             if up + slope * x < high + high_slope * x:
-                high, high_slope = up, slope
+                high = up
+                high_slope = slope
             if down + slope * x > low + low_slope * x:
-                low, low_slope = down, slope
+                low = down
+                low_slope = slope
     return low, low_slope, high, high_slope, greatest
 
 
@@ -292,8 +313,10 @@ def slowdown(line, grid, speeds, velocity, acceleration):
     """The factor, at least 1, by which the motion must be slowed to keep the limits between grid points
     too."""
     waypoints, knots, directions, half_widths = line
-    dof, worst = waypoints.shape[1], 1.0
-    first, second = np.empty(dof), np.empty(dof)
+    dof = waypoints.shape[1]
+    worst = 1.0
+    first = np.empty(dof)
+    second = np.empty(dof)
     for i in range(len(grid) - 1):
         width = grid[i + 1] - grid[i]
         pull = (speeds[i + 1] ** 2 - speeds[i] ** 2) / (2 * width)
@@ -325,12 +348,14 @@ def sample_positions(line, grid, speeds, times):
     for i in range(len(grid) - 1):
         both = speeds[i] + speeds[i + 1]
         ends[i + 1] = ends[i] + (2 * (grid[i + 1] - grid[i]) / both if both > 0 else 0.0)
-    q, i = np.empty((len(times), waypoints.shape[1])), 0
+    q = np.empty((len(times), waypoints.shape[1]))
+    i = 0
     for k in range(len(times)):
         time = min(times[k], ends[-1])
         while i < len(grid) - 2 and ends[i + 1] <= time:
             i += 1
-        lasts, ago = ends[i + 1] - ends[i], time - ends[i]
+        lasts = ends[i + 1] - ends[i]
+        ago = time - ends[i]
         pull = (speeds[i + 1] - speeds[i]) / lasts if lasts > 0 else 0.0
         s = min(grid[i] + (speeds[i] + 0.5 * pull * ago) * ago, grid[i + 1])
         if times[k] >= ends[-1]:

@@ -59,9 +59,11 @@ def rate_violations(
             wrong = ~right
             i = int(np.flatnonzero(wrong.any(axis=1))[0])
             beyond = np.where(wrong, np.nan_to_num(check.off - check.allowed, nan=np.inf), 0.0)
-            j, time = int(beyond[i].argmax()), float(trajectory.times[i])
+            j = int(beyond[i].argmax())
+            time = float(trajectory.times[i])
             if check.kind not in found or time < found[check.kind].time:
-                name, rate = robot.joint_names[j], abs(float(check.rates[i, j]))
+                name = robot.joint_names[j]
+                rate = abs(float(check.rates[i, j]))
                 message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
                 found[check.kind] = Violation(check.kind, time, message, name, None, float(beyond[i, j]))
     return list(found.values())
@@ -84,8 +86,12 @@ class _Check(NamedTuple):
 
 def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: JointValues) -> Iterator[_Check]:
     trajectory = cubics.trajectory
-    q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
-    step, mean, change = cubics.steps, cubics.extremes.mean, np.diff(v, axis=0) / cubics.steps
+    q = trajectory.positions
+    v = trajectory.velocities
+    a = trajectory.accelerations
+    step = cubics.steps
+    mean = cubics.extremes.mean
+    change = np.diff(v, axis=0) / cubics.steps
     blur = 2 * settings.limit_slack / step
     """Uncertainty of the mean velocities, from the resolution of positions."""
     share = 1 + settings.rate_slack
@@ -102,22 +108,23 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         rule = "but the motion is to begin at the problem's start_velocity and end at rest"
     yield _Check("rest", "velocity", v, at_ends, nothing, lambda *_: rule)
 
-    most, onwards = robot.velocity, "mean velocity from here to the next row"
+    most = robot.velocity
+    onwards = "mean velocity from here to the next row"
     yield limited("jump", onwards, mean, most, settings.jump * most + blur)
     # Velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step.
     onwards = "velocity by its positions from here to the next row"
     yield limited("velocity", onwards, cubics.extremes.velocity, most, share * most + 1.5 * blur)
     yield limited("velocity", "velocity", v, most, share * most)
 
-    around, length = (
-        _padded(2 * begins - mean[:1], mean, -mean[-1:]),
-        _padded(step[:1], step, step[-1:]),
-    )
+    around = _padded(2 * begins - mean[:1], mean, -mean[-1:])
+    length = _padded(step[:1], step, step[-1:])
     unsure = _padded(blur[:1], blur, blur[-1:])
     apart = (length[1:] + length[:-1]) / 2
-    second, unsure = (around[1:] - around[:-1]) / apart, (unsure[1:] + unsure[:-1]) / apart
+    second = (around[1:] - around[:-1]) / apart
+    unsure = (unsure[1:] + unsure[:-1]) / apart
     most = robot.acceleration
-    peaks, bent = cubics.extremes.acceleration, 6 * blur / step
+    peaks = cubics.extremes.acceleration
+    bent = 6 * blur / step
     yield limited("acceleration", "mean acceleration by its positions", second, most, share * most + unsure)
     yield limited("acceleration", "acceleration by its positions", peaks, most, share * most + bent)
     yield limited("acceleration", "mean acceleration by its velocities", change, most, share * most)
@@ -129,7 +136,8 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
     """Allowed difference between mean velocities and the means of the rows' velocities."""
-    off, allowed = np.abs(mean - (v[1:] + v[:-1]) / 2), possible + blur
+    off = np.abs(mean - (v[1:] + v[:-1]) / 2)
+    allowed = possible + blur
     yield _Check(
         "rates",
         "mean velocity from here to the next row",
@@ -139,9 +147,12 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         lambda i, j: f"but the velocities of these rows are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
     if len(a) > 1 and (off <= allowed).all():  # else the cubics are not those of the positions
-        start, end = cubics.extremes.start, cubics.extremes.end
-        before, after = _padded(start[:1], end), _padded(start, end[-1:])
-        low, high = np.minimum(before, after), np.maximum(before, after)
+        start = cubics.extremes.start
+        end = cubics.extremes.end
+        before = _padded(start[:1], end)
+        after = _padded(start, end[-1:])
+        low = np.minimum(before, after)
+        high = np.maximum(before, after)
         outside = np.maximum(low - a, a - high)
         if begins.any():
             outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
@@ -157,16 +168,19 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
         return
-    times, resolution = trajectory.times, settings.limit_slack
+    times = trajectory.times
+    resolution = settings.limit_slack
     onwards = "mean velocity from an earlier row to here"
     most = robot.velocity
     first, span = _worst_earlier_row(times, q, (times - times[0])[:, None] * share * most)
     moved = _change_since(q, first) / span
     yield limited("velocity", onwards, moved, most, share * most + 2 * resolution / span)
 
-    stated_positions, allowed = _cumulative(step * (v[1:] + v[:-1]) / 2), _cumulative(step * possible)
+    stated_positions = _cumulative(step * (v[1:] + v[:-1]) / 2)
+    allowed = _cumulative(step * possible)
     first, span = _worst_earlier_row(times, q - stated_positions, allowed)
-    moved, stated = _change_since(q, first) / span, _change_since(stated_positions, first) / span
+    moved = _change_since(q, first) / span
+    stated = _change_since(stated_positions, first) / span
     yield _Check(
         "rates",
         onwards,
@@ -196,14 +210,16 @@ def _worst_earlier_row(
     The excess is the change of `way` since that row, in either direction, minus the growth of `allowed`. The
     first row refers to itself.
     """
-    rows, beyond = np.arange(len(way))[:, None], np.full(way.shape, -np.inf)
+    rows = np.arange(len(way))[:, None]
+    beyond = np.full(way.shape, -np.inf)
     first = np.broadcast_to(rows, way.shape)
     for signed in (way, -way):
         room = signed - allowed
         least = np.minimum.accumulate(room, axis=0)
         at = np.maximum.accumulate(np.where(room <= least, rows, 0), axis=0)
         # shifted by one row to exclude the row itself
-        least, at = _padded(room[:1], least[:-1]), _padded(first[:1], at[:-1])
+        least = _padded(room[:1], least[:-1])
+        at = _padded(first[:1], at[:-1])
         first = np.where(room - least > beyond, at, first)
         beyond = np.maximum(beyond, room - least)
     return first, np.maximum(times[:, None] - times[first], MIN_TIME)
@@ -223,12 +239,14 @@ def _second_differences(
     """Mean accelerations about each row, from positions at the nearest rows at least `window` [s] away, and
     their uncertainty. Before the motion the arm moves at its start velocity, and afterwards it stands
     still."""
-    times, q = trajectory.times, trajectory.positions
+    times = trajectory.times
+    q = trajectory.positions
     clock = _padded(times[:1] - window, times, times[-1:] + window)
     rows = _padded(q[:1] - window * begins, q, q[-1:])
     low = np.searchsorted(clock, times - window, side="right") - 1
     high = np.searchsorted(clock, times + window)
-    before, after = (times - clock[low])[:, None], (clock[high] - times)[:, None]
+    before = (times - clock[low])[:, None]
+    after = (clock[high] - times)[:, None]
     apart = (before + after) / 2
     outside = (low == 0).astype(float) + (high == len(clock) - 1)
     unsure = 2 * resolution * (1 / before + 1 / after) + outside[:, None] * nothing

@@ -103,8 +103,10 @@ def goal_error(
             return None
         return GoalError(f"{off:.3g} from the nearest goal configuration (largest joint error)", None, off)
     T_goal_end = inverse(goal.T_base_frame) @ link_pose(robot, q, goal.frame)
-    distance, angle = float(np.linalg.norm(T_goal_end[:3, 3])), rotation_angle(T_goal_end[:3, :3])
-    xyz, rpy = goal.xyz_tolerance, goal.rpy_tolerance
+    distance = float(np.linalg.norm(T_goal_end[:3, 3]))
+    angle = rotation_angle(T_goal_end[:3, :3])
+    xyz = goal.xyz_tolerance
+    rpy = goal.rpy_tolerance
     slack = settings.goal_slack
     if xyz is None:
         there = distance <= max(settings.goal_distance, blend)
@@ -165,7 +167,8 @@ def sample_path(q: Configurations, step: float, after: float = 0.0) -> tuple[Val
     counts = np.maximum(np.ceil(steps / step), 1).astype(int)
     shares = [np.arange(count) / count for count in counts]
     places = np.append(np.repeat(np.arange(len(counts)), counts) + np.concatenate([[], *shares]), len(counts))
-    places, rows = places[places >= after], np.arange(len(q))
+    places = places[places >= after]
+    rows = np.arange(len(q))
     return places, np.column_stack([np.interp(places, rows, joint) for joint in q.T])
 
 

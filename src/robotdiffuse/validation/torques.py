@@ -56,7 +56,8 @@ def trajectory_pieces(trajectory: Trajectory) -> Pieces:
     if len(trajectory.positions) == 1:
         return static_pieces(trajectory.positions)
     cubics = Cubics(trajectory)
-    extremes, h = cubics.extremes, cubics.steps
+    extremes = cubics.extremes
+    h = cubics.steps
     change = np.abs(extremes.end - extremes.start)
     pull = np.stack([extremes.acceleration, change, np.zeros_like(change)])
     most = extremes.velocity
@@ -100,35 +101,48 @@ def first_beyond(
 ) -> Excess | None:
     """As `first_excess`, for k `values` of states, such as torques; `bends` are bounds on their second
     derivatives along each piece, by the share."""
-    allowed, count = limits * (1 + slack), len(bends)
-    piece, low, high = np.arange(count), np.zeros(count), np.ones(count)
+    allowed = limits * (1 + slack)
+    count = len(bends)
+    piece = np.arange(count)
+    low = np.zeros(count)
+    high = np.ones(count)
 
     def looked(piece: ndarray, share: ndarray) -> ndarray:
         return np.abs(values(*states(piece, share)))
 
-    at_low, at_high = looked(piece, low), looked(piece, high)
+    at_low = looked(piece, low)
+    at_high = looked(piece, high)
     places: list[ndarray] = [np.zeros(0)]
     beyond: list[ndarray] = [np.zeros((0, len(allowed)))]
     while len(piece):
         bulge = bends[piece] * (high - low)[:, None] ** 2 / 8
         most = np.maximum(at_low, at_high)
         open_ = most + bulge > allowed
-        begun, goes_on = (at_low > allowed).any(axis=1), (at_high > allowed).any(axis=1)
+        begun = (at_low > allowed).any(axis=1)
+        goes_on = (at_high > allowed).any(axis=1)
         unsure = np.minimum(bulge, RESOLUTION * limits)
         last = bulge <= unsure if len(piece) <= MAX_OPEN_PIECES else np.ones_like(open_)
-        over, lost = begun | goes_on, (open_ & last).any(axis=1)
+        over = begun | goes_on
+        lost = (open_ & last).any(axis=1)
         wrong = np.flatnonzero(over | lost)
         places.append(piece[wrong] + np.where(over & ~begun, high, low)[wrong])
         beyond.append((np.where(most > allowed, most, most + unsure) - allowed)[wrong])
         coarse = over & (begun != goes_on) & (high - low > PLACE_RESOLUTION)
         halved = open_.any(axis=1) & (coarse | ~(over | lost))
-        piece, low, high = piece[halved], low[halved], high[halved]
+        piece = piece[halved]
+        low = low[halved]
+        high = high[halved]
         middle = (low + high) / 2
         at_middle = looked(piece, middle)
-        at_low, at_high = at_low[halved], at_high[halved]
-        at_low, at_high = np.concatenate([at_low, at_middle]), np.concatenate([at_middle, at_high])
-        low, high, piece = np.append(low, middle), np.append(middle, high), np.tile(piece, 2)
-    place, excess = np.concatenate(places), np.concatenate(beyond)
+        at_low = at_low[halved]
+        at_high = at_high[halved]
+        at_low = np.concatenate([at_low, at_middle])
+        at_high = np.concatenate([at_middle, at_high])
+        low = np.append(low, middle)
+        high = np.append(middle, high)
+        piece = np.tile(piece, 2)
+    place = np.concatenate(places)
+    excess = np.concatenate(beyond)
     if not len(place):
         return None
     i = int(place.argmin())

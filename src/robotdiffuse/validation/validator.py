@@ -88,7 +88,9 @@ class Verifier:
     """Validates motions for one problem; data of the robot and the scene is prepared once."""
 
     def __init__(self, problem: Problem, settings: VerifySettings = DEFAULT) -> None:
-        self.problem, self.settings, self.robot = problem, settings, problem.robot
+        self.problem = problem
+        self.settings = settings
+        self.robot = problem.robot
 
     def path(self, path: Path) -> Report:
         """See `verify`."""
@@ -122,7 +124,8 @@ class Verifier:
             return Report(False, Violation("time", 0.0, message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
-        cubics, begins = Cubics(trajectory), self.problem.start_velocity
+        cubics = Cubics(trajectory)
+        begins = self.problem.start_velocity
         found = rate_violations(self.robot, trajectory, self.settings, begins, cubics)
         at_rest = None
         if self.problem.waypoints:
@@ -154,7 +157,8 @@ class Verifier:
 
         Places are added until that is little beside the clearances.
         """
-        settings, chord = self.settings, self.settings.chord
+        settings = self.settings
+        chord = self.settings.chord
         radii = self._continuous.checks.motion_radii
         while True:
             times, positions, off = cubics.sampled(chord)
@@ -181,7 +185,8 @@ class Verifier:
     def _check_shape(self, what: str, motion: Path | Trajectory) -> None:
         shape = motion.positions.shape
         if tuple(motion.joint_names) != self.robot.joint_names:
-            given, right = joined(motion.joint_names), joined(self.robot.joint_names)
+            given = joined(motion.joint_names)
+            right = joined(self.robot.joint_names)
             raise InputError(f"{what}.joint_names is {given}; the robot's planned joints are {right}")
         if len(shape) != 2 or shape[1] != self.robot.dof or shape[0] == 0:
             raise InputError(
@@ -250,7 +255,8 @@ class Verifier:
         if (difference <= self.settings.start_tolerance).all():
             return None
         j = int(difference.argmax())
-        name, excess = self.robot.joint_names[j], float(difference[j])
+        name = self.robot.joint_names[j]
+        excess = float(difference[j])
         begins, start = distinct(q[0, j], self.problem.start[j])
         message = f"the motion begins at {name} = {begins}; the problem's start is {start}"
         return Violation("start", 0.0, message, name, None, excess)
@@ -263,7 +269,8 @@ class Verifier:
             return None
         i = int(wrapped[0])
         j = int(np.abs(turns[i]).argmax())
-        name, step = self.robot.joint_names[j], float(q[i + 1, j] - q[i, j])
+        name = self.robot.joint_names[j]
+        step = float(q[i + 1, j] - q[i, j])
         message = (
             f"{name} turns by {step:.4g} rad from row {i} to row {i + 1}, nearly a whole turn: unwrap values "
             f"that were wrapped to ±pi, or add rows on the way"
@@ -276,8 +283,10 @@ class Verifier:
         bad = np.flatnonzero((excess > self.settings.limit_slack).any(axis=1))
         if not len(bad):
             return None
-        i, j = int(bad[0]), int(excess[bad[0]].argmax())
-        name, at = self.robot.joint_names[j], place.format(clock[i])
+        i = int(bad[0])
+        j = int(excess[bad[0]].argmax())
+        name = self.robot.joint_names[j]
+        at = place.format(clock[i])
         value, low, high = distinct(q[i, j], self.robot.lower[j], self.robot.upper[j])
         message = f"{name} is {value} at {at}; its limits are {low} to {high}"
         return Violation("limits", float(clock[i]), message, name, None, float(excess[i, j]))
@@ -299,7 +308,8 @@ class Verifier:
 
     def _limits_between(self, cubics: Cubics) -> list[Violation]:
         """The first place between rows where a cubic leaves the joint limits."""
-        robot, extremes = self.robot, cubics.extremes
+        robot = self.robot
+        extremes = cubics.extremes
         beyond = np.maximum(robot.lower - extremes.lower, extremes.upper - robot.upper)
         beyond[robot.continuous] = 0.0
         if not (beyond > self.settings.limit_slack).any():
@@ -313,18 +323,21 @@ class Verifier:
     def _too_fast(self, cubics: Cubics) -> list[Violation]:
         """The first place where a frame is not proved to be as slow as its constraint requires."""
         assert self.constraints is not None
-        limits, trajectory = self.constraints.speed_limits, cubics.trajectory
+        limits = self.constraints.speed_limits
+        trajectory = cubics.trajectory
         if not len(limits) or not len(cubics.steps):
             return []
         pieces = trajectory_pieces(trajectory)
-        speeds, bends = self.constraints.speeds, self.constraints.speed_bends(pieces.along.v) / cubics.steps
+        speeds = self.constraints.speeds
+        bends = self.constraints.speed_bends(pieces.along.v) / cubics.steps
         beyond = first_beyond(
             limits, lambda q, v, _: speeds(q, v), bends, pieces.states, self.settings.rate_slack
         )
         if beyond is None:
             return []
         at = float(np.interp(beyond.place, np.arange(len(trajectory.times)), trajectory.times))
-        one, most = self.constraints.speed_limited[beyond.joint], limits[beyond.joint]
+        one = self.constraints.speed_limited[beyond.joint]
+        most = limits[beyond.joint]
         speed, limit = distinct(beyond.torque, most, digits=4)
         message = f"{one.frame} moves at {speed} m/s; {one.kind} allows {limit} m/s"
         return [Violation("speed", at, message, one.frame, one.kind, beyond.excess)]
@@ -336,10 +349,8 @@ class Verifier:
         beyond = first_excess(self.dynamics, pieces, self.settings.rate_slack)
         if beyond is None:
             return []
-        at, name = (
-            float(np.interp(beyond.place, np.arange(len(clock)), clock)),
-            self.robot.joint_names[beyond.joint],
-        )
+        at = float(np.interp(beyond.place, np.arange(len(clock)), clock))
+        name = self.robot.joint_names[beyond.joint]
         message = self.dynamics.torque_message(beyond.joint, beyond.torque) + what
         return [Violation("torque", at, message, name, None, beyond.excess)]
 
@@ -371,7 +382,8 @@ class Verifier:
     def _waypoints(self, q: ndarray, clock: ndarray, at_rest: ndarray | None) -> Violation | None:
         """The first of the problem's waypoints at which the motion does not stop, or that it does not pass
         within its blend, after the waypoints before it."""
-        problem, after = self.problem, 0.0
+        problem = self.problem
+        after = 0.0
         for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
             if blend:
                 place = first_place_within(self.robot, goal, q, blend, self.settings, after)
@@ -419,7 +431,8 @@ class Verifier:
 def _spaced_rows(q, step):
     """Indices of rows of q[n, dof] such that each is at least `step` from the one before, beginning with row
     0."""
-    kept, count = np.zeros(len(q), np.int64), 1
+    kept = np.zeros(len(q), np.int64)
+    count = 1
     for i in range(1, len(q)):
         total = 0.0
         for j in range(q.shape[1]):
@@ -438,7 +451,9 @@ def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
 
 
 def _moving_contact_violation(contact: "TimedContact") -> Violation:
-    link, other, time = contact.link, contact.obstacle, contact.time
+    link = contact.link
+    other = contact.obstacle
+    time = contact.time
     message = f"{describe_contact(link, other, contact.depth, False)} at {time:.3f} s"
     return Violation("scene_collision", time, message, link, other, contact.depth)
 
@@ -469,7 +484,8 @@ def violations(
     found = [
         w for w in report.found if w.kind != "limits" and not (w.kind in CONTACT_KINDS and w.other in still)
     ]
-    q, clock = motion.positions, np.arange(len(motion.positions), dtype=float)
+    q = motion.positions
+    clock = np.arange(len(motion.positions), dtype=float)
     if timed:
         rates = any(wrong.kind in RATE_KINDS for wrong in found)
         clock, q = (motion.times, q) if rates else Cubics(motion).sampled(settings.chord)[:2]
@@ -477,7 +493,8 @@ def violations(
         found.append(collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock))))
     if timed:
         times, turns = Cubics(motion).turns()
-        clock, q = np.concatenate([clock, times]), np.concatenate([q, turns])
+        clock = np.concatenate([clock, times])
+        q = np.concatenate([q, turns])
     found += _limit_violations(problem, q, clock, settings)
     return tuple(sorted(found, key=lambda wrong: wrong.time))
 
@@ -485,13 +502,17 @@ def violations(
 def _limit_violations(
     problem: Problem, q: ndarray, clock: ndarray, settings: VerifySettings
 ) -> list[Violation]:
-    robot, found = problem.robot, []
+    robot = problem.robot
+    found = []
     beyond = np.maximum(robot.lower - q, q - robot.upper)
     beyond[:, robot.continuous] = 0.0
     for j in np.flatnonzero((beyond > settings.limit_slack).any(axis=0)).tolist():
         over = np.flatnonzero(beyond[:, j] > settings.limit_slack)
-        i, most = int(over[clock[over].argmin()]), float(beyond[:, j].max())
-        name, low, high = robot.joint_names[j], robot.lower[j], robot.upper[j]
+        i = int(over[clock[over].argmin()])
+        most = float(beyond[:, j].max())
+        name = robot.joint_names[j]
+        low = robot.lower[j]
+        high = robot.upper[j]
         message = f"{name} leaves its limits, {low:.6g} to {high:.6g}, by up to {most:.3g}"
         found.append(Violation("limits", float(clock[i]), message, name, None, most))
     return found

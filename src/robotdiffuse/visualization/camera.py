@@ -93,7 +93,8 @@ def framed(
         rotation = Camera(target + toward, target, *size).rotation
         x, y, z = ((points - target) @ rotation.T).T
         distance = max((np.abs(x) / side - z).max(), (y / bottom - z).max(), (y / top - z).max(), 0.3)
-        u, v = x / (z + distance), y / (z + distance)
+        u = x / (z + distance)
+        v = y / (z + distance)
         off = 0.5 * np.array([u.min() + u.max(), v.min() + v.max() - top - bottom])
         target = target + distance * rotation[:2].T @ off
     return Camera(target + distance * toward, target, *size)
@@ -118,14 +119,16 @@ def best_view(
     points = np.concatenate([moving, obstacles.vertices[near]])
     points = points[ConvexHull(points, qhull_options="QJ").vertices]
     small = (160, max(1, 160 * size[1] // size[0]))
-    best, best_score = _direction(0.0, ELEVATIONS[0]), -1.0
+    best = _direction(0.0, ELEVATIONS[0])
+    best_score = -1.0
     around = np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS) if azimuth is None else np.array([azimuth])
     for elevation in ELEVATIONS:
         for angle in around:
             camera = framed(points, _direction(angle, elevation), small, free)
             score = _score(camera, arm, ghosts, trace, obstacles)
             if score > best_score:
-                best, best_score = _direction(angle, elevation), score
+                best = _direction(angle, elevation)
+                best_score = score
     return framed(points, best, size, free)
 
 
@@ -153,9 +156,11 @@ def _score(
         drawn, _, _ = drawn_by(camera, part)
         score += weight * float((drawn > hidden).sum() / max(1, (drawn > 0).sum()))
     pixels = camera.project(trace)
-    column, row = pixels[:, 0].astype(int), pixels[:, 1].astype(int)
+    column = pixels[:, 0].astype(int)
+    row = pixels[:, 1].astype(int)
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    column, row = column.clip(0, camera.width - 1), row.clip(0, camera.height - 1)
+    column = column.clip(0, camera.width - 1)
+    row = row.clip(0, camera.height - 1)
     seen = inside & (pixels[:, 2] > hidden[row, column])
     steps = np.linalg.norm(np.diff(pixels[:, :2], axis=0), axis=1)
     return score + float(steps[seen[1:]].sum()) / camera.height

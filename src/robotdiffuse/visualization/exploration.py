@@ -50,7 +50,8 @@ TILE = PictureSettings(width=720, height=450, ghosts=2)
 GAP = 6
 """Between moments [pixels]."""
 GAP_COLOR = (0xFF, 0xFF, 0xFF)
-UNKNOWN_ALPHA, PREDICTED_ALPHA = 0.27, 0.55
+UNKNOWN_ALPHA = 0.27
+PREDICTED_ALPHA = 0.55
 SHARE_COLORS = ((0x8A, 0x93, 0xA0), UNKNOWN)
 """Of the labels of the shares that were seen free, and unknown."""
 CAPTION_SIZE = 1.7
@@ -94,7 +95,8 @@ def moments(explorer: RecordedExplorer) -> list[Moment]:
 
 def title(act: RecordedAct) -> str:
     """What the arm does in an act."""
-    step, duration = act.step, act.duration
+    step = act.step
+    duration = act.duration
     name = {DONE: "at the goal"}.get(step.kind, step.kind)
     return f"{name} ({duration:.1f} s)" if duration else name
 
@@ -159,7 +161,8 @@ def faces_between(inside: Voxels, outside: Voxels) -> tuple[Int[ndarray, "n"], B
 
     A face has one number: axis · voxels + the flat index of the voxel before it along that axis.
     """
-    numbers, first = [], []
+    numbers = []
+    first = []
     for axis in range(3):
         before = [slice(None)] * 3
         after = [slice(None)] * 3
@@ -226,7 +229,8 @@ def _tile(
     camera: Camera,
     settings: PictureSettings,
 ) -> Image.Image:
-    robot, act = explorer.robot, moment.act
+    robot = explorer.robot
+    act = moment.act
     shown = shown_voxels(moment.known, act, known)
     occupied, predicted, unknown = (
         faces_surface(*pair, color)
@@ -255,7 +259,8 @@ def _joined(tiles: list[Image.Image]) -> Image.Image:
     """The pictures in rows of two or three."""
     columns = min(len(tiles), 3 if len(tiles) > 4 else 2)
     rows = -(-len(tiles) // columns)
-    width, height = tiles[0].width + GAP, tiles[0].height + GAP
+    width = tiles[0].width + GAP
+    height = tiles[0].height + GAP
     sheet = Image.new("RGB", (columns * width - GAP, rows * height - GAP), GAP_COLOR)
     for i, tile in enumerate(tiles):
         sheet.paste(tile, (i % columns * width, i // columns * height))
@@ -293,7 +298,8 @@ def _page_time(time: float, act: int) -> float:
 
 def _whole_motion(explorer: RecordedExplorer) -> Trajectory:
     """All motions with the pauses between them."""
-    times, positions = [], []
+    times = []
+    positions = []
     for number, act in enumerate(explorer.acts):
         times.append(np.array([_page_time(act.begins, number - 1)]))
         positions.append(act.configuration[None])
@@ -349,7 +355,8 @@ def _act(explorer: RecordedExplorer, moment: Moment) -> dict[str, Any]:
 
 
 def _facts(explorer: RecordedExplorer) -> list[tuple[str, str]]:
-    last, kinds = explorer.acts[-1].step, Counter(act.step.kind for act in explorer.acts)
+    last = explorer.acts[-1].step
+    kinds = Counter(act.step.kind for act in explorer.acts)
     return [
         ("status", "solved" if last.kind == DONE else last.kind),
         ("policy", explorer.settings.policy.replace("_", " ")),

@@ -103,7 +103,8 @@ def write_gallery(
     ending or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
-    replays, buttons = [], []
+    replays = []
+    buttons = []
     for i, entry in enumerate(entries):
         data = page_data(robot, entry.scene, entry.motion, moving=entry.moving)
         replays.append(page_text(entry.title, data))

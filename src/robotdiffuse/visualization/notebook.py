@@ -17,7 +17,8 @@ class Replay:
     """The output of a notebook cell: a replay in an iframe."""
 
     def __init__(self, page: str, height: int) -> None:
-        self._page, self._height = page, height
+        self._page = page
+        self._height = height
 
     def _repr_html_(self) -> str:
         style = "width: 100%; border: 0; border-radius: 8px"

@@ -24,9 +24,11 @@ from robotdiffuse.visualization.rasterizer import blend_ghost, draw, light_latti
 
 SUPERSAMPLING = 2
 """Rendered pixels per pixel along each side."""
-SKY_LIGHTS, SKY_MAP = 60, 320
-KEY_LIGHTS, KEY_MAP = 28, 768
-"""Number of lights of the sky and of the main light, and edge length of the shadow map of each [pixels]."""
+SKY_LIGHTS = 60
+SKY_MAP = 320
+# Number of lights of the sky and of the main light, and edge length of the shadow map of each [pixels].
+KEY_LIGHTS = 28
+KEY_MAP = 768
 LIGHT_SPACING = 4
 """Light is computed at every fourth pixel of the supersampled image."""
 KEY_DIRECTION = np.array([0.35, -0.45, 0.82])
@@ -48,7 +50,8 @@ MOVED_ALPHA = 0.22
 TRACE_STEPS = 240
 """Configurations along a motion of which the trace is drawn."""
 WHITE = (0xFF, 0xFF, 0xFF)
-SHELL_COLOR, SHELL_ALPHA = (0x35, 0xB8, 0x5C), 0.2
+SHELL_COLOR = (0x35, 0xB8, 0x5C)
+SHELL_ALPHA = 0.2
 MARGINS = (0.05, 0.11)
 """Fractions of the height left free above the arm, and below it for the caption."""
 
@@ -172,7 +175,8 @@ def render(
     added, clear: further surfaces in the base frame, solid and see-through.
     moving: obstacles that are solid where they are at the start, and see-through later.
     """
-    arm, obstacles = DrawnArm(robot), drawables(scene, moving)
+    arm = DrawnArm(robot)
+    obstacles = drawables(scene, moving)
     q = dense(motion.positions, TRACE_STEPS)
     surroundings = join([one.surface for one in obstacles])
     goal = arm.posed(q[-1])
@@ -206,7 +210,8 @@ def render(
 
 def _shell(arm: DrawnArm, q: Float[ndarray, "dof"], thickness: float) -> Surface:
     """The covering spheres of the arm, enlarged by the thickness of the shell [m]."""
-    robot, T_base_frame = arm.robot, arm.frames(q)
+    robot = arm.robot
+    T_base_frame = arm.frames(q)
     balls = []
     for link, spheres in robot.spheres.items():
         T = T_base_frame[robot.link_frame(link)] @ robot.T_frame_link(link)
@@ -287,7 +292,8 @@ def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tup
     center = np.zeros(3)
     radius = 0.1
     if len(solid.vertices):
-        low, high = solid.vertices.min(0).clip(-2.5, 2.5), solid.vertices.max(0).clip(-2.5, 2.5)
+        low = solid.vertices.min(0).clip(-2.5, 2.5)
+        high = solid.vertices.max(0).clip(-2.5, 2.5)
         center = 0.5 * (low + high)
         away = np.linalg.norm(solid.vertices - center, axis=1)
         radius = max(radius, min(3.0, float(away.max())))
@@ -326,7 +332,8 @@ def tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
     )
     t = np.linspace(0, 1, n)[:, None, None]
     colors = np.broadcast_to(((1 - t) * first + t * last) / 255.0, normals.shape)
-    i, j = np.arange(n - 1)[:, None] * TUBE_SIDES, np.arange(TUBE_SIDES)
+    i = np.arange(n - 1)[:, None] * TUBE_SIDES
+    j = np.arange(TUBE_SIDES)
     following = (j + 1) % TUBE_SIDES
     quad = [i + j, i + following, i + TUBE_SIDES + j, i + TUBE_SIDES + following]
     faces = np.concatenate([np.stack(quad[:3], -1).reshape(-1, 3), np.stack(quad[1:], -1).reshape(-1, 3)])
@@ -374,8 +381,10 @@ def caption(
     enlarged: factor of the size of the letters."""
     scale = enlarged * image.width / 1600
     pen = ImageDraw.Draw(image)
-    big, small = ImageFont.load_default(max(8, 30 * scale)), ImageFont.load_default(max(7, 19 * scale))
-    left, bottom = 44 * scale, image.height - 40 * scale
+    big = ImageFont.load_default(max(8, 30 * scale))
+    small = ImageFont.load_default(max(7, 19 * scale))
+    left = 44 * scale
+    bottom = image.height - 40 * scale
     pen.text((left, bottom - 30 * scale), title, fill=(0x22, 0x2B, 0x38), font=big, anchor="ls")
     for i, (label, value) in enumerate(facts):
         for text, fill, gap in (

@@ -102,7 +102,8 @@ def _colliding_links(
     arm: DrawnArm, states: Float[ndarray, "n dof"], validities: list[StateValidity]
 ) -> list[tuple[Surface, Color]]:
     """The surfaces of the links that collide in each state, and their colour."""
-    robot, links = arm.robot, link_surfaces(arm.robot)
+    robot = arm.robot
+    links = link_surfaces(arm.robot)
     marks = []
     for q, validity in zip(states, validities, strict=False):  # there may be no goal state
         T_base_frame = arm.frames(q)

@@ -16,10 +16,18 @@ def draw(near, ident, screen, faces):
     """
     h, w = near.shape
     for f in range(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        x0, y0, z0 = screen[a, 0], screen[a, 1], screen[a, 2]
-        x1, y1, z1 = screen[b, 0], screen[b, 1], screen[b, 2]
-        x2, y2, z2 = screen[c, 0], screen[c, 1], screen[c, 2]
+        a = faces[f, 0]
+        b = faces[f, 1]
+        c = faces[f, 2]
+        x0 = screen[a, 0]
+        y0 = screen[a, 1]
+        z0 = screen[a, 2]
+        x1 = screen[b, 0]
+        y1 = screen[b, 1]
+        z1 = screen[b, 2]
+        x2 = screen[c, 0]
+        y2 = screen[c, 1]
+        z2 = screen[c, 2]
         if z0 <= 0 or z1 <= 0 or z2 <= 0:
             continue
         area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
@@ -65,8 +73,11 @@ def _lit(light, x, y, z, nx, ny, nz, offset, stride):
     `bias` so that surfaces do not shadow themselves.
     """
     maps, directions, scale, center, size, bias = light
-    x, y, z = x + nx * bias - center[0], y + ny * bias - center[1], z + nz * bias - center[2]
-    got, total = 0.0, 0.0
+    x = x + nx * bias - center[0]
+    y = y + ny * bias - center[1]
+    z = z + nz * bias - center[2]
+    got = 0.0
+    total = 0.0
     for k in range(offset, maps.shape[0], stride):
         d = directions[k]
         cosine = nx * d[2, 0] + ny * d[2, 1] + nz * d[2, 2]
@@ -98,7 +109,8 @@ def _grid(x, y, spacing, width, footprint):
 @kernel()
 def _ray(rays, row, column):
     """The ray through the middle of a pixel, with depth 1."""
-    px, py = column + 0.5, row + 0.5
+    px = column + 0.5
+    py = row + 0.5
     rx = rays[0, 0] * px + rays[0, 1] * py + rays[0, 2]
     ry = rays[1, 0] * px + rays[1, 1] * py + rays[1, 2]
     rz = rays[2, 0] * px + rays[2, 1] * py + rays[2, 2]
@@ -119,14 +131,17 @@ def _surface(row, column, near, ident, screen, faces, normals, camera, height):
     """The surface at a pixel: depth (0 for none), ray, normal towards the eye, corner weights, whether
     solid."""
     eye, rays = camera
-    px, py = column + 0.5, row + 0.5
+    px = column + 0.5
+    py = row + 0.5
     rx, ry, rz = _ray(rays, row, column)
     if rz < 0 and eye[2] > height and rz / (height - eye[2]) > near[row, column]:
         return (height - eye[2]) / rz, rx, ry, rz, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, False
     if near[row, column] <= 0:
         return 0.0, rx, ry, rz, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, False
     f = ident[row, column]
-    i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+    i = faces[f, 0]
+    j = faces[f, 1]
+    k = faces[f, 2]
     u, v, t = _corner_weights(screen, i, j, k, px, py)
     nx, ny, nz, length = _normal(normals, i, j, k, u, v, t)
     if nx * rx + ny * ry + nz * rz > 0:
@@ -137,7 +152,8 @@ def _surface(row, column, near, ident, screen, faces, normals, camera, height):
 @kernel()
 def light_lattice(spacing, near, ident, screen, faces, normals, camera, height, sky, key):
     """Light at every `spacing`-th pixel, [rows, columns, 7]: depth, normal, sky, key, whether solid."""
-    rows, columns = near.shape[0] // spacing, near.shape[1] // spacing
+    rows = near.shape[0] // spacing
+    columns = near.shape[1] // spacing
     lattice = np.zeros((rows, columns, 7), np.float32)
     eye = camera[0]
     for row in range(rows):
@@ -147,9 +163,15 @@ def light_lattice(spacing, near, ident, screen, faces, normals, camera, height, 
             )
             if depth <= 0:
                 continue
-            x, y, z = eye[0] + depth * rx, eye[1] + depth * ry, eye[2] + depth * rz
+            x = eye[0] + depth * rx
+            y = eye[1] + depth * ry
+            z = eye[2] + depth * rz
             at = lattice[row, column]
-            at[0], at[1], at[2], at[3], at[6] = depth, nx, ny, nz, 1.0 if solid else 0.0
+            at[0] = depth
+            at[1] = nx
+            at[2] = ny
+            at[3] = nz
+            at[6] = 1.0 if solid else 0.0
             at[4] = _lit(sky, x, y, z, nx, ny, nz, 0, 1)
             at[5] = _lit(key, x, y, z, nx, ny, nz, 0, 1)
     return lattice
@@ -158,9 +180,13 @@ def light_lattice(spacing, near, ident, screen, faces, normals, camera, height, 
 @kernel()
 def _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid):
     """Light interpolated from the surrounding lattice points that show the same smooth surface."""
-    y, x = row / spacing, column / spacing
-    top, left = int(y), int(x)
-    sky, key, total = 0.0, 0.0, 0.0
+    y = row / spacing
+    x = column / spacing
+    top = int(y)
+    left = int(x)
+    sky = 0.0
+    key = 0.0
+    total = 0.0
     for i in range(2):
         for j in range(2):
             if top + i >= lattice.shape[0] or left + j >= lattice.shape[1]:
@@ -217,22 +243,28 @@ def shade(
                 image[row, column, c] = background[0][c] * up + background[1][c] * (1 - up)
             if depth <= 0:
                 continue
-            x, y, z = eye[0] + depth * rx, eye[1] + depth * ry, eye[2] + depth * rz
+            x = eye[0] + depth * rx
+            y = eye[1] + depth * ry
+            z = eye[2] + depth * rz
             far = min(1.0, np.sqrt(x * x + y * y) / radius)
             mix = 1.0 if solid else (1 - far * far) ** 2
             if mix <= 0:
                 continue
             s, q, total = _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid)
             if total > 0.25:
-                s, q = s / total, q / total
+                s = s / total
+                q = q / total
             else:
                 part = (row % 2) * 2 + column % 2
                 s = _lit(sky, x, y, z, nx, ny, nz, part, 4)
                 q = _lit(key, x, y, z, nx, ny, nz, part, 4)
-            stripe, gloss = 0.0, 0.0
+            stripe = 0.0
+            gloss = 0.0
             if solid:
                 f = ident[row, column]
-                hx, hy, hz = toward[0] - rx / norm, toward[1] - ry / norm, toward[2] - rz / norm
+                hx = toward[0] - rx / norm
+                hy = toward[1] - ry / norm
+                hz = toward[2] - rz / norm
                 half = max(0.0, (nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz))
                 edge = 1 + (nx * rx + ny * ry + nz * rz) / norm
                 gloss = 0.20 * min(1.0, 3 * q) * half**60 + 0.12 * s * edge**4
@@ -259,9 +291,12 @@ def blend_ghost(image, solid, near, ident, screen, faces, normals, colors, camer
             # It must be slightly nearer than the solid arm: links that only turn about their axis coincide.
             if near[row, column] <= 1.003 * solid[row, column]:
                 continue
-            px, py = column + 0.5, row + 0.5
+            px = column + 0.5
+            py = row + 0.5
             f = ident[row, column]
-            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            i = faces[f, 0]
+            j = faces[f, 1]
+            k = faces[f, 2]
             u, v, t = _corner_weights(screen, i, j, k, px, py)
             rx, ry, rz = _ray(rays, row, column)
             nx, ny, nz, length = _normal(normals, i, j, k, u, v, t)

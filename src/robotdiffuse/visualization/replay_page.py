@@ -88,7 +88,8 @@ def page_data(
     moving: Sequence[MovingObstacle] = (),
 ) -> dict[str, Any]:
     """What the page reads; see `write_replay`."""
-    arm, obstacles = DrawnArm(robot), drawables(scene, moving)
+    arm = DrawnArm(robot)
+    obstacles = drawables(scene, moving)
     times, positions = _thinned(*timed(motion))
     camera = view_of_motion(arm, obstacles, motion.positions, VIEW_SIZE, VIEW_MARGINS)
     return {
@@ -171,7 +172,8 @@ def page_shapes(scene: Scene) -> list[dict[str, Any]]:
 
 def _shape(obstacle: Drawable) -> dict[str, Any]:
     """An obstacle for the page: its fields, or packed geometry."""
-    shape, color = obstacle.shape, obstacle.color
+    shape = obstacle.shape
+    color = obstacle.color
     if isinstance(shape, Triangulated):
         return page_surface(shape.name, obstacle.surface, color)
     record: dict[str, Any] = {"kind": shape.kind, "name": shape.name, "color": color}

@@ -36,10 +36,14 @@ LINKS = {
 @cache
 def clad_arm(name: str) -> Robot:
     """Skew joints, one of them prismatic; each link is two boxes side by side, covered by spheres."""
-    rng, robot = np.random.default_rng(0), example_robot(name)
-    meshes, spheres = {}, {}
+    rng = np.random.default_rng(0)
+    robot = example_robot(name)
+    meshes = {}
+    spheres = {}
     for link in dict.fromkeys(link for arm in LINKS[name] for link in arm):
-        low, parts, covers = rng.uniform(-0.06, 0.0, 3), [], []
+        low = rng.uniform(-0.06, 0.0, 3)
+        parts = []
+        covers = []
         for _ in range(2):
             size = rng.uniform(0.02, 0.1, 3)
             parts.append(box_mesh(low, low + size))
@@ -89,13 +93,13 @@ robots = st.sampled_from(list(LINKS))
 
 @given(robots, seeds, st.sampled_from([0.01, 0.05, 0.2]), st.booleans())
 def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, cloud: bool) -> None:
-    rng, robot = np.random.default_rng(seed), clad_arm(name)
-    scene, q = scene_of(rng, cloud), curve(rng, robot, width)
-    validator, checker, exact = (
-        ContinuousCollision(robot, scene, 1e-4, 0.5),
-        CollisionChecker(robot, scene),
-        ExactCollision(robot, scene),
-    )
+    rng = np.random.default_rng(seed)
+    robot = clad_arm(name)
+    scene = scene_of(rng, cloud)
+    q = curve(rng, robot, width)
+    validator = ContinuousCollision(robot, scene, 1e-4, 0.5)
+    checker = CollisionChecker(robot, scene)
+    exact = ExactCollision(robot, scene)
     motion = Motion(q, motion_pieces.travel_along(q, validator.checks.motion_radii))
     whole = Pieces(
         np.zeros(1), np.full(1, motion.travel[-1]), np.ones((1, len(checks_of(robot))), dtype=np.bool_)
@@ -118,7 +122,8 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
     assert (found.lower[0] <= apart.min(axis=0) + slack).all()
     assert (found.clearance[0] <= apart[20] + slack).all()
     posture = convex_bounds.make_posture(validator.arm.hulls, validator.solids, robot.dof)
-    found.clearance[:], found.lower[:] = -np.inf, -np.inf
+    found.clearance[:] = -np.inf
+    found.lower[:] = -np.inf
     motion_certificate.bound_by_convex_parts(
         validator.arm, validator.solids, motion, validator.checks, found, np.ones(2), 0.5, 1e-4, posture
     )
@@ -131,7 +136,8 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
 @given(robots, seeds)
 def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
     """From any initial guess, to the 2 % at which the search ends."""
-    rng, robot = np.random.default_rng(seed), clad_arm(name)
+    rng = np.random.default_rng(seed)
+    robot = clad_arm(name)
     scene = scene_of(rng, False)
     q = rng.uniform(robot.lower, robot.upper)
     exact, arrays, (arm, parts) = (
@@ -141,7 +147,8 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
     )
     posture = convex_bounds.make_posture(arm, arrays, robot.dof)
     slides = np.array(robot.prismatic, np.bool_)
-    offsets, parents = robot.frame_offsets.copy(), robot.kernel_parents
+    offsets = robot.frame_offsets.copy()
+    parents = robot.kernel_parents
     convex_bounds.pose(offsets, parents, slides, q, np.zeros(robot.dof), posture)
     for found in exact.link_distances(q):
         guess = rng.normal(size=3)
@@ -160,7 +167,8 @@ def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
 def test_the_certificate_of_curved_motions(name: str, seed: int, cloud: bool) -> None:
     """Among them those of links of several parts, of which the first alone may be clear: bounds that were
     read off it settled pieces in which the others hit."""
-    rng, robot = np.random.default_rng(seed), clad_arm(name)
+    rng = np.random.default_rng(seed)
+    robot = clad_arm(name)
     scene = scene_of(rng, cloud)
     q = np.concatenate([curve(rng, robot, 0.15), curve(rng, robot, 0.02)])
     found = ContinuousCollision(robot, scene, 1e-4, 0.5).sweep(q)

@@ -30,7 +30,8 @@ from robotdiffuse.core.kernels import allocation_free
 
 @allocation_free(inner=False)
 def _calculate(a, b, s, out):
-    x, y = load(a, 0, 0), load(b, 1, 1)
+    x = load(a, 0, 0)
+    y = load(b, 1, 1)
     store(out, 0, 0, x + y * s)
     store(out, 1, 0, s - x)
     store(out, 2, 0, minimum(x, y))
@@ -62,9 +63,11 @@ def test_arithmetic_is_numpys() -> None:
     rng = np.random.default_rng(0)
     a = rng.normal(0, 3, (1, W)).astype(np.float32)
     b = rng.normal(0, 3, (2, 3 * W)).astype(np.float32)
-    out, s = np.zeros((8, W), np.float32), np.float32(0.7)
+    out = np.zeros((8, W), np.float32)
+    s = np.float32(0.7)
     mask, low, high, third = _calculate(a, b, s, out)
-    x, y = a[0], b[1, W : 2 * W]
+    x = a[0]
+    y = b[1, W : 2 * W]
     right = [
         *(x + y * s, s - x, np.minimum(x, y), np.maximum(x, s), np.sqrt(abs(x))),
         *(np.copysign(y, x), np.floor(x), np.arange(W)),
@@ -76,7 +79,8 @@ def test_arithmetic_is_numpys() -> None:
 
 def test_gathered_bits() -> None:
     rng = np.random.default_rng(1)
-    table, index = np.arange(100, dtype=np.float32), rng.integers(0, 100, (1, W)).astype(np.float32)
+    table = np.arange(100, dtype=np.float32)
+    index = rng.integers(0, 100, (1, W)).astype(np.float32)
     out = np.zeros((1, W), np.float32)
     total = _look_up(table, index, np.int32(4), out)
     np.testing.assert_array_equal(out, index)
@@ -84,7 +88,8 @@ def test_gathered_bits() -> None:
 
 
 def test_lanes_of_float64_or_of_a_strided_array_are_refused() -> None:
-    index, out = np.zeros((1, W), np.float32), np.zeros((1, W), np.float32)
+    index = np.zeros((1, W), np.float32)
+    out = np.zeros((1, W), np.float32)
     for table in (np.arange(100.0), np.arange(100, dtype=np.float32)[::2]):
         with pytest.raises(TypingError, match="gather"):
             _look_up(table, index, np.int32(4), out)

@@ -51,29 +51,37 @@ def _work(pipe: Connection, seed: int, kinds: tuple[str, ...]) -> None:
 def run_campaign(seconds: float, seed: int, kinds: tuple[str, ...]) -> Campaign:
     """Run as many inputs as there is time for, numbered from `seed` on."""
     found = Campaign(Counter(), [], dict.fromkeys(kinds, 0.0))
-    context, until, number = multiprocessing.get_context("spawn"), time.monotonic() + seconds, seed
+    context = multiprocessing.get_context("spawn")
+    until = time.monotonic() + seconds
+    number = seed
     while time.monotonic() < until:
         ours, theirs = context.Pipe()
         worker = context.Process(target=_work, args=(theirs, number, kinds), daemon=True)
         worker.start()
         theirs.close()
-        ended, first = False, True
+        ended = False
+        first = True
         while not ended and time.monotonic() < until:
-            kind, took = kinds[number % len(kinds)], 0.0
+            kind = kinds[number % len(kinds)]
+            took = 0.0
             try:
                 ended = not ours.poll(HANG_TIMEOUT)
                 result, said, took = ("fault", "it does not end", HANG_TIMEOUT) if ended else ours.recv()
             except EOFError:
                 worker.join()
-                ended, result, said = True, "fault", f"the process ended with {worker.exitcode}"
+                ended = True
+                result = "fault"
+                said = f"the process ended with {worker.exitcode}"
             took = 0.0 if first else took  # the first input loads compiled code
             if took > CPU_LIMIT and kind != "socket":
-                result, said = "fault", f"{took:.1f} s"
+                result = "fault"
+                said = f"{took:.1f} s"
             found.counts[kind, result] += 1
             found.slowest[kind] = max(found.slowest[kind], took)
             if result == "fault":
                 found.faults.append(f"{kind} {number}: {said}")
-            number, first = number + 1, False
+            number = number + 1
+            first = False
         worker.kill()
         worker.join()
     return found

@@ -69,7 +69,8 @@ def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
     if rng.random() < 0.2:
         data["goal"] = {"pose": POSE}
     if rng.random() < 0.1:
-        data["views"], data["unknown"] = [VIEW], "optimistic"
+        data["views"] = [VIEW]
+        data["unknown"] = "optimistic"
     else:
         data |= (*({},) * 3, EQUIPPED, CONSTRAINED, MOVING, IN_MOTION)[rng.integers(7)]
     ending = (".yaml", ".json", ".jsonl")[rng.integers(3)]
@@ -232,14 +233,16 @@ def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     from robotdiffuse.robots.kinematics import link_pose
 
     source = DATA / "panda"
-    text, meshes = (source / "robot.json").read_text(), (source / "meshes.npz").read_bytes()
+    text = (source / "robot.json").read_text()
+    meshes = (source / "meshes.npz").read_bytes()
     damage = rng.random() < 0.7
     content = text_of(rng, json.loads(text), ".json") if damage else text.encode()
     (folder / "robot.json").write_bytes(content)
     if not damage and rng.random() < 0.7:
         import io
 
-        stream, arrays = io.BytesIO(), dict(np.load(source / "meshes.npz"))
+        stream = io.BytesIO()
+        arrays = dict(np.load(source / "meshes.npz"))
         name = ("sizes", "vertices", "faces")[rng.integers(3)]
         flat = arrays[name] = arrays[name].copy()
         row = rng.integers(len(flat))
@@ -328,7 +331,8 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
     problem = problem_from_record(PROBLEM | {"scene": PROBLEM["scene"][:1]})
     rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3)
-    times, still = np.array([0.0, 10.0, 20.0]), np.zeros_like(rows)
+    times = np.array([0.0, 10.0, 20.0])
+    still = np.zeros_like(rows)
     trajectory = Trajectory(problem.robot.joint_names, times, rows, still, still)
     ending = (".json", ".yaml", ".csv", ".mcap", ".rosbag2")[rng.integers(5)]
     file = folder / f"motion{ending}"
@@ -385,7 +389,8 @@ def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Depth images, and the views that name them."""
     from PIL import Image
 
-    ending, image = (".png", ".npy", ".npz")[rng.integers(3)], rng.integers(0, 3000, (6, 8)).astype(np.uint16)
+    ending = (".png", ".npy", ".npz")[rng.integers(3)]
+    image = rng.integers(0, 3000, (6, 8)).astype(np.uint16)
     file = folder / f"depth{ending}"
     if ending == ".png":
         Image.fromarray(image).save(file)
@@ -469,7 +474,8 @@ def _npz(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
     from robotdiffuse.datasets.external import import_npz
 
-    stream, x = io.BytesIO(), np.zeros((2, 254, 7), np.float32)
+    stream = io.BytesIO()
+    x = np.zeros((2, 254, 7), np.float32)
     x += np.array(PROBLEM["start"], np.float32)
     y = np.concatenate([x[:, 0], x[:, -1], np.ones((2, 9), np.float32)], axis=1)
     if rng.random() < 0.3:

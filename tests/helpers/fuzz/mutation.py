@@ -112,7 +112,8 @@ def nasty(rng: np.random.Generator) -> Any:
 def damaged(rng: np.random.Generator, content: bytes) -> bytes:
     """Bytes with one to four changes: flipped, cut, doubled, or replaced by a token."""
     for _ in range(rng.integers(1, 5)):
-        at, action = int(rng.integers(len(content) + 1)), rng.integers(5)
+        at = int(rng.integers(len(content) + 1))
+        action = rng.integers(5)
         size = int(rng.integers(1, 30))
         token = TOKENS[rng.integers(len(TOKENS))]
         if action == 0:

@@ -183,7 +183,9 @@ def sent(rng: np.random.Generator, one: Draft, damaged: Any) -> Sent:
     whole = rng.random() < 0.15
     for _ in range(0 if whole else rng.integers(0, 4)):
         damage(rng, one)
-    name, answers, leaves = b"", 1, False
+    name = b""
+    answers = 1
+    leaves = False
     way = rng.integers(20)
     if way == 0:
         name = (b"mine", b"\xc3\xa9", b"a b", b"x" * 150)[rng.integers(4)]
@@ -196,7 +198,8 @@ def sent(rng: np.random.Generator, one: Draft, damaged: Any) -> Sent:
         cuts = np.sort(rng.integers(0, len(content) + 1, rng.integers(1, 5))).tolist()
         pieces = [content[a:b] for a, b in zip([0, *cuts], [*cuts, len(content)], strict=True)]
     elif way in (4, 5):
-        pieces, leaves = [content[: rng.integers(len(content) + 1)]], True
+        pieces = [content[: rng.integers(len(content) + 1)]]
+        leaves = True
     elif way == 6:
         pieces = [content[: rng.integers(len(content) + 1)]]
     elif way in (7, 8):
@@ -224,7 +227,8 @@ def exchange(address: tuple[str, int], sent: Sent) -> str:
         if sent.cancels:
             cancel = Draft(b"DELETE", b"/requests/" + b"".join(b"%%%02x" % byte for byte in sent.cancels))
             exchange(address, Sent([cancel.written], 1, False, b"", False))
-        stream, said = client.makefile("rb"), ""
+        stream = client.makefile("rb")
+        said = ""
         for _ in range(sent.answers):
             answer = _read(client, stream, until, sent.head)
             if answer is None:
@@ -340,7 +344,8 @@ class Server:
             raise WrongError(f"the server ended with {self.process.returncode}")
         if json.loads(self.answer(self.good))["waypoints"] != self.expected:
             raise WrongError("a good request has another answer")
-        until, state = time.monotonic() + LIMIT, {}
+        until = time.monotonic() + LIMIT
+        state = {}
         while time.monotonic() < until:
             state = json.loads(self.answer(Draft(b"GET", b"/health")))
             if state["workers_busy"] == state["requests_waiting"] == 0:

@@ -30,7 +30,9 @@ def arm(monkeypatch):
 def stored(tmp_path_factory):
     """Two shards of motions that bend towards the side of the obstacle, which is too far away to change
     clearances; and an encoder."""
-    home, arm, rng = tmp_path_factory.mktemp("stored"), box_arm(), np.random.default_rng(0)
+    home = tmp_path_factory.mktemp("stored")
+    arm = box_arm()
+    rng = np.random.default_rng(0)
     folder = home / "data"
     write_manifest(folder, manifest_of(arm))
     for i, n in enumerate((100, 60)):
@@ -39,7 +41,8 @@ def stored(tmp_path_factory):
         s = np.linspace(0, 1, STORED)[:, None]
         q = ends[0] * (1 - s) + ends[1] * s + 0.5 * side[:, None, None] * np.sin(np.pi * s)
         arrays = random_arrays(arm, n, rng)
-        kinds, params = np.zeros_like(arrays["obstacle_kinds"]), np.zeros_like(arrays["obstacle_params"])
+        kinds = np.zeros_like(arrays["obstacle_kinds"])
+        params = np.zeros_like(arrays["obstacle_params"])
         kinds[:, 0] = SPHERE
         params[:, 0, :4] = np.stack([0.01 * rng.random(n), 0.5 * side, 0 * side + 1, 0 * side + 0.2], -1)
         arrays |= {"trajectories": q, "obstacle_kinds": kinds, "obstacle_params": params}

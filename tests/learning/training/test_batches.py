@@ -20,7 +20,8 @@ WAYPOINTS = 48
 
 def test_random_scenes():
     scenes = random_scenes(300, 12, np.random.default_rng(0))
-    kinds, params = scenes.kinds, scenes.params
+    kinds = scenes.kinds
+    params = scenes.params
     assert set(np.unique(kinds)) == {0, SPHERE, BOX}
     assert (params[kinds == 0] == 0).all()
     assert (params[kinds == SPHERE, 3] > 0).all()
@@ -42,7 +43,8 @@ def test_codes_are_cached_beside_the_data(data, arm):
 
 
 def test_turned_copies_are_for_training_alone(data, arm):
-    encoder, messages = load_encoder(data.parent / "encoder"), []
+    encoder = load_encoder(data.parent / "encoder")
+    messages = []
     plain = load_data(str(data), arm, encoder, WAYPOINTS, messages.append)
     turned = load_data(str(data), arm, encoder, WAYPOINTS, messages.append, turned_copies=2)
     assert turned.validation == plain.validation and len(turned) > len(plain)

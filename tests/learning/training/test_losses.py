@@ -51,7 +51,8 @@ def test_distances_are_those_of_the_kernel(floor: bool) -> None:
 def test_the_hinge_and_its_gradient() -> None:
     rng = np.random.default_rng(2)
     scenes = PackedScenes.pack([ROP.scene(rng)], 2, floor=True)
-    arm, q = ArmDistance(DOUBLE), configurations(1, 6, 3).requires_grad_()
+    arm = ArmDistance(DOUBLE)
+    q = configurations(1, 6, 3).requires_grad_()
 
     def loss(at: torch.Tensor) -> torch.Tensor:
         return hinge(arm(at, scenes), 0.2).square().mean()

@@ -133,7 +133,8 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
     with pytest.raises(InputError, match="processes = '2', now it is '1'"):
         train_planner(settings, str(out / "parts"))
 
-    draw, gradients = Batches.draw, {}
+    draw = Batches.draw
+    gradients = {}
 
     def both(self, count, rng):
         if gradients:
@@ -247,7 +248,8 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
     losses = [float(row["loss"]) for row in read_log(out)]
     assert np.mean(losses[-3:]) < losses[0]
     model = exported_model("model", out, arm)
-    start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
+    start = np.array([-1.0, 0.2, 0.5])
+    goal = np.array([1.0, -0.3, 0.4])
     z = model.encode(np.zeros((0, 3)))
 
     def clearances(q):
@@ -302,7 +304,8 @@ def test_planner_learns_which_side(tmp_path, data, arm):
         load_data(str(data), arm, model.encoder, WAYPOINTS, print)
     )
     rng = np.random.default_rng(0)
-    start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
+    start = np.array([-1.0, 0.2, 0.5])
+    goal = np.array([1.0, -0.3, 0.4])
     for side in (-1.0, 1.0):
         scene = Scene([Box([0, 0, -0.05], [2, 2, 0.1]), Sphere([0.0, 0.5 * side, 1.0], 0.2)])
         z = model.encode(sample_surface(scene, 256, rng))
@@ -367,8 +370,10 @@ def test_trains_without_some_conditions(data, tmp_path):
 def test_motion_through_the_floor_or_an_obstacle_is_not_free() -> None:
     panda = load_robot("panda")
     start = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
-    beside, down = start.copy(), start.copy()
-    beside[0], down[1] = 1.0, 1.7
+    beside = start.copy()
+    down = start.copy()
+    beside[0] = 1.0
+    down[1] = 1.7
     motions = np.linspace([start, start], [beside, down], 5, axis=1)
     floor = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1))
     assert free_in_scene(CollisionChecker(panda, Scene([floor])), motions).tolist() == [True, False]

@@ -85,9 +85,12 @@ class Gaussian(MotionNetwork):
         condition: Float[Tensor, "batch condition"],
         dropped: Bool[Tensor, "batch"] | None = None,
     ) -> Float[Tensor, "batch rows dof"]:
-        at, x = round(float(level[0]) * self.schedule.steps), features.numpy()
-        signal, noise = float(self.schedule.signal[at]), float(self.schedule.noise[at])
-        inner, t = x[:, 1:-1].astype(np.float64), np.linspace(0, 1, x.shape[1])[1:-1, None]
+        at = round(float(level[0]) * self.schedule.steps)
+        x = features.numpy()
+        signal = float(self.schedule.signal[at])
+        noise = float(self.schedule.noise[at])
+        inner = x[:, 1:-1].astype(np.float64)
+        t = np.linspace(0, 1, x.shape[1])[1:-1, None]
         line = (1 - t) * x[:, :1] + t * x[:, -1:]
         total = signal**2 * bumps(x.shape[1]) + noise**2 * np.eye(x.shape[1] - 2)
         seen = noise * np.linalg.solve(total, inner - signal * line)
@@ -103,7 +106,8 @@ def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
     """Lines with bumps around one ball; a third of them are marked trivial."""
     rng = np.random.default_rng(1)
     t = np.linspace(0, 1, waypoints)[:, None]
-    middle, half = (PANDA.lower + PANDA.upper) / 2, (PANDA.upper - PANDA.lower) / 2
+    middle = (PANDA.lower + PANDA.upper) / 2
+    half = (PANDA.upper - PANDA.lower) / 2
     ends = middle + half * rng.uniform(-0.6, 0.6, (2, count, 1, PANDA.dof))
     q = (1 - t) * ends[0] + t * ends[1] + 0.3 * np.sin(np.pi * t) * rng.normal(size=(count, 1, PANDA.dof))
     scenes = PackedScenes.pack([Scene([BALL])] * count, 1)
@@ -118,7 +122,9 @@ def stay(q: ndarray, _left: int) -> ndarray:
 @pytest.mark.slow
 def test_the_loss_falls() -> None:
     torch.manual_seed(0)
-    network, data, rng = MotionNetwork(RANGES, SMALL), data_of(32), np.random.default_rng(0)
+    network = MotionNetwork(RANGES, SMALL)
+    data = data_of(32)
+    rng = np.random.default_rng(0)
     batches = Batches(data, network, lambda _scenes, _q: np.zeros(0), 0.1, None)
     loss_of = PlannerLoss(network, PANDA, TRAINING, Processes("cpu"))
     optimizer = torch.optim.AdamW(network.parameters(), lr=4e-3)
@@ -136,7 +142,8 @@ def test_the_loss_falls() -> None:
 
 
 def test_share_of_trivial_motions() -> None:
-    data, rng = data_of(30), np.random.default_rng(0)
+    data = data_of(30)
+    rng = np.random.default_rng(0)
     drawn = data.draw(4000, 0.2, rng)
     assert data.trivial[drawn].mean() == pytest.approx(0.2, abs=0.02)
     assert set(np.unique(drawn)) == set(range(30))
@@ -165,7 +172,8 @@ def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> N
 
 def test_samples_hold_their_ends_exactly() -> None:
     torch.manual_seed(0)
-    network, rng = MotionNetwork(RANGES, SMALL), np.random.default_rng(0)
+    network = MotionNetwork(RANGES, SMALL)
+    rng = np.random.default_rng(0)
     starts, goals = (rng.uniform(PANDA.lower, PANDA.upper, (3, PANDA.dof)).astype(np.float32) for _ in "ab")
 
     def guide(q: ndarray, left: int) -> ndarray:
@@ -218,7 +226,8 @@ def test_the_process_is_that_of_natural_splines() -> None:
     expected = []
     for motion in q:
         second = CubicSpline(np.arange(12), motion, bc_type="natural")(np.arange(12), 2)
-        a, b = second[:-1], second[1:]
+        a = second[:-1]
+        b = second[1:]
         expected.append(0.5 * ((a * a + a * b + b * b) / 3).sum())
     assert process_costs(q) == pytest.approx(expected)
     line = np.linspace(0, 1, 12)[None, :, None] * np.ones((1, 1, 2))
@@ -227,12 +236,15 @@ def test_the_process_is_that_of_natural_splines() -> None:
 
 def test_the_precision_is_that_of_the_process() -> None:
     """Against the covariance of the process propagated from a vague first state."""
-    waypoints, vague = 8, 1e3 * np.eye(2)
-    transition, noise = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
+    waypoints = 8
+    vague = 1e3 * np.eye(2)
+    transition = np.array([[1.0, 1.0], [0.0, 1.0]])
+    noise = np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
     covariance = np.zeros((2 * waypoints, 2 * waypoints))
     covariance[:2, :2] = vague
     for i in range(1, waypoints):
-        here, before = slice(2 * i, 2 * i + 2), slice(2 * i - 2, 2 * i)
+        here = slice(2 * i, 2 * i + 2)
+        before = slice(2 * i - 2, 2 * i)
         covariance[here, : 2 * i] = transition @ covariance[before, : 2 * i]
         covariance[: 2 * i, here] = covariance[here, : 2 * i].T
         covariance[here, here] = transition @ covariance[before, before] @ transition.T + noise
@@ -387,7 +399,8 @@ def test_training_stopped_and_continued_ends_the_same(
     write_motions(tmp_path / "data", PANDA, random_motions(PANDA, 40))
     asked = ["train", "baseline", "trajectory_prior", "--data", str(tmp_path / "data")]
     asked += ["--samples", "80", "--batch", "8"]
-    original, steps = PlannerLoss.__call__, 0
+    original = PlannerLoss.__call__
+    steps = 0
 
     def interrupted(self: PlannerLoss, *given):
         nonlocal steps

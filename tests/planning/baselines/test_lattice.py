@@ -41,7 +41,8 @@ SPACING = 0.35
 
 
 def scene_of_spheres(rng: np.random.Generator, count: int = 5) -> Scene:
-    angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.35, 1.3, count)
+    angle = rng.uniform(-np.pi, np.pi, count)
+    distance = rng.uniform(0.35, 1.3, count)
     centers = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), np.zeros(count)])
     return Scene([Sphere(center, rng.uniform(0.05, 0.15)) for center in centers])
 
@@ -59,14 +60,18 @@ def least_cost(
     checker: CollisionChecker, start: np.ndarray, goals: np.ndarray, settings: LatticeSettings
 ) -> float:
     """The least cost by Dijkstra's algorithm over the whole graph."""
-    lower, upper, origin = ARM.lower, ARM.upper, start.astype(float)
+    lower = ARM.lower
+    upper = ARM.upper
+    origin = start.astype(float)
     low = np.ceil((lower - origin) / SPACING).astype(int)
     high = np.floor((upper - origin) / SPACING).astype(int)
     nodes = list(product(*(range(a, b + 1) for a, b in zip(low, high, strict=True))))
     number = {node: i for i, node in enumerate(nodes)}
     q = (origin + SPACING * np.array(nodes)).astype(np.float32)
     free = checker.free(q)
-    pairs, ends, costs = [], [], []
+    pairs = []
+    ends = []
+    costs = []
     for move in product((-1, 0, 1), repeat=3):
         joints = np.abs(move).sum()
         if not 0 < joints <= settings.joints_per_move or next(step for step in move if step) < 0:
@@ -142,7 +147,8 @@ def test_repairs_cost_what_a_new_search_costs(seed, joints):
     """Obstacles move, appear and disappear, while the arm moves along its path."""
     checker, start, goals, rng = arm_problem(seed)
     settings = DStarLiteSettings(spacing=0.3, joints_per_move=joints, resolution=0.02)
-    search, at = DStarLiteSearch(checker, start, goals, settings), None
+    search = DStarLiteSearch(checker, start, goals, settings)
+    at = None
     cost_of(search)
     for step in range(6):
         shapes = list(checker.scene.shapes)
@@ -169,7 +175,8 @@ def test_repairs_cost_what_a_new_search_costs(seed, joints):
 
 
 def test_repairs_of_small_changes_expand_less():
-    repaired, fresh = 0, 0
+    repaired = 0
+    fresh = 0
     for seed in range(10):
         checker, start, goals, rng = arm_problem(seed)
         settings = DStarLiteSettings(spacing=0.15, resolution=0.02)
@@ -310,7 +317,8 @@ def test_two_arms_do_not_outrun_the_time_limit(settings: AStarSettings | DStarLi
     """Regression: with 14 joints 200 expansions checked 78,400 edges between two readings of the clock, which
     took a second; before that, moves of two joints were selected from all 3^14, for half a minute."""
     baxter = load_robot("baxter")
-    rng, checker = np.random.default_rng(0), CollisionChecker(baxter, Scene())
+    rng = np.random.default_rng(0)
+    checker = CollisionChecker(baxter, Scene())
     q = rng.uniform(baxter.lower, baxter.upper, (2000, 14)).astype(np.float32)
     start, goal = q[checker.free(q)][:2]
     search = AStarSearch if isinstance(settings, AStarSettings) else DStarLiteSearch

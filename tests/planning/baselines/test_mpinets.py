@@ -70,7 +70,9 @@ def clouds_of(network: MPiNetsNetwork, count: int, seed: int = 0) -> torch.Tenso
 @pytest.mark.parametrize("points", [20, 300])
 def test_grouping_is_that_of_brute_force(points: int) -> None:
     cloud = np.random.default_rng(points).normal(size=(3, points, 3)).astype(np.float32)
-    count, most, radius = 12, 7, 0.8
+    count = 12
+    most = 7
+    radius = 0.8
     centres, around = group_points(torch.from_numpy(cloud), count, most, radius)
     for x, chosen, near in zip(cloud.astype(np.float64), centres, around, strict=True):
         distance = np.linalg.norm(x[:, None] - x[None], axis=2)
@@ -109,7 +111,8 @@ def test_samples_are_steps_of_the_motions(network: MPiNetsNetwork) -> None:
 def test_loss_falls_on_few_motions() -> None:
     torch.manual_seed(0)
     network = MPiNetsNetwork(RANGES, replace(SMALL, noise=0.0))
-    data, rng = line_data(False), np.random.default_rng(0)
+    data = line_data(False)
+    rng = np.random.default_rng(0)
     network.fit_statistics(data)
     optimizer = torch.optim.Adam(network.parameters(), 3e-3)
     losses = []

@@ -49,7 +49,8 @@ def network(settings: MPNetSettings = SMALL, seed: int = 0) -> MPNetNetwork:
 
 def motions(waypoints: int = 48) -> TrajectoryData:
     """Motions from left to right over walls of several heights, and back; and a straight one."""
-    q, scenes = [], []
+    q = []
+    scenes = []
     s = np.linspace(0, 1, waypoints)[:, None]
     for i, height in enumerate((0.3, 0.4, 0.5, 0.6)):
         way = (1 - s) * LEFT + s * RIGHT + height * np.sin(np.pi * s) * np.eye(7)[1] * -1.5
@@ -63,7 +64,9 @@ def motions(waypoints: int = 48) -> TrajectoryData:
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> str:
     """A folder with a small network after some training."""
-    net, data, rng = network(), motions(), np.random.default_rng(0)
+    net = network()
+    data = motions()
+    rng = np.random.default_rng(0)
     net.fit_statistics(data)
     optimizer = torch.optim.Adam(net.parameters(), 3e-3)
     for step in range(80):
@@ -80,7 +83,8 @@ def planning(weights: str, problem: Problem, **changes: object) -> NeuralPlannin
     settings = replace(MPNetPlannerSettings(weights), **changes)
     checker = CollisionChecker(problem.robot, problem.scene)
     start_goal = StartGoal(checker, problem.start, np.array([RIGHT]))
-    context, rng = PlanningContext("mpnet", problem, PlanRequest(60.0)), np.random.default_rng(1)
+    context = PlanningContext("mpnet", problem, PlanRequest(60.0))
+    rng = np.random.default_rng(1)
     return NeuralPlanning(context, start_goal, network(), settings, rng)
 
 
@@ -90,7 +94,9 @@ def wall_problem(scene: Scene = WALL) -> Problem:
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0], ids=["auto-encoder", "end to end"])
 def test_the_loss_falls(fraction: float) -> None:
-    net, data, rng = network(), motions(), np.random.default_rng(0)
+    net = network()
+    data = motions()
+    rng = np.random.default_rng(0)
     net.fit_statistics(data)
     optimizer = torch.optim.Adam(net.parameters(), 3e-3)
     losses = []
@@ -100,7 +106,8 @@ def test_the_loss_falls(fraction: float) -> None:
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-    first, last = np.mean(losses[:5]), np.mean(losses[-20:])
+    first = np.mean(losses[:5])
+    last = np.mean(losses[-20:])
     assert last < 0.6 * first
     if fraction:
         assert last < 0.8, "straight steps have a loss of 1"
@@ -129,7 +136,8 @@ def test_the_contractive_penalty_is_the_jacobian_squared(code: int, draws: int, 
 
 
 def test_waypoints_are_a_step_apart_or_the_goal() -> None:
-    net, data = network(replace(SMALL, step=0.5)), motions()
+    net = network(replace(SMALL, step=0.5))
+    data = motions()
     here, following, goal = net.training_samples(data.q, np.random.default_rng(0))
     moved = np.linalg.norm(following - here, axis=1)
     at_goal = (following == goal).all(1)
@@ -141,7 +149,8 @@ def test_waypoints_are_a_step_apart_or_the_goal() -> None:
 
 
 def test_the_order_of_the_points_does_not_matter_and_no_points_are_zeros() -> None:
-    net, rng = network(), np.random.default_rng(0)
+    net = network()
+    rng = np.random.default_rng(0)
     cloud = torch.from_numpy(rng.uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.9], (2, 40, 3)).astype(np.float32))
     shuffled = cloud[:, torch.from_numpy(rng.permutation(40))]
     torch.testing.assert_close(net.encode(cloud), net.encode(shuffled))
@@ -155,7 +164,8 @@ def test_the_order_of_the_points_does_not_matter_and_no_points_are_zeros() -> No
 
 def test_dropout_is_on_in_planning_and_drawn_from_the_generator(weights: str) -> None:
     net = network().eval()
-    z, q = torch.zeros(1, 8), torch.from_numpy(LEFT[None].astype(np.float32))
+    z = torch.zeros(1, 8)
+    q = torch.from_numpy(LEFT[None].astype(np.float32))
     goal = torch.from_numpy(RIGHT[None].astype(np.float32))
     generator = torch.Generator().manual_seed(0)
     first, second = (net.next_states(z, q, goal, generator) for _ in range(2))
@@ -192,7 +202,8 @@ def test_contraction_never_lengthens_and_stays_free(weights: str) -> None:
     over = np.array(
         [LEFT, [0.45, -0.3, 0, -1.9, 0, 2.2, 0.785], UP, [-0.45, -0.3, 0, -1.9, 0, 2.2, 0.785], RIGHT]
     )
-    rng, tried = np.random.default_rng(0), 0
+    rng = np.random.default_rng(0)
+    tried = 0
     for _ in range(30):
         path = np.repeat(over, 2, axis=0)
         path[1:-1] += rng.normal(0, 0.08, path[1:-1].shape)

@@ -95,7 +95,8 @@ def test_a_goal_where_the_arm_stands(planner):
 
 @every
 def test_one_of_several_goals(planner):
-    blocked, near = np.append(0.0, LEFT[1:]), LEFT + 0.05
+    blocked = np.append(0.0, LEFT[1:])
+    near = LEFT + 0.05
     several = problem(blocked, RIGHT, near)
     assert explain_collision(PANDA, WALL, blocked) is not None
     result = plan(planner, several)
@@ -212,7 +213,10 @@ class UncheckedStartGoal(planners.StartGoal):
 
     def __init__(self, *_):
         self.checker = CollisionChecker(PANDA, WALL)
-        self.start, self.start_lead, self.goals, self.goal_leads = LEFT, LEFT, [RIGHT], [RIGHT]
+        self.start = LEFT
+        self.start_lead = LEFT
+        self.goals = [RIGHT]
+        self.goal_leads = [RIGHT]
 
 
 OMPL_CHECKS = planners.ob.MotionValidator, planners.ob.StateValidityChecker

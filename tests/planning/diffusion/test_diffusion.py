@@ -31,13 +31,16 @@ assert MODEL is not None
 
 def samples_of(seed: int) -> list[Path]:
     """The first batch for the problem, drawn as the planner draws it."""
-    planner, checker, rng = Diffusion(), CollisionChecker(PANDA, PROBLEM.scene), np.random.default_rng(seed)
+    planner = Diffusion()
+    checker = CollisionChecker(PANDA, PROBLEM.scene)
+    rng = np.random.default_rng(seed)
     assert MODEL is not None
     code = encode(MODEL, checker, planner.settings.points, rng)
     ends = LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
     drawn = planner.draw(MODEL, checker, code, *ends, rng)
     for q in drawn:
-        q[0], q[-1] = LEFT, RIGHT
+        q[0] = LEFT
+        q[-1] = RIGHT
     return [Path(PANDA.joint_names, q) for q in drawn]
 
 

@@ -148,14 +148,17 @@ def test_the_first_path_comes_before_the_network_runs(monkeypatch):
 
 def test_the_network_is_loaded_before_the_clock_starts(monkeypatch):
     """So it has its turn from the first call on, however short the limit, and costs that call nothing."""
-    order, model, solve = [], RobotDiffuse.model, RobotDiffuse.solve
+    order = []
+    model = RobotDiffuse.model
+    solve = RobotDiffuse.solve
     monkeypatch.setattr(
         RobotDiffuse, "model", lambda self, robot: order.append("model") or model(self, robot)
     )
     monkeypatch.setattr(
         RobotDiffuse, "solve", lambda self, *given: order.append("solve") or solve(self, *given)
     )
-    drawn, draw = [], RobotDiffuse.draw
+    drawn = []
+    draw = RobotDiffuse.draw
     monkeypatch.setattr(RobotDiffuse, "draw", lambda *given: drawn.append(1) or draw(*given))
     planner = RobotDiffuse(RobotDiffuseSettings(network_share=0.9))  # which is due soon after the path
     planner.plan(PROBLEM, time_limit=2.0, until="time_limit", objective="length")
@@ -205,7 +208,9 @@ STRANGER = Problem(replace(PANDA, name="stranger"), Scene([BALL]), LEFT, JointGo
 @pytest.fixture
 def noise_at(monkeypatch):
     """The iterations of search before each batch of smooth noise, and whether there was a path."""
-    drawn, searches, search_of = [], [], AnytimeSearch.of
+    drawn = []
+    searches = []
+    search_of = AnytimeSearch.of
 
     def search(*arguments):
         searches.append(search_of(*arguments))
@@ -263,7 +268,8 @@ def test_encodings_distinguish_scenes():
 
 
 def test_the_guidance_scale_reaches_the_network():
-    checker, model = CollisionChecker(PANDA, PROBLEM.scene), exported_model("model", None, PANDA)
+    checker = CollisionChecker(PANDA, PROBLEM.scene)
+    model = exported_model("model", None, PANDA)
     code = encode(model, checker, 320, np.random.default_rng(0))
     plain, same, strong = (
         RobotDiffuse(RobotDiffuseSettings(samples=2, guidance_steps=0, guidance_scale=scale)).draw(

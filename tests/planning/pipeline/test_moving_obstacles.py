@@ -39,7 +39,8 @@ def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | 
     assert found.status is Status.SOLVED, found.reason
     assert found.trajectory is not None
     assert verify_trajectory(task, found.trajectory).valid
-    motion, least = found.trajectory, np.inf
+    motion = found.trajectory
+    least = np.inf
     for t in np.arange(0.0, motion.duration, 0.02):
         q = np.array([np.interp(t, motion.times, column) for column in motion.positions.T])
         exact = ExactCollision(PANDA, rd.Scene([obstacle.at(t)]))

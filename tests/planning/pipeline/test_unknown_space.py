@@ -122,7 +122,8 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
     assert result.assumption == "unknown is occupied" and result.confidence == RATES["unknown is occupied"]
     assert result.path is not None
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, near)]).astype(np.float32)
-    swept, path = np.zeros(SHAPE, np.bool_), result.path.positions.astype(np.float32)
+    swept = np.zeros(SHAPE, np.bool_)
+    path = result.path.positions.astype(np.float32)
     sweep(compile_robot(PANDA), path, np.float32(0), *COARSE.frame, swept)
     filled = COARSE.within(ends, CARVING_MARGIN + VOXEL / 2)
     unknown = observe(problem.views, PANDA, START).unknown & ~filled

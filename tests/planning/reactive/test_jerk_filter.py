@@ -17,17 +17,22 @@ def test_limits_hold_at_every_time_however_often_the_arm_brakes(seed: int) -> No
     rng = np.random.default_rng(seed)
     jerk = PANDA.acceleration * 10 ** rng.uniform(0.5, 3.0)
     jerk[rng.random(7) < 0.2] = np.inf
-    step, period = rng.choice([0.001, 0.005, 0.01]), rng.choice([0.02, 0.0137])
+    step = rng.choice([0.001, 0.005, 0.01])
+    period = rng.choice([0.02, 0.0137])
     waypoints = np.cumsum(rng.normal(size=(5, 7)) * 0.3, axis=0)
     line = BlendedPolyline(waypoints, half_widths(waypoints, np.full(3, 0.1)))
     filtered = JerkFilter(PANDA, jerk, step, waypoints[0])
-    path, given = TimedPath(PANDA, filtered.acceleration, line, True), SpeedProfile(np.zeros(2), np.zeros(2))
+    path = TimedPath(PANDA, filtered.acceleration, line, True)
+    given = SpeedProfile(np.zeros(2), np.zeros(2))
     dense = path.coarse(path.onwards(0.0, 0.0), 0.002)[1]
-    reach, since, last = motion_radii(PANDA).max(axis=0), 0.0, None
+    reach = motion_radii(PANDA).max(axis=0)
+    since = 0.0
+    last = None
     for k in range(400):
         now = k * period
         filtered.advance(path, given, since, now)
-        given, since = given.rest(now - since), now
+        given = given.rest(now - since)
+        since = now
         if k % 11 < 8 and given.s[0] < path.end:  # else the arm brakes for a while
             given = path.on_then_rest(float(given.s[0]), float(given.speeds[0]), period)
         motion = filtered.follow(path, given)

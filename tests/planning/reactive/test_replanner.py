@@ -18,7 +18,8 @@ from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")
 START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
-SPEED, PERIOD = 0.4, 0.02
+SPEED = 0.4
+PERIOD = 0.02
 FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
 
 
@@ -43,7 +44,9 @@ def test_every_command_is_a_certified_stop(count: int, seed: int) -> None:
     replanner = loop(places)
     names = [one.name for one in replanner.problem.moving]
     jerk = jerk_limits(PANDA)
-    before, renewed, arrived = None, 0, False
+    before = None
+    renewed = 0
+    arrived = False
     for k in range(600):
         now = k * PERIOD
         seen = places + now * velocities
@@ -76,7 +79,8 @@ def test_every_command_is_a_certified_stop(count: int, seed: int) -> None:
             )
             violation = verify_trajectory(still, motion).violation
             assert violation is None, violation
-        before, arrived = command, command.arrived
+        before = command
+        arrived = command.arrived
         if arrived:
             break
     assert arrived
@@ -107,7 +111,8 @@ def test_a_late_step_finds_the_arm_where_the_last_command_left_it() -> None:
 def test_steps_of_two_threads_follow_each_other() -> None:
     replanner = loop(np.array([[0.5, 1.5, 0.5]]))
     clock = counted(1)
-    commands, refused = list[Any](), list[str]()
+    commands = list[Any]()
+    refused = list[str]()
     reading = Lock()
 
     def steps(_: int) -> None:
@@ -208,7 +213,9 @@ def test_the_replanner_refuses_what_it_does_not_support(what: str) -> None:
 @pytest.mark.parametrize("goal", ["start", "pose", "here"])
 def test_a_new_goal_is_reached_from_where_the_motion_ends(goal: str) -> None:
     replanner = loop(np.array([[0.0, -3.0, 0.5]]))
-    seen, command, before = {"sphere": [0.0, -3.0, 0.5]}, None, None
+    seen = {"sphere": [0.0, -3.0, 0.5]}
+    command = None
+    before = None
     pose = rd.PoseGoal("panda_hand", PANDA.fk(START))
     for k in range(600):
         command = replanner.step(seen, k * PERIOD)

@@ -40,7 +40,9 @@ def ends() -> tuple[np.ndarray, np.ndarray]:
 def test_paths_are_below_the_bound_and_join_the_ends() -> None:
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)
     start, goals = ends()
-    longest, bound, found = np.float32(1.0), np.float32(np.inf), 0
+    longest = np.float32(1.0)
+    bound = np.float32(np.inf)
+    found = 0
     state = random_state(0)
     for _ in range(20):
         trees = rrt_kernel.make_trees(start, goals, 20_000)
@@ -52,15 +54,14 @@ def test_paths_are_below_the_bound_and_join_the_ends() -> None:
         assert motions_free(space, path).all()
         for tree in (0, 1):  # costs are the lengths of the ways from the roots
             size = trees.sizes[tree]
-            nodes, parents, costs = (
-                trees.nodes[tree, :size],
-                trees.parents[tree, :size],
-                trees.costs[tree, :size],
-            )
+            nodes = trees.nodes[tree, :size]
+            parents = trees.parents[tree, :size]
+            costs = trees.costs[tree, :size]
             for n in np.flatnonzero(parents >= 0):
                 step = np.linalg.norm(nodes[n] - nodes[parents[n]])
                 assert costs[n] == pytest.approx(costs[parents[n]] + step, abs=1e-3)
-        bound, found = np.float32(path_length(path)), found + 1
+        bound = np.float32(path_length(path))
+        found = found + 1
     assert found >= 3
 
 
@@ -97,7 +98,8 @@ def test_samples_are_in_the_spheroid_of_a_goal() -> None:
     bound = np.float32(1.3 * np.linalg.norm(goals[0] - start))
     far = np.full(7, 10.0, np.float32)
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)._replace(lower=-far, upper=far)
-    state, q = random_state(3), np.empty(7, np.float32)
+    state = random_state(3)
+    q = np.empty(7, np.float32)
     shares = rrt_kernel.goal_shares(start, goals, bound)
     assert 0 < shares[0] < shares[1] == 1
     near = np.zeros(2)
@@ -161,7 +163,8 @@ def test_a_clearance_above_the_default_falls_back_through_it() -> None:
 
 def test_the_clearance_of_a_call_overrides_that_of_the_problem() -> None:
     wide = Problem(PANDA, WALL, LEFT, RIGHT, clearance=0.05)
-    kept, less = AORRTC().plan(wide, 5.0), AORRTC().plan(wide, 5.0, clearance=0.0)
+    kept = AORRTC().plan(wide, 5.0)
+    less = AORRTC().plan(wide, 5.0, clearance=0.0)
     assert kept.trajectory is not None and less.trajectory is not None
     assert kept.trajectory.duration > less.trajectory.duration
     with pytest.raises(InputError, match=r"clearance is -0\.1; it must be a distance from 0 to 0.5 m"):
@@ -234,7 +237,8 @@ def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.Mon
 def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)
     for seed in range(5):
-        state, trees = random_state(seed), rrt_kernel.make_trees(*ends(), 5_000)
+        state = random_state(seed)
+        trees = rrt_kernel.make_trees(*ends(), 5_000)
         path = rrt_kernel.search(space, None, trees, rrt_kernel.INFINITE, np.float32(1.0), 100_000, state)
         for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300)):
             short = tighten(space, simplify(space, path, rounds), tries, state)

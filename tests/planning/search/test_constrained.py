@@ -53,7 +53,8 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
     if isinstance(constraint, rd.OnLine):
         off = np.linalg.norm(np.cross(p - constraint.point, constraint.direction), axis=1)
         return float(off.max()) - constraint.tolerance
-    first, last = link_pose(PANDA, START, HAND), link_pose(PANDA, GOAL, HAND)
+    first = link_pose(PANDA, START, HAND)
+    last = link_pose(PANDA, GOAL, HAND)
     way = last[:3, 3] - first[:3, 3]
     share = np.clip((p - first[:3, 3]) @ way / (way @ way), 0, 1)
     off = np.linalg.norm(p - first[:3, 3] - share[:, None] * way, axis=1) - constraint.tolerance

@@ -102,7 +102,8 @@ def test_shortcuts_keep_ends_and_freedom_and_do_not_lengthen():
 def test_search_can_be_continued():
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)
     trees = rrt_kernel.make_trees(LEFT.astype(np.float32), RIGHT[None].astype(np.float32), 5000)
-    state, sizes = random_state(1), []
+    state = random_state(1)
+    sizes = []
     for _ in range(1000):
         if len(rrt_kernel.search(space, None, trees, rrt_kernel.INFINITE, np.float32(0.3), 1, state)):
             break

@@ -56,7 +56,9 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
     h = axis[1] - axis[0]
     free = checker.free(np.array(list(product(axis, axis)))).reshape(cells, cells)
     steps = [(i, j) for i, j in product(range(-5, 6), repeat=2) if gcd(i, j) == 1]
-    rows, columns, lengths = [], [], []
+    rows = []
+    columns = []
+    lengths = []
     number = np.arange(cells * cells).reshape(cells, cells)
     for i, j in steps:
         here = np.s_[max(0, -i) : cells - max(0, i), max(0, -j) : cells - max(0, j)]
@@ -64,7 +66,8 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
         open_ = free[here] & free[there]
         # nodes that a long step passes over must be free too
         for t in np.arange(1, max(abs(i), abs(j))) / max(abs(i), abs(j)):
-            a, b = round(t * i), round(t * j)
+            a = round(t * i)
+            b = round(t * j)
             middle = np.s_[max(0, -i) + a : cells - max(0, i) + a, max(0, -j) + b : cells - max(0, j) + b]
             open_ = open_ & free[middle]
         rows.append(number[here][open_])
@@ -95,11 +98,10 @@ def test_rrt_star_alone_converges_to_the_optimum(planar) -> None:
     assert optimum > 1.1 * np.linalg.norm(goal - start), "the straight line must not do"
     space = search_space(checker, 0.01)
     start = start.astype(np.float32)
-    trees, goals = (
-        rrt_kernel.make_trees(start, np.empty((0, 2), np.float32), 60_000),
-        make_goals(start, goal[None]),
-    )
-    state, costs = random_state(0), []
+    trees = rrt_kernel.make_trees(start, np.empty((0, 2), np.float32), 60_000)
+    goals = make_goals(start, goal[None])
+    state = random_state(0)
+    costs = []
     for iterations in (500, 3_000, 30_000):
         grow(space, trees, goals, np.float32(0.5), iterations, state)
         costs.append(float(trees.costs[0, goals.node[0]]) / optimum)
@@ -124,7 +126,8 @@ def consistent(trees: rrt_kernel.Trees) -> None:
         parent = int(trees.parents[0, node])
         gap = np.linalg.norm(trees.nodes[0, node].astype(float) - trees.nodes[0, parent])
         assert abs(trees.costs[0, node] - trees.costs[0, parent] - gap) < 1e-3
-        siblings, child = [], int(trees.children[0, parent])
+        siblings = []
+        child = int(trees.children[0, parent])
         while child >= 0:
             siblings.append(child)
             child = int(trees.siblings[0, child])
@@ -155,7 +158,8 @@ def test_nearest_nodes_are_those_of_brute_force(count: int, dof: int, most: int,
     # rounded: many equal coordinates, and copies
     points = rng.normal(size=(count, dof)).round(int(rng.integers(1, 6))).astype(np.float32)
     trees = rrt_kernel.make_trees(points[0], points, count)
-    index, squares = np.empty(most, np.int32), np.empty(most, np.float32)
+    index = np.empty(most, np.int32)
+    squares = np.empty(most, np.float32)
     for q in rng.normal(size=(5, dof)).astype(np.float32):
         found = rrt_kernel.nearest_few(trees, 1, q, index, squares)
         assert found == min(most, count) == len(set(index[:found].tolist()))
@@ -170,15 +174,19 @@ def test_samples_fill_the_hyperspheroid_evenly() -> None:
     a, b = rng.normal(size=(2, 4)).astype(np.float32)
     wide = np.full(4, 100, np.float32)
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)._replace(lower=-wide, upper=wide)
-    gap, state = np.float32(np.linalg.norm(b - a)), random_state(0)
-    length, inner = np.float32(1.5) * gap, np.float32(1.2) * gap
-    out, sums = np.empty(4, np.float32), []
+    gap = np.float32(np.linalg.norm(b - a))
+    state = random_state(0)
+    length = np.float32(1.5) * gap
+    inner = np.float32(1.2) * gap
+    out = np.empty(4, np.float32)
+    sums = []
     for _ in range(20_000):
         rrt_kernel.sample_within(space, a, b, length, out, state)
         sums.append(np.linalg.norm(out - a) + np.linalg.norm(out - b))
     assert max(sums) <= length * 1.0001
     volume = [c * (c**2 - gap**2) ** 1.5 for c in (inner, length)]
-    share, expected = np.mean(np.array(sums) < inner), volume[0] / volume[1]
+    share = np.mean(np.array(sums) < inner)
+    expected = volume[0] / volume[1]
     assert abs(share - expected) < 4 * np.sqrt(expected / 20_000)
 
 
@@ -243,7 +251,8 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
     arm = two_joints()
     arm = arm.with_locked({arm.joint_names[1]: 0.0})
     checker = CollisionChecker(arm, Scene([Sphere([0.87, 0.0, side * 0.16], 0.1) for side in (1, -1)]))
-    start, goal = np.array([-0.9]), np.array([0.9])
+    start = np.array([-0.9])
+    goal = np.array([0.9])
     least = checker.link_clearances(np.linspace(start, goal, 200)).min()
     assert 0.01 < least < 0.02
     search = SharedTreeSearch(checker, start, goal[None], ENDLESS, random_state(0))

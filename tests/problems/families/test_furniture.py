@@ -104,7 +104,8 @@ def test_regions_are_free_and_in_reach(name: str) -> None:
 
 
 def turned(yaw: float) -> np.ndarray:
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
@@ -152,7 +153,8 @@ def test_tables_as_their_settings_say() -> None:
 def test_doors_hang_on_the_edges_of_cells_and_drawers_have_room_inside() -> None:
     """Every door begins at an upright, whatever its angle; some are shut, some open beyond a right angle."""
     cabinet = replace(CABINET, turn=(0.0, 0.0), bearing=(0.0, 0.0), distance=(0.6, 0.6))
-    angles, drawers = [], 0
+    angles = []
+    drawers = 0
     rng = np.random.default_rng(8)
     for _ in range(60):
         shapes, regions = cabinet.build(rng)
@@ -229,7 +231,9 @@ def test_problems_for_a_panda_are_possible_and_hard(panda: Robot, name: str) -> 
     scenes; the line between the two configurations is not free in 0.97, 0.81, 0.75 of these."""
     rng = np.random.default_rng(7)
     quick = InverseKinematicsSettings(max_rounds=2, patience=1)
-    scenes, possible, hard = 10, 0, 0
+    scenes = 10
+    possible = 0
+    hard = 0
     for _ in range(scenes):
         furnished = FURNITURE[name].furnish(rng, base_spheres(panda))
         checker = CollisionChecker(panda, furnished.scene)

@@ -18,7 +18,8 @@ FLOOR = 1
 def test_papers_scenes() -> None:
     rng = np.random.default_rng(0)
     shapes = [shape for _ in range(300) for shape in ROP.scene(rng).shapes]
-    floors, obstacles = shapes[::3], [shape for shape in shapes if shape.name != "floor"]
+    floors = shapes[::3]
+    obstacles = [shape for shape in shapes if shape.name != "floor"]
     assert len(obstacles) == 600
     for floor in floors:
         assert isinstance(floor, Box) and floor.name == "floor"

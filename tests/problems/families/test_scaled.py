@@ -44,7 +44,8 @@ def test_problems_of_an_arm_of_five_joints_and_a_third_of_the_reach(name: str) -
     tips = np.array([link_pose(SMALL, row, SMALL.tip)[:3, 3] for row in q])
     assert ((tips >= family.region[0]) & (tips <= family.region[1])).all()
     np.testing.assert_allclose(tips[1:], [drawn.T_base_tip[:3, 3]] * len(drawn.goals), atol=1e-5)
-    floor, theirs = family.floor, load_family(name).floor
+    floor = family.floor
+    theirs = load_family(name).floor
     assert floor is not None and theirs is not None
     np.testing.assert_array_equal(floor.size, 0.4 * theirs.size)
     np.testing.assert_array_equal(drawn.scene.shapes[0].bounds, floor.bounds)

@@ -418,7 +418,8 @@ def test_files_are_looked_up_from_the_problem(tmp_path: Path, monkeypatch: pytes
 
 def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
     folder = DATA / "motion_bench_maker"
-    scene, request = str(folder / "scene0001.yaml"), str(folder / "request0001.yaml")
+    scene = str(folder / "scene0001.yaml")
+    request = str(folder / "request0001.yaml")
     loaded = load_problem(written(tmp_path, GOOD | {"scene": scene}))
     assert [shape.name for shape in loaded.scene.shapes] == ["can", "board"]
     loaded = load_problem(written(tmp_path, {"robot": "panda", "scene": scene, "request": request}))

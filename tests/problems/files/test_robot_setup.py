@@ -18,7 +18,8 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.validation.validator import verify
 
-START, GOAL = [-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2], [0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
+START = [-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
+GOAL = [0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]
 WALL = {"box": {"center": [0.5, 0.0, 0.25], "size": [0.3, 0.06, 0.3], "name": "wall"}}
 CUP = {
     "link": "panda_hand",

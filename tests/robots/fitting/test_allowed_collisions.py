@@ -104,7 +104,8 @@ def test_what_a_link_carries_is_the_arms_own() -> None:
 )
 def test_what_a_link_carries_on_a_held_joint_is_the_arms_own(held: dict[str, float], found: str) -> None:
     """The bellows of the vendor's Fetch have a joint of their own, which planning holds."""
-    robot, z = with_middle(overlapping(0.0)), np.array([0, 0, 1.0])
+    robot = with_middle(overlapping(0.0))
+    z = np.array([0, 0, 1.0])
     *rest, bellows = robot.joints
     carried = [Joint("3", "prismatic", "m", "c", bellows.T_parent_joint, z, 0.0, 1.0)]
     if "5" in held:
@@ -132,8 +133,10 @@ def test_what_one_joint_folds_into_up_to_its_stop_is_allowed(bound: float, found
     joints = (replace(j, lower=-0.2, upper=0.2) if j.name == last else j for j in wide.joints)
     wide = replace(wide, joints=tuple(joints))
     (box,) = wide.meshes["l1"]
-    thick, ball = ConvexMesh(box.vertices * (1, 16, 1), box.faces), np.array([[0.25, 0, 0, 0.6]])
-    meshes, spheres = wide.meshes | {"l1": (thick,)}, wide.spheres | {"l1": ball}
+    thick = ConvexMesh(box.vertices * (1, 16, 1), box.faces)
+    ball = np.array([[0.25, 0, 0, 0.6]])
+    meshes = wide.meshes | {"l1": (thick,)}
+    spheres = wide.spheres | {"l1": ball}
     assert reasons(replace(wide, meshes=meshes, spheres=spheres))["l1", "l3"] == found
 
 

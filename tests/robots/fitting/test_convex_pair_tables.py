@@ -47,7 +47,9 @@ def disc(radius: float, thickness: float) -> Surface:
 @cache
 def made() -> Prepared:
     """A flange 3 mm from both prongs of a fork at any angle; bent far back, it hits the base of the fork."""
-    y, x, rates = np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), (2.0, 8.0, 80.0)
+    y = np.array([0, 1.0, 0])
+    x = np.array([1.0, 0, 0])
+    rates = (2.0, 8.0, 80.0)
     joints = (
         Joint("bend", "revolute", "fork", "wrist", np.eye(4), y, -3.0, 3.0, *rates),
         Joint(
@@ -70,7 +72,8 @@ def shares(robot: Robot) -> tuple[float, int]:
     free."""
     q = np.random.default_rng(3).uniform(robot.lower, robot.upper, (3000, robot.dof))
     checker = CollisionChecker(robot, Scene())
-    free, exact = checker.free(q), ~ExactCollision(robot, Scene()).collides(q)
+    free = checker.free(q)
+    exact = ~ExactCollision(robot, Scene()).collides(q)
     assert (checker.pair_clearances(q)[free] > 0).all()
     return float(1 - free[exact].mean()), int((free & ~exact).sum())
 

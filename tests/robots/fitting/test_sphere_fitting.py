@@ -73,7 +73,8 @@ def test_nothing_inside_is_left_open(name: str) -> None:
 def test_grid_knows_signed_distances() -> None:
     """Compared with the distance of a box by hand, and at the inner corner of an L."""
     solid = Solid.of(SHAPES["box"], TOLERANCE)
-    points, half = solid.points, np.array([0.05, 0.03, 0.1])
+    points = solid.points
+    half = np.array([0.05, 0.03, 0.1])
     beyond = np.abs(points) - half
     np.testing.assert_allclose(solid.distance.ravel(), beyond.max(1), atol=1e-9)
     # a wall shared by two boxes is not surface

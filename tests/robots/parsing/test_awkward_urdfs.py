@@ -135,7 +135,8 @@ def test_an_arm_four_times_as_large_takes_no_more_spheres(tmp_path: Path) -> Non
     links."""
     counts = []
     for size in (2, 8):
-        length, width = 0.4 * size, 0.06 * size
+        length = 0.4 * size
+        width = 0.06 * size
         box = (
             f'<collision><origin xyz="0 0 {length / 2}"/><geometry><box size="{width} {width} {length}"/>'
             "</geometry></collision>"

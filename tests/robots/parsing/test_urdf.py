@@ -41,7 +41,8 @@ ARM = """<robot name="tiny">
     <axis xyz="0 1 0"/></joint>
 </robot>
 """
-BOX, TUBE = '<box size="0.06 0.06 0.3"/>', '<cylinder radius="0.03" length="0.2"/>'
+BOX = '<box size="0.06 0.06 0.3"/>'
+TUBE = '<cylinder radius="0.03" length="0.2"/>'
 GRIPPER = """
   <link name="palm"/> <link name="left"/> <link name="right"/> <link name="tcp"/>
   <joint name="mount" type="fixed"><parent link="fore"/><child link="palm"/></joint>
@@ -90,7 +91,8 @@ def test_gripper_is_left_out_and_locked(tmp_path: Path) -> None:
 
 def test_base_and_tip_are_selectable(tmp_path: Path) -> None:
     file = urdf(tmp_path, AWKWARD)
-    whole, part = read_urdf(file), read_urdf(file, base="turret", tip="wrist")
+    whole = read_urdf(file)
+    part = read_urdf(file, base="turret", tip="wrist")
     assert (whole.base, whole.tip) == ("floor", "tool")
     assert whole.locked == {"lid_joint": 0.0}
     assert part.joint_names == ("arm_joint", "wrist_joint")
@@ -116,7 +118,8 @@ def test_what_has_no_thickness_is_given_some(corners: list[list[float]], thin: i
 
 
 MESH = '<mesh filename="package://a/b.stl"/>'
-FORE, LOOP = '<parent link="upper"/><child link="fore"/>', '<parent link="base"/><child link="upper"/>'
+FORE = '<parent link="upper"/><child link="fore"/>'
+LOOP = '<parent link="base"/><child link="upper"/>'
 BAD = {
     "not XML": ("<robot", "well-formed"),
     "not a robot": ("<model/>", "<model>"),
@@ -280,7 +283,8 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     # balls, because they are fitted quickly
     balls = ARM.replace(BOX, '<sphere radius="0.15"/>').replace(TUBE, '<sphere radius="0.1"/>')
-    file, steps = urdf(tmp_path, balls), []
+    file = urdf(tmp_path, balls)
+    steps = []
     with coarse_grids():
         report = add_robot(
             file,

@@ -101,7 +101,8 @@ def test_the_badge_says_what_the_arm_does(session: ExplorationSession) -> None:
     assert exploration_badge(session.state).headline == "not begun"
     session.set_mode(RUNNING)
     state = until(session, lambda state: state.phase == MOVING)
-    badge, step = exploration_badge(state), state.acts[-1].step
+    badge = exploration_badge(state)
+    step = state.acts[-1].step
     assert badge.headline.startswith(f"{len(state.acts)}. ") and badge.lines[0] == step.reason
     assert badge.lines[-1].startswith("of the map ")
     state = until(session, lambda state: state.phase == ENDED)

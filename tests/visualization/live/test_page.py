@@ -22,9 +22,11 @@ if TYPE_CHECKING:
 pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
 playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
 
-PATIENCE, COMPILING = 120_000, 300_000
-"""[ms]; a new machine compiles before the first plan."""
-VALID, INVALID = "[data-validity=valid]", "[data-validity=invalid]"
+# [ms]; a new machine compiles before the first plan.
+PATIENCE = 120_000
+COMPILING = 300_000
+VALID = "[data-validity=valid]"
+INVALID = "[data-validity=invalid]"
 
 until = partial(waiting.until, patience=PATIENCE / 1000)
 

@@ -20,7 +20,8 @@ def test_viser_is_silent_and_other_threads_print(
 ) -> None:
     """While viser started or stopped, sys.stdout was replaced for all threads: others' output was lost."""
     during = []
-    start, stop = viser.ViserServer.__init__, viser.ViserServer.stop
+    start = viser.ViserServer.__init__
+    stop = viser.ViserServer.stop
 
     def watched_start(self: Any, *words: Any, **options: Any) -> None:
         during.append(sys.stdout)

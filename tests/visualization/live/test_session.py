@@ -135,7 +135,8 @@ def test_the_target_is_dragged(session: Session) -> None:
 
 def _stands(state: State, T: np.ndarray) -> bool:
     """Whether the configuration shown for the goal reaches it."""
-    q, robot = state.goal_configuration, state.problem.robot
+    q = state.goal_configuration
+    robot = state.problem.robot
     return q is not None and np.allclose(link_pose(robot, q, state.goal_frame), T, atol=1e-5)
 
 
@@ -301,7 +302,9 @@ def test_latest_goes_on_after_an_error(caplog: pytest.LogCaptureFixture) -> None
 
 
 def test_latest_drops_what_was_not_begun() -> None:
-    done, begun, go = [], threading.Event(), threading.Event()
+    done = []
+    begun = threading.Event()
+    go = threading.Event()
 
     def do(work: int) -> None:
         begun.set()

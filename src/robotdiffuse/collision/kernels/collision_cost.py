@@ -34,12 +34,20 @@ def frames_of(robot, q, frames):
     frames[0, :] = _ZERO
     frames[0, 0] = frames[0, 4] = frames[0, 8] = _ONE
     for j in range(len(q)):
-        parent, child, offset = frames[parent_of(robot.parents, j)], frames[j + 1], robot.offsets[j]
-        c, s, slide = np.cos(q[j]), np.sin(q[j]), _ZERO
+        parent = frames[parent_of(robot.parents, j)]
+        child = frames[j + 1]
+        offset = robot.offsets[j]
+        c = np.cos(q[j])
+        s = np.sin(q[j])
+        slide = _ZERO
         if robot.offsets[j, 12] > _ZERO:
-            c, s, slide = _ONE, _ZERO, q[j]
+            c = _ONE
+            s = _ZERO
+            slide = q[j]
         for k in range(3):
-            r0, r1, r2 = parent[3 * k], parent[3 * k + 1], parent[3 * k + 2]
+            r0 = parent[3 * k]
+            r1 = parent[3 * k + 1]
+            r2 = parent[3 * k + 2]
             x = r0 * offset[0] + r1 * offset[3] + r2 * offset[6]
             y = r0 * offset[1] + r1 * offset[4] + r2 * offset[7]
             z = r0 * offset[2] + r1 * offset[5] + r2 * offset[8]
@@ -62,18 +70,31 @@ def placed(frame, x, y, z):
 @allocation_free(fastmath=True)
 def solid_distance(solid, x, y, z):
     """Signed distance of a point to a row of `SceneArrays.solids`, and its gradient."""
-    dx, dy, dz = x - solid[0], y - solid[1], z - solid[2]
+    dx = x - solid[0]
+    dy = y - solid[1]
+    dz = z - solid[2]
     u = dx * solid[3] + dy * solid[4] + dz * solid[5]
     v = dx * solid[6] + dy * solid[7] + dz * solid[8]
     w = dx * solid[9] + dy * solid[10] + dz * solid[11]
-    a, b, c = abs(u) - solid[12], abs(v) - solid[13], abs(w) - solid[14]
+    a = abs(u) - solid[12]
+    b = abs(v) - solid[13]
+    c = abs(w) - solid[14]
     # outward directions along the first two axes; a cylinder has a single radial one
-    ou, ov, pu, pv = np.copysign(_ONE, u), _ZERO, _ZERO, np.copysign(_ONE, v)
+    ou = np.copysign(_ONE, u)
+    ov = _ZERO
+    pu = _ZERO
+    pv = np.copysign(_ONE, v)
     if solid[16] > _ZERO:
         r = np.sqrt(u * u + v * v) + _TINY
-        a, b, ou, ov = r - solid[12], -solid[12], u / r, v / r
+        a = r - solid[12]
+        b = -solid[12]
+        ou = u / r
+        ov = v / r
     if a <= _ZERO and b <= _ZERO and c <= _ZERO:
-        d, na, nb, nc = max(a, b, c), _ZERO, _ZERO, _ZERO
+        d = max(a, b, c)
+        na = _ZERO
+        nb = _ZERO
+        nc = _ZERO
         if a >= b and a >= c:
             na = _ONE
         elif b >= c:
@@ -81,10 +102,16 @@ def solid_distance(solid, x, y, z):
         else:
             nc = _ONE
     else:
-        a, b, c = max(a, _ZERO), max(b, _ZERO), max(c, _ZERO)
+        a = max(a, _ZERO)
+        b = max(b, _ZERO)
+        c = max(c, _ZERO)
         d = np.sqrt(a * a + b * b + c * c) + _TINY
-        na, nb, nc = a / d, b / d, c / d
-    u, v, w = na * ou + nb * pu, na * ov + nb * pv, np.copysign(nc, w)
+        na = a / d
+        nb = b / d
+        nc = c / d
+    u = na * ou + nb * pu
+    v = na * ov + nb * pv
+    w = np.copysign(nc, w)
     return (
         d - solid[15],
         solid[3] * u + solid[6] * v + solid[9] * w,
@@ -99,15 +126,24 @@ def scene_distance(scene, x, y, z, limit):
 
     Distances to point clouds may be too large by a few millimetres.
     """
-    best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
+    best = limit
+    bx = _ZERO
+    by = _ZERO
+    bz = _ZERO
     for k in range(len(scene.solids)):
         d, nx, ny, nz = solid_distance(scene.solids[k], x, y, z)
         if d < best:
-            best, bx, by, bz = d, nx, ny, nz
+            best = d
+            bx = nx
+            by = ny
+            bz = nz
     if len(scene.points):
         d, nx, ny, nz = near_point(scene, x, y, z, best)
         if d < best:
-            best, bx, by, bz = d, nx, ny, nz
+            best = d
+            bx = nx
+            by = ny
+            bz = nz
     return best, bx, by, bz
 
 
@@ -127,18 +163,23 @@ def _pull(robot, frames, frame, wrench, grad):
     """Subtracts the effect of a wrench on a frame on the joints before it from `grad`."""
     while frame > 0:
         j = frame - 1
-        axis, frame = frames[j + 1], parent_of(robot.parents, j)
-        ax, ay, az = axis[2], axis[5], axis[8]
-        fx, fy, fz = wrench[0], wrench[1], wrench[2]
+        axis = frames[j + 1]
+        frame = parent_of(robot.parents, j)
+        ax = axis[2]
+        ay = axis[5]
+        az = axis[8]
+        fx = wrench[0]
+        fy = wrench[1]
+        fz = wrench[2]
         if robot.offsets[j, 12] > _ZERO:
             grad[j] -= ax * fx + ay * fy + az * fz
         else:
-            px, py, pz = axis[9], axis[10], axis[11]
-            mx, my, mz = (
-                wrench[3] - (py * fz - pz * fy),
-                wrench[4] - (pz * fx - px * fz),
-                wrench[5] - (px * fy - py * fx),
-            )
+            px = axis[9]
+            py = axis[10]
+            pz = axis[11]
+            mx = wrench[3] - (py * fz - pz * fy)
+            my = wrench[4] - (pz * fx - px * fz)
+            mz = wrench[5] - (px * fy - py * fx)
             grad[j] -= ax * mx + ay * my + az * mz
 
 
@@ -154,9 +195,12 @@ def _close(around, part, x, y, z, reach):
 @allocation_free(forceinline=True)
 def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
     """Cost of a group's row of spheres towards the scene; adds their forces to the wrench."""
-    cost, around, bound = _ZERO, scene.solid_boxes, robot.row_bounds[row]
+    cost = _ZERO
+    around = scene.solid_boxes
+    bound = robot.row_bounds[row]
     u, v, w = placed(frame, bound[0], bound[1], bound[2])
-    reach, any_close = bound[3] + margin, 0
+    reach = bound[3] + margin
+    any_close = 0
     if reach <= _ZERO:  # a margin this negative turns the cost off
         return cost
     for part in range(len(around)):
@@ -164,12 +208,16 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
     near_cloud = len(scene.points) > 0 and points_lower_bound(scene, u, v, w) < reach
     if any_close == 0 and not near_cloud:
         return cost
-    a, b, c = load(robot.rows, row, 0), load(robot.rows, row, 1), load(robot.rows, row, 2)
+    a = load(robot.rows, row, 0)
+    b = load(robot.rows, row, 1)
+    c = load(robot.rows, row, 2)
     x = a * frame[0] + b * frame[1] + c * frame[2] + frame[9]
     y = a * frame[3] + b * frame[4] + c * frame[5] + frame[10]
     z = a * frame[6] + b * frame[7] + c * frame[8] + frame[11]
     within = load(robot.rows, row, 3) + margin
-    best, pushed, zero = within, 0, x * _ZERO
+    best = within
+    pushed = 0
+    zero = x * _ZERO
     for part in range(len(around)):
         close = _close(around, part, u, v, w, reach)
         while close:
@@ -186,7 +234,9 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
                 nearer &= nearer - 1
     if near_cloud:
         for i in range(robot.row_sizes[row]):
-            px, py, pz = lane(x, i), lane(y, i), lane(z, i)
+            px = lane(x, i)
+            py = lane(y, i)
+            pz = lane(z, i)
             d, nx, ny, nz = near_point(scene, px, py, pz, lane(best, i))
             if d < lane(best, i):
                 pushed &= ~(1 << i)
@@ -197,7 +247,9 @@ def _row_cost(robot, scene, g, row, frame, margin, nearest, wrench):
     while pushed:
         i = first_lane(pushed)
         pushed &= pushed - 1
-        px, py, pz = lane(x, i), lane(y, i), lane(z, i)
+        px = lane(x, i)
+        py = lane(y, i)
+        pz = lane(z, i)
         d, nx, ny, nz = solid_distance(scene.solids[nearest[i]], px, py, pz)
         h = max(lane(within, i) - d, _ZERO)
         cost += _HALF * h * h
@@ -234,26 +286,34 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
     sufficiently negative margin turns its part of the cost off.
     """
     frames_of(robot, q, work.frames)
-    frames, wrench, other = work.frames, work.wrench[0], work.wrench[1]
+    frames = work.frames
+    wrench = work.wrench[0]
+    other = work.wrench[1]
     cost = _ZERO
     for g in range(len(robot.frame)):
         index = robot.frame[g]
         if index == 0:
             continue
-        wrench[:], of_link = _ZERO, _ZERO
+        wrench[:] = _ZERO
+        of_link = _ZERO
         for row in range(robot.first_row[g], robot.first_row[g + 1]):
             of_link += _row_cost(robot, scene, g, row, frames[index], margin, work.nearest, wrench)
         if of_link > _ZERO:
             cost += of_link
             _pull(robot, frames, index, wrench, grad)
     for p in range(len(robot.pairs)):
-        a, b = robot.pairs[p, 0], robot.pairs[p, 1]
+        a = robot.pairs[p, 0]
+        b = robot.pairs[p, 1]
         if pairs[p] >= self_margin:
             continue
-        ia, ib = robot.frame[a], robot.frame[b]
-        fa, fb, bb = frames[ia], frames[ib], robot.bounds[b]
+        ia = robot.frame[a]
+        ib = robot.frame[b]
+        fa = frames[ia]
+        fb = frames[ib]
+        bb = robot.bounds[b]
         cx, cy, cz = placed(fb, bb[0], bb[1], bb[2])
-        wrench[:], other[:] = _ZERO, _ZERO
+        wrench[:] = _ZERO
+        other[:] = _ZERO
         for s in range(robot.first[a], robot.first[a + 1]):
             x, y, z = placed(fa, robot.spheres[s, 0], robot.spheres[s, 1], robot.spheres[s, 2])
             reach = robot.spheres[s, 3] + bb[3] + self_margin
@@ -261,12 +321,16 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
                 continue
             for t in range(robot.first[b], robot.first[b + 1]):
                 u, v, w = placed(fb, robot.spheres[t, 0], robot.spheres[t, 1], robot.spheres[t, 2])
-                dx, dy, dz = x - u, y - v, z - w
+                dx = x - u
+                dy = y - v
+                dz = z - w
                 d = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
                 h = robot.spheres[s, 3] + robot.spheres[t, 3] + self_margin - d
                 if h > _ZERO:
                     cost += _HALF * h * h
-                    fx, fy, fz = h * dx / d, h * dy / d, h * dz / d
+                    fx = h * dx / d
+                    fy = h * dy / d
+                    fz = h * dz / d
                     _push(wrench, x, y, z, fx, fy, fz)
                     _push(other, u, v, w, -fx, -fy, -fz)
         _pull(robot, frames, ia, wrench, grad)
@@ -277,7 +341,8 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
 @kernel(nogil=True)
 def cost_gradients(robot, scene, q, margin, self_margin):
     """Collision costs [n] of the rows of q[n, dof] and their gradients [n, dof]; see `cost_gradient_at`."""
-    costs, grads = np.empty(len(q), np.float32), np.zeros(q.shape, np.float32)
+    costs = np.empty(len(q), np.float32)
+    grads = np.zeros(q.shape, np.float32)
     scratch = make_cost_workspace(q.shape[1])
     pairs = pair_clearances(robot, q, self_margin)
     for i in range(len(q)):
@@ -311,7 +376,8 @@ def clearances_and_gradients(robot, scene, q, limit, margin):
     """Clearances [n, moving groups] to the scene, at most `limit`, and gradients [n, dof]; see
     `clearances_and_gradients_into`."""
     moving = len(robot.frame) - np.searchsorted(robot.frame, 1)
-    clearances, gradients = np.empty((len(q), moving), np.float32), np.empty(q.shape, np.float32)
+    clearances = np.empty((len(q), moving), np.float32)
+    gradients = np.empty(q.shape, np.float32)
     work = make_clearance_workspace(robot, len(scene.solids))
     clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearances, gradients)
     return clearances, gradients

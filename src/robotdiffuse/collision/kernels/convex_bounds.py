@@ -96,10 +96,13 @@ def pose(offsets, parents, slides, q, dq, posture):
     """
     for j in range(len(q)):
         parent = parent_of(parents, j)
-        child, before, twist = posture.frames[j + 1], posture.twists[parent], posture.twists[j + 1]
+        child = posture.frames[j + 1]
+        before = posture.twists[parent]
+        twist = posture.twists[j + 1]
         step(posture.frames[parent], offsets[j], slides[j], q[j], child)
         for r in range(3):
-            a, b = (r + 1) % 3, (r + 2) % 3
+            a = (r + 1) % 3
+            b = (r + 2) % 3
             axis = child[r, 2] * dq[j]
             moment = (child[a, 3] * child[b, 2] - child[b, 3] * child[a, 2]) * dq[j]
             twist[r] = before[r] + (0.0 if slides[j] else axis)
@@ -110,10 +113,17 @@ def pose(offsets, parents, slides, q, dq, posture):
 def part_speed(hulls, p, base, posture):
     """Upper bound on how far any point of a part moves from the middle to an end, seen from frame `base` [m],
     without the remainder."""
-    frame, ball = hulls.frame[p], hulls.balls[p]
-    twist, other, T = posture.twists[frame], posture.twists[base], posture.frames[frame]
-    a, b, c = twist[0] - other[0], twist[1] - other[1], twist[2] - other[2]
-    x, y, z = placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)
+    frame = hulls.frame[p]
+    ball = hulls.balls[p]
+    twist = posture.twists[frame]
+    other = posture.twists[base]
+    T = posture.frames[frame]
+    a = twist[0] - other[0]
+    b = twist[1] - other[1]
+    c = twist[2] - other[2]
+    x = placed(T, ball, 0)
+    y = placed(T, ball, 1)
+    z = placed(T, ball, 2)
     u = b * z - c * y + twist[3] - other[3]
     v = c * x - a * z + twist[4] - other[4]
     w = a * y - b * x + twist[5] - other[5]
@@ -123,8 +133,11 @@ def part_speed(hulls, p, base, posture):
 @inner_kernel()
 def ball_to_solid(hulls, p, solids, o, posture):
     """Lower bound of the distance of a part to an obstacle in the middle, from the part's ball [m]."""
-    T, ball = posture.frames[hulls.frame[p]], hulls.balls[p]
-    x, y, z = placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)
+    T = posture.frames[hulls.frame[p]]
+    ball = hulls.balls[p]
+    x = placed(T, ball, 0)
+    y = placed(T, ball, 1)
+    z = placed(T, ball, 2)
     gap = point_to_box(x, y, z, solids.rotation[o], solids.middle[o], solids.half[o], solids.disc[o])
     return gap - solids.rounding[o] - ball[3]
 
@@ -132,8 +145,11 @@ def ball_to_solid(hulls, p, solids, o, posture):
 @inner_kernel()
 def ball_to_ball(hulls, p, q, posture):
     """Lower bound of the distance of two parts in the middle, from their balls [m]."""
-    S, T, total = posture.frames[hulls.frame[p]], posture.frames[hulls.frame[q]], 0.0
-    a, b = hulls.balls[p], hulls.balls[q]
+    S = posture.frames[hulls.frame[p]]
+    T = posture.frames[hulls.frame[q]]
+    total = 0.0
+    a = hulls.balls[p]
+    b = hulls.balls[q]
     for r in range(3):
         total += (placed(S, a, r) - placed(T, b, r)) ** 2
     return np.sqrt(total) - a[3] - b[3]
@@ -153,19 +169,24 @@ def _least(vertices, first, last, x, y, z, offset, u, v, w, speed):
 @inner_kernel()
 def _furthest(vertices, first, last, x, y, z):
     """Index of the vertex that is furthest in a direction."""
-    best, at = -np.inf, first
+    best = -np.inf
+    at = first
     for i in range(first, last):
         a = vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z
         if a > best:
-            best, at = a, i
+            best = a
+            at = i
     return at
 
 
 @inner_kernel()
 def _support_of_part(hulls, p, posture, sign, row):
     """Writes the vertex of a part that is furthest along sign * points[0] to points[row]."""
-    T, points = posture.frames[hulls.frame[p]], posture.points
-    x, y, z = sign * points[0, 0], sign * points[0, 1], sign * points[0, 2]
+    T = posture.frames[hulls.frame[p]]
+    points = posture.points
+    x = sign * points[0, 0]
+    y = sign * points[0, 1]
+    z = sign * points[0, 2]
     i = _furthest(
         hulls.vertices,
         hulls.first[p],
@@ -182,8 +203,11 @@ def _support_of_part(hulls, p, posture, sign, row):
 def _support_of_solid(solids, o, posture):
     """Writes the point of an obstacle, without its rounding, that is furthest along points[0] to
     points[2]."""
-    R, points = solids.rotation[o], posture.points
-    x, y, z = points[0, 0], points[0, 1], points[0, 2]
+    R = solids.rotation[o]
+    points = posture.points
+    x = points[0, 0]
+    y = points[0, 1]
+    z = points[0, 2]
     a = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
     b = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
     c = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
@@ -199,19 +223,27 @@ def _support_of_solid(solids, o, posture):
 def _least_along(hulls, p, base, sign, posture):
     """Minimum height of a part along sign * points[0] at the two ends of the motion, without the remainder,
     with velocities seen from frame `base`."""
-    n, T = posture.points[0], posture.frames[hulls.frame[p]]
-    twist, seen = posture.twists[hulls.frame[p]], posture.twists[base]
-    at_start, at_stop = np.inf, np.inf
+    n = posture.points[0]
+    T = posture.frames[hulls.frame[p]]
+    twist = posture.twists[hulls.frame[p]]
+    seen = posture.twists[base]
+    at_start = np.inf
+    at_stop = np.inf
     for i in range(hulls.first[p], hulls.first[p + 1]):
         vertex = hulls.vertices[:, i]
-        x, y, z = placed(T, vertex, 0), placed(T, vertex, 1), placed(T, vertex, 2)
-        a, b, c = twist[0] - seen[0], twist[1] - seen[1], twist[2] - seen[2]
+        x = placed(T, vertex, 0)
+        y = placed(T, vertex, 1)
+        z = placed(T, vertex, 2)
+        a = twist[0] - seen[0]
+        b = twist[1] - seen[1]
+        c = twist[2] - seen[2]
         u = b * z - c * y + twist[3] - seen[3]
         v = c * x - a * z + twist[4] - seen[4]
         w = a * y - b * x + twist[5] - seen[5]
         height = sign * (n[0] * x + n[1] * y + n[2] * z)
         speed = sign * (n[0] * u + n[1] * v + n[2] * w)
-        at_start, at_stop = min(at_start, height - speed), min(at_stop, height + speed)
+        at_start = min(at_start, height - speed)
+        at_stop = min(at_stop, height + speed)
     return at_start - hulls.rounding[p], at_stop - hulls.rounding[p]
 
 
@@ -222,26 +254,31 @@ def separation(hulls, p, solids, other, base, posture):
     The first is that in the middle, the second the minimum along the motion, without the remainder, seen from
     frame `base`. A negative `other` stands for part -1 - other, which moves too if its frame is not `base`.
     """
-    x, y, z = posture.points[0, 0], posture.points[0, 1], posture.points[0, 2]
+    x = posture.points[0, 0]
+    y = posture.points[0, 1]
+    z = posture.points[0, 2]
     frame = hulls.frame[p]
-    T, twist, seen = posture.frames[frame], posture.twists[frame], posture.twists[base]
-    a, b, c = twist[0] - seen[0], twist[1] - seen[1], twist[2] - seen[2]
+    T = posture.frames[frame]
+    twist = posture.twists[frame]
+    seen = posture.twists[base]
+    a = twist[0] - seen[0]
+    b = twist[1] - seen[1]
+    c = twist[2] - seen[2]
     # n . (w x p) = (n x w) . p
-    u, v, w = y * c - z * b, z * a - x * c, x * b - y * a
+    u = y * c - z * b
+    v = z * a - x * c
+    w = x * b - y * a
     speed = u * T[0, 3] + v * T[1, 3] + w * T[2, 3]
     speed += x * (twist[3] - seen[3]) + y * (twist[4] - seen[4]) + z * (twist[5] - seen[5])
     offset = x * T[0, 3] + y * T[1, 3] + z * T[2, 3] - hulls.rounding[p]
-    lx, ly, lz = (
-        T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
-        T[0, 1] * x + T[1, 1] * y + T[2, 1] * z,
-        T[0, 2] * x + T[1, 2] * y + T[2, 2] * z,
-    )
-    lu, lv, lw = (
-        T[0, 0] * u + T[1, 0] * v + T[2, 0] * w,
-        T[0, 1] * u + T[1, 1] * v + T[2, 1] * w,
-        T[0, 2] * u + T[1, 2] * v + T[2, 2] * w,
-    )
-    first, last = hulls.first[p], hulls.first[p + 1]
+    lx = T[0, 0] * x + T[1, 0] * y + T[2, 0] * z
+    ly = T[0, 1] * x + T[1, 1] * y + T[2, 1] * z
+    lz = T[0, 2] * x + T[1, 2] * y + T[2, 2] * z
+    lu = T[0, 0] * u + T[1, 0] * v + T[2, 0] * w
+    lv = T[0, 1] * u + T[1, 1] * v + T[2, 1] * w
+    lw = T[0, 2] * u + T[1, 2] * v + T[2, 2] * w
+    first = hulls.first[p]
+    last = hulls.first[p + 1]
     along = _least(hulls.vertices, first, last, lx, ly, lz, offset, lu, lv, lw, speed)
     middle = _least(hulls.vertices, first, last, lx, ly, lz, offset, 0.0, 0.0, 0.0, 0.0)
     reach = 0.0
@@ -271,8 +308,11 @@ def _holds_origin(e, new):
     """Whether the tetrahedron of `new` and `new` + e[0], e[1], e[2] contains the origin."""
     inside = 1.0
     for k in range(3):
-        a, b = e[(k + 1) % 3], e[(k + 2) % 3]
-        x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        a = e[(k + 1) % 3]
+        b = e[(k + 2) % 3]
+        x = a[1] * b[2] - a[2] * b[1]
+        y = a[2] * b[0] - a[0] * b[2]
+        z = a[0] * b[1] - a[1] * b[0]
         volume = e[k, 0] * x + e[k, 1] * y + e[k, 2] * z
         if abs(volume) < 1e-30:
             return False
@@ -292,7 +332,8 @@ def _nearest(simplex, count, edges, nearest):
     or 0 if the origin is inside.
     """
     new = simplex[count - 1]
-    least, kept = _dot(new, new), 0
+    least = _dot(new, new)
+    kept = 0
     for r in range(3):
         nearest[r] = new[r]
         for k in range(count - 1):
@@ -301,22 +342,30 @@ def _nearest(simplex, count, edges, nearest):
         return 0
     for i in range(count - 1):
         for j in range(i, count - 1):
-            e, f = edges[i], edges[j]
-            a, b, c = _dot(e, e), _dot(e, f), _dot(f, f)
-            d, g, x, y = -_dot(new, e), -_dot(new, f), 0.0, 0.0
+            e = edges[i]
+            f = edges[j]
+            a = _dot(e, e)
+            b = _dot(e, f)
+            c = _dot(f, f)
+            d = -_dot(new, e)
+            g = -_dot(new, f)
+            x = 0.0
+            y = 0.0
             if i == j:
                 x = d / max(a, 1e-300)
                 inside = 0 < x < 1
             else:
                 area = max(a * c - b * b, 1e-300)
-                x, y = (d * c - g * b) / area, (g * a - d * b) / area
+                x = (d * c - g * b) / area
+                y = (g * a - d * b) / area
                 inside = x > 0 and y > 0 and x + y < 1
             if inside:
                 total = 0.0
                 for r in range(3):
                     total += (new[r] + x * e[r] + y * f[r]) ** 2
                 if total < least:
-                    least, kept = total, 1 << i | 1 << j
+                    least = total
+                    kept = 1 << i | 1 << j
                     for r in range(3):
                         nearest[r] = new[r] + x * e[r] + y * f[r]
     at = 0
@@ -332,10 +381,15 @@ def _nearest(simplex, count, edges, nearest):
 def find_plane(hulls, p, solids, other, posture):
     """Replaces the normal points[0], an initial guess, by that of the plane with the widest gap between two
     bodies in the middle of the motion. False if they touch, or nearly."""
-    points, simplex = posture.points, posture.simplex
+    points = posture.points
+    simplex = posture.simplex
     rounding = hulls.rounding[p] + (solids.rounding[other] if other >= 0 else hulls.rounding[-1 - other])
-    best, gap, count = -np.inf, np.inf, 0
-    n0, n1, n2 = points[0, 0], points[0, 1], points[0, 2]
+    best = -np.inf
+    gap = np.inf
+    count = 0
+    n0 = points[0, 0]
+    n1 = points[0, 1]
+    n2 = points[0, 2]
     for _ in range(MAX_GJK_STEPS):
         _support_of_part(hulls, p, posture, -1.0, 1)
         if other >= 0:
@@ -347,9 +401,12 @@ def find_plane(hulls, p, solids, other, posture):
         reached = _dot(simplex[count], points[0])
         if reached > best:
             best = reached
-            n0, n1, n2 = points[0, 0], points[0, 1], points[0, 2]
+            n0 = points[0, 0]
+            n1 = points[0, 1]
+            n2 = points[0, 2]
         count = _nearest(simplex, count + 1, posture.edges, points[0])
-        before, gap = gap, np.sqrt(_dot(points[0], points[0]))
+        before = gap
+        gap = np.sqrt(_dot(points[0], points[0]))
         if count == 0 or gap - rounding < GJK_ABSOLUTE_TOLERANCE:
             return False
         for r in range(3):
@@ -359,7 +416,9 @@ def find_plane(hulls, p, solids, other, posture):
             or gap >= before
         ):
             break
-    points[0, 0], points[0, 1], points[0, 2] = n0, n1, n2
+    points[0, 0] = n0
+    points[0, 1] = n1
+    points[0, 2] = n2
     return best > rounding
 
 

@@ -16,7 +16,9 @@ def step(parent, offset, slides, q, child):
         y = parent[r, 0] * offset[0, 1] + parent[r, 1] * offset[1, 1] + parent[r, 2] * offset[2, 1]
         z = parent[r, 0] * offset[0, 2] + parent[r, 1] * offset[1, 2] + parent[r, 2] * offset[2, 2]
         t = parent[r, 0] * offset[0, 3] + parent[r, 1] * offset[1, 3] + parent[r, 2] * offset[2, 3]
-        child[r, 0], child[r, 1], child[r, 2] = x * c + y * s, y * c - x * s, z
+        child[r, 0] = x * c + y * s
+        child[r, 1] = y * c - x * s
+        child[r, 2] = z
         child[r, 3] = t + parent[r, 3] + z * slide
 
 
@@ -30,8 +32,11 @@ def placed(T, p, r):
 def point_to_box(x, y, z, rotation, middle, half, disc):
     """Lower bound of the signed distance [m] from a point to a box with rotation R_box_base[3, 3], whose
     first two half edges are increased by the radius of a disc; negative inside."""
-    outside, deepest = 0.0, -np.inf
-    x, y, z = x - middle[0], y - middle[1], z - middle[2]
+    outside = 0.0
+    deepest = -np.inf
+    x = x - middle[0]
+    y = y - middle[1]
+    z = z - middle[2]
     for r in range(3):
         d = rotation[r, 0] * x + rotation[r, 1] * y + rotation[r, 2] * z
         d = abs(d) - half[r] - (disc if r < 2 else 0.0)

@@ -67,7 +67,8 @@ class ClearanceWorkspace(NamedTuple):
 @kernel()
 def make_clearance_workspace(robot, solids):
     """Scratch memory for one thread and at most so many solids."""
-    joints, groups = len(robot.offsets), len(robot.frame)
+    joints = len(robot.offsets)
+    groups = len(robot.frame)
     frames = np.zeros((joints + 1, 12 * W), np.float32)
     for k in (0, 4, 8):
         frames[0, k * W : (k + 1) * W] = 1.0
@@ -89,7 +90,9 @@ def make_clearance_workspace(robot, solids):
 def to_solid(x, y, z, vx, vy, vz, solid):
     """Signed distances of points in 16 lanes to a row of `SceneArrays.solids`, and the parts of their
     velocities along the lines to its nearest points."""
-    dx, dy, dz = x - solid[0], y - solid[1], z - solid[2]
+    dx = x - solid[0]
+    dy = y - solid[1]
+    dz = z - solid[2]
     u = dx * solid[3] + dy * solid[4] + dz * solid[5]
     v = dx * solid[6] + dy * solid[7] + dz * solid[8]
     w = dx * solid[9] + dy * solid[10] + dz * solid[11]
@@ -102,11 +105,15 @@ def to_solid(x, y, z, vx, vy, vz, solid):
         p = (u * p + v * q) / maximum(from_axis, _TINY)
         u, v = from_axis - solid[12], u * _ZERO - solid[12]
     else:
-        p, q = p * copysign(_ONE, u), q * copysign(_ONE, v)
-        u, v = absolute(u) - solid[12], absolute(v) - solid[13]
+        p = p * copysign(_ONE, u)
+        q = q * copysign(_ONE, v)
+        u = absolute(u) - solid[12]
+        v = absolute(v) - solid[13]
     w = absolute(w) - solid[14]
     inside = minimum(maximum(maximum(u, v), w), _ZERO)
-    u, v, w = maximum(u, _ZERO), maximum(v, _ZERO), maximum(w, _ZERO)
+    u = maximum(u, _ZERO)
+    v = maximum(v, _ZERO)
+    w = maximum(w, _ZERO)
     d = sqrt(u * u + v * v + w * w)
     return d + inside - solid[15], absolute(u * p + v * q + w * r) / maximum(d, _TINY)
 
@@ -149,9 +156,12 @@ def place_motions(robot, q, dq, work):
     place_frames(robot, q, work.frames, work.centres)
     work.placed[:] = False
     for j in range(len(robot.offsets)):
-        parent, f, slides = parent_of(robot.parents, j), j + 1, robot.offsets[j, 12]
+        parent = parent_of(robot.parents, j)
+        f = j + 1
+        slides = robot.offsets[j, 12]
         for k in range(3):
-            a, b = (k + 1) % 3, (k + 2) % 3
+            a = (k + 1) % 3
+            b = (k + 2) % 3
             axis = load(work.frames, f, 3 * k + 2) * load(dq, j, 0)
             moment = load(work.frames, f, 9 + a) * load(work.frames, f, 3 * b + 2)
             moment = moment - load(work.frames, f, 9 + b) * load(work.frames, f, 3 * a + 2)
@@ -189,7 +199,10 @@ def _mark_near(robot, scene, g, speed, work):
     radius away from the group. For the points, which come after the solids, there is only a lower bound.
     """
     x, y, z = _at(work.centres, g)
-    radius, least, zero, solids = robot.bounds[g, 3], load(work.need, 0, 0), x * _ZERO, len(scene.solids)
+    radius = robot.bounds[g, 3]
+    least = load(work.need, 0, 0)
+    zero = x * _ZERO
+    solids = len(scene.solids)
     for k in range(solids):
         distance, _ = to_solid(x, y, z, zero, zero, zero, scene.solids[k])
         if len(scene.may_touch) and scene.may_touch[g, k]:
@@ -213,7 +226,8 @@ def _mark_near(robot, scene, g, speed, work):
 def group_along(robot, scene, g, moving, work):
     """Writes clearances of a group to the scene, at most `work.need`, and their bounds along the motions to
     `work`. Without `moving` the twists are taken for zero."""
-    frame, solids = robot.frame[g], len(scene.solids)
+    frame = robot.frame[g]
+    solids = len(scene.solids)
     x, y, z = _at(work.centres, g)
     zero = x * _ZERO
     speed = _speed(work.twists, frame, 0, x, y, z, robot.bounds[g, 3]) if moving else zero
@@ -242,8 +256,13 @@ def group_along(robot, scene, g, moving, work):
 @allocation_free(forceinline=True)
 def pair_along(robot, p, moving, work):
     """As `group_along`, between the links of a checked pair."""
-    a, b = robot.pairs[p, 0], robot.pairs[p, 1]
-    spheres, bounds, twists, f, g = robot.spheres, robot.bounds, work.twists, robot.frame[a], robot.frame[b]
+    a = robot.pairs[p, 0]
+    b = robot.pairs[p, 1]
+    spheres = robot.spheres
+    bounds = robot.bounds
+    twists = work.twists
+    f = robot.frame[a]
+    g = robot.frame[b]
     x, y, z = _at(work.centres, a)
     u, v, w = _at(work.centres, b)
     zero = x * _ZERO
@@ -266,7 +285,9 @@ def pair_along(robot, p, moving, work):
             # only the difference of the velocities along the line between the centres counts, whatever frame
             # it is seen from
             i, j, k = _velocity(twists, g, dx, dy, dz) if moving else (zero, zero, zero)
-            dx, dy, dz = x - dx, y - dy, z - dz
+            dx = x - dx
+            dy = y - dy
+            dz = z - dz
             distance = _length(dx, dy, dz)
             towards = absolute(dx * (p - i) + dy * (q - j) + dz * (r - k)) / maximum(distance, _TINY)
             _lower_to(distance - (spheres[s, 3] + spheres[t, 3]), towards, work)
@@ -299,7 +320,9 @@ def block_pair_clearances(robot, q, limit, work, out):
     work.need[:] = limit
     for p in range(len(out)):
         pair_along(robot, p, False, work)
-        table, bit, known = robot.pairs[p, 2], robot.pairs[p, 3], 0
+        table = robot.pairs[p, 2]
+        bit = robot.pairs[p, 3]
+        known = 0
         if table >= 0 and reduce_min(load(work.clearance, 0, 0)) <= _ZERO:
             known = ~lanes_that_may_touch(robot, table, bit, q)
         for i in range(W):
@@ -310,7 +333,8 @@ def block_pair_clearances(robot, q, limit, work, out):
 @inner_kernel()
 def pair_clearances_into(robot, q, limit, work, out):
     """Writes clearances of the checked pairs for the rows of q[n, dof] to out[n, pairs]."""
-    block, found = np.empty((q.shape[1], W), np.float32), np.empty((out.shape[1], W), np.float32)
+    block = np.empty((q.shape[1], W), np.float32)
+    found = np.empty((out.shape[1], W), np.float32)
     for start in range(0, len(q), W):
         take_block(q, start, block)
         block_pair_clearances(robot, block, limit, work, found)
@@ -320,7 +344,8 @@ def pair_clearances_into(robot, q, limit, work, out):
 @inner_kernel()
 def clearances_into(robot, scene, q, limit, work, out):
     """Writes clearances of the moving groups for the rows of q[n, dof] to out[n, groups]."""
-    block, found = np.empty((q.shape[1], W), np.float32), np.empty((out.shape[1], W), np.float32)
+    block = np.empty((q.shape[1], W), np.float32)
+    found = np.empty((out.shape[1], W), np.float32)
     for start in range(0, len(q), W):
         take_block(q, start, block)
         block_clearances(robot, scene, block, limit, work, found)

@@ -35,8 +35,9 @@ from robotdiffuse.core.kernels import allocation_free, kernel
 _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
 _HALF = np.float32(0.5)
-TABLE_HEADER, TABLE_SIDE = 6, 130
-"""Numbers before the cells, and cells along each side, in a table of `sphere_pair_tables.py`."""
+# Numbers before the cells, and cells along each side, in a table of `sphere_pair_tables.py`.
+TABLE_HEADER = 6
+TABLE_SIDE = 130
 ALL_LANES = (1 << W) - 1
 """The mask of all lanes."""
 _ZERO = np.float32(0.0)
@@ -66,7 +67,8 @@ def _turn(frames, parent, j, offset, q):
     c = _sine_of_turn(_QUARTER - far)
     s = copysign(_sine_of_turn(_QUARTER - absolute(far - _QUARTER)), turns)
     for k in range(3):
-        r0, r1 = load(frames, parent, 3 * k), load(frames, parent, 3 * k + 1)
+        r0 = load(frames, parent, 3 * k)
+        r1 = load(frames, parent, 3 * k + 1)
         r2 = load(frames, parent, 3 * k + 2)
         x = r0 * offset[0] + r1 * offset[3] + r2 * offset[6]
         y = r0 * offset[1] + r1 * offset[4] + r2 * offset[7]
@@ -83,7 +85,8 @@ def _slide(frames, parent, j, offset, q):
     """Writes the frame behind a prismatic joint in 16 lanes: frames[j + 1] = frames[parent] @ offset @
     Tz(q)."""
     for k in range(3):
-        r0, r1 = load(frames, parent, 3 * k), load(frames, parent, 3 * k + 1)
+        r0 = load(frames, parent, 3 * k)
+        r1 = load(frames, parent, 3 * k + 1)
         r2 = load(frames, parent, 3 * k + 2)
         z = r0 * offset[2] + r1 * offset[5] + r2 * offset[8]
         store(frames, j + 1, 3 * k, r0 * offset[0] + r1 * offset[3] + r2 * offset[6])
@@ -96,7 +99,9 @@ def _slide(frames, parent, j, offset, q):
 @allocation_free(forceinline=True)
 def _centres_of(frames, f, spheres, s):
     """Positions of a sphere's centre in 16 lanes."""
-    x, y, z = spheres[s, 0], spheres[s, 1], spheres[s, 2]
+    x = spheres[s, 0]
+    y = spheres[s, 1]
+    z = spheres[s, 2]
     return (
         load(frames, f, 0) * x + load(frames, f, 1) * y + load(frames, f, 2) * z + load(frames, f, 9),
         load(frames, f, 3) * x + load(frames, f, 4) * y + load(frames, f, 5) * z + load(frames, f, 10),
@@ -149,7 +154,9 @@ def make_workspace(robot, scene):
 @allocation_free(forceinline=True)
 def _touching(x, y, z, radius, solids, k):
     """Mask of the lanes whose sphere touches obstacle k."""
-    dx, dy, dz = x - solids[k, 0], y - solids[k, 1], z - solids[k, 2]
+    dx = x - solids[k, 0]
+    dy = y - solids[k, 1]
+    dz = z - solids[k, 2]
     u = dx * solids[k, 3] + dy * solids[k, 4] + dz * solids[k, 5]
     v = dx * solids[k, 6] + dy * solids[k, 7] + dz * solids[k, 8]
     w = dx * solids[k, 9] + dy * solids[k, 10] + dz * solids[k, 11]
@@ -177,7 +184,9 @@ def _coordinate(frames, f, i, k, x, y, z):
 @allocation_free(forceinline=True)
 def _place_row(robot, row, frames, f, i):
     """Positions of a row of spheres in configuration (lane) i."""
-    x, y, z = load(robot.rows, row, 0), load(robot.rows, row, 1), load(robot.rows, row, 2)
+    x = load(robot.rows, row, 0)
+    y = load(robot.rows, row, 1)
+    z = load(robot.rows, row, 2)
     return (
         _coordinate(frames, f, i, 0, x, y, z),
         _coordinate(frames, f, i, 1, x, y, z),
@@ -188,8 +197,10 @@ def _place_row(robot, row, frames, f, i):
 @allocation_free(forceinline=True)
 def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
     """Those of the lanes `near` in which a group touches obstacle k."""
-    hits, f = 0, robot.frame[g]
-    first, last = robot.first_row[g], robot.first_row[g + 1]
+    hits = 0
+    f = robot.frame[g]
+    first = robot.first_row[g]
+    last = robot.first_row[g + 1]
     for row in range(first, last):
         lanes_that_may_touch = near & ~hits
         if last - first > 1:
@@ -209,8 +220,10 @@ def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
 @allocation_free(forceinline=True)
 def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
     """Those of the lanes `near` in which a group touches a point of the scene."""
-    hits, f = 0, robot.frame[g]
-    first, last = robot.first_row[g], robot.first_row[g + 1]
+    hits = 0
+    f = robot.frame[g]
+    first = robot.first_row[g]
+    last = robot.first_row[g + 1]
     for row in range(first, last):
         lanes_that_may_touch = near & ~hits
         if last - first > 1:
@@ -230,17 +243,24 @@ def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
 @allocation_free(forceinline=True)
 def _touching_balls(x, y, z, radius, u, v, w, other):
     """Mask of the lanes in which two spheres touch each other."""
-    dx, dy, dz, reach = x - u, y - v, z - w, radius + other
+    dx = x - u
+    dy = y - v
+    dz = z - w
+    reach = radius + other
     return dx * dx + dy * dy + dz * dz < reach * reach
 
 
 @allocation_free(forceinline=True)
 def _touching_each_other(robot, a, b, near, stop_at_first, work):
     """Those of the lanes `near` in which two groups touch each other."""
-    hits, frames, bounds = 0, work.frames, robot.row_bounds
+    hits = 0
+    frames = work.frames
+    bounds = robot.row_bounds
     for row in range(robot.first_row[a], robot.first_row[a + 1]):
         x, y, z = _centres_of(frames, robot.frame[a], bounds, row)
-        u, v, w = load(work.centres, b, 0), load(work.centres, b, 1), load(work.centres, b, 2)
+        u = load(work.centres, b, 0)
+        v = load(work.centres, b, 1)
+        w = load(work.centres, b, 2)
         near_row = near & ~hits & _touching_balls(x, y, z, bounds[row, 3], u, v, w, robot.bounds[b, 3])
         if near_row == 0:
             continue
@@ -263,7 +283,8 @@ def _rows_touch(robot, row, f, other, g, i, work):
     """Whether a row of spheres of frame f touches another one of frame g in lane i."""
     x, y, z = _place_row(robot, row, work.frames, f, i)
     u, v, w = _place_row(robot, other, work.frames, g, i)
-    radius, placed = load(robot.rows, row, 3), work.row
+    radius = load(robot.rows, row, 3)
+    placed = work.row
     store(placed, 0, 0, u)
     store(placed, 0, 1, v)
     store(placed, 0, 2, w)
@@ -278,19 +299,21 @@ def _rows_touch(robot, row, f, other, g, i, work):
 def _hits_scene(robot, scene, padding, stop_at_first, work):
     """Mask of the lanes in which the robot touches the scene."""
     hits = 0
-    frames, around, solids = work.frames, scene.solid_boxes, scene.solids
+    frames = work.frames
+    around = scene.solid_boxes
+    solids = scene.solids
     for g in range(len(robot.frame)):
         if robot.frame[g] == 0:
             continue
-        x, y, z = load(work.centres, g, 0), load(work.centres, g, 1), load(work.centres, g, 2)
-        x0, x1, y0, y1, z0, z1 = (
-            reduce_min(x),
-            reduce_max(x),
-            reduce_min(y),
-            reduce_max(y),
-            reduce_min(z),
-            reduce_max(z),
-        )
+        x = load(work.centres, g, 0)
+        y = load(work.centres, g, 1)
+        z = load(work.centres, g, 2)
+        x0 = reduce_min(x)
+        x1 = reduce_max(x)
+        y0 = reduce_min(y)
+        y1 = reduce_max(y)
+        z0 = reduce_min(z)
+        z1 = reduce_max(z)
         reach = robot.bounds[g, 3] + padding
         for row in range(len(around)):
             dx = maximum(maximum(load(around, row, 0) - x1, x0 - load(around, row, 3)), _ZERO)
@@ -322,7 +345,8 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
 def lanes_that_may_touch(robot, table, bit, q):
     """Mask of the lanes in which a pair may touch according to its table; see `sphere_pair_tables.py`."""
     row = robot.pair_tables[table]
-    first, second = load(q, np.int32(row[0]), 0), load(q, np.int32(row[3]), 0)
+    first = load(q, np.int32(row[0]), 0)
+    second = load(q, np.int32(row[3]), 0)
     i = minimum(maximum((first - row[1]) * row[2], _ZERO), np.float32(TABLE_SIDE - 1))
     j = minimum(maximum((second - row[4]) * row[5], _ZERO), np.float32(TABLE_SIDE - 1))
     cells = gather(row, floor(i) * np.float32(TABLE_SIDE) + floor(j) + np.float32(TABLE_HEADER))
@@ -332,11 +356,19 @@ def lanes_that_may_touch(robot, table, bit, q):
 @allocation_free(forceinline=True)
 def _hits_itself(robot, q, hits, stop_at_first, work):
     """`hits`, with the lanes added in which a checked pair of links touches."""
-    centres, bounds = work.centres, robot.bounds
+    centres = work.centres
+    bounds = robot.bounds
     for p in range(len(robot.pairs)):
-        a, b, table, bit = robot.pairs[p, 0], robot.pairs[p, 1], robot.pairs[p, 2], robot.pairs[p, 3]
-        x, y, z = load(centres, a, 0), load(centres, a, 1), load(centres, a, 2)
-        u, v, w = load(centres, b, 0), load(centres, b, 1), load(centres, b, 2)
+        a = robot.pairs[p, 0]
+        b = robot.pairs[p, 1]
+        table = robot.pairs[p, 2]
+        bit = robot.pairs[p, 3]
+        x = load(centres, a, 0)
+        y = load(centres, a, 1)
+        z = load(centres, a, 2)
+        u = load(centres, b, 0)
+        v = load(centres, b, 1)
+        w = load(centres, b, 2)
         near = _touching_balls(x, y, z, bounds[a, 3], u, v, w, bounds[b, 3]) & ~hits
         if table >= 0:
             near &= lanes_that_may_touch(robot, table, bit, q)

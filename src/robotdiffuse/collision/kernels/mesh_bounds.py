@@ -35,7 +35,9 @@ def scene_bounds(frames, frame, centers, radii, boxes):
     for i in range(len(frames)):
         T = frames[i, frame]
         for p in range(len(radii)):
-            x, y, z = placed(T, centers[p], 0), placed(T, centers[p], 1), placed(T, centers[p], 2)
+            x = placed(T, centers[p], 0)
+            y = placed(T, centers[p], 1)
+            z = placed(T, centers[p], 2)
             for o in range(obstacles):
                 gap = point_to_box(x, y, z, rotation[o], middle[o], half[o], 0.0)
                 out[i, p * obstacles + o] = gap - rounding[o] - radii[p]
@@ -49,12 +51,17 @@ def pair_bounds(frames, frame, centers, radii, other_frame, other_centers, other
     others = len(other_radii)
     out = np.empty((len(frames), len(radii) * others))
     for i in range(len(frames)):
-        S, T = frames[i, frame], frames[i, other_frame]
+        S = frames[i, frame]
+        T = frames[i, other_frame]
         for p in range(len(radii)):
-            x, y, z = placed(S, centers[p], 0), placed(S, centers[p], 1), placed(S, centers[p], 2)
+            x = placed(S, centers[p], 0)
+            y = placed(S, centers[p], 1)
+            z = placed(S, centers[p], 2)
             for o in range(others):
                 c = other_centers[o]
-                u, v, w = x - placed(T, c, 0), y - placed(T, c, 1), z - placed(T, c, 2)
+                u = x - placed(T, c, 0)
+                v = y - placed(T, c, 1)
+                w = z - placed(T, c, 2)
                 gap = np.sqrt(u * u + v * v + w * w)
                 out[i, p * others + o] = gap - radii[p] - other_radii[o]
     return out

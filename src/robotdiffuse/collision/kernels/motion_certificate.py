@@ -42,7 +42,8 @@ COAL_BELOW = 0.002
 """The same for distances that only Coal computes, which take fifty times as long [m]."""
 MAX_SPLIT = 4
 """A piece is split into at most this many parts at a time."""
-SCENE, PAIR = 0, 1
+SCENE = 0
+PAIR = 1
 
 
 class Arm(NamedTuple):
@@ -108,7 +109,8 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
     configuration(motion, stop, scratch)
     square = 0.0
     for j in range(dof):
-        before, after = dq[j] - q[j], scratch[j] - q[j]
+        before = dq[j] - q[j]
+        after = scratch[j] - q[j]
         dq[j] = 0.5 * (after - before)
         e[j] = 0.5 * abs(after + before)
         most[j] = max(abs(before), abs(after))
@@ -130,7 +132,8 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
 @inner_kernel(inline="always")
 def _remainder(radii, second, e, most):
     """The bound on |r| at the top of this file [m]."""
-    total, before = 0.0, 0.0
+    total = 0.0
+    before = 0.0
     for k in range(len(radii)):
         if k == second:
             before = 0.0
@@ -145,10 +148,16 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
     """Bounds of the pieces from the spheres; lowers best[2], the smallest measured clearances by kind."""
     n, count = pieces.undecided.shape
     dof = motion.q.shape[1]
-    clearance, lower = np.full((n, count), np.inf), np.full((n, count), np.inf)
+    clearance = np.full((n, count), np.inf)
+    lower = np.full((n, count), np.inf)
     rest = np.zeros((n, count))
-    block, moves = np.empty((dof, W), np.float32), np.empty((dof, W), np.float32)
-    q, dq, e, most, scratch = np.empty(dof), np.empty(dof), np.empty(dof), np.empty(dof), np.empty(dof)
+    block = np.empty((dof, W), np.float32)
+    moves = np.empty((dof, W), np.float32)
+    q = np.empty(dof)
+    dq = np.empty(dof)
+    e = np.empty(dof)
+    most = np.empty(dof)
+    scratch = np.empty(dof)
     for first in range(0, n, W):
         last = min(first + W, n)
         for i in range(W):
@@ -159,10 +168,12 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
                     if pieces.undecided[row, c]:
                         rest[row, c] = _remainder(checks.motion_radii[c], checks.second[c], e, most)
             for j in range(dof):
-                block[j, i], moves[j, i] = q[j], dq[j]
+                block[j, i] = q[j]
+                moves[j, i] = dq[j]
         place_motions(arm.spheres, block, moves, work)
         for c in range(count - 1, -1, -1):
-            open_ones, kind = 0, checks.kind[c]
+            open_ones = 0
+            kind = checks.kind[c]
             for i in range(W):
                 row = first + i
                 work.need[0, i] = -1.0
@@ -204,7 +215,11 @@ def bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, c
     """
     n, count = found.clearance.shape
     dof = motion.q.shape[1]
-    q, dq, e, most, scratch = np.empty(dof), np.empty(dof), np.empty(dof), np.empty(dof), np.empty(dof)
+    q = np.empty(dof)
+    dq = np.empty(dof)
+    e = np.empty(dof)
+    most = np.empty(dof)
+    scratch = np.empty(dof)
     asked = 0
     for row in range(n):
         posed = False
@@ -217,7 +232,9 @@ def bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, c
                 _spread(motion, found.pieces.start[row], found.pieces.stop[row], q, dq, e, most, scratch)
                 meshes.pose(arm.offsets, arm.parents, arm.slides, q, dq, posture)
                 posed = True
-            rest, kind, coarser = found.rest[row, c], checks.kind[c], found.clearance[row, c]
+            rest = found.rest[row, c]
+            kind = checks.kind[c]
+            coarser = found.clearance[row, c]
             clearance, lower, best[kind], coarse, touching = _parted(
                 arm.hulls, solids, checks, c, rest, best[kind], tightness, contact, posture
             )
@@ -244,8 +261,13 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     near; and whether bodies touch, or nearly.
     """
     against_scene = checks.kind[c] == SCENE
-    base, common, parts = checks.base[c], checks.common[c], len(hulls.frame)
-    clearance, lower, coarse, touching = CLEARANCE_CAP, CLEARANCE_CAP, False, False
+    base = checks.base[c]
+    common = checks.common[c]
+    parts = len(hulls.frame)
+    clearance = CLEARANCE_CAP
+    lower = CLEARANCE_CAP
+    coarse = False
+    touching = False
     others = range(len(solids.disc)) if against_scene else range(checks.parts[c, 2], checks.parts[c, 3])
     for p in range(checks.parts[c, 0], checks.parts[c, 1]):
         speed = meshes.part_speed(hulls, p, base, posture)
@@ -270,7 +292,8 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
                     touching = True
                 elif measured:
                     best = min(best, middle)
-            clearance, lower = min(clearance, middle), min(lower, along - rest)
+            clearance = min(clearance, middle)
+            lower = min(lower, along - rest)
     return clearance, lower, best, coarse, touching
 
 
@@ -279,20 +302,24 @@ def settle(checks, found, best, certified, tightness):
     """Settles the checks whose bounds suffice and splits the other pieces; lowers certified[2]."""
     pieces = found.pieces
     n, count = found.clearance.shape
-    parts, total = np.zeros(n, np.int64), np.int64(0)
+    parts = np.zeros(n, np.int64)
+    total = np.int64(0)
     for row in range(n):
         for c in range(count):
             if not pieces.undecided[row, c]:
                 continue
             kind = checks.kind[c]
-            least, lower = tightness * best[kind], found.lower[row, c]
+            least = tightness * best[kind]
+            lower = found.lower[row, c]
             if lower >= least:
                 pieces.undecided[row, c] = False
                 certified[kind] = min(certified[kind], lower)
                 continue
             # the loss of clearance along a piece falls linearly with its length, the remainder quadratically
-            rest, spare = found.rest[row, c], found.clearance[row, c] - least
-            lost, k = found.clearance[row, c] - lower - rest, 2
+            rest = found.rest[row, c]
+            spare = found.clearance[row, c] - least
+            lost = found.clearance[row, c] - lower - rest
+            k = 2
             while k < MAX_SPLIT and not lost / k + rest / (k * k) <= spare:
                 k += 1
             parts[row] = max(parts[row], k)
@@ -314,11 +341,14 @@ def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightnes
         asked = bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, contact, posture)
         n, count = found.clearance.shape
         if n == 0 or asked:
-            rows, columns, k = np.empty(asked, np.int64), np.empty(asked, np.int64), 0
+            rows = np.empty(asked, np.int64)
+            columns = np.empty(asked, np.int64)
+            k = 0
             for row in range(n):
                 for c in range(count):
                     if found.travel[row, c] >= 0:
-                        rows[k], columns[k] = row, c
+                        rows[k] = row
+                        columns[k] = c
                         k += 1
             return found, rows, columns
         pieces = settle(checks, found, best, certified, tightness)

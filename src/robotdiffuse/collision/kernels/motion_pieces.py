@@ -88,36 +88,49 @@ def first_pieces(motion, checks, travel):
     q, way = motion
     n, dof = q.shape
     ends = [0.0]
-    last, before = 0.0, -1
+    last = 0.0
+    before = -1
     for i in range(1, n):
         if way[i] <= way[i - 1]:
             continue
-        dot, a, b = 1.0, 1.0, 1.0
+        dot = 1.0
+        a = 1.0
+        b = 1.0
         if before >= 0:
-            dot, a, b = 0.0, 0.0, 0.0
+            dot = 0.0
+            a = 0.0
+            b = 0.0
             for j in range(dof):
-                u, v = q[before + 1, j] - q[before, j], q[i, j] - q[i - 1, j]
-                dot, a, b = dot + u * v, a + u * u, b + v * v
+                u = q[before + 1, j] - q[before, j]
+                v = q[i, j] - q[i - 1, j]
+                dot = dot + u * v
+                a = a + u * u
+                b = b + v * v
         if dot < STRAIGHT_COSINE * np.sqrt(a * b):
             _cut(ends, last, way[i - 1], travel)
             last = way[i - 1]
         before = i - 1
     if way[n - 1] > last:
         _cut(ends, last, way[n - 1], travel)
-    start, stop = np.empty(len(ends)), np.empty(len(ends))
+    start = np.empty(len(ends))
+    stop = np.empty(len(ends))
     for k in range(len(ends)):
-        start[k], stop[k] = ends[max(k - 1, 0)], ends[k]
+        start[k] = ends[max(k - 1, 0)]
+        stop[k] = ends[k]
     return Pieces(start, stop, np.ones((len(ends), len(checks.kind)), np.bool_))
 
 
 @inner_kernel()
 def split(pieces, parts, total):
     """Every piece in parts[n] equal parts, `total` altogether; 0 drops a piece."""
-    start, stop = np.empty(total), np.empty(total)
+    start = np.empty(total)
+    stop = np.empty(total)
     undecided = np.empty((total, pieces.undecided.shape[1]), np.bool_)
     at = 0
     for row in range(len(parts)):
-        begin, end, count = pieces.start[row], pieces.stop[row], parts[row]
+        begin = pieces.start[row]
+        end = pieces.stop[row]
+        count = parts[row]
         for k in range(count):
             start[at] = begin + (end - begin) * (k / count)
             stop[at] = end if k + 1 == count else begin + (end - begin) * ((k + 1) / count)

@@ -67,16 +67,19 @@ def motion_free(space, a, b, block, work):
     length = distance(a, b)
     pieces = max(int(np.ceil(length / RELAXATION_STEP)), 1)
     half = np.float32(0.5) * length / np.float32(pieces)
-    first, first_padding = 0, padding_near(space, a, b, np.float32(0.5) / np.float32(pieces), half)
+    first = 0
+    first_padding = padding_near(space, a, b, np.float32(0.5) / np.float32(pieces), half)
     for k in range(1, pieces + 1):
         padding = np.float32(-1.0)
         if k < pieces:
             padding = padding_near(space, a, b, (np.float32(k) + np.float32(0.5)) / np.float32(pieces), half)
         if padding != first_padding:
-            s, t = np.float32(first) / np.float32(pieces), np.float32(k) / np.float32(pieces)
+            s = np.float32(first) / np.float32(pieces)
+            t = np.float32(k) / np.float32(pieces)
             if not _stretch_free(space, a, b, s, t, first_padding, block, work):
                 return False
-            first, first_padding = k, padding
+            first = k
+            first_padding = padding
     return True
 
 
@@ -87,7 +90,8 @@ def padding_near(space, a, b, share, around):
     Near a start or goal that is closer to the scene, it is the padding which that allows, plus
     RELAXATION_SLOPE per radian of distance from it.
     """
-    padding, dof = space.padding, len(a)
+    padding = space.padding
+    dof = len(a)
     for m in range(len(space.near_ends)):
         total = np.float32(0.0)
         for j in range(dof):
@@ -122,7 +126,8 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
 def motions_free(space, path):
     """Whether each straight motion between rows of path[n, dof] is free of collision; row 0 is not
     checked."""
-    work, block = make_workspace(space.robot, space.scene), np.empty((path.shape[1], W), np.float32)
+    work = make_workspace(space.robot, space.scene)
+    block = np.empty((path.shape[1], W), np.float32)
     out = np.empty(len(path) - 1, np.bool_)
     for i in range(len(path) - 1):
         out[i] = motion_free(space, path[i], path[i + 1], block, work)

@@ -80,7 +80,8 @@ class Tasks(NamedTuple):
 @inner_kernel()
 def pose_at(tracks, o, time, rotation, xyz):
     """Writes the pose of obstacle o at a time: R_base_obstacle [3, 3] and its origin [3]."""
-    low, high = tracks.first[o], tracks.first[o + 1] - 1
+    low = tracks.first[o]
+    high = tracks.first[o + 1] - 1
     share = 0.0
     if time >= tracks.times[high]:
         low = high
@@ -94,9 +95,11 @@ def pose_at(tracks, o, time, rotation, xyz):
     for k in range(4):
         dot += tracks.wxyz[low, k] * tracks.wxyz[high, k]
     angle = np.arccos(min(max(dot, -1.0), 1.0))
-    a, b = 1.0 - share, share
+    a = 1.0 - share
+    b = share
     if angle > 1e-7:
-        a, b = np.sin((1.0 - share) * angle) / np.sin(angle), np.sin(share * angle) / np.sin(angle)
+        a = np.sin((1.0 - share) * angle) / np.sin(angle)
+        b = np.sin(share * angle) / np.sin(angle)
     w = a * tracks.wxyz[low, 0] + b * tracks.wxyz[high, 0]
     x = a * tracks.wxyz[low, 1] + b * tracks.wxyz[high, 1]
     y = a * tracks.wxyz[low, 2] + b * tracks.wxyz[high, 2]
@@ -118,17 +121,22 @@ def speed_between(tracks, o, start, stop):
 @inner_kernel()
 def _obstacle_distance(tracks, o, rotation, xyz, x, y, z):
     """Signed distance of a point to obstacle o without its growth [m]; inside, a lower bound."""
-    x, y, z = x - xyz[0], y - xyz[1], z - xyz[2]
+    x = x - xyz[0]
+    y = y - xyz[1]
+    z = z - xyz[2]
     u = abs(rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z - tracks.centre[o, 0])
     v = abs(rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z - tracks.centre[o, 1])
     w = abs(rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z - tracks.centre[o, 2])
     w -= tracks.half[o, 2]
     if tracks.disc[o] > 0:
         a = np.sqrt(u * u + v * v) - tracks.disc[o]
-        outside, deepest = max(a, 0.0) ** 2, a
+        outside = max(a, 0.0) ** 2
+        deepest = a
     else:
-        a, b = u - tracks.half[o, 0], v - tracks.half[o, 1]
-        outside, deepest = max(a, 0.0) ** 2 + max(b, 0.0) ** 2, max(a, b)
+        a = u - tracks.half[o, 0]
+        b = v - tracks.half[o, 1]
+        outside = max(a, 0.0) ** 2 + max(b, 0.0) ** 2
+        deepest = max(a, b)
     outside += max(w, 0.0) ** 2
     return np.sqrt(outside) + min(max(deepest, w), 0.0) - tracks.rounding[o]
 
@@ -201,28 +209,39 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     the tasks that are left to the exact meshes, one pair each, as (start, stop, link, obstacle): in their
     middles the spheres are within `least`.
     """
-    dof, count, obstacles = q.shape[1], len(links.frame), len(tracks.growth)
+    dof = q.shape[1]
+    count = len(links.frame)
+    obstacles = len(tracks.growth)
     ways = cumulative_motion(q)
     frames = np.zeros((dof + 1, 4, 4))
     for i in range(dof + 1):
         frames[i, 3, 3] = 1.0
     for k in range(3):
         frames[0, k, k] = 1.0
-    middle, moved = np.empty(dof), np.empty(dof)
-    rotation, xyz = np.empty((3, 3)), np.empty(3)
+    middle = np.empty(dof)
+    moved = np.empty(dof)
+    rotation = np.empty((3, 3))
+    xyz = np.empty(3)
     travel = np.empty(count)
-    starts, stops = np.empty(MAX_HALVINGS + 2), np.empty(MAX_HALVINGS + 2)
+    starts = np.empty(MAX_HALVINGS + 2)
+    stops = np.empty(MAX_HALVINGS + 2)
     depths = np.empty(MAX_HALVINGS + 2, np.int64)
     pairs = np.empty((MAX_HALVINGS + 2, count, obstacles), np.bool_)
     left = [(0.0, 0.0, 0, 0) for _ in range(0)]
     certified = CLEARANCE_CAP
     for task in range(len(tasks.start)):
-        starts[0], stops[0], depths[0], size = tasks.start[task], tasks.stop[task], 0, 1
+        starts[0] = tasks.start[task]
+        stops[0] = tasks.stop[task]
+        depths[0] = 0
+        size = 1
         pairs[0] = tasks.pairs[task]
         while size > 0:
             size -= 1
-            start, stop, depth = starts[size], stops[size], depths[size]
-            time, half = 0.5 * (start + stop), 0.5 * (stop - start)
+            start = starts[size]
+            stop = stops[size]
+            depth = depths[size]
+            time = 0.5 * (start + stop)
+            half = 0.5 * (stop - start)
             row, share = _row_at(times, time)
             first, first_share = _row_at(times, start)
             last, last_share = _row_at(times, stop)
@@ -238,13 +257,15 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                     travel[link] += links.motion_radii[link, j] * moved[j]
             again = False
             for o in range(obstacles):
-                posed, speed = False, 0.0
+                posed = False
+                speed = 0.0
                 for link in range(count):
                     if not pairs[size, link, o]:
                         continue
                     if not posed:
                         pose_at(tracks, o, time, rotation, xyz)
-                        speed, posed = speed_between(tracks, o, start, stop) * half, True
+                        speed = speed_between(tracks, o, start, stop) * half
+                        posed = True
                     grown = tracks.growth[o] * max(time, 0.0)
                     lost = travel[link] + speed + tracks.growth[o] * half
                     asked = max(least, tightness * best[0])
@@ -263,8 +284,10 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                         again = True
             if again:
                 pairs[size + 1] = pairs[size]
-                starts[size + 1], stops[size + 1] = start, time
-                starts[size], stops[size] = time, stop
+                starts[size + 1] = start
+                stops[size + 1] = time
+                starts[size] = time
+                stops[size] = stop
                 depths[size] = depths[size + 1] = depth + 1
                 size += 2
     return certified, left
@@ -274,14 +297,17 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
 def free_at_times(links, tracks, q, times, least):
     """Whether the covering spheres keep `least` [m] from all obstacles, [n, k], at each of q[n, dof] and each
     of the increasing times[k]."""
-    dof, count, obstacles = q.shape[1], len(links.frame), len(tracks.growth)
+    dof = q.shape[1]
+    count = len(links.frame)
+    obstacles = len(tracks.growth)
     frames = np.zeros((dof + 1, 4, 4))
     for i in range(dof + 1):
         frames[i, 3, 3] = 1.0
     for k in range(3):
         frames[0, k, k] = 1.0
     out = np.ones((len(q), len(times)), np.bool_)
-    rotations, places = np.empty((obstacles, len(times), 3, 3)), np.empty((obstacles, len(times), 3))
+    rotations = np.empty((obstacles, len(times), 3, 3))
+    places = np.empty((obstacles, len(times), 3))
     speeds = np.empty(obstacles)
     for o in range(obstacles):
         speeds[o] = speed_between(tracks, o, times[0], times[-1]) + tracks.growth[o]

@@ -21,7 +21,8 @@ def nearest_voxels(run):
     axis (A. Meijster, J. Roerdink, W. Hesselink, 2000).
     """
     nx, ny, nz = run.shape
-    squares, holders = np.full((nx, ny, nz), _NO_POINTS, np.int32), run.copy()
+    squares = np.full((nx, ny, nz), _NO_POINTS, np.int32)
+    holders = run.copy()
     for i in range(nx):
         for j in range(ny):
             for way in (1, -1):
@@ -30,10 +31,13 @@ def nearest_voxels(run):
                     last = k if run[i, j, k] >= 0 else last
                     square = (k - last) ** 2
                     if last >= 0 and square < squares[i, j, k]:
-                        squares[i, j, k], holders[i, j, k] = square, run[i, j, last]
+                        squares[i, j, k] = square
+                        holders[i, j, k] = run[i, j, last]
     longest = max(nx, ny)
-    kept, since = np.empty(longest, np.int32), np.empty(longest, np.int32)
-    before, whose = np.empty(longest, np.int32), np.empty(longest, np.int32)
+    kept = np.empty(longest, np.int32)
+    since = np.empty(longest, np.int32)
+    before = np.empty(longest, np.int32)
+    whose = np.empty(longest, np.int32)
     for i in range(nx):
         for k in range(nz):
             _nearest_in_line(squares[i, :, k], holders[i, :, k], kept, since, before, whose)
@@ -49,9 +53,11 @@ def _nearest_in_line(squares, holders, kept, since, before, whose):
 
     The first `top` + 1 entries of `kept` are the voxels on the envelope, each from place `since` on.
     """
-    n, top = len(squares), -1
+    n = len(squares)
+    top = -1
     for u in range(n):
-        before[u], whose[u] = squares[u], holders[u]
+        before[u] = squares[u]
+        whose[u] = holders[u]
         if before[u] == _NO_POINTS:
             continue
         while (
@@ -65,11 +71,13 @@ def _nearest_in_line(squares, holders, kept, since, before, whose):
             from_here = 1 + int(ahead / np.float64(2 * (u - s)) + _ROUNDED)
         if from_here < n:
             top += 1
-            kept[top], since[top] = u, from_here
+            kept[top] = u
+            since[top] = from_here
     if top < 0:
         return
     for u in range(n - 1, -1, -1):
         s = kept[top]
-        squares[u], holders[u] = before[s] + (u - s) ** 2, whose[s]
+        squares[u] = before[s] + (u - s) ** 2
+        holders[u] = whose[s]
         if u == since[top]:
             top -= 1

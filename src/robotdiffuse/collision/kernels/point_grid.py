@@ -50,7 +50,8 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
     for i in range(nx):
         for j in range(ny):
             for k in range(nz):
-                v, b = (i * ny + j) * nz + k, holders[i, j, k]
+                v = (i * ny + j) * nz + k
+                b = holders[i, j, k]
                 # no voxel with points is nearer, and no point is more than `blur` from its voxel's centre
                 lower = voxel * np.sqrt(np.float32(squares[i, j, k])) - blur
                 distances[v] = max(band, lower)
@@ -59,14 +60,14 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
                 nearest[v] = starts[b]
                 if lower >= band:
                     continue
-                cx, cy, cz = (
-                    low[0] + (np.float32(i) + _HALF) * voxel,
-                    low[1] + (np.float32(j) + _HALF) * voxel,
-                    low[2] + (np.float32(k) + _HALF) * voxel,
-                )
+                cx = low[0] + (np.float32(i) + _HALF) * voxel
+                cy = low[1] + (np.float32(j) + _HALF) * voxel
+                cz = low[2] + (np.float32(k) + _HALF) * voxel
                 best = band * band
                 for p in range(starts[b], starts[b + 1]):
-                    dx, dy, dz = points[p, 0] - cx, points[p, 1] - cy, points[p, 2] - cz
+                    dx = points[p, 0] - cx
+                    dy = points[p, 1] - cy
+                    dz = points[p, 2] - cz
                     d = dx * dx + dy * dy + dz * dz
                     if d < best:
                         best = d
@@ -81,12 +82,15 @@ def _balls(points, starts):
     """A ball [x, y, z, radius] around the points of each voxel that has any."""
     balls = np.zeros((len(starts) - 1, 4), np.float32)
     for b in range(len(balls)):
-        ball, share = balls[b], _ONE / np.float32(starts[b + 1] - starts[b])
+        ball = balls[b]
+        share = _ONE / np.float32(starts[b + 1] - starts[b])
         for p in range(starts[b], starts[b + 1]):
             for axis in range(3):
                 ball[axis] += share * points[p, axis]
         for p in range(starts[b], starts[b + 1]):
-            dx, dy, dz = points[p, 0] - ball[0], points[p, 1] - ball[1], points[p, 2] - ball[2]
+            dx = points[p, 0] - ball[0]
+            dy = points[p, 1] - ball[1]
+            dz = points[p, 2] - ball[2]
             ball[3] = max(ball[3], np.sqrt(dx * dx + dy * dy + dz * dz) + _SLACK)
     return balls
 
@@ -112,11 +116,18 @@ def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
     for b in range(len(balls)):
         x, y, z, radius = balls[b]
         wide = band + radius
-        px, py, pz, span = (x - low[0]) / voxel, (y - low[1]) / voxel, (z - low[2]) / voxel, wide / voxel
-        i0, i1 = max(int(px - span), 0), min(int(px + span) + 1, nx)
-        j0, j1 = max(int(py - span), 0), min(int(py + span) + 1, ny)
-        k0, k1 = max(int(pz - span), 0), min(int(pz + span) + 1, nz)
-        n, zero = np.int32(k1 - k0), np.float32(k0) + _HALF
+        px = (x - low[0]) / voxel
+        py = (y - low[1]) / voxel
+        pz = (z - low[2]) / voxel
+        span = wide / voxel
+        i0 = max(int(px - span), 0)
+        i1 = min(int(px + span) + 1, nx)
+        j0 = max(int(py - span), 0)
+        j1 = min(int(py + span) + 1, ny)
+        k0 = max(int(pz - span), 0)
+        k1 = min(int(pz + span) + 1, nz)
+        n = np.int32(k1 - k0)
+        zero = np.float32(k0) + _HALF
         for i in range(i0, i1):
             cx = low[0] + (np.float32(i) + _HALF) * voxel
             for j in range(j0, j1):
@@ -126,7 +137,8 @@ def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
                 if base >= wide * wide or not _any_closer(distances, at, n, base, pz - zero, voxel, radius):
                     continue
                 for p in range(starts[b], starts[b + 1]):
-                    dx, dy = cx - points[p, 0], cy - points[p, 1]
+                    dx = cx - points[p, 0]
+                    dy = cy - points[p, 1]
                     height = (points[p, 2] - low[2]) / voxel - zero
                     _closer(distances, nearest, at, n, dx * dx + dy * dy, height, voxel, np.int32(p), band)
 
@@ -159,17 +171,26 @@ def _ask_grid(x, y, z, radius, scene):
     """Two masks of spheres in 16 lanes, from the grid: those that may touch a point, and those that surely
     do."""
     frame = scene.grid_frame
-    band, voxel = frame[7], frame[3]
+    band = frame[7]
+    voxel = frame[3]
     inverse = _ONE / voxel
-    fx, fy, fz = (x - frame[0]) * inverse, (y - frame[1]) * inverse, (z - frame[2]) * inverse
+    fx = (x - frame[0]) * inverse
+    fy = (y - frame[1]) * inverse
+    fz = (z - frame[2]) * inverse
     cx = minimum(maximum(fx, _ZERO), frame[8] - _HALF)
     cy = minimum(maximum(fy, _ZERO), frame[9] - _HALF)
     cz = minimum(maximum(fz, _ZERO), frame[10] - _HALF)
-    ix, iy, iz = floor(cx), floor(cy), floor(cz)
+    ix = floor(cx)
+    iy = floor(cy)
+    iz = floor(cz)
     g = gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz)
-    ex, ey, ez = cx - ix - _HALF, cy - iy - _HALF, cz - iz - _HALF
+    ex = cx - ix - _HALF
+    ey = cy - iy - _HALF
+    ez = cz - iz - _HALF
     e = sqrt(ex * ex + ey * ey + ez * ez) * voxel
-    ox, oy, oz = fx - cx, fy - cy, fz - cz
+    ox = fx - cx
+    oy = fy - cy
+    oz = fz - cz
     out = (ox * ox + oy * oy + oz * oz) * (voxel * voxel)
     inner = maximum(g - e, _ZERO)
     free = radius + (frame[5] + _SLACK)
@@ -183,7 +204,9 @@ def far_from_points(scene, x0, x1, y0, y1, z0, z1, radius):
     """Whether a look-up in the middle of a box excludes that a sphere with its centre in the box touches a
     point."""
     lower, _, _ = _look_up(scene, _HALF * (x0 + x1), _HALF * (y0 + y1), _HALF * (z0 + z1))
-    dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+    dx = x1 - x0
+    dy = y1 - y0
+    dz = z1 - z0
     return lower > radius + _HALF * np.sqrt(dx * dx + dy * dy + dz * dz) + _SLACK
 
 
@@ -209,12 +232,12 @@ def _near_by_eight(x, y, z, radius, scene):
     lz = minimum(floor(maximum(fz - _HALF, _ZERO)), frame[10] - np.float32(2.0))
     bound = fx * _ZERO
     for corner in range(8):
-        ix, iy, iz = (
-            lx + np.float32(corner >> 2),
-            ly + np.float32((corner >> 1) & 1),
-            lz + np.float32(corner & 1),
-        )
-        ex, ey, ez = fx - ix - _HALF, fy - iy - _HALF, fz - iz - _HALF
+        ix = lx + np.float32(corner >> 2)
+        iy = ly + np.float32((corner >> 1) & 1)
+        iz = lz + np.float32(corner & 1)
+        ex = fx - ix - _HALF
+        ey = fy - iy - _HALF
+        ez = fz - iz - _HALF
         e = sqrt(ex * ex + ey * ey + ez * ez) * frame[3]
         bound = maximum(bound, gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz) - e)
     return bound < radius + (frame[5] + _SLACK)
@@ -240,9 +263,13 @@ def touch_points(x, y, z, radius, scene):
 def _columns(frame, rx, ry, reach):
     """Index ranges of the columns of cells that may contain points within `reach` of a place in the grid's
     frame."""
-    cell, mx, my = frame[4], int(frame[11]), int(frame[12])
-    i0, i1 = max(int((rx - reach) / cell), 0), min(int((rx + reach) / cell), mx - 1)
-    j0, j1 = max(int((ry - reach) / cell), 0), min(int((ry + reach) / cell), my - 1)
+    cell = frame[4]
+    mx = int(frame[11])
+    my = int(frame[12])
+    i0 = max(int((rx - reach) / cell), 0)
+    i1 = min(int((rx + reach) / cell), mx - 1)
+    j0 = max(int((ry - reach) / cell), 0)
+    j1 = min(int((ry + reach) / cell), my - 1)
     return i0, i1 + 1, j0, j1 + 1
 
 
@@ -250,14 +277,17 @@ def _columns(frame, rx, ry, reach):
 def _in_column(scene, i, j, rx, ry, rz, reach):
     """Index range of the points in a column's cells within `reach`; empty if there are none."""
     frame = scene.grid_frame
-    cell, my, mz = frame[4], int(frame[12]), int(frame[13])
+    cell = frame[4]
+    my = int(frame[12])
+    mz = int(frame[13])
     gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), _ZERO)
     gy = max(max(np.float32(j) * cell - ry, ry - np.float32(j + 1) * cell), _ZERO)
     rest = reach * reach - gx * gx - gy * gy
     if rest <= _ZERO:
         return np.int32(0), np.int32(0)
     half = np.sqrt(rest) + _SLACK
-    k0, k1 = max(int((rz - half) / cell), 0), min(int((rz + half) / cell), mz - 1)
+    k0 = max(int((rz - half) / cell), 0)
+    k1 = min(int((rz + half) / cell), mz - 1)
     if k0 > k1:
         return np.int32(0), np.int32(0)
     column = (i * my + j) * mz
@@ -267,17 +297,23 @@ def _in_column(scene, i, j, rx, ry, rz, reach):
 @allocation_free()
 def _touches(scene, x, y, z, radius):
     """Whether a sphere touches a point: the nearest one by the grid, or another in the cells around."""
-    frame, rows = scene.grid_frame, scene.point_rows
+    frame = scene.grid_frame
+    rows = scene.point_rows
     _, _, p = _look_up(scene, x, y, z)
     if p >= 0:
         point = scene.points[p]
-        dx, dy, dz, r = point[0] - x, point[1] - y, point[2] - z, radius + point[3]
+        dx = point[0] - x
+        dy = point[1] - y
+        dz = point[2] - z
+        r = radius + point[3]
         if dx * dx + dy * dy + dz * dz < r * r:
             return True
     reach = radius + frame[5] + _SLACK
     if reach <= _ZERO:
         return False
-    rx, ry, rz = x - frame[0], y - frame[1], z - frame[2]
+    rx = x - frame[0]
+    ry = y - frame[1]
+    rz = z - frame[2]
     i0, i1, j0, j1 = _columns(frame, rx, ry, reach)
     for i in range(i0, i1):
         for j in range(j0, j1):
@@ -285,7 +321,9 @@ def _touches(scene, x, y, z, radius):
             # sixteen points at once; a row may begin and end with points outside the range, which does no
             # harm
             for row in range(first // W, (last + W - 1) // W if last > first else 0):
-                dx, dy, dz = load(rows, row, 0) - x, load(rows, row, 1) - y, load(rows, row, 2) - z
+                dx = load(rows, row, 0) - x
+                dy = load(rows, row, 1) - y
+                dz = load(rows, row, 2) - z
                 r = load(rows, row, 3) + radius
                 if dx * dx + dy * dy + dz * dz < r * r:
                     return True
@@ -298,15 +336,23 @@ def _look_up(scene, x, y, z):
     and the index of the point stored in the voxel."""
     frame = scene.grid_frame
     voxel = frame[3]
-    fx, fy, fz = (x - frame[0]) / voxel, (y - frame[1]) / voxel, (z - frame[2]) / voxel
+    fx = (x - frame[0]) / voxel
+    fy = (y - frame[1]) / voxel
+    fz = (z - frame[2]) / voxel
     cx = min(max(fx, _ZERO), frame[8] - _HALF)
     cy = min(max(fy, _ZERO), frame[9] - _HALF)
     cz = min(max(fz, _ZERO), frame[10] - _HALF)
-    ix, iy, iz = np.int32(cx), np.int32(cy), np.int32(cz)
+    ix = np.int32(cx)
+    iy = np.int32(cy)
+    iz = np.int32(cz)
     index = (ix * np.int32(frame[9]) + iy) * np.int32(frame[10]) + iz
-    ex, ey, ez = cx - np.float32(ix) - _HALF, cy - np.float32(iy) - _HALF, cz - np.float32(iz) - _HALF
+    ex = cx - np.float32(ix) - _HALF
+    ey = cy - np.float32(iy) - _HALF
+    ez = cz - np.float32(iz) - _HALF
     inner = max(scene.grid[index] - voxel * np.sqrt(ex * ex + ey * ey + ez * ez), _ZERO)
-    ox, oy, oz = fx - cx, fy - cy, fz - cz
+    ox = fx - cx
+    oy = fy - cy
+    oz = fz - cz
     out = voxel * voxel * (ox * ox + oy * oy + oz * oz)
     return np.sqrt(inner * inner + out) - frame[5] - _SLACK, out, scene.nearest[index]
 
@@ -314,18 +360,23 @@ def _look_up(scene, x, y, z):
 @allocation_free(fastmath=True)
 def _search(scene, x, y, z, limit):
     """Distance to the surface of the nearest point below `limit`, else `limit`."""
-    points, frame = scene.points, scene.grid_frame
+    points = scene.points
+    frame = scene.grid_frame
     reach = limit + frame[5] + _SLACK
     best = limit
     if reach <= _ZERO:
         return best
-    rx, ry, rz = x - frame[0], y - frame[1], z - frame[2]
+    rx = x - frame[0]
+    ry = y - frame[1]
+    rz = z - frame[2]
     i0, i1, j0, j1 = _columns(frame, rx, ry, reach)
     for i in range(i0, i1):
         for j in range(j0, j1):
             first, last = _in_column(scene, i, j, rx, ry, rz, reach)
             for p in range(first, last):
-                dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                dx = points[p, 0] - x
+                dy = points[p, 1] - y
+                dz = points[p, 2] - z
                 r = best + points[p, 3]
                 square = dx * dx + dy * dy + dz * dz
                 if r > _ZERO and square < r * r:
@@ -348,7 +399,9 @@ def points_distance(scene, x, y, z, limit):
     if p < 0:
         return lower
     point = scene.points[p]
-    dx, dy, dz = point[0] - x, point[1] - y, point[2] - z
+    dx = point[0] - x
+    dy = point[1] - y
+    dz = point[2] - z
     best = min(np.sqrt(dx * dx + dy * dy + dz * dz) - point[3], limit)
     return _search(scene, x, y, z, best)
 
@@ -366,23 +419,36 @@ def near_point(scene, x, y, z, limit):
     It is the nearest of the points stored in the eight voxels around, and too far by a few millimetres at
     most. It serves for gradients, where an exact search would take too long.
     """
-    best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
+    best = limit
+    bx = _ZERO
+    by = _ZERO
+    bz = _ZERO
     lower, _, _ = _look_up(scene, x, y, z)
     if lower >= limit:
         return best, bx, by, bz
-    frame, points = scene.grid_frame, scene.points
-    nx, ny, nz = int(frame[8]), int(frame[9]), int(frame[10])
+    frame = scene.grid_frame
+    points = scene.points
+    nx = int(frame[8])
+    ny = int(frame[9])
+    nz = int(frame[10])
     voxel = frame[3]
     i = min(max(int(np.floor((x - frame[0]) / voxel - _HALF)), 0), nx - 2)
     j = min(max(int(np.floor((y - frame[1]) / voxel - _HALF)), 0), ny - 2)
     k = min(max(int(np.floor((z - frame[2]) / voxel - _HALF)), 0), nz - 2)
     for corner in range(8):
-        a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
+        a = corner >> 2
+        b = (corner >> 1) & 1
+        c = corner & 1
         p = scene.nearest[((i + a) * ny + j + b) * nz + k + c]
         if p < 0:
             continue
-        dx, dy, dz = x - points[p, 0], y - points[p, 1], z - points[p, 2]
+        dx = x - points[p, 0]
+        dy = y - points[p, 1]
+        dz = z - points[p, 2]
         d = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
         if d - points[p, 3] < best:
-            best, bx, by, bz = d - points[p, 3], dx / d, dy / d, dz / d
+            best = d - points[p, 3]
+            bx = dx / d
+            by = dy / d
+            bz = dz / d
     return best, bx, by, bz

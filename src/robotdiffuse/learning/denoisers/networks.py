@@ -314,7 +314,8 @@ class UNet(Denoiser):
     ) -> None:
         super().__init__(settings, waypoints, dof, features, condition)
         widths = [settings.width * multiple for multiple in settings.multiples]
-        halvings, token = len(widths) - 1, settings.condition_width
+        halvings = len(widths) - 1
+        token = settings.condition_width
         self.padding = -waypoints % 2**halvings
 
         def blocks(inputs: int, outputs: int) -> nn.ModuleList:

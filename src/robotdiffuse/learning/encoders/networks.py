@@ -212,7 +212,8 @@ class PointAutoencoder(Autoencoder):
         sizes = (3 + 6 * OCTAVES, *settings.points)
         self.points = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
         self.empty = nn.Parameter(torch.zeros(2 * sizes[-1]))
-        hidden, code = settings.hidden, settings.code
+        hidden = settings.hidden
+        code = settings.code
         self.head = nn.Sequential(
             nn.LayerNorm(2 * sizes[-1]), nn.Linear(2 * sizes[-1], hidden), nn.GELU("tanh"),
             nn.Linear(hidden, code),
@@ -280,13 +281,15 @@ class PointAutoencoder(Autoencoder):
     def _query_positions(self, cloud: Cloud, rng: Generator) -> Float[Tensor, "batch queries 3"]:
         """Positions at which the distance is reconstructed: half of them close to the surfaces."""
         batch, points, _ = cloud.shape
-        low, high = np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.3])
+        low = np.array([-1.0, -1.0, 0.0])
+        high = np.array([1.0, 1.0, 1.3])
         positions = torch.from_numpy(rng.uniform(low, high, (batch, DISTANCE_QUERIES, 3)).astype(np.float32))
         chosen = torch.from_numpy(rng.integers(0, points, DISTANCE_QUERIES // 2))
         spread = torch.from_numpy(
             0.1 * rng.standard_normal((batch, DISTANCE_QUERIES // 2, 3), dtype=np.float32)
         )
-        positions, close = positions.to(cloud.device), cloud[:, chosen] + spread.to(cloud.device)
+        positions = positions.to(cloud.device)
+        close = cloud[:, chosen] + spread.to(cloud.device)
         away = ~self.near(close)[..., None]
         return torch.cat(
             [

@@ -26,7 +26,8 @@ class BaselineNetwork(Network):
 
     def __init__(self, robot: RobotIdentity, settings: Any) -> None:
         super().__init__()
-        self.robot, self.settings = robot, settings
+        self.robot = robot
+        self.settings = settings
         self.dof, self.normalizer = robot.dof, robot.normalizer()
 
     def fit_statistics(self, data: TrajectoryData) -> None:
@@ -68,7 +69,8 @@ class _BaselineTask(MotionTask):
     def __init__(self, settings: BaselineTraining, processes: Processes) -> None:
         self.title, robot = settings.name, load_robot(settings.robot)
         torch.manual_seed(settings.seed)
-        kind, own = NETWORKS.load(settings.name), NETWORKS.defaults(settings.name)
+        kind = NETWORKS.load(settings.name)
+        own = NETWORKS.defaults(settings.name)
         self.module = kind(RobotIdentity.of(robot), own)
         super().__init__(settings, robot, None, processes)
         self.module.fit_statistics(self.train_data)

@@ -133,7 +133,8 @@ def load_data(
     parts: dict[str, list[_Part]] = {"train": [], "validation": []}
     encoder_fingerprint = "" if encoder is None else fingerprint(encoder)
     prints: list[str] = []
-    count, shards = 0, len(shard_indices(folder))
+    count = 0
+    shards = len(shard_indices(folder))
     for rows in read_rows(folder, robot, waypoints, turned_copies):
         prints += [rows.shard.fingerprint] * (rows.turn == 0)
         key = f"{rows.shard.fingerprint}-{encoder_fingerprint}" + (f"-turn{rows.turn}" if rows.turn else "")
@@ -245,8 +246,11 @@ class Batches:
         trivial_share: float,
         weight_limit: float | None,
     ) -> None:
-        self.data, self.model, self.clearances = data, model, clearances
-        self.trivial_share, self.weight_limit = trivial_share, weight_limit
+        self.data = data
+        self.model = model
+        self.clearances = clearances
+        self.trivial_share = trivial_share
+        self.weight_limit = weight_limit
 
     def draw(self, count: int, rng: np.random.Generator) -> Batch:
         """A random batch."""
@@ -258,9 +262,12 @@ class Batches:
 
     def at(self, rows: ndarray, levels: ndarray, rng: np.random.Generator) -> Batch:
         """The batch of these rows at these noise levels."""
-        data, model, schedule = self.data, self.model, self.model.schedule
+        data = self.data
+        model = self.model
+        schedule = self.model.schedule
         scenes = data.scenes[rows]
-        codes, clouds = np.zeros((len(rows), model.settings.code), np.float32), None
+        codes = np.zeros((len(rows), model.settings.code), np.float32)
+        clouds = None
         if data.codes is not None:
             codes = data.codes[rows].astype(np.float32)
         elif model.encoder is not None:

@@ -154,7 +154,8 @@ class CompletionTask(TrainingTask):
     module: CompletionNetwork
 
     def __init__(self, settings: CompletionTraining, processes: Processes) -> None:
-        self.settings, self.processes = settings, processes
+        self.settings = settings
+        self.processes = processes
         self.identity = {}
         self.robot = load_robot(settings.robot)
         torch.manual_seed(settings.seed)
@@ -197,12 +198,14 @@ class CompletionTask(TrainingTask):
                 fitted_temperature(logits[::CALIBRATION_STRIDE], truth[::CALIBRATION_STRIDE])
             )
         report = {"validation": loss, "temperature": float(network.temperature)}
-        all_p, all_truth = [], []
+        all_p = []
+        all_truth = []
         for name in FAMILIES:
             held_out = self._held_out((name,), VALIDATION_SAMPLES + CALIBRATION_SAMPLES, TEST_SAMPLES)
             logits, truth, unknown = self._predictions(held_out)
             p = 1 / (1 + np.exp(-logits / float(network.temperature)))
-            p, truth = p[unknown], truth[unknown]
+            p = p[unknown]
+            truth = truth[unknown]
             called = p > OCCUPIED_PROBABILITY
             right = float((called & truth).sum())
             report[f"precision {name}"] = right / max(1.0, float(called.sum()))
@@ -212,7 +215,8 @@ class CompletionTask(TrainingTask):
             if name in families:
                 all_p.append(p)
                 all_truth.append(truth)
-        p, truth = np.concatenate(all_p), np.concatenate(all_truth)
+        p = np.concatenate(all_p)
+        truth = np.concatenate(all_truth)
         report["calibration error"] = calibration_error(p, truth)
         self._figures = {"reliability": reliability(p, truth)}
         return report

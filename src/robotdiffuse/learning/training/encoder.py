@@ -17,8 +17,9 @@ from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.loop import Processes, TrainingTask, Validation, on_cpu, train
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
-READOUT_SCENES, TEST_SCENES = 2048, 512
-"""Scenes that a linear read-out is fitted to, and further ones that it is tested on."""
+# Scenes that a linear read-out is fitted to, and further ones that it is tested on.
+READOUT_SCENES = 2048
+TEST_SCENES = 512
 READOUT_POSITIONS = np.stack(
     np.meshgrid([-0.6, -0.2, 0.2, 0.6], [-0.6, -0.2, 0.2, 0.6], [0.2, 0.5, 0.8], indexing="ij"), -1
 ).reshape(-1, 3)
@@ -45,7 +46,9 @@ class _EncoderTask(TrainingTask):
     module: Autoencoder
 
     def __init__(self, settings: EncoderTraining, processes: Processes) -> None:
-        self.settings, self.processes, self.identity = settings, processes, {}
+        self.settings = settings
+        self.processes = processes
+        self.identity = {}
         torch.manual_seed(settings.seed)
         module = make_encoder(settings.name, settings.encoder)
         assert isinstance(module, Autoencoder)  # by EncoderTraining
@@ -53,7 +56,9 @@ class _EncoderTask(TrainingTask):
         self._most = settings.points if module.settings.any_size else module.settings.cloud
 
     def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
-        settings, module, most = self.settings, self.module, self._most
+        settings = self.settings
+        module = self.module
+        most = self._most
         points = int(rng.integers(max(1, most // 8), most + 1)) if module.settings.any_size else most
         error, _ = self._reconstruction(settings.batch, points, rng)
         theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()

@@ -273,7 +273,8 @@ class TrainingRun:
                     due = now - saved > self.settings.checkpoint_seconds
                     elapsed, stopped, due = self.processes.mean(now - last, stop.is_set(), due)
                     self.at.seconds += elapsed
-                    rate, last = self._samples_per_step / max(elapsed, 1e-9), now
+                    rate = self._samples_per_step / max(elapsed, 1e-9)
+                    last = now
                     if self.at.step % LOG_EVERY == 0:
                         self._log(None)
                         text = f"{self.rows[-1]['loss']:.4f}" if self.rows else ""
@@ -331,7 +332,9 @@ class TrainingRun:
         random_state = self.rng.bit_generator.state  # kept, so that other batches follow this time
         self._restore(check=False)
         self.rng.bit_generator.state = random_state
-        self.at.skipped, self.at.rollbacks, self.at.seconds = at.skipped, at.rollbacks + 1, at.seconds
+        self.at.skipped = at.skipped
+        self.at.rollbacks = at.rollbacks + 1
+        self.at.seconds = at.seconds
         self._bad = 0
 
     @contextmanager
@@ -468,9 +471,11 @@ class TrainingRun:
             ) from None
 
     def _check_same(self, notes: dict) -> None:
-        now, before = json.loads(json.dumps(self.settings.to_json())), notes["settings"]
+        now = json.loads(json.dumps(self.settings.to_json()))
+        before = notes["settings"]
         alone = {"processes": "1"}
-        now, before = now | alone | self.identity, before | alone | notes["identity"]
+        now = now | alone | self.identity
+        before = before | alone | notes["identity"]
         for name, value in now.items():
             if name not in FREE_SETTINGS and before.get(name) != value:
                 raise InputError(
@@ -541,7 +546,9 @@ class MotionTask(TrainingTask):
 
         Raises InputError if the data do not fit the robot, or there are none for training.
         """
-        self.settings, self.robot, self.processes = settings, robot, processes
+        self.settings = settings
+        self.robot = robot
+        self.processes = processes
         # the first process caches the codes of the scenes for the others
         with processes.first_goes_first():
             self.data = load_data(

@@ -39,7 +39,8 @@ class ForwardKinematics:
         turns = np.zeros((3, 4, 4))
         turns[0, 2, 2] = turns[0, 3, 3] = 1
         turns[1, 0, 0] = turns[1, 1, 1] = 1
-        turns[2, 1, 0], turns[2, 0, 1] = 1, -1
+        turns[2, 1, 0] = 1
+        turns[2, 0, 1] = -1
         slides = np.stack([np.eye(4), np.outer([0, 0, 1, 0], [0, 0, 0, 1])])
         self._steps = []
         """By joint, [12, 4]: C, A and B transposed, stacked; [8, 4]: C and the slide of a prismatic joint."""
@@ -51,7 +52,8 @@ class ForwardKinematics:
         """T_base_frame of all dof + 1 frames, the base (identity) first."""
         batch = q.shape[:-1]
         q = q.to(self.device, self.dtype).reshape(-1, self.robot.dof).t()
-        cosines, sines = q.cos(), q.sin()
+        cosines = q.cos()
+        sines = q.sin()
         # the batch is the last axis here, so that every operation runs along contiguous numbers
         T = torch.eye(4, dtype=self.dtype, device=self.device)[:3, :, None].expand(3, 4, q.shape[1])
         frames = [T]
@@ -113,7 +115,8 @@ class SurfacePoints:
         """
         robot = kinematics.robot
         self._kinematics = kinematics
-        frames, points = [], []
+        frames = []
+        points = []
         for link, meshes in robot.meshes.items():
             if robot.link_frame(link) == 0 or not meshes:
                 continue
@@ -154,7 +157,8 @@ class ArmDistance:
         )
         self._kinematics = kinematics
         self._frame = torch.as_tensor(groups[groups > 0], device=kinematics.device).long()
-        self._centres, self._radii = spheres[:, :3], spheres[:, 3]
+        self._centres = spheres[:, :3]
+        self._radii = spheres[:, 3]
 
     def __call__(
         self, q: Float[Tensor, "n waypoints dof"], scenes: PackedScenes
@@ -177,7 +181,8 @@ class ArmDistance:
 
 def _obstacles(scenes: PackedScenes) -> Float[Tensor, "16 n slots"]:
     """Centre, half edges, radius and rotation of the obstacles; a sphere is a box of size 0 with a radius."""
-    box, sphere = (scenes.kinds == BOX)[..., None], (scenes.kinds == SPHERE)[..., None]
+    box = (scenes.kinds == BOX)[..., None]
+    sphere = (scenes.kinds == SPHERE)[..., None]
     centre, size, wxyz = np.split(scenes.params, (3, 6), -1)
     rotation = rotation_from_quaternion(np.where(box, wxyz, [1, 0, 0, 0])).reshape(*scenes.kinds.shape, 9)
     parts = centre, np.where(box, size / 2, 0), np.where(sphere, size[..., :1], 0), rotation
@@ -192,7 +197,8 @@ def _nearest(
     slot = torch.zeros_like(least, dtype=torch.int64)
     for j in np.flatnonzero(present.any(0)):
         rows = torch.from_numpy(np.flatnonzero(present[:, j])).to(at.device)
-        distance, before = _distance(at[:, rows], obstacles[:, rows, j, None]), least[rows]
+        distance = _distance(at[:, rows], obstacles[:, rows, j, None])
+        before = least[rows]
         slot[rows] = torch.where(distance < before, int(j), slot[rows])
         least[rows] = torch.minimum(distance, before)
     return slot, least

@@ -73,7 +73,8 @@ def _sampled_free(
     candidates: int,
     rng: np.random.Generator,
 ) -> Bool[ndarray, "candidates"]:
-    q, checker = data.q[row], CollisionChecker(robot, data.scenes.scene(row))
+    q = data.q[row]
+    checker = CollisionChecker(robot, data.scenes.scene(row))
     code = np.zeros(0)
     if data.codes is not None:
         code = data.codes[row]
@@ -84,7 +85,8 @@ def _sampled_free(
     def guide(q: ndarray, _level: float) -> ndarray:
         return guidance(q, PRIOR_GUIDANCE_STEPS)[0]
 
-    start, goal = q[0].astype(np.float64), q[-1].astype(np.float64)
+    start = q[0].astype(np.float64)
+    goal = q[-1].astype(np.float64)
     clearances = link_clearances(checker, model.settings)
     settings = SamplingSettings(samples=candidates, sampling_steps=min(SAMPLING_STEPS, model.schedule.steps))
     guided = guide if model.encoder is None else None
@@ -151,7 +153,8 @@ class PlannerTask(MotionTask):
         if own.progressive:
             self.model.coarsen(block_at(fraction))
         batches = Batches(data, self._on_cpu, self.clearances, own.trivial_share, own.weight_limit)
-        batch, dropped = batches.draw(own.batch, rng), None
+        batch = batches.draw(own.batch, rng)
+        dropped = None
         if own.condition_drop > 0 and not validating:
             dropped = torch.from_numpy(rng.random(own.batch) < own.condition_drop)
         return self._loss(batch, fraction, rng, dropped)
@@ -192,7 +195,9 @@ class PlannerLoss:
     def __init__(
         self, model: MotionNetwork, robot: Robot, settings: PlannerTraining, processes: Processes
     ) -> None:
-        self.model, self.settings, self.processes = model, settings.losses, processes
+        self.model = model
+        self.settings = settings.losses
+        self.processes = processes
         kinematics = ForwardKinematics(robot, device=processes.device)
         rng = np.random.default_rng(settings.seed)
         self.points = (
@@ -208,7 +213,9 @@ class PlannerLoss:
         dropped: Bool[Tensor, "n"] | None = None,
     ) -> Float[Tensor, ""]:
         """The loss. fraction: of the training that is done; dropped: samples whose condition is hidden."""
-        model, losses, device = self.model, self.settings, self.processes.device
+        model = self.model
+        losses = self.settings
+        device = self.processes.device
         features, level, condition, target, weight = (
             torch.from_numpy(a).to(device)
             for a in (batch.features, batch.level, batch.condition, batch.target, batch.weight)
@@ -234,7 +241,8 @@ class PlannerLoss:
         rng: np.random.Generator,
     ) -> Float[Tensor, "n"]:
         """L_point and L_collision of each sample, at some of the waypoints."""
-        model, losses = self.model, self.settings
+        model = self.model
+        losses = self.settings
         last = model.settings.waypoints - 1
         waypoints = sorted(
             rng.choice(np.arange(1, last), min(losses.waypoints, last - 1), replace=False).tolist()

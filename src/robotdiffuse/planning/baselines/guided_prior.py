@@ -138,7 +138,8 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        prior, samples = self.network(context.problem.robot), self.settings.samples
+        prior = self.network(context.problem.robot)
+        samples = self.settings.samples
         start, goals = shared_out(*start_goal.rows(), samples)
         space = search_space(start_goal.checker, SAMPLE_RESOLUTION)
         closest: tuple[int, float, ndarray] | None = None
@@ -218,7 +219,8 @@ def sample(
     except _StoppedError:
         return None
     q = prior.joints(prior.clipped(x), reference)
-    q[:, 0], q[:, -1] = starts, goals
+    q[:, 0] = starts
+    q[:, -1] = goals
     return q
 
 
@@ -260,10 +262,8 @@ def collision_gradient(
     depth = np.sqrt(2 * squares)
     gradients = gradients / np.maximum(depth, np.float32(1e-6))[:, None]
     at_waypoints = count * waypoints
-    costs, by_frame = (
-        depth[:at_waypoints].reshape(q.shape[:2]).sum(1),
-        gradients[:at_waypoints].reshape(q.shape),
-    )
+    costs = depth[:at_waypoints].reshape(q.shape[:2]).sum(1)
+    by_frame = gradients[:at_waypoints].reshape(q.shape)
     if between:
         weight = np.float32(1 / between)
         costs = costs + weight * depth[at_waypoints:].reshape(count, -1).sum(1)
@@ -336,7 +336,8 @@ class MPD(GuidedPrior[MPDSettings]):
 
     def guided(self, checker: CollisionChecker, q: Trajectories) -> Trajectories:
         """Trajectories after the gradient steps of one denoising step; their ends stay fixed."""
-        settings, robot = self.settings, checker.robot
+        settings = self.settings
+        robot = checker.robot
         for _ in range(GUIDE_STEPS):
             _, gradient = collision_gradient(
                 checker, q, settings.margin, settings.self_margin, settings.between
@@ -389,7 +390,8 @@ def position_precision(waypoints: int) -> Float[ndarray, "waypoints waypoints"]:
     natural cubic splines; straight lines cost nothing.
     """
     every = state_precision(waypoints)
-    position, velocity = slice(0, None, 2), slice(1, None, 2)
+    position = slice(0, None, 2)
+    velocity = slice(1, None, 2)
     mixed = every[position, velocity]
     return every[position, position] - mixed @ np.linalg.solve(every[velocity, velocity], mixed.T)
 
@@ -494,7 +496,8 @@ class EDMP(GuidedPrior[EDMPSettings]):
 
     def guided(self, checker: CollisionChecker, q: Trajectories, left: int) -> Trajectories:
         """The batch after a gradient step of every guide on its rows; the ends of trajectories stay fixed."""
-        settings, moved = self.settings, q.copy()
+        settings = self.settings
+        moved = q.copy()
         for share, guide in zip(settings.shares(), settings.guides, strict=True):
             margin = guide.margin(left, settings.sampling_steps)
             if margin is None:

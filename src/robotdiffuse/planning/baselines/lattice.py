@@ -50,8 +50,10 @@ from robotdiffuse.scenes.scene import Scene
 
 INFINITE = 1 << 60
 """Cost of nodes that are not reached."""
-UNKNOWN, FREE, BLOCKED = 0, 1, 2
-"""States of nodes and edges."""
+# States of nodes and edges.
+UNKNOWN = 0
+FREE = 1
+BLOCKED = 2
 NODES, QUEUED, EXPANSIONS, TARGET, OFFSET = range(5)
 """Places in `Table.values`."""
 _FACTOR_1, _FACTOR_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
@@ -91,13 +93,17 @@ def make_table(goals: int, max_nodes: int, edges: int) -> Table:
     n = goals + max_nodes
     slots = np.zeros(1 << (2 * n - 1).bit_length(), np.int32)
     keys, g, rhs, first, second = (np.empty(n, np.int64) for _ in range(5))
-    parent, heap, place = np.empty(n, np.int32), np.empty(n, np.int32), np.zeros(n, np.int32)
-    state, known = np.zeros(n, np.uint8), np.zeros((n, edges), np.uint8)
+    parent = np.empty(n, np.int32)
+    heap = np.empty(n, np.int32)
+    place = np.zeros(n, np.int32)
+    state = np.zeros(n, np.uint8)
+    known = np.zeros((n, edges), np.uint8)
     values = np.zeros(5, np.int64)
     table = Table(slots, keys, g, rhs, parent, state, known, heap, place, first, second, values)
     table.values[NODES] = goals
     table.g[:goals] = table.rhs[:goals] = INFINITE
-    table.parent[:goals], table.state[:goals] = -1, FREE
+    table.parent[:goals] = -1
+    table.state[:goals] = FREE
     return table
 
 
@@ -123,7 +129,10 @@ def find(table, key, add):
     if table.slots[i] == 0 and add and node < len(table.keys):
         table.values[NODES] += 1
         table.slots[i] = node + 1
-        table.keys[node], table.g[node], table.rhs[node], table.parent[node] = key, INFINITE, INFINITE, -1
+        table.keys[node] = key
+        table.g[node] = INFINITE
+        table.rhs[node] = INFINITE
+        table.parent[node] = -1
     return np.int64(table.slots[i]) - 1
 
 
@@ -141,7 +150,9 @@ def _before(table, a, b):
 @allocation_free()
 def _settle(table, i, node):
     """Fill the gap at place i of the heap with a node, moved up or down to where its keys belong."""
-    heap, place, queued = table.heap, table.place, table.values[QUEUED]
+    heap = table.heap
+    place = table.place
+    queued = table.values[QUEUED]
     while i > 0 and _before(table, node, heap[(i - 1) // 2]):
         heap[i] = heap[(i - 1) // 2]
         place[heap[i]] = i + 1
@@ -155,13 +166,15 @@ def _settle(table, i, node):
         heap[i] = heap[child]
         place[heap[i]] = i + 1
         i = child
-    heap[i], place[node] = node, i + 1
+    heap[i] = node
+    place[node] = i + 1
 
 
 @allocation_free(inner=False)
 def put(table, node, first, second):
     """Queue a node, or change its keys if it is queued."""
-    table.first[node], table.second[node] = first, second
+    table.first[node] = first
+    table.second[node] = second
     if table.place[node] == 0:
         table.values[QUEUED] += 1
         table.place[node] = table.values[QUEUED]
@@ -288,20 +301,25 @@ def _check_nodes(s, nodes):
 def _look_around(s, node, near, steps, add):
     """Write the neighbors of a node, and the costs of the edges to them; neighbors that are not in memory are
     added if `add`. Returns False if memory is full."""
-    lattice, table, at = s.lattice, s.table, s.at
+    lattice = s.lattice
+    table = s.table
+    at = s.at
     moves, dof = lattice.moves.shape
     _coordinates(lattice, table.keys[node], at)
     for m in range(moves):
-        key, inside = table.keys[node], True
+        key = table.keys[node]
+        inside = True
         for j in range(dof):
             if lattice.moves[m, j] != 0:
                 inside &= 0 <= at[j] + lattice.moves[m, j] < lattice.counts[j]
                 key += lattice.moves[m, j] * lattice.strides[j]
-        near[m], steps[m] = find(table, key, add) if inside else np.int64(-1), lattice.costs[m]
+        near[m] = find(table, key, add) if inside else np.int64(-1)
+        steps[m] = lattice.costs[m]
         if add and inside and near[m] < 0:
             return False
     for goal in range(len(lattice.goals)):
-        square, corner = 0.0, True
+        square = 0.0
+        corner = True
         for j in range(dof):
             low = np.int64(np.floor(lattice.goals_at[goal, j]))
             corner &= low <= at[j] <= low + 1
@@ -317,12 +335,14 @@ def _edge_free(s, u, v, e):
 
     Of a move and its negative, the first half has the motion that is checked, for the same result from both.
     """
-    lattice, table = s.lattice, s.table
+    lattice = s.lattice
+    table = s.table
     moves = len(lattice.moves)
     half = moves // 2
     if table.state[u] != FREE or table.state[v] != FREE:
         return False
-    node, column = (v if half <= e < moves else u), (e % half if e < moves else e - half)
+    node = v if half <= e < moves else u
+    column = e % half if e < moves else e - half
     remembered = table.edges.shape[1] > 0
     if remembered and table.edges[node, column] != UNKNOWN:
         return table.edges[node, column] == FREE
@@ -352,9 +372,11 @@ def heuristic(lattice, at, targets, cell):
     best = np.inf
     diagonal = 1.0 / np.sqrt(len(at))
     for k in range(len(targets)):
-        square, by_joint = 0.0, 0.0
+        square = 0.0
+        by_joint = 0.0
         for j in range(len(at)):
-            d, low = at[j] - targets[k, j], np.int64(np.floor(targets[k, j]))
+            d = at[j] - targets[k, j]
+            low = np.int64(np.floor(targets[k, j]))
             square += d * d
             steps = max(low - at[j], at[j] - low - cell, 0)
             by_joint += steps * lattice.slope + (abs(d) - steps) * diagonal
@@ -365,7 +387,8 @@ def heuristic(lattice, at, targets, cell):
 @allocation_free()
 def _queue_key(s, node):
     """CalculateKey of D* Lite, whose k_m is OFFSET."""
-    least, bound = min(s.table.g[node], s.table.rhs[node]), np.int64(0)
+    least = min(s.table.g[node], s.table.rhs[node])
+    bound = np.int64(0)
     if node >= len(s.lattice.goals):
         _coordinates(s.lattice, s.table.keys[node], s.at)
         bound = np.int64(s.inflation * heuristic(s.lattice, s.at, s.targets, s.cell))
@@ -386,7 +409,8 @@ def _queue_if_inconsistent(s, node):
 def _choose_parent(s, node):
     """Set rhs and the parent of a node by all of its edges. Those that cannot lower rhs are not checked."""
     table = s.table
-    table.rhs[node], table.parent[node] = INFINITE, -1
+    table.rhs[node] = INFINITE
+    table.parent[node] = -1
     if table.state[node] != FREE:
         return
     _look_around(s, node, s.near_other, s.steps_other, False)
@@ -395,15 +419,18 @@ def _choose_parent(s, node):
         if v >= 0:
             cost = table.g[v] + s.steps_other[e]
             if cost < table.rhs[node] and _edge_free(s, node, v, e):
-                table.rhs[node], table.parent[node] = cost, v
+                table.rhs[node] = cost
+                table.parent[node] = v
 
 
 @kernel(nogil=True)
 def search(s, expansions):
     """ComputeShortestPath of D* Lite, for up to `expansions` expansions; returns an Outcome. Edges that
     cannot lower a node's cost are not checked."""
-    table, goals = s.table, len(s.lattice.goals)
-    g, rhs = table.g, table.rhs
+    table = s.table
+    goals = len(s.lattice.goals)
+    g = table.g
+    rhs = table.rhs
     for _ in range(expansions):
         u = np.int64(table.heap[0]) if table.values[QUEUED] > 0 else table.values[TARGET]
         if u < goals:
@@ -431,7 +458,8 @@ def search(s, expansions):
                 closed = s.inflation > 1 and g[v] < INFINITE
                 if cost >= rhs[v] or closed or not _edge_free(s, u, v, e):
                     continue
-                rhs[v], table.parent[v] = cost, u
+                rhs[v] = cost
+                table.parent[v] = u
             elif table.parent[v] == u:
                 _choose_parent(s, v)
             else:
@@ -448,11 +476,14 @@ def update(s, distances, reaches):
     point of the arm moves by half of each move [m]; an edge is unchanged if both of its nodes are farther
     away than that. Edges to the goals are all checked again.
     """
-    table, half, goals = s.table, len(reaches), len(s.lattice.goals)
+    table = s.table
+    half = len(reaches)
+    goals = len(s.lattice.goals)
     changed = np.zeros(len(table.keys), np.bool_)
     for node in range(goals, table.values[NODES]):
         if distances[node] <= 0 or table.state[node] == UNKNOWN:
-            table.state[node], changed[node] = UNKNOWN, True
+            table.state[node] = UNKNOWN
+            changed[node] = True
         _look_around(s, node, s.near, s.steps, False)
         for column in range(table.edges.shape[1]):
             if table.edges[node, column] == UNKNOWN:
@@ -523,8 +554,10 @@ def make_lattice(
     robot: Robot, start: Configuration, goals: Configurations, settings: LatticeSettings
 ) -> tuple[Lattice, int]:
     """The lattice through the start, and the start's key. Raises InputError for one that is too large."""
-    spacing, name = settings.spacing, settings.settings_name
-    start, most = start.astype(float), min(settings.joints_per_move, robot.dof)
+    spacing = settings.spacing
+    name = settings.settings_name
+    start = start.astype(float)
+    most = min(settings.joints_per_move, robot.dof)
     below, above = (
         np.maximum(np.floor(distance / spacing - LIMIT_MARGIN), 0).astype(np.int64)
         for distance in (start - robot.lower, robot.upper - start)
@@ -578,7 +611,9 @@ class AStarSearch(Generic[LatticePlannerSettings]):
         padding: float = 0.0,
     ) -> None:
         """`padding` is the distance to obstacles that paths keep [m]."""
-        self.settings, self.padding, self.goals = settings, padding, goals
+        self.settings = settings
+        self.padding = padding
+        self.goals = goals
         self._lattice, key = make_lattice(checker.robot, start, goals, settings)
         self._expansions = max(CLOCK_INTERVAL // len(self._lattice.moves), 1)
         self._begin(checker, key)
@@ -587,7 +622,8 @@ class AStarSearch(Generic[LatticePlannerSettings]):
         """Make the table, and queue the nodes of the source."""
         self._table = make_table(len(self.goals), self.settings.max_nodes, 0)
         [start] = add_nodes(self._table, np.array([start_key]))
-        self._table.rhs[start], self._table.state[start] = 0, FREE
+        self._table.rhs[start] = 0
+        self._table.state[start] = FREE
         put(self._table, start, 0, 0)
         self._use(checker, self._lattice.goals_at, 1, getattr(self.settings, "inflation", 1.0), -1)
 
@@ -601,7 +637,8 @@ class AStarSearch(Generic[LatticePlannerSettings]):
     ) -> None:
         """The compiled search among the obstacles of a checker; see `Search`."""
         space = search_space(checker, self.settings.resolution, self.padding)
-        edges, dof = len(self._lattice.moves) + len(self.goals), checker.robot.dof
+        edges = len(self._lattice.moves) + len(self.goals)
+        dof = checker.robot.dof
         near, steps, near_other, steps_other = np.empty((4, edges), np.int64)
         a, b = np.empty((2, dof), np.float32)
         self.checker = checker
@@ -651,7 +688,8 @@ class AStarSearch(Generic[LatticePlannerSettings]):
         return keys[:, None] // self._lattice.strides % self._lattice.counts
 
     def _configurations(self, at: Int[ndarray, "n dof"]) -> Configurations:
-        robot, lattice = self.checker.robot, self._lattice
+        robot = self.checker.robot
+        lattice = self._lattice
         return np.clip(lattice.origin + lattice.spacing * at, robot.lower, robot.upper)
 
 
@@ -660,7 +698,8 @@ class DStarLiteSearch(AStarSearch[DStarLiteSettings]):
     the 2^dof nodes around each goal."""
 
     def _begin(self, checker: CollisionChecker, start_key: int) -> None:
-        goals, lattice = len(self.goals), self._lattice
+        goals = len(self.goals)
+        lattice = self._lattice
         half = len(lattice.moves) // 2
         corners = np.floor(lattice.goals_at).astype(np.int64)[:, None] + list(
             product((0, 1), repeat=len(lattice.counts))
@@ -703,7 +742,8 @@ class DStarLiteSearch(AStarSearch[DStarLiteSettings]):
         """A lower bound of the distance of the arm at each node from shapes that were added, removed or moved
         [m]."""
         distances = np.full(len(self._table.keys), np.inf, np.float32)
-        before, after = self.checker.scene.shapes, checker.scene.shapes
+        before = self.checker.scene.shapes
+        after = checker.scene.shapes
         kept = {id(shape) for shape in before} & {id(shape) for shape in after}
         kept = kept if self.checker.scene.allowed_contacts == checker.scene.allowed_contacts else set()
         moved = [shape for shape in (*before, *after) if id(shape) not in kept]
@@ -772,10 +812,14 @@ class _LatticePlanner(Planner[LatticePlannerSettings]):
 class AStar(_LatticePlanner[AStarSettings]):
     """Weighted A* on a lattice."""
 
-    name, settings_class, search = "a_star", AStarSettings, AStarSearch
+    name = "a_star"
+    settings_class = AStarSettings
+    search = AStarSearch
 
 
 class DStarLite(_LatticePlanner[DStarLiteSettings]):
     """D* Lite on a lattice, for one problem; `DStarLiteSearch` can be repaired after changes."""
 
-    name, settings_class, search = "d_star_lite", DStarLiteSettings, DStarLiteSearch
+    name = "d_star_lite"
+    settings_class = DStarLiteSettings
+    search = DStarLiteSearch

@@ -63,7 +63,8 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        network, rng = self.network(context.problem.robot), context.rng
+        network = self.network(context.problem.robot)
+        rng = context.rng
         best: _Motion | None = None
         tried = 0
         while best is None or context.remaining > 0:
@@ -97,7 +98,8 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
 
         tried: number of roll-outs before; the very first one goes on even if it collides.
         """
-        settings, first = self.settings, tried == 0
+        settings = self.settings
+        first = tried == 0
         space = search_space(start_goal.checker, settings.resolution)
         start, goals = start_goal.rows()
         order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")
@@ -129,7 +131,8 @@ class _Motion:
     """The motion of a roll-out so far."""
 
     def __init__(self, start: Float32[ndarray, "dof"], goal: Float32[ndarray, "dof"]) -> None:
-        self.waypoints, self.goal = [start], goal
+        self.waypoints = [start]
+        self.goal = goal
         self.collided = self.arrived = False
 
     @property

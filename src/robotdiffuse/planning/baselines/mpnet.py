@@ -74,8 +74,10 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        network, settings = self.network(context.problem.robot), self.settings
-        best, rounds = Attempt(np.inf, np.inf, np.zeros((0, 0))), 0
+        network = self.network(context.problem.robot)
+        settings = self.settings
+        best = Attempt(np.inf, np.inf, np.zeros((0, 0)))
+        rounds = 0
         while rounds == 0 or context.remaining > 0:
             one = NeuralPlanning(context, start_goal, network, settings, context.rng)
             found = one.best()
@@ -117,7 +119,9 @@ class NeuralPlanning:
         settings: MPNetPlannerSettings,
         rng: np.random.Generator,
     ) -> None:
-        self.context, self.network, self.settings = context, network, settings
+        self.context = context
+        self.network = network
+        self.settings = settings
         self.space = search_space(
             start_goal.checker, settings.resolution, start_goal.kept_clearance(settings.clearance)
         )
@@ -167,8 +171,11 @@ class NeuralPlanning:
         Motions whose ends were not connected have a segment in collision; so may others, whose states
         collide.
         """
-        forth, back = [[q] for q in starts], [[q] for q in goals]
-        near, far, apart = forth, back, list(range(len(starts)))
+        forth = [[q] for q in starts]
+        back = [[q] for q in goals]
+        near = forth
+        far = back
+        apart = list(range(len(starts)))
         for _ in range(self.settings.steps):
             if not apart or self.context.remaining <= 0:
                 break

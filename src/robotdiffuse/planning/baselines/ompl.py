@@ -91,7 +91,8 @@ class Watch:
     @contextmanager
     def until_shorter(self, planner: Any, than: float) -> Iterator[ob.PlannerTerminationCondition]:
         """A condition that also ends the search once the planner has a path shorter than this [rad]."""
-        self._planner, self._shorter_than = planner, than
+        self._planner = planner
+        self._shorter_than = than
         yield from self._while(ob.PlannerTerminationCondition(self._is_over))
 
     def caught(self, error: BaseException) -> None:
@@ -101,7 +102,8 @@ class Watch:
 
     def raise_caught(self) -> None:
         """Raise the kept exception and drop it, as its traceback refers to the validity checkers."""
-        error, self._error = self._error, None
+        error = self._error
+        self._error = None
         try:
             if error is not None:
                 raise error
@@ -131,13 +133,15 @@ class StateChecks(ob.StateValidityChecker):
 
     def __init__(self, information: ob.SpaceInformation, space: Space, watch: Watch) -> None:
         super().__init__(information)
-        self._space, self._watch = space, watch
+        self._space = space
+        self._watch = watch
         self._joints = slice(0, len(space.lower))
         self._q = np.empty((1, len(space.lower)), np.float32)
 
     def isValid(self, state: ob.RealVectorStateType) -> bool:
         try:
-            space, self._q[0] = self._space, state[self._joints]
+            space = self._space
+            self._q[0] = state[self._joints]
             return bool(lane_collision.free_many(space.robot, space.scene, self._q, space.padding)[0])
         except BaseException as error:
             self._watch.caught(error)
@@ -149,14 +153,16 @@ class MotionChecks(ob.MotionValidator):
 
     def __init__(self, information: ob.SpaceInformation, space: Space, watch: Watch) -> None:
         super().__init__(information)
-        self._space, self._watch = space, watch
+        self._space = space
+        self._watch = watch
         self._joints = slice(0, len(space.lower))
         self._line = np.empty((2, len(space.lower)), np.float32)
 
     def checkMotion(self, a: ob.RealVectorStateType, b: ob.RealVectorStateType) -> bool:
         line = self._line
         try:
-            line[0], line[1] = a[self._joints], b[self._joints]
+            line[0] = a[self._joints]
+            line[1] = b[self._joints]
             return bool(motions_free(self._space, line)[0])
         except BaseException as error:
             self._watch.caught(error)
@@ -200,24 +206,30 @@ class OmplPlanner(Planner[OmplSettings]):
 
     def _best(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """The shortest valid path when time runs out or a path is optimal."""
-        problem, settings, attempt = context.problem, self.settings, 0
+        problem = context.problem
+        settings = self.settings
+        attempt = 0
         start, goals = start_goal.rows()
         nearest = float(np.linalg.norm(goals - start, axis=1).min())
         enough = (1 + OPTIMAL) * max(nearest, SAME_STATE_DISTANCE)
-        best, shortest, searched = None, np.inf, np.inf
+        best = None
+        shortest = np.inf
+        searched = np.inf
         search = _Search(context, start_goal, self, settings, attempt)
         while search.run(shorter_than=max((1 - IMPROVEMENT) * searched, enough)):
             path = Path(problem.robot.joint_names, start_goal.complete(search.path()))
             searched = search.cost
             if path.length < shortest:
                 if context.validator.path(path).valid:
-                    best, shortest = path.positions, path.length
+                    best = path.positions
+                    shortest = path.length
                     context.improved(shortest)
                     if searched <= enough:
                         break
                 else:
                     settings = replace(settings, resolution=finer_resolution(settings.resolution))
-                    attempt, searched = attempt + 1, np.inf
+                    attempt = attempt + 1
+                    searched = np.inf
                     search = _Search(context, start_goal, self, settings, attempt)
             if context.remaining <= 0:
                 break
@@ -231,21 +243,27 @@ class OmplPlanner(Planner[OmplSettings]):
 class OmplRRT(OmplPlanner):
     """S. LaValle and J. Kuffner, "Randomized kinodynamic planning", IJRR 2001."""
 
-    name, algorithm, anytime = "ompl_rrt", og.RRT, False
+    name = "ompl_rrt"
+    algorithm = og.RRT
+    anytime = False
 
 
 class OmplRRTConnect(OmplPlanner):
     """J. Kuffner and S. LaValle, "RRT-Connect: An efficient approach to single-query path planning",
     ICRA 2000."""
 
-    name, algorithm, anytime = "ompl_rrt_connect", og.RRTConnect, False
+    name = "ompl_rrt_connect"
+    algorithm = og.RRTConnect
+    anytime = False
 
 
 class OmplPRM(OmplPlanner):
     """L. Kavraki et al., "Probabilistic roadmaps for path planning in high-dimensional configuration spaces",
     IEEE Transactions on Robotics and Automation 1996."""
 
-    name, algorithm, anytime = "ompl_prm", og.PRM, False
+    name = "ompl_prm"
+    algorithm = og.PRM
+    anytime = False
     # a second thread adds all goals but the first, and holds the roadmap's lock while it waits for Python's,
     # which the first thread holds while it waits for the roadmap's; with a single goal it adds none
     backwards = True
@@ -254,27 +272,35 @@ class OmplPRM(OmplPlanner):
 class OmplRRTStar(OmplPlanner):
     """S. Karaman and E. Frazzoli, "Sampling-based algorithms for optimal motion planning", IJRR 2011."""
 
-    name, algorithm, anytime = "ompl_rrt_star", og.RRTstar, True
+    name = "ompl_rrt_star"
+    algorithm = og.RRTstar
+    anytime = True
 
 
 class OmplInformedRRTStar(OmplPlanner):
     """J. Gammell et al., "Informed RRT*: Optimal sampling-based path planning focused via direct sampling of
     an admissible ellipsoidal heuristic", IROS 2014."""
 
-    name, algorithm, anytime = "ompl_informed_rrt_star", og.InformedRRTstar, True
+    name = "ompl_informed_rrt_star"
+    algorithm = og.InformedRRTstar
+    anytime = True
 
 
 class OmplBITStar(OmplPlanner):
     """J. Gammell et al., "Batch informed trees (BIT*)", IJRR 2020."""
 
-    name, algorithm, anytime = "ompl_bit_star", og.BITstar, True
+    name = "ompl_bit_star"
+    algorithm = og.BITstar
+    anytime = True
 
 
 class OmplAORRTC(OmplPlanner):
     """T. Wilson et al., "AORRTC: Almost-surely asymptotically optimal planning with RRT-Connect",
     IEEE Robotics and Automation Letters 2025."""
 
-    name, algorithm, anytime = "ompl_aorrtc", og.AORRTC, True
+    name = "ompl_aorrtc"
+    algorithm = og.AORRTC
+    anytime = True
 
 
 class _Search:
@@ -290,7 +316,8 @@ class _Search:
     ) -> None:
         # OMPL seeds every generator that it creates from here on from this source; 0 is not a seed
         ou.RNG.setSeed(int(np.random.SeedSequence([context.request.seed, attempt]).generate_state(1)[0]) or 1)
-        self._call, self._robot = context, context.problem.robot
+        self._call = context
+        self._robot = context.problem.robot
         self._watch = Watch(context)
         space = search_space(
             start_goal.checker, settings.resolution, start_goal.kept_clearance(settings.clearance)
@@ -378,7 +405,8 @@ class _Search:
 
 
 def _state_space(robot: Robot) -> ob.RealVectorStateSpace:
-    states, bounds = ob.RealVectorStateSpace(robot.dof), ob.RealVectorBounds(robot.dof)
+    states = ob.RealVectorStateSpace(robot.dof)
+    bounds = ob.RealVectorBounds(robot.dof)
     for joint in range(robot.dof):
         bounds.setLow(joint, float(robot.lower[joint]))
         bounds.setHigh(joint, float(robot.upper[joint]))

@@ -11,7 +11,8 @@ from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.start_goal import StartGoal
 
-NEAREST, ANY = "nearest", "any"
+NEAREST = "nearest"
+ANY = "any"
 
 
 @dataclass(frozen=True)

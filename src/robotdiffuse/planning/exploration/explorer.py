@@ -106,7 +106,8 @@ class Explorer:
         if free_zone is not None:
             self.map.declare_free(free_zone)
         self._planner = load_planner("robotdiffuse")
-        self._rng, self._seed = np.random.default_rng(seed), seed
+        self._rng = np.random.default_rng(seed)
+        self._seed = seed
         self._views = ViewMemory(robot)
         self._goal_seen = GoalSeen(robot, self.map, self._views, settings.see_goal)
         self._goal: Goal | None = None
@@ -146,7 +147,8 @@ class Explorer:
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
         q = vector("explorer", "configuration", configuration, self.robot.dof)
-        self._news, self._free = [], self.map.free
+        self._news = []
+        self._free = self.map.free
         if goal_error(self.robot, self._goal, q, ARRIVED) is None:
             return Step(DONE, "the arm is at the goal")
         if not len(self._views):
@@ -250,11 +252,13 @@ class Explorer:
         tentative, wanted = self._least_unseen(problem) if path is None else (motion, self.wanted(path))
         if tentative.path is None:
             return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
-        kept, under = None, policy
+        kept = None
+        under = policy
         if policy == CHANCE and predicted is not None:
             kept = self._with_confidence(tentative, predicted)
         elif not wanted.any():
-            kept, under = self._within_seen_free(problem, tentative.path.positions, "as seen"), STRICT
+            kept = self._within_seen_free(problem, tentative.path.positions, "as seen")
+            under = STRICT
         if kept is not None and self._may_go(kept, under):
             return self._go(kept, under)
         predicted = self.predicted() if predicted is None else predicted

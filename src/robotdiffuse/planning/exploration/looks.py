@@ -68,7 +68,9 @@ class ReachableTree:
 
     def way(self, number: int) -> Configurations:
         """Waypoints from the start to one of the configurations."""
-        nodes, parents, path = self._trees.nodes[0], self._trees.parents[0], [number]
+        nodes = self._trees.nodes[0]
+        parents = self._trees.parents[0]
+        path = [number]
         while parents[path[-1]] >= 0:
             path.append(parents[path[-1]])
         way = simplify(self._space, nodes[path[::-1]], 1).astype(np.float64)
@@ -85,17 +87,20 @@ def first_parts(waypoints: Configurations) -> Iterator[Configurations]:
         yield np.concatenate([waypoints[at < end], last[None]])
 
 
-CONFIGURATIONS, TARGETS, ROUNDS = 900, 1200, 5
-"""Reachable configurations that a look is chosen from, at first; random ones that they are sought by in a
-round; and the most rounds."""
+# Reachable configurations that a look is chosen from, at first; random ones that they are sought by in a
+# round; and the most rounds.
+CONFIGURATIONS = 900
+TARGETS = 1200
+ROUNDS = 5
 SPREADS = (0.3, 0.8, 2.0)
 """Standard deviations of the distances of random ones from the arm's, in equal parts [rad]."""
 LONGEST_STEP = 1.0
 """The longest step towards one [rad, joint-space L2]; most are much shorter, for gaps."""
 REFINEMENTS = (0.25, 0.1)
 """Standard deviations of the configurations around the best ones, in rounds after the first [rad]."""
-REFINED, NEIGHBOURS = 12, 15
-"""Number of the best ones, and of configurations around each of them."""
+# Number of the best ones, and of configurations around each of them.
+REFINED = 12
+NEIGHBOURS = 15
 MAX_VOXELS = 1500
 """Most swept voxels from which looks are scored."""
 FULL_COST_LENGTH = 8.0
@@ -143,7 +148,8 @@ def best_looks(
         np.maximum(filled, np.where(known.free, np.float32(0), probability), out=filled)
     if len(at) > MAX_VOXELS:
         chosen = rng.choice(len(at), MAX_VOXELS, replace=False)
-        at, weights = at[chosen], weights[chosen]
+        at = at[chosen]
+        weights = weights[chosen]
     start, (width, height) = tree.configurations[0], camera.size
 
     def scored(q: Configurations) -> Float[ndarray, "n"]:

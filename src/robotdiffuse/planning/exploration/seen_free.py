@@ -95,8 +95,10 @@ def _walls() -> list[Box]:
     walls = []
     for axis in range(3):
         for at, name in ((low[axis] - WALL / 2, "before"), (high[axis] + WALL / 2, "beyond")):
-            center, size = (low + high) / 2, high - low + 2 * WALL
-            center[axis], size[axis] = at, WALL
+            center = (low + high) / 2
+            size = high - low + 2 * WALL
+            center[axis] = at
+            size[axis] = WALL
             walls.append(Box(tuple(center), tuple(size), name=f"{name} the map, {'xyz'[axis]}"))
     return walls
 
@@ -113,7 +115,10 @@ class GoalSeen:
     def __init__(self, robot: Robot, known: OccupancyMap, views: ViewMemory, required: bool) -> None:
         """views: kept ones, which count for new goals. required: False if goals need not be seen; nothing is
         missing then."""
-        self._robot, self._known, self._views, self._required = robot, known, views, required
+        self._robot = robot
+        self._known = known
+        self._views = views
+        self._required = required
         self._unseen: dict[tuple[float, ...], Points] = {}
         """Centres of the balls that no view has shown to be free, by configuration [m]."""
         self.taken: list[Configuration] = []

@@ -104,7 +104,8 @@ class RecordedExplorer(Explorer):
     def next(self, configuration: ArrayLike) -> Step:
         """See `Explorer.next`."""
         q = vector("explorer", "configuration", configuration, self.robot.dof)
-        begins, step = self.duration, super().next(q)
+        begins = self.duration
+        step = super().next(q)
         T = None
         if step.kind == LOOK and self.cameras:
             T = self.cameras[0].poses(self.robot, _waypoints(step, q)[-1:])[0]
@@ -135,16 +136,19 @@ def _waypoints(step: Step, q: Configuration) -> Configurations:
 
 WRIST_OFFSET = (0.04, 0.0, 0.03)
 """Position of the simulated camera in the frame of the arm's tip [m]."""
-SIZE, FIELD_OF_VIEW = (320, 240), (1.22, 0.96)
-"""Width and height of its images [pixels], and horizontal and vertical field of view [rad]."""
+# Width and height of its images [pixels], and horizontal and vertical field of view [rad].
+SIZE = (320, 240)
+FIELD_OF_VIEW = (1.22, 0.96)
 LENS_RADIUS = 0.005
 """A camera nearer to an obstacle than this sees nothing [m]."""
 MIN_DEPTH = 0.15
 """Nearer surfaces give no return [m]."""
-BESIDE_POSITION, BESIDE_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
-"""Of the camera beside the arm [m]."""
-BESIDE_SIZE, BESIDE_FOCAL_LENGTH = (640, 480), 460.0
-"""Width, height and focal length of its images [pixels]."""
+# Of the camera beside the arm [m].
+BESIDE_POSITION = (-0.5, 1.1, 1.2)
+BESIDE_TARGET = (0.6, 0.0, 0.5)
+# Width, height and focal length of its images [pixels].
+BESIDE_SIZE = (640, 480)
+BESIDE_FOCAL_LENGTH = 460.0
 FLOOR = "floor"
 """Shapes of this name are known without being seen."""
 FREE_ZONE = ((-0.36, -0.36, 0.0), (0.36, 0.36, 0.7))
@@ -153,8 +157,9 @@ UNSUPPORTED = (
     "waypoints", "constraints", "moving", "payload", "start_velocity", "views", "unknown", "clearance"
 )  # fmt: skip
 """Fields of problems that an Explorer does not take into account."""
-IMAGE_PERIOD, MAX_IMAGES = 0.25, 8
-"""Time between images during a motion [s], and the most images of a motion, that at its end included."""
+# Time between images during a motion [s], and the most images of a motion, that at its end included.
+IMAGE_PERIOD = 0.25
+MAX_IMAGES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +249,8 @@ def explore(
     The cameras on the arm take images during each motion. beside: an image of a camera that stands; it takes
     another one after each motion, of what the arm hid before.
     """
-    rng, q = np.random.default_rng(seed), problem.start
+    rng = np.random.default_rng(seed)
+    q = problem.start
     explorer.set_goal(problem.goal)
     for camera in explorer.cameras:
         explorer.observe(taken(problem, camera, q, noise, rng))
@@ -253,7 +259,8 @@ def explore(
         if step.motion is None or step.motion.path is None:
             yield Event(step, q)
             return
-        path, trajectory = step.motion.path, step.motion.trajectory
+        path = step.motion.path
+        trajectory = step.motion.trajectory
         asked = step.motion.problem
         true = Problem(problem.robot, problem.scene, asked.start, asked.goal)
         found = verify(true, path).violation
@@ -265,7 +272,8 @@ def explore(
         q = path.positions[-1]
         if beside is not None:
             height, width = beside.depth.shape
-            T, size = beside.T_base_camera, (width, height)
+            T = beside.T_base_camera
+            size = (width, height)
             view = ray_cast(problem.scene, T, beside.intrinsics, size, problem.robot, q)
             explorer.observe(measured(view, np.inf, noise, rng))
         yield Event(step, q, "" if found is None else found.message)

@@ -43,9 +43,14 @@ class ArmCamera(Value):
         return link_poses(robot, q, self.link) @ self.T_link_camera
 
 
-GO, LOOK, DONE, STUCK = "go", "look", "done", "stuck"
-"""What a step asks for."""
-STRICT, CHANCE, STRICT_THEN_CHANCE = "strict", "chance", "strict_then_chance"
+# What a step asks for.
+GO = "go"
+LOOK = "look"
+DONE = "done"
+STUCK = "stuck"
+STRICT = "strict"
+CHANCE = "chance"
+STRICT_THEN_CHANCE = "strict_then_chance"
 POLICIES = (STRICT, CHANCE, STRICT_THEN_CHANCE)
 
 

@@ -72,7 +72,8 @@ def stop_before(
     """
     if not 0 <= time <= motion.duration:
         raise InputError(f"time is {shown(time)}; it must be in [0, {motion.duration:.4g}] s of the motion")
-    here, end = motion.at(time).positions, motion.positions[-1]
+    here = motion.at(time).positions
+    end = motion.positions[-1]
     seen = seen_shapes(views, robot, known, here, end[None])
     points = np.concatenate([np.zeros((0, 3)), *(shape.points for shape in seen)])
     appeared = PointCloud(points[_within(points, free)], APPEARED_PADDING, name="appeared")
@@ -97,14 +98,16 @@ def _within(points: Points, free: Voxels) -> Bool[ndarray, "n"]:
 
 def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
     """The motion from a time on that rests as early as possible, on the same path and within the limits."""
-    best, rests = _rows(motion, time, motion.duration - time, 0.0, RAMPS[0]), motion.duration
+    best = _rows(motion, time, motion.duration - time, 0.0, RAMPS[0])
+    rests = motion.duration
     for delay in np.arange(0.0, motion.duration - time, BRAKING_DELAY):
         for braking, ramp in product(BRAKING_TIMES, RAMPS):
             if time + delay + braking / 2 >= rests:
                 break
             found = _rows(motion, time, float(delay), float(braking), ramp)
             if _within_limits(robot, found):
-                best, rests = found, time + delay + braking / 2
+                best = found
+                rests = time + delay + braking / 2
                 break
     return best
 
@@ -118,10 +121,14 @@ def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: f
     duration = delay + braking
     count = max(int(np.ceil(duration / ROW_TIME)), 1)
     times = duration * np.arange(count + 1) / count
-    passed, speed, slowing = times, np.ones(count + 1), np.zeros(count + 1)
+    passed = times
+    speed = np.ones(count + 1)
+    slowing = np.zeros(count + 1)
     if braking > 0:
-        u, most = np.clip((times - delay) / braking, 0.0, 1.0), 1 / (1 - ramp)
-        left, parts = 1 - u, [u < ramp, u <= 1 - ramp]
+        u = np.clip((times - delay) / braking, 0.0, 1.0)
+        most = 1 / (1 - ramp)
+        left = 1 - u
+        parts = [u < ramp, u <= 1 - ramp]
         early = u - most * u**3 / (6 * ramp)
         middle = u - most * (u**2 / 2 - ramp * u / 2 + ramp**2 / 6)
         ways = [early, middle, 0.5 - most * left**3 / (6 * ramp)]
@@ -130,7 +137,8 @@ def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: f
         speed = 1 - np.select(parts, slower, 1 - most * left**2 / (2 * ramp))
         slowing = -np.select(parts, [most * u / ramp, most + 0 * u], most * left / ramp) / braking
     q, v, a, _ = motion.at(np.minimum(time + passed, motion.duration))
-    speed, slowing = speed[:, None], slowing[:, None]
+    speed = speed[:, None]
+    slowing = slowing[:, None]
     return Trajectory(motion.joint_names, times, q, v * speed, a * speed**2 + v * slowing)
 
 

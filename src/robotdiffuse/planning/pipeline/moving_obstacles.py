@@ -33,7 +33,8 @@ from robotdiffuse.trajectories.timing import MIN_DISTANCE, SPEED_FACTORS, StopGr
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verifier
 
-UNREACHED, WAITED = -2, -1
+UNREACHED = -2
+WAITED = -1
 CELLS_PER_CLOCK_CHECK = 10_000_000
 """Cells of motions that are visited between two readings of the clock."""
 
@@ -72,7 +73,8 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
     """Go through `count` ticks from `begin`, and write to came[ticks, places] by which motion a place is
     reached at a tick, or WAITED. Returns the tick at which the last place is first reached; -1 if it is none
     of these."""
-    places, ticks = len(cell), clear.shape[1]
+    places = len(cell)
+    ticks = clear.shape[1]
     for now in range(begin, min(begin + count, ticks - 1)):
         if came[now, places - 1] != UNREACHED:
             return now
@@ -86,7 +88,8 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
                 continue
             free = True
             for k in range(first[m + 1] - first[m] - 1):
-                a, b = cells[first[m] + k], cells[first[m] + k + 1]
+                a = cells[first[m] + k]
+                b = cells[first[m] + k + 1]
                 if not (clear[a, now + k + 1] and clear[b, now + k] and clear[b, now + k + 1]):
                     free = False
                     break
@@ -118,8 +121,9 @@ CELL_SECONDS = 1e-8
 """Least computing time per cell of the grid (a configuration at a time) [s]."""
 GRID_TRAVEL = 0.02
 """No point of the arm moves further than this between two configurations of the grid [m]."""
-EXTRA_TIME, DURATION_FACTOR = 5.0, 3.0
-"""The grid ends at this factor of the duration without moving obstacles, plus this time [s]."""
+# The grid ends at this factor of the duration without moving obstacles, plus this time [s].
+EXTRA_TIME = 5.0
+DURATION_FACTOR = 3.0
 PATH_TIME_FRACTION = 0.5
 """Part of the time left that planning each path gets."""
 
@@ -138,8 +142,11 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
             Status.INVALID_START, f"the start is in collision: {first.link} touches {first.obstacle}"
         )
     context.begin_search()
-    rng, attempts, tried = np.random.default_rng(request.seed), 0, 0
-    horizon, reason = 0.0, ""
+    rng = np.random.default_rng(request.seed)
+    attempts = 0
+    tried = 0
+    horizon = 0.0
+    reason = ""
     while attempts == 0 or context.remaining > 0:
         scene = problem.scene
         if attempts % 2:  # paths around the obstacles where they are at some time
@@ -183,7 +190,8 @@ def _solved(
 ) -> PlanResult:
     assert found.scene_clearance is not None and found.self_clearance is not None
     assert scene is not None and itself is not None
-    scene, itself = min(scene, found.scene_clearance), min(itself, found.self_clearance)
+    scene = min(scene, found.scene_clearance)
+    itself = min(itself, found.self_clearance)
     return replace(
         found,
         reason=f"{found.reason}, timed among moving obstacles",
@@ -199,7 +207,8 @@ def _solved(
 
 def _stops(problem: Problem, path: Path) -> list[int]:
     """The rows of a path at its waypoints: for each the first one after the waypoint before."""
-    rows, stops = range(len(path.positions)), [0]
+    rows = range(len(path.positions))
+    stops = [0]
     for goal in problem.waypoints:
         there = (i for i in rows[stops[-1] :] if goal_error(problem.robot, goal, path.positions[i]) is None)
         stops.append(next(there))
@@ -217,7 +226,8 @@ def _timed(
     of times; None if there is none."""
     path = found.path
     assert path is not None
-    robot, validator = problem.robot, verifier(replace(problem, moving=()))
+    robot = problem.robot
+    validator = verifier(replace(problem, moving=()))
     if path.length < MIN_DISTANCE:
         return time_parameterize(robot, path, lambda _: True, validator.collision_free, context.timing)
     rests = StopGraph(

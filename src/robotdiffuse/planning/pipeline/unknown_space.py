@@ -43,11 +43,13 @@ from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
-MAX_FIRST_MOTIONS, MIN_FIRST_MOTIONS = 8, 4
-"""First motions under an assumption that the one of least probability is chosen from: most and fewest ..."""
-ACCEPTABLE_RISK, NEGLIGIBLE_RISK = 2.0, 0.1
-"""... the search for more of them ends after the fewest once one sweeps a summed probability of no more than
-the first, and at once when one sweeps no more than the second."""
+# First motions under an assumption that the one of least probability is chosen from: most and fewest ...
+MAX_FIRST_MOTIONS = 8
+MIN_FIRST_MOTIONS = 4
+# ... the search for more of them ends after the fewest once one sweeps a summed probability of no more than
+# the first, and at once when one sweeps no more than the second.
+ACCEPTABLE_RISK = 2.0
+NEGLIGIBLE_RISK = 0.1
 CONFIDENCE_TOLERANCE = 0.01
 """A shorter motion is preferred if its confidence is lower by no more than this."""
 AS_SEEN_TIME_FRACTION = 0.3
@@ -99,7 +101,8 @@ def plan_with_unknown_space(
     if problem.views and all(view.is_blind for view in problem.views):
         context.note(BLIND)
     attempts = _Attempts(solver, context, unknown)
-    as_seen, limit = replace(problem, views=()), request.time_limit
+    as_seen = replace(problem, views=())
+    limit = request.time_limit
     failed = list[str]()
     if policy != OPTIMISTIC:
         goals = _goals(context, as_seen)
@@ -166,7 +169,8 @@ def assumptions_of(
 
     predicted: the probability that each fine voxel is occupied, for the policy "predicted".
     """
-    robot, known = problem.robot, problem.known_scene
+    robot = problem.robot
+    known = problem.known_scene
     policy, _ = policy_for(problem)
     if policy == PADDED:
         seen = [shape.points for shape in problem.scene.shapes if isinstance(shape, SeenPoints)]
@@ -220,7 +224,9 @@ class _Attempts:
     """The attempts of a planner under the assumptions of one call."""
 
     def __init__(self, solver: Solver, context: PlanningContext, unknown: UnknownSpace) -> None:
-        self.solver, self.context, self.unknown = solver, context, unknown
+        self.solver = solver
+        self.context = context
+        self.unknown = unknown
 
     def best(self, problem: Problem, assumption: str, until: float) -> PlanResult:
         """A motion found by `until` [s since the call], or the result that says why there is none.
@@ -254,7 +260,8 @@ class _Attempts:
         return replace(chosen.result, planning_time=self.context.elapsed)
 
     def _attempt(self, problem: Problem, until: float, request: PlanRequest) -> PlanResult:
-        whole, began = self.context.request, self.context.elapsed
+        whole = self.context.request
+        began = self.context.elapsed
         limit = max(until - began, MIN_TIME_FRACTION * whole.time_limit)
         result = attempt(self.solver, problem, replace(request, time_limit=limit))
         progress = tuple((began + at, length) for at, length in result.progress)
@@ -266,7 +273,9 @@ class _Motion:
 
     def __init__(self, result: PlanResult, assumption: str, unknown: UnknownSpace) -> None:
         assert result.path is not None
-        self._result, self._assumption, self.length = result, assumption, result.path.length
+        self._result = result
+        self._assumption = assumption
+        self.length = result.path.length
         self._crossed = unknown.crossed(result.path)
         self.risk = self._crossed.risk
         self.confidence = confidence(assumption, self._crossed)

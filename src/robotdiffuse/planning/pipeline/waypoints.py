@@ -38,8 +38,9 @@ BLEND_FRACTION = 0.9
 MAX_DEVIATION_PER_BLEND = 10.0
 """First corner deviation that is tried, per metre of blend [rad/m]: some joints move the frame only a
 little."""
-DEVIATION_FACTOR, MAX_DEVIATIONS = 0.9, 80
-"""Each corner deviation that is tried is this factor of the last, up to this many times."""
+# Each corner deviation that is tried is this factor of the last, up to this many times.
+DEVIATION_FACTOR = 0.9
+MAX_DEVIATIONS = 80
 MIN_TIME_LIMIT = 1e-3
 """Time limit of what remains to be done once time has run out [s]."""
 
@@ -81,7 +82,9 @@ def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanReques
 def _motions(context: PlanningContext, segments: Sequence[PlanResult]) -> list[Trajectory]:
     """The motions from stop to stop: of single segments, or of several with blended waypoints between
     them."""
-    blend, motions, first = context.problem.blend, list[Trajectory](), 0
+    blend = context.problem.blend
+    motions = list[Trajectory]()
+    first = 0
     for k in range(len(segments)):
         if k == len(blend) or blend[k] == 0:
             run = segments[first : k + 1]
@@ -96,8 +99,10 @@ def _motions(context: PlanningContext, segments: Sequence[PlanResult]) -> list[T
 def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], first: int) -> Trajectory | None:
     """The segments, of which `first` is the number of the first, as one motion without stops; None if the
     validator refuses it."""
-    problem, last = context.problem, first + len(segments) - 1
-    goals, blend = (*problem.waypoints, problem.goal), problem.blend[first:last]
+    problem = context.problem
+    last = first + len(segments) - 1
+    goals = (*problem.waypoints, problem.goal)
+    blend = problem.blend[first:last]
     path = _path(segments)
     part = replace(
         problem,
@@ -142,7 +147,8 @@ def _corners(
 
 def _deviation(problem: Problem, path: Path, row: int, goal: Goal, blend: float) -> float:
     """How far the motion may leave the path's corner at a row and still pass a goal within its blend."""
-    q, deviation = path.positions, MAX_DEVIATION_PER_BLEND * blend
+    q = path.positions
+    deviation = MAX_DEVIATION_PER_BLEND * blend
     for _ in range(MAX_DEVIATIONS):
         middle = corner_middle(q, row, deviation)
         if goal_error(problem.robot, goal, middle, blend=BLEND_FRACTION * blend) is None:
@@ -162,7 +168,8 @@ def _joined(
     context: PlanningContext, segments: Sequence[PlanResult], motions: Sequence[Trajectory]
 ) -> PlanResult:
     """The result for the segments as one motion, validated as one."""
-    path, trajectory = _path(segments), _one_after_another(motions)
+    path = _path(segments)
+    trajectory = _one_after_another(motions)
     reports = context.validator.path(path), context.validator.trajectory(trajectory)
     for report in reports:
         if report.violation is not None:
@@ -194,7 +201,8 @@ def _joined(
 
 def _one_after_another(motions: Sequence[Trajectory]) -> Trajectory:
     """Motions from rest to rest as one; a row that ends one and begins the next is kept once."""
-    times, parts = [motions[0].times], [motions[0]]
+    times = [motions[0].times]
+    parts = [motions[0]]
     for motion in motions[1:]:
         if len(motion.times) > 1:  # a segment that ends where it begins takes no time
             times.append(times[-1][-1] + motion.times[1:])
@@ -211,7 +219,8 @@ def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequ
 
     Raises InputError for a velocity beyond the scaled velocity limits of the request.
     """
-    context, robot = PlanningContext(solver.name, problem, request), problem.robot
+    context = PlanningContext(solver.name, problem, request)
+    robot = problem.robot
     velocity = problem.start_velocity
     assert velocity is not None
     beyond = np.flatnonzero(np.abs(velocity) > request.velocity_scaling * robot.velocity)

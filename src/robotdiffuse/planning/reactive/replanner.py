@@ -65,7 +65,8 @@ class ObservedObstacle:
 
     def again(self, value: ArrayLike, now: float) -> "ObservedObstacle":
         """The obstacle after a new observation."""
-        name, T_before = self.obstacle.name, self.obstacle.shape.T_base_shape
+        name = self.obstacle.name
+        T_before = self.obstacle.shape.T_base_shape
         xyz = numbers(value)
         if xyz is not None and xyz.shape == (3,) and within(xyz):
             T = transform(xyz, T_before[:3, :3])
@@ -102,7 +103,8 @@ class PredictedObstacles:
     """Moving obstacles from a time on, grown or predicted, for checks of motions in time."""
 
     def __init__(self, robot: Robot, moving: list[MovingObstacle], since: float) -> None:
-        self._moving, self._since = moving, since
+        self._moving = moving
+        self._since = since
         self._collision = MovingCollision(robot, moving, 0.0, 0.0)
         self.margin = np.zeros(len(moving))
 
@@ -149,8 +151,9 @@ class PredictedObstacles:
 
 SEARCH_TIME_LIMIT = 10.0
 """Time limit for the first path [s]."""
-COARSE_RESOLUTION, COARSE_SAMPLE_TIME = 0.05, 0.04
-"""For predictions: resolution of motion checks [m], and time between two rows of a motion [s]."""
+# For predictions: resolution of motion checks [m], and time between two rows of a motion [s].
+COARSE_RESOLUTION = 0.05
+COARSE_SAMPLE_TIME = 0.04
 MARGIN_FRACTIONS = 1.0, 0.6, 0.3
 """Fractions of the safety margin that are tried."""
 DRIVING_PERIODS = 1, 6
@@ -230,19 +233,23 @@ class Replanner:
         for what in ("waypoints", "constraints", "payload"):
             if getattr(problem, what):
                 raise InputError(f"problem.{what}: the replanner does not support it; rd.plan does")
-        self.problem, self.settings, self.seed = problem, settings, seed
+        self.problem = problem
+        self.settings = settings
+        self.seed = seed
         self._robot, self._still = problem.robot, replace(problem, moving=())
         self._validator = verifier(self._still)
         self._rng = np.random.default_rng(seed)
         self._seen = {one.name: ObservedObstacle(one) for one in problem.moving}
-        self._now, self._searches = -np.inf, 0
+        self._now = -np.inf
+        self._searches = 0
         self._next: TimedPath | None = None
         stated = np.where(problem.robot.jerk > 0, problem.robot.jerk, np.inf)
         jerk = stated if settings.jerk is None else np.full(problem.robot.dof, settings.jerk)
         self._filter = JerkFilter(problem.robot, jerk, settings.sample_time, problem.start)
         self._path, self._goals, self._space = self._first_path()
-        self._since, self._motion = -np.inf, AT_REST
-        """The motion under way: along the path, from this time on, before it is filtered."""
+        # The motion under way: along the path, from this time on, before it is filtered.
+        self._since = -np.inf
+        self._motion = AT_REST
         self._left = False
         """Whether the arm leaves the path at the end of its motion, for a new goal."""
         self._rehearse()
@@ -271,7 +278,8 @@ class Replanner:
         if isinstance(start_goal, PlanResult):
             raise InputError(f"the replanner cannot take this goal: {start_goal.reason}")
         self.problem, self._goals = problem, np.array(start_goal.goals)
-        self._next, self._left = None, True
+        self._next = None
+        self._left = True
 
     @locked
     def step(self, observation: Mapping[str, ArrayLike], now: float) -> Command:
@@ -318,7 +326,8 @@ class Replanner:
 
     def _at_goal(self) -> bool:
         """Whether the arm, at rest, is at a goal."""
-        path, s = self._path, float(self._motion.s[0])
+        path = self._path
+        s = float(self._motion.s[0])
         if self._left:
             return bool(np.linalg.norm(self._goals - path.at(s), axis=1).min() < MIN_LENGTH)
         return bool(path.to_goal and path.then is None and s >= path.end)
@@ -365,7 +374,8 @@ class Replanner:
     def _choose_path(self, predicted: PredictedObstacles) -> bool:
         """Search for another path if an obstacle is predicted on the present one; returns whether none is
         predicted on the path that the arm is on."""
-        rest_time, rest = self._rest_time, self._path.at(float(self._motion.s[-1]))
+        rest_time = self._rest_time
+        rest = self._path.at(float(self._motion.s[-1]))
         ahead = self._path if self._next is None else self._next
         clear = self._path_clear(predicted, ahead, self._next is None)
         moving = not self._rests or self._motion.duration > 0
@@ -394,7 +404,8 @@ class Replanner:
         still = self._still.scene
         scene = still.with_shapes([*still.shapes, *predicted.shapes(later)])
         checker = CollisionChecker(self._robot, scene)
-        roots, after = list(self._goals), [np.zeros((0, self._robot.dof))] * len(self._goals)
+        roots = list(self._goals)
+        after = [np.zeros((0, self._robot.dof))] * len(self._goals)
         if self._path.to_goal and not self._left:
             old = self._path.remaining(float(self._motion.s[-1]))
             free = motions_free(search_space(checker, COARSE_RESOLUTION), old.astype(np.float32))
@@ -423,7 +434,8 @@ class Replanner:
         directions = self._rng.normal(size=(EVASIONS, robot.dof))
         directions *= EVASION_RADIUS / np.linalg.norm(directions, axis=1, keepdims=True)
         ends = np.clip(rest + directions, robot.lower, robot.upper)
-        best, best_time = None, predicted.comes(rest, time, HORIZON) or np.inf
+        best = None
+        best_time = predicted.comes(rest, time, HORIZON) or np.inf
         for end in ends:
             lasts = float((np.abs(end - rest) / robot.velocity).max()) + EVASION_OVERHEAD
             comes = predicted.comes_to(np.stack([rest, end]), np.array([time, time + lasts]), HORIZON)
@@ -431,7 +443,8 @@ class Replanner:
                 continue
             if not motions_free(self._space, np.stack([rest, end]).astype(np.float32)).all():
                 continue
-            best, best_time = end, np.inf if comes is None else comes
+            best = end
+            best_time = np.inf if comes is None else comes
             if comes is None:
                 break
         if best is None:
@@ -448,14 +461,20 @@ class Replanner:
         if not self._rests:
             return
         if self._next is not None:
-            self._path, self._next, self._motion, self._left = self._next, None, AT_REST, False
+            self._path = self._next
+            self._next = None
+            self._motion = AT_REST
+            self._left = False
         elif not self._left and self._path.then is not None and self._motion.s[0] >= self._path.end:
-            self._path, self._motion = self._path.then, AT_REST
+            self._path = self._path.then
+            self._motion = AT_REST
 
     def _extend(self, predicted: PredictedObstacles, grown: PredictedObstacles, clear: bool) -> bool:
         """Extend the motion if the extension is certified and useful; returns whether it was extended."""
-        settings, path = self.settings, self._path
-        s, speed = float(self._motion.s[0]), float(self._motion.speeds[0])
+        settings = self.settings
+        path = self._path
+        s = float(self._motion.s[0])
+        speed = float(self._motion.speeds[0])
         if s >= path.end or self._left:
             return False
         for periods in DRIVING_PERIODS:

@@ -28,8 +28,9 @@ from robotdiffuse.trajectories.timing_kernel import controllable, sample_positio
 from robotdiffuse.validation.tolerances import DEFAULT
 from robotdiffuse.validation.validator import Verifier, verifier
 
-VELOCITY_FRACTION, ACCELERATION_FRACTION = 0.99, 0.96
-"""Parts of the limits that are used at the grid points; the rest covers what lies between them."""
+# Parts of the limits that are used at the grid points; the rest covers what lies between them.
+VELOCITY_FRACTION = 0.99
+ACCELERATION_FRACTION = 0.96
 CORNER_SAMPLES = 65
 """Configurations of a rounded corner that are checked with a distance."""
 MIN_LENGTH = 1e-4
@@ -119,7 +120,8 @@ class TimedPath:
         """The path's first and second derivatives on the grid, the grid of s, and the largest ṡ² on it."""
         count = max(int(self.line.length / LINE_INTERVAL), 8)
         grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER_INTERVALS))
-        one, two = self.line(grid, 1), self.line(grid, 2)
+        one = self.line(grid, 1)
+        two = self.line(grid, 2)
         return (
             one,
             two,
@@ -160,7 +162,8 @@ class TimedPath:
 
     def positions(self, motion: SpeedProfile, times: Float[ndarray, "n"]) -> Configurations:
         """Configurations at times after the beginning of a motion, which rests after its end [s]."""
-        s, speeds = np.append(motion.s, motion.s[-1]), np.append(motion.speeds, 0.0)
+        s = np.append(motion.s, motion.s[-1])
+        speeds = np.append(motion.speeds, 0.0)
         return sample_positions(self.line.arrays, s, speeds, times)
 
     def coarse(self, motion: SpeedProfile, step: float) -> tuple[Float[ndarray, "n"], Configurations]:
@@ -185,7 +188,8 @@ class JerkFilter:
     def __init__(self, robot: Robot, jerk: Configuration, step: float, q: Configuration) -> None:
         """At rest at q; `step`: between two times of the grid [s]."""
         reach = float((motion_radii(robot) @ robot.acceleration).max())
-        self.joint_names, self.step = robot.joint_names, step
+        self.joint_names = robot.joint_names
+        self.step = step
         share = ACCELERATION_FRACTION
         while True:
             window = max(int(np.ceil(2 * share * (robot.acceleration / jerk).max() / step)), 1)
@@ -202,7 +206,9 @@ class JerkFilter:
         self._window = window
         self._samples = np.repeat(q[None], window + 3, axis=0)
         """At the last times of the grid, up to the one with index `_index`."""
-        self._origin, self._index, self._ago = -np.inf, 0, 0.0
+        self._origin = -np.inf
+        self._index = 0
+        self._ago = 0.0
 
     @property
     def lag(self) -> float:
@@ -229,7 +235,9 @@ class JerkFilter:
     def follow(self, path: TimedPath, motion: SpeedProfile) -> Trajectory:
         """The filtered motion from now on until it rests, if the given motion begins now; two rows if it
         rests."""
-        step, window, u = self.step, self._window, self._ago / self.step
+        step = self.step
+        window = self._window
+        u = self._ago / self.step
         resting = self.at_rest and motion.duration == 0
         count = 1 if resting else int(np.ceil((motion.duration + self._ago) / step)) + window + 2
         times = step * np.arange(1, count + 1) - self._ago
@@ -237,7 +245,9 @@ class JerkFilter:
         # differences from the end, so that the motion ends exactly there
         total = np.cumsum(np.concatenate([0 * raw[:1], raw - raw[-1]]), axis=0)
         points = (total[window:] - total[:-window]) / window
-        before, at, after = points[1:-3], points[2:-2], points[3:-1]
+        before = points[1:-3]
+        at = points[2:-2]
+        after = points[3:-1]
         first = np.array(
             [
                 [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, 1 + 3 * u + 3 * u**2 - 3 * u**3, u**3],

@@ -36,9 +36,10 @@ MIN_APPROACH = 0.95
 """A step must bring the distance to its target down to this part or less."""
 MAX_STEP_FACTOR = 2.0
 """A step is at most this many times as long as the straight line that it replaces."""
-SHORTCUT_GAIN, MAX_FAILED_SHORTCUTS = 0.99, 20
-"""A shortcut counts if it leaves at most this part of the length; after this many in a row that do not, no
-more are tried."""
+# A shortcut counts if it leaves at most this part of the length; after this many in a row that do not, no
+# more are tried.
+SHORTCUT_GAIN = 0.99
+MAX_FAILED_SHORTCUTS = 20
 MIN_CORNER_MOVE = 0.005
 """Smoothing leaves corners that it would move by less than this [rad]."""
 MAX_INITIAL_PIECE = 0.15
@@ -83,7 +84,8 @@ def _keep(limits, q):
 @overload(rrt_kernel.extended)
 def _extended(space, limits, trees, tree, near, q, longest, scratch):
     def extended(space, limits, trees, tree, near, q, longest, scratch):
-        origin, end = trees.nodes[tree, near], scratch.end
+        origin = trees.nodes[tree, near]
+        end = scratch.end
         gap = distance(origin, q)
         if gap <= longest:
             end[:] = q
@@ -109,7 +111,8 @@ def _extended(space, limits, trees, tree, near, q, longest, scratch):
 def _straight(limits, a, b):
     """Whether the straight piece between two configurations is proved to keep the constraints, with values
     little above those at its ends."""
-    rows, work = limits.rows, limits.work
+    rows = limits.rows
+    work = limits.work
     evaluate(rows, a, 0, work)
     evaluate(rows, b, 1, work)
     for m in range(len(limits.kept)):
@@ -130,10 +133,13 @@ def between(space, limits, a, b, most, scratch):
 
     Returns their number; 0 if none was found, or it is longer than `most` [rad].
     """
-    stack, here = limits.stack, limits.here
+    stack = limits.stack
+    here = limits.here
     stack[0] = b
     here[:] = a
-    top, count, done = 1, 0, 0.0
+    top = 1
+    count = 0
+    done = 0.0
     while top > 0:
         target = stack[top - 1]
         gap = distance(here, target)
@@ -144,7 +150,9 @@ def between(space, limits, a, b, most, scratch):
                 return 0
             limits.out[count] = target
             here[:] = target
-            top, count, done = top - 1, count + 1, done + gap
+            top = top - 1
+            count = count + 1
+            done = done + gap
             continue
         if top == MAX_DEPTH or gap < MIN_PIECE:
             return 0
@@ -172,7 +180,8 @@ def simplify(space, limits, path, rounds, tries, state):
     """A path with the same ends that is no longer: try shortcuts between random places, `tries` of them; then
     in each of `rounds` rounds smooth the corners and leave out waypoints that a straight piece can skip."""
     scratch = rrt_kernel.make_scratch(space, path)
-    points, lost = _finer(path), 0
+    points = _finer(path)
+    lost = 0
     for _ in range(tries):
         n = len(points)
         if n < 3 or lost > MAX_FAILED_SHORTCUTS:
@@ -200,7 +209,8 @@ def _finer(path):
     total = 1
     for i in range(len(path) - 1):
         total += max(1, int(np.ceil(distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
-    out, n = np.empty((total, path.shape[1])), 0
+    out = np.empty((total, path.shape[1]))
+    n = 0
     for i in range(len(path) - 1):
         parts = max(1, int(np.ceil(distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
         for part in range(parts):
@@ -213,22 +223,27 @@ def _finer(path):
 @inner_kernel()
 def _skipped(space, limits, path, scratch):
     """The path without waypoints that straight pieces can skip, in growing steps."""
-    out, n, i = np.empty(path.shape), 0, 0
+    out = np.empty(path.shape)
+    n = 0
+    i = 0
     while True:
         out[n] = path[i]
         n += 1
         if i == len(path) - 1:
             return out[:n].copy()
-        following, ahead = i + 1, 2
+        following = i + 1
+        ahead = 2
         while i + ahead < len(path) and _usable(space, limits, path[i], path[i + ahead], scratch):
-            following, ahead = i + ahead, ahead + max(1, ahead // 2)
+            following = i + ahead
+            ahead = ahead + max(1, ahead // 2)
         i = following
 
 
 @inner_kernel()
 def _smoothed(space, limits, path, scratch):
     """The path with the middles of its pieces as waypoints, and its corners moved towards them."""
-    finer, dof = np.empty((2 * len(path) - 1, path.shape[1])), path.shape[1]
+    finer = np.empty((2 * len(path) - 1, path.shape[1]))
+    dof = path.shape[1]
     for i in range(len(path)):
         finer[2 * i] = path[i]
         if i > 0:

@@ -66,9 +66,10 @@ ATTEMPTS_PER_ITERATION = 0.2
 """Attempts to make a motion faster per iteration of the search; both then take about the same time."""
 ATTEMPTS_AFTER_SEARCH = 200
 """Attempts between two checks whether to go on, once the search has ended."""
-TIME_GAIN, TIME_PATIENCE = 0.0025, 1_600
-"""With until "converged", attempts end when doubling them reduced the time by less than this part, but not
-before this many."""
+# With until "converged", attempts end when doubling them reduced the time by less than this part, but not
+# before this many.
+TIME_GAIN = 0.0025
+TIME_PATIENCE = 1_600
 MIN_TIME_GAIN = 0.01
 """A faster motion is validated before the search ends if its estimated time is less by this part."""
 MAX_DETOUR = 1.05
@@ -286,7 +287,8 @@ class AnytimeSearch:
         self._set_level(self._level)
 
     def _set_level(self, level: int) -> None:
-        self._level, self._tried = level, 0
+        self._level = level
+        self._tried = 0
         self.space = self.start_goal.space(self.settings.resolution, self.clearance)
 
     def _lower_clearance(self, fallback: Callable[[], None] | None) -> None:
@@ -314,7 +316,8 @@ class AnytimeSearch:
 
     def _iterate(self) -> None:
         """Run some iterations of a round, and offer the path that they find."""
-        most, trees = self.settings.iterations, self._trees
+        most = self.settings.iterations
+        trees = self._trees
         capacity = most + len(self.goals) + 2 * self.spare_nodes
         if trees is None or self.work >= self._round_end or trees.sizes.max() + self.spare_nodes >= capacity:
             trees = self._trees = rrt_kernel.make_trees(self.start, self.goals, capacity)
@@ -347,7 +350,8 @@ class ConstrainedSearch(AnytimeSearch):
         with loading():  # its code is compiled apart, and rarely needed
             from robotdiffuse.planning.search import constrained
 
-        self._code, self.spare_nodes = constrained, constrained.MAX_PIECES
+        self._code = constrained
+        self.spare_nodes = constrained.MAX_PIECES
         kept = constraints.limits(TOLERANCE_FRACTION)
         at_ends = constraints.values(np.stack([start, *start_goal.goal_leads])).max(axis=0) + END_MARGIN
         kept = np.minimum(np.maximum(kept, at_ends), constraints.rows.limit)
@@ -417,7 +421,8 @@ class _Validation:
     """The best validated result of a search, and which of its paths was validated when."""
 
     def __init__(self, context: PlanningContext, search: AnytimeSearch) -> None:
-        self.context, self.search = context, search
+        self.context = context
+        self.search = search
         self.best: PlanResult | None = None
         self._by_time = context.request.objective == TIME
         self._path: ndarray | None = None
@@ -448,7 +453,8 @@ class _Validation:
 
         Returns whether there is a valid path to answer with.
         """
-        search, motions = self.search, self.search.motions
+        search = self.search
+        motions = self.search.motions
         assert search.best is not None
         self._validated_at = search.work
         self._late = self.context.remaining <= 0
@@ -469,7 +475,9 @@ class _Validation:
 
         Results before these count only if time ran out, or else the clock would decide which is returned.
         """
-        search, motions, before = self.search, self.search.motions, self.best
+        search = self.search
+        motions = self.search.motions
+        before = self.best
         if before is None or self.context.ended or self._late:
             return
         if motions is None:
@@ -500,11 +508,13 @@ class _Validation:
         if result is None:
             result = self._finished(paths[1], stage, None)
         if result is not None:
-            self._path, self._shortest = path, result
+            self._path = path
+            self._shortest = result
         return result is not None
 
     def _accepts_motion(self, candidate: Candidate) -> bool:
-        start_goal, most = self.search.start_goal, self.context.timing.corner_deviation
+        start_goal = self.search.start_goal
+        most = self.context.timing.corner_deviation
         path = start_goal.complete(candidate.path)
         # the exact start or goal may be added beside the ends of the search
         deviations = np.full(len(path), most)
@@ -516,11 +526,13 @@ class _Validation:
 
     def _finished(self, path: ndarray, stage: str, deviations: ndarray | None) -> PlanResult | None:
         """Validate and time a path, and keep its result."""
-        search, wanted = self.search, self.context.clearance
+        search = self.search
+        wanted = self.context.clearance
         keeps = search.keeps_clearance
         notes = ()
         if search.clearance < wanted:
-            kept, asked = 100 * search.clearance, 100 * wanted
+            kept = 100 * search.clearance
+            asked = 100 * wanted
             notes = (
                 f"searched with a clearance of {kept:.2g} cm, not {asked:.2g} cm: "
                 "no path was found with that",
@@ -552,7 +564,8 @@ def anytime(
     improve: spends some time on shorter paths.
     fallback: may offer paths where the search finds none at any clearance.
     """
-    request, problem = context.request, context.problem
+    request = context.request
+    problem = context.problem
     if request.objective == TIME and request.until != FIRST and not problem.constraints:
         straight = float(np.linalg.norm(search.goals - search.start, axis=1).min())
         several = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)

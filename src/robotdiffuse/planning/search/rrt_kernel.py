@@ -104,7 +104,8 @@ def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
     Returns the last node added; -1 if the motion is not free, if no path through its end can be shorter than
     `bound` [rad], and if the tree is full.
     """
-    origin, end = trees.nodes[tree, near], scratch.end
+    origin = trees.nodes[tree, near]
+    end = scratch.end
     gap = distance(origin, q)
     share = _ONE if gap <= longest else longest / gap
     for j in range(len(end)):
@@ -129,9 +130,13 @@ def search(space, limits, trees, bound, longest, iterations, state):
 
     Returns the waypoints [n, dof] from the start to a goal; n = 0 if none was found yet.
     """
-    nodes, costs, sizes = trees.nodes, trees.costs, trees.sizes
-    scratch, sample = make_scratch(space, trees.nodes), np.empty(nodes.shape[2], nodes.dtype)
-    start, goals = nodes[0, 0], nodes[1, : _root_count(trees, 1)]
+    nodes = trees.nodes
+    costs = trees.costs
+    sizes = trees.sizes
+    scratch = make_scratch(space, trees.nodes)
+    sample = np.empty(nodes.shape[2], nodes.dtype)
+    start = nodes[0, 0]
+    goals = nodes[1, : _root_count(trees, 1)]
     bounded = bound < INFINITE
     shares = goal_shares(start, goals, bound)
     for _ in range(iterations):
@@ -139,7 +144,8 @@ def search(space, limits, trees, bound, longest, iterations, state):
         other = 1 - tree
         allowed = bound
         if bounded:
-            u, g = random(state), 0
+            u = random(state)
+            g = 0
             while g < len(goals) - 1 and u > shares[g]:
                 g += 1
             sample_within(space, start, goals[g], bound, sample, state)
@@ -192,13 +198,15 @@ def extend(space, trees, targets, longest):
 @allocation_free(inline="always")
 def add(trees, tree, q, cost, parent):
     """Add a node to a tree, which must not be full; returns the node."""
-    here, dof = trees.sizes[tree], len(q)
+    here = trees.sizes[tree]
+    dof = len(q)
     for j in range(dof):
         trees.nodes[tree, here, j] = q[j]
         if here % W == 0:
             trees.columns[tree * dof + j, here : here + W] = _NOWHERE
         trees.columns[tree * dof + j, here] = q[j]
-    trees.costs[tree, here], trees.parents[tree, here] = cost, parent
+    trees.costs[tree, here] = cost
+    trees.parents[tree, here] = parent
     trees.children[tree, here] = -1
     if parent >= 0:
         trees.siblings[tree, here] = trees.children[tree, parent]
@@ -210,8 +218,10 @@ def add(trees, tree, q, cost, parent):
 @allocation_free()
 def rewire(trees, tree, node, parent, cost):
     """Move a node, with its subtree, to another parent."""
-    parents, costs = trees.parents[tree], trees.costs[tree]
-    children, siblings = trees.children[tree], trees.siblings[tree]
+    parents = trees.parents[tree]
+    costs = trees.costs[tree]
+    children = trees.children[tree]
+    siblings = trees.siblings[tree]
     old = parents[node]
     if children[old] == node:
         children[old] = siblings[node]
@@ -220,7 +230,9 @@ def rewire(trees, tree, node, parent, cost):
         while siblings[before] != node:
             before = siblings[before]
         siblings[before] = siblings[node]
-    parents[node], siblings[node], children[parent] = parent, children[parent], node
+    parents[node] = parent
+    siblings[node] = children[parent]
+    children[parent] = node
     gain = costs[node] - cost
     costs[node] = cost
     # all descendants, in depth-first order without a stack
@@ -262,7 +274,8 @@ def nearest(trees, tree, q, allowed):
     q, the nearest root.
     """
     bounded = allowed < INFINITE
-    best, where = INFINITE, -1
+    best = INFINITE
+    where = -1
     for part in range((trees.sizes[tree] + W - 1) // W):
         apart = _squared(trees, tree, part, q)
         if bounded:
@@ -275,14 +288,17 @@ def nearest(trees, tree, q, allowed):
         i = 0
         while near != 0:
             if near & 1 and lane(both, i) < best:
-                best, where = lane(both, i), W * part + i
-            near, i = near >> 1, i + 1
+                best = lane(both, i)
+                where = W * part + i
+            near = near >> 1
+            i = i + 1
     if where >= 0:
         return where
     for n in range(_root_count(trees, tree)):
         apart = distance(trees.nodes[tree, n], q)
         if apart < best:
-            best, where = apart, n
+            best = apart
+            where = n
     return where
 
 
@@ -290,21 +306,25 @@ def nearest(trees, tree, q, allowed):
 def nearest_few(trees, tree, q, index, squares):
     """Write the nodes nearest to q to `index`, the nearest first, and their squared distances to `squares`;
     returns their number, fewer than len(index) only in a smaller tree."""
-    count, worst = 0, _FAR
+    count = 0
+    worst = _FAR
     for part in range((trees.sizes[tree] + W - 1) // W):
         apart = _squared(trees, tree, part, q)
-        near, i = apart < worst, 0
+        near = apart < worst
+        i = 0
         while near != 0:
             if near & 1 and lane(apart, i) < worst:
                 count = min(count + 1, len(index))
                 at = count - 1
                 while at > 0 and squares[at - 1] > lane(apart, i):
-                    index[at], squares[at] = index[at - 1], squares[at - 1]
+                    index[at] = index[at - 1]
+                    squares[at] = squares[at - 1]
                     at -= 1
                 index[at], squares[at] = W * part + i, lane(apart, i)
                 if count == len(index):
                     worst = squares[count - 1]
-            near, i = near >> 1, i + 1
+            near = near >> 1
+            i = i + 1
     return count
 
 
@@ -324,7 +344,8 @@ def _squared(trees, tree, part, q):
 def _lower_cost(space, trees, tree, leaf, scratch, state):
     """Give a leaf a parent through which its cost is lower: draws such parents until an edge collides."""
     q = trees.nodes[tree, leaf]
-    parent, cost = trees.parents[tree, leaf], trees.costs[tree, leaf]
+    parent = trees.parents[tree, leaf]
+    cost = trees.costs[tree, leaf]
     least = _to_roots(trees, tree, q)
     while cost > least:
         other = nearest(trees, tree, q, least + random(state) * (cost - least))
@@ -333,7 +354,8 @@ def _lower_cost(space, trees, tree, leaf, scratch, state):
             break
         if not motion_free(space, trees.nodes[tree, other], q, scratch.block, scratch.work):
             break
-        parent, cost = other, through
+        parent = other
+        cost = through
     rewire(trees, tree, leaf, parent, cost)
 
 
@@ -347,7 +369,8 @@ def sample_box(space, q, state):
 @kernel()
 def goal_shares(start, goals, bound):
     """Cumulative shares of the samples for each goal, by the volumes of their hyperspheroids."""
-    shares, total = np.empty(len(goals), np.float32), _ZERO
+    shares = np.empty(len(goals), np.float32)
+    total = _ZERO
     for g in range(len(goals)):
         straight = distance(start, goals[g])
         if straight < bound:
@@ -372,7 +395,8 @@ def sample_within(space, start, goal, bound, q, state):
     for j in range(dof):
         q[j] *= scale * (_HALF * bound if j == 0 else across)
     # Householder reflection of the first axis onto the direction of the goal
-    along, total = _ZERO, _ZERO
+    along = _ZERO
+    total = _ZERO
     for j in range(dof):
         v = (_ONE if j == 0 else _ZERO) - (goal[j] - start[j]) / max(straight, np.float32(1e-9))
         along += v * q[j]
@@ -393,9 +417,11 @@ def _normal(state):
 @kernel()
 def branch(trees, tree, node):
     """Waypoints [n, dof] from a root to a node; n = 0 for node -1."""
-    count, at = 0, node
+    count = 0
+    at = node
     while at >= 0:
-        count, at = count + 1, trees.parents[tree, at]
+        count = count + 1
+        at = trees.parents[tree, at]
     path = np.empty((count, trees.nodes.shape[2]), trees.nodes.dtype)
     for i in range(count - 1, -1, -1):
         path[i] = trees.nodes[tree, node]
@@ -408,7 +434,8 @@ def _joined(trees, tree, here, there):
     """The path from the start to a goal through two nodes at the same place, `here` in `tree` and `there` in
     the other."""
     first, second = (here, there) if tree == 0 else (there, here)
-    forth, back = branch(trees, 0, first), branch(trees, 1, trees.parents[1, second])
+    forth = branch(trees, 0, first)
+    back = branch(trees, 1, trees.parents[1, second])
     path = np.empty((len(forth) + len(back), forth.shape[1]), forth.dtype)
     path[: len(forth)] = forth
     path[len(forth) :] = back[::-1]

@@ -111,7 +111,8 @@ def draw_goal(trees, goals, state):
     lower it.
     """
     best = _best_cost(trees, goals)
-    total, chosen = _ZERO, -1
+    total = _ZERO
+    chosen = -1
     for g in range(len(goals.at)):
         if not _is_open(trees, goals, g, best):
             continue
@@ -163,16 +164,20 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
     # k of k-nearest RRT*: S. Karaman and E. Frazzoli, IJRR 2011, e (1 + 1 / d) ln n
     most = np.ceil(np.e * (1.0 + 1.0 / len(q)) * np.log(trees.sizes[0] + 1.0))
     count = nearest_few(trees, 0, q, index[: min(int(most), NEIGHBOURS)], gaps)
-    nodes, costs, best = trees.nodes[0], trees.costs[0], _best_cost(trees, goals)
+    nodes = trees.nodes[0]
+    costs = trees.costs[0]
+    best = _best_cost(trees, goals)
     remaining = _remaining(trees, goals, q, best)
     for i in range(count):
         gaps[i] = np.sqrt(gaps[i])
     # parents in the order of cost: mostly the first is free; a negative distance marks those in collision
     while True:
-        chosen, cost = -1, INFINITE
+        chosen = -1
+        cost = INFINITE
         for i in range(count):
             if gaps[i] >= _ZERO and costs[index[i]] + gaps[i] < cost:
-                chosen, cost = i, costs[index[i]] + gaps[i]
+                chosen = i
+                cost = costs[index[i]] + gaps[i]
         # of no use, or a copy of a node
         if chosen < 0 or cost + remaining >= best or gaps[chosen] <= np.float32(1e-6):
             return -1
@@ -182,7 +187,8 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
         gaps[chosen] = -_ONE - gaps[chosen]
     node = add(trees, 0, q, cost, parent)
     for i in range(count):
-        near, through = index[i], cost + gaps[i]
+        near = index[i]
+        through = cost + gaps[i]
         if gaps[i] < _ZERO or near == parent or through >= costs[near] * (_ONE - GAIN):
             continue
         if motion_free(space, q, nodes[near], scratch.block, scratch.work):
@@ -217,8 +223,10 @@ def grow(space, trees, goals, longest, iterations, state):
     """RRT* iterations with extensions of at most `longest` [rad]; they end early when the tree is full or no
     path can be shortened."""
     dof = trees.nodes.shape[2]
-    scratch, sample = rrt_kernel.make_scratch(space, trees.nodes), np.empty(dof, np.float32)
-    index, gaps = np.empty(NEIGHBOURS, np.int32), np.empty(NEIGHBOURS, np.float32)
+    scratch = rrt_kernel.make_scratch(space, trees.nodes)
+    sample = np.empty(dof, np.float32)
+    index = np.empty(NEIGHBOURS, np.int32)
+    gaps = np.empty(NEIGHBOURS, np.float32)
     _grow(space, trees, goals, longest, iterations, state, scratch, sample, index, gaps)
 
 
@@ -248,7 +256,8 @@ def graft(trees, goals, path, g):
         return
     if trees.sizes[0] + len(path) >= trees.nodes.shape[1]:
         return
-    node, cost = 0, _ZERO
+    node = 0
+    cost = _ZERO
     for i in range(1, len(path) - 1):
         cost += distance(path[i - 1], path[i])
         node = add(trees, 0, path[i], cost, node)
@@ -328,7 +337,8 @@ class SharedTreeSearch:
     @property
     def finished(self) -> bool:
         """Whether it is enough by the settings: no path can be shorter, or it hardly improves any more."""
-        settings, costs = self.settings, self.costs
+        settings = self.settings
+        costs = self.costs
         if self.cost < np.inf:
             if self.targets.bound.min() >= self.cost * (1 - GAIN):
                 return True
@@ -348,7 +358,8 @@ class SharedTreeSearch:
 
     def round(self) -> None:
         """Run a round: one path by RRT-Connect, RRT* iterations, and shortcuts of the best path."""
-        settings, longest = self.settings, np.float32(self.settings.range)
+        settings = self.settings
+        longest = np.float32(self.settings.range)
         g = draw_goal(self.tree, self.targets, self._state)
         if g >= 0:
             self._connect(np.arange(len(self.goals)) if self.best_goal < 0 else np.array([g]))

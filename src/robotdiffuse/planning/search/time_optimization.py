@@ -22,22 +22,27 @@ from robotdiffuse.trajectories.speed_limits import TimingSettings, scaled_limits
 from robotdiffuse.trajectories.straight_line import straight_line_time
 from robotdiffuse.trajectories.timing_kernel import estimated_time, evaluate_at, least_time, rounded_line
 
-REMOVE_SHARE, ADD_SHARE, WIDEN_SHARE = 0.02, 0.05, 0.12
-"""Of all attempts, the part up to REMOVE_SHARE removes a waypoint unless it is the only one, that up to
-ADD_SHARE adds one in the middle of a segment and moves it, and that up to WIDEN_SHARE changes a corner's
-deviation. All others move a waypoint, and half of them change its deviation too."""
-WIDENING, MAX_DEVIATION = 1.5, 1.0
-"""Factor by which the deviation of a corner changes, and the most it may reach [rad, joint-space L2]."""
-MAX_MOVE, MOVE_LOG_RANGE = 0.4, 5.0
-"""Longest move of a waypoint in each joint [rad], and the natural logarithm of its ratio to the shortest."""
+# Of all attempts, the part up to REMOVE_SHARE removes a waypoint unless it is the only one, that up to
+# ADD_SHARE adds one in the middle of a segment and moves it, and that up to WIDEN_SHARE changes a corner's
+# deviation. All others move a waypoint, and half of them change its deviation too.
+REMOVE_SHARE = 0.02
+ADD_SHARE = 0.05
+WIDEN_SHARE = 0.12
+# Factor by which the deviation of a corner changes, and the most it may reach [rad, joint-space L2].
+WIDENING = 1.5
+MAX_DEVIATION = 1.0
+# Longest move of a waypoint in each joint [rad], and the natural logarithm of its ratio to the shortest.
+MAX_MOVE = 0.4
+MOVE_LOG_RANGE = 5.0
 REPEAT_FACTOR = 2.0
 """Length of the move that follows a successful one, in its direction."""
 MIN_DEVIATION = 0.002
 """Corners are rounded with at least this deviation [rad]; the timing may round them less."""
 MIN_SEGMENT = 0.005
 """Shortest segment [rad]."""
-MAX_CHORD, MAX_CHORDS = 0.05, 16
-"""A rounded corner is checked along chords of this length [rad], of which there are at most MAX_CHORDS."""
+# A rounded corner is checked along chords of this length [rad], of which there are at most MAX_CHORDS.
+MAX_CHORD = 0.05
+MAX_CHORDS = 16
 
 
 @kernel(nogil=True)
@@ -49,9 +54,13 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
     waypoint moves on in the same direction.
     """
     dof = path.shape[1]
-    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
-    a, b = np.empty(dof, np.float32), np.empty(dof, np.float32)
-    step, moved = np.zeros(dof), np.int64(0)  # a literal 0 would be compiled separately
+    work = make_workspace(space.robot, space.scene)
+    block = np.empty((dof, W), np.float32)
+    a = np.empty(dof, np.float32)
+    b = np.empty(dof, np.float32)
+    # a literal 0 would be compiled separately
+    step = np.zeros(dof)
+    moved = np.int64(0)
     for _ in range(tries):
         new, wider, first, last = _candidate(space, path, deviations, step, moved, state)
         moved = 0
@@ -65,7 +74,9 @@ def reduce_time(space, path, deviations, time, velocity, acceleration, longest, 
             if len(new) == len(path):
                 step[:] = new[last] - path[last]
                 moved = last if np.abs(step).max() > 0 else 0
-            path, deviations, time = new, wider, new_time
+            path = new
+            deviations = wider
+            time = new_time
     return path, deviations, time
 
 
@@ -77,23 +88,31 @@ def _candidate(space, path, deviations, step, again, state):
     kind = np.float32(1.0) if again else random(state)
     i = again if again else 1 + min(int(random(state) * (n - 2)), n - 3)
     if kind < REMOVE_SHARE and n > 3:
-        new, wider = np.empty((n - 1, dof)), np.empty(n - 3)
-        new[:i], new[i:] = path[:i], path[i + 1 :]
-        wider[: i - 1], wider[i - 1 :] = deviations[: i - 1], deviations[i:]
+        new = np.empty((n - 1, dof))
+        wider = np.empty(n - 3)
+        new[:i] = path[:i]
+        new[i:] = path[i + 1 :]
+        wider[: i - 1] = deviations[: i - 1]
+        wider[i - 1 :] = deviations[i:]
         return new, wider, i - 1, i - 1
     if kind < ADD_SHARE:
         i = 1 + min(int(random(state) * (n - 1)), n - 2)
-        new, wider = np.empty((n + 1, dof)), np.empty(n - 1)
-        new[:i], new[i + 1 :] = path[:i], path[i:]
+        new = np.empty((n + 1, dof))
+        wider = np.empty(n - 1)
+        new[:i] = path[:i]
+        new[i + 1 :] = path[i:]
         new[i] = 0.5 * (path[i - 1] + path[i])
-        wider[: i - 1], wider[i:] = deviations[: i - 1], deviations[i - 1 :]
+        wider[: i - 1] = deviations[: i - 1]
+        wider[i:] = deviations[i - 1 :]
         wider[i - 1] = deviations[min(i - 1, n - 3)]
     else:
-        new, wider = path.copy(), deviations.copy()
+        new = path.copy()
+        wider = deviations.copy()
     if again:
         new[i] += REPEAT_FACTOR * step
     elif kind < ADD_SHARE or kind >= WIDEN_SHARE:
-        size, share = MAX_MOVE * np.exp(-MOVE_LOG_RANGE * random(state)), random(state)
+        size = MAX_MOVE * np.exp(-MOVE_LOG_RANGE * random(state))
+        share = random(state)
         for j in range(dof):
             if random(state) < share:
                 new[i, j] += size * (2.0 * random(state) - 1.0)
@@ -112,9 +131,11 @@ def _candidate(space, path, deviations, step, again, state):
 def _is_free(space, line, first, last, a, b, block, work):
     """Whether segments `first` to `last` of the polyline are free, and the rounded corners at their ends and
     next to them."""
-    waypoints, widths = line[0], line[3]
+    waypoints = line[0]
+    widths = line[3]
     for i in range(first, last + 1):
-        a[:], b[:] = waypoints[i], waypoints[i + 1]
+        a[:] = waypoints[i]
+        b[:] = waypoints[i + 1]
         if not motion_free(space, a, b, block, work):
             return False
     for corner in range(max(first - 2, 0), min(last + 2, len(widths))):
@@ -142,8 +163,10 @@ def free_deviations(space, path, deviation):
     """For each corner of a free polyline [n, dof], the largest of `deviation` and its halves for which the
     rounded corner is free [n - 2], and at least MIN_DEVIATION."""
     dof = path.shape[1]
-    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
-    a, b = np.empty(dof, np.float32), np.empty(dof, np.float32)
+    work = make_workspace(space.robot, space.scene)
+    block = np.empty((dof, W), np.float32)
+    a = np.empty(dof, np.float32)
+    b = np.empty(dof, np.float32)
     out = np.full(len(path) - 2, deviation)
     for i in range(len(out)):
         while out[i] > MIN_DEVIATION:
@@ -156,8 +179,9 @@ def free_deviations(space, path, deviation):
 
 MAX_CANDIDATES = 6
 """Candidates that are kept."""
-FIRST_ATTEMPTS, ATTEMPTS = 32, 16
-"""Attempts to make a candidate faster when it is offered, and later in turn."""
+# Attempts to make a candidate faster when it is offered, and later in turn.
+FIRST_ATTEMPTS = 32
+ATTEMPTS = 16
 BEST_TURNS = 3
 """The fastest candidate has this many turns before another one has its own."""
 OPTIMALITY_TOLERANCE = 2e-3
@@ -249,7 +273,8 @@ class TimeOptimization:
     @property
     def optimal(self) -> bool:
         """Whether no motion to any goal can be faster by more than OPTIMALITY_TOLERANCE."""
-        best, most = self.best, (1 + OPTIMALITY_TOLERANCE) * self._bound
+        best = self.best
+        most = (1 + OPTIMALITY_TOLERANCE) * self._bound
         return best is not None and best.time <= ESTIMATE_ERROR * most and self._least_time(best) <= most
 
     def fastest(self) -> list[Candidate]:

@@ -39,8 +39,10 @@ class Ranges(Settings):
                 raise InputError(f"{name} is from {pair[0]} to {pair[1]}; the first must not be greater")
 
 
-CONFIGURATION, POSITION, POSE = "configuration", "position", "pose"
-"""Kinds of targets: a goal configuration, a position of the robot's tip, or its pose."""
+# Kinds of targets: a goal configuration, a position of the robot's tip, or its pose.
+CONFIGURATION = "configuration"
+POSITION = "position"
+POSE = "pose"
 
 BATCH_SIZE = 64
 """Configurations sampled at once; many of them are free."""

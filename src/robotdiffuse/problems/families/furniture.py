@@ -56,8 +56,9 @@ PLACE_TRIES = 30
 """Samples of a free place for one object before the scene is sampled anew."""
 MIN_GAP = 0.01
 """Minimum distance between the objects on a table or on the ground [m]."""
-MIN_TABLE_HEIGHT, MIN_COUNTER_HEIGHT = 0.3, 0.25
-"""Minimum height of tables with a region beneath them, and of counters with one inside [m]."""
+# Minimum height of tables with a region beneath them, and of counters with one inside [m].
+MIN_TABLE_HEIGHT = 0.3
+MIN_COUNTER_HEIGHT = 0.25
 MIN_OPENING = 0.16
 """Minimum height and width of an opening that the hand is to enter [m]."""
 TOP_HEIGHT = 0.3
@@ -206,7 +207,8 @@ class FurnitureFrame:
     """Frame of a piece of furniture: x points away from the arm, y to the left, z up from the ground."""
 
     def __init__(self, settings: Furniture, distance: Range, rng: Generator) -> None:
-        bearing, away = rng.uniform(*settings.bearing), rng.uniform(*distance)
+        bearing = rng.uniform(*settings.bearing)
+        away = rng.uniform(*distance)
         self.yaw = float(bearing + rng.uniform(*settings.turn))
         self.xy = away * np.array([np.cos(bearing), np.sin(bearing)])
         self.rotation = rotation_about(-DOWN, self.yaw)
@@ -218,11 +220,13 @@ class FurnitureFrame:
     def box(self, low: Corner, high: Corner, name: str, turn: float = 0.0) -> Box:
         """A box with two opposite corners in this frame, then rotated about its middle by `turn` [rad]."""
         half = (self.yaw + turn) / 2
-        middle, size = (np.array(low) + high) / 2, np.subtract(high, low)
+        middle = (np.array(low) + high) / 2
+        size = np.subtract(high, low)
         return Box(self.point(middle), size, (np.cos(half), 0.0, 0.0, np.sin(half)), name)
 
     def region(self, low: Corner, high: Corner, approach: Vector) -> Region:
-        middle, size = (np.array(low) + high) / 2, np.subtract(high, low)
+        middle = (np.array(low) + high) / 2
+        size = np.subtract(high, low)
         return Region(self.point(middle), size, self.yaw, self.rotation @ approach)
 
 
@@ -261,7 +265,10 @@ class Surface:
     """
 
     def __init__(self, frame: FurnitureFrame, length: float, side: float, height: float) -> None:
-        self.frame, self.length, self.side, self.height = frame, length, side, height
+        self.frame = frame
+        self.length = length
+        self.side = side
+        self.height = height
         self.taken: list[Rectangle] = []
 
     def place(self, half_x: float, half_y: float, rng: Generator) -> tuple[float, float]:
@@ -281,7 +288,8 @@ class Surface:
         for _ in range(count(numbers, rng)):
             half = rng.uniform(*size) / 2
             (x, y), top = self.place(half, half, rng), self.height + 2 * half
-            low, high = (x - half, y - half, self.height), (x + half, y + half, top)
+            low = (x - half, y - half, self.height)
+            high = (x + half, y + half, top)
             found.append(self.frame.region(low, high, DOWN))
         return found
 
@@ -372,13 +380,16 @@ class Shelf(Furniture):
 
     def build(self, rng: Generator) -> Build:
         frame = FurnitureFrame(self, self.distance, rng)
-        depth, t = rng.uniform(*self.depth), rng.uniform(*self.thickness)
+        depth = rng.uniform(*self.depth)
+        t = rng.uniform(*self.thickness)
         rows = rng.uniform(*self.row_height, count(self.boards, rng) - 1)
         tops = rng.uniform(*self.lowest) + t + edges(rows, t)
         columns = rng.uniform(*self.column_width, count(self.columns, rng))
         sides = edges(columns, t)
         sides -= (sides[-1] + t) / 2
-        left, right, height = sides[0], sides[-1] + t, tops[-1]
+        left = sides[0]
+        right = sides[-1] + t
+        height = tops[-1]
         shapes: list[Box | Sphere] = [
             frame.box((0.0, left + t, z - t), (depth, right - t, z), "board") for z in tops
         ]
@@ -436,13 +447,15 @@ class Crate(Furniture):
         taken: list[Rectangle] = []
         for _ in range(count(self.crates, rng)):
             x, y = rng.uniform(*self.length, 2) / 2
-            h, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
+            h = rng.uniform(*self.height)
+            t = rng.uniform(*self.thickness)
             frame = _free_place(self, float(np.hypot(x + t, y + t)), taken, rng)
             low = 0.0
             if rng.random() < self.raised_share:
                 low = rng.uniform(*self.block_height)
                 shapes.append(frame.box((-x - t, -y - t, 0.0), (x + t, y + t, low), "block"))
-            bottom, top = low + t, low + t + h
+            bottom = low + t
+            top = low + t + h
             shapes.append(frame.box((-x - t, -y - t, low), (x + t, y + t, bottom), "bottom"))
             for side in (-1, 1):
                 a, b = sorted((side * x, side * (x + t)))
@@ -524,8 +537,10 @@ class Table(Furniture):
 
     def build(self, rng: Generator) -> Build:
         frame = FurnitureFrame(self, self.distance, rng)
-        length, side = rng.uniform(*self.length), rng.uniform(*self.width) / 2
-        height, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
+        length = rng.uniform(*self.length)
+        side = rng.uniform(*self.width) / 2
+        height = rng.uniform(*self.height)
+        t = rng.uniform(*self.thickness)
         legs = rng.random() < self.legs_share
         under = height - t
         bottom = under if legs else 0.0
@@ -539,9 +554,11 @@ class Table(Furniture):
                 inner = side - w
                 regions.append(frame.region((0.0, -inner, 0.0), (length / 2, inner, under), AHEAD))
         surface = Surface(frame, length, side, height)
-        kind, top = rng.random(), height + rng.uniform(*self.divider_height)
+        kind = rng.random()
+        top = height + rng.uniform(*self.divider_height)
         if kind < self.wall_share:
-            start, y = rng.uniform(0.0, length / 3), rng.uniform(-side / 3, side / 3)
+            start = rng.uniform(0.0, length / 3)
+            y = rng.uniform(-side / 3, side / 3)
             shapes.append(frame.box((start, y - t / 2, height), (length, y + t / 2, top), "wall"))
             surface.taken.append(((start + length) / 2, y, (length - start) / 2, t / 2))
         elif kind < self.wall_share + self.pillar_share:
@@ -610,13 +627,17 @@ class Kitchen(Furniture):
 
     @property
     def max_obstacles(self) -> int:
-        wall, hollow, cupboards = 1, 5, 3 + 2 * self.cupboards[1]
+        wall = 1
+        hollow = 5
+        cupboards = 3 + 2 * self.cupboards[1]
         return wall + hollow * (1 + self.ovens[1]) + self.solids[1] + cupboards + self.objects[1]
 
     def build(self, rng: Generator) -> Build:
         frame = FurnitureFrame(self, self.distance, rng)
-        depth, side = rng.uniform(*self.depth), rng.uniform(*self.width) / 2
-        height, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
+        depth = rng.uniform(*self.depth)
+        side = rng.uniform(*self.width) / 2
+        height = rng.uniform(*self.height)
+        t = rng.uniform(*self.thickness)
         shapes: list[Box | Sphere] = []
         regions: list[Region] = []
 
@@ -638,12 +659,15 @@ class Kitchen(Furniture):
         top = self._cupboards(frame, depth, hang, t, shapes, regions, rng)
         shapes.append(frame.box((depth, -side, 0.0), (depth + t, side, top), "wall"))
         counter = Surface(frame, depth, side, height)
-        ovens, solids = count(self.ovens, rng), count(self.solids, rng)
+        ovens = count(self.ovens, rng)
+        solids = count(self.solids, rng)
         for i in range(ovens + solids):
-            a, b = rng.uniform(*self.appliance_depth) / 2, rng.uniform(*self.appliance_width) / 2
+            a = rng.uniform(*self.appliance_depth) / 2
+            b = rng.uniform(*self.appliance_width) / 2
             b *= 1.0 if i < ovens else rng.uniform(0.5, 1.0)
             (x, y), high = counter.place(a, b, rng), height + rng.uniform(*self.appliance_height)
-            low_corner, high_corner = (x - a, y - b, height), (x + a, y + b, high)
+            low_corner = (x - a, y - b, height)
+            high_corner = (x + a, y + b, high)
             if i < ovens:
                 hollow(low_corner, high_corner, "oven")
             else:
@@ -664,12 +688,14 @@ class Kitchen(Furniture):
     ) -> float:
         """Adds the cupboards and their insides; returns the height of their top."""
         widths = rng.uniform(*self.cupboard_width, count(self.cupboards, rng))
-        front, top = depth - rng.uniform(*self.cupboard_depth), low + rng.uniform(*self.cupboard_height)
+        front = depth - rng.uniform(*self.cupboard_depth)
+        top = low + rng.uniform(*self.cupboard_height)
         if not len(widths):
             return top
         sides = edges(widths, t)
         sides -= (sides[-1] + t) / 2
-        left, right = float(sides[0]), float(sides[-1]) + t
+        left = float(sides[0])
+        right = float(sides[-1]) + t
         for z in (low, top - t):
             shapes.append(frame.box((front, left, z), (depth, right, z + t), "cupboard"))
         shapes += [
@@ -734,19 +760,25 @@ class Cabinet(Furniture):
 
     @property
     def max_obstacles(self) -> int:
-        boards, uprights, doors = self.rows[1] + 1, self.columns[1] + 1, self.rows[1] * self.columns[1]
-        legs, back = 4, 1
+        boards = self.rows[1] + 1
+        uprights = self.columns[1] + 1
+        doors = self.rows[1] * self.columns[1]
+        legs = 4
+        back = 1
         return boards + uprights + legs + back + doors + DRAWER_SHAPES * self.max_drawers + self.objects[1]
 
     def build(self, rng: Generator) -> Build:
         frame = FurnitureFrame(self, self.distance, rng)
-        depth, t = rng.uniform(*self.depth), float(np.exp(rng.uniform(*np.log(self.thickness))))
+        depth = rng.uniform(*self.depth)
+        t = float(np.exp(rng.uniform(*np.log(self.thickness))))
         on_ground = rng.random() < self.ground_share
         low = 0.0 if on_ground else rng.uniform(*self.lowest)
         tops = low + t + edges(rng.uniform(*self.row_height, count(self.rows, rng)), t)
         sides = edges(rng.uniform(*self.column_width, count(self.columns, rng)), t)
         sides -= (sides[-1] + t) / 2
-        left, right, height = float(sides[0]), float(sides[-1]) + t, float(tops[-1])
+        left = float(sides[0])
+        right = float(sides[-1]) + t
+        height = float(tops[-1])
         boards = tops if rng.random() < self.top_share else tops[:-1]
         shapes: list[Box | Sphere] = [
             frame.box((0.0, left + t, z - t), (depth, right - t, z), "board") for z in boards.tolist()
@@ -795,7 +827,8 @@ class Cabinet(Furniture):
         """The bottom, front, back and sides of a drawer that is pulled out of a cell, and the part of its
         inside that is in front of the cabinet."""
         y, end, z, ceiling = cell
-        x, top = -depth * rng.uniform(*self.pulled), z + (ceiling - z) * rng.uniform(0.4, 1.0)
+        x = -depth * rng.uniform(*self.pulled)
+        top = z + (ceiling - z) * rng.uniform(0.4, 1.0)
         far = x + depth
         corners = (
             ((x, y, z), (far, end, z + t)),

@@ -33,7 +33,8 @@ def scale_for(robot: Robot) -> float:
 
 def family_for(name: str, robot: Robot) -> Family:
     """A family scaled to the arm. Raises InputError, which lists the known names, for an unknown one."""
-    family, scale = load_family(name), scale_for(robot)
+    family = load_family(name)
+    scale = scale_for(robot)
     return family if scale == 1.0 else ScaledFamily(family, scale)
 
 

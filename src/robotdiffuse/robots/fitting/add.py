@@ -18,9 +18,10 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.robots.user_data_dir import user_robots
 
-MIN_FREE, MAX_FALSE_COLLISIONS = 0.2, 0.08
-"""A warning is given below this fraction of free configurations, and above this fraction of false
-collisions."""
+# A warning is given below this fraction of free configurations, and above this fraction of false
+# collisions.
+MIN_FREE = 0.2
+MAX_FALSE_COLLISIONS = 0.08
 MAX_PROPOSED = 3
 """Pairs proposed by the error for a robot that always collides with itself, if no single pair always
 collides."""
@@ -71,7 +72,8 @@ class AddReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Problems that will limit planning, and allowed pairs of links whose meshes collide."""
-        found, of = [], self.false_collisions
+        found = []
+        of = self.false_collisions
         worst = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in of.pairs[:3])
         if of.free < MIN_FREE:
             often = sorted(of.pairs, key=lambda pair: -pair.colliding)[:3]
@@ -201,9 +203,7 @@ def add_robot(
         f"{measured.by_spheres:.1%}"
     )
     write_robot_folder(replace(made.robot, notes=(*robot.notes, note)), folder, source | shares)
-    seconds, memory = (
-        time.process_time() - begin,
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT,
-    )
+    seconds = time.process_time() - begin
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
     shown = (made.links, made.pairs, made.false_collisions, seconds, memory, found, differences)
     return AddReport(read_robot_folder(folder), folder, *shown)

@@ -11,10 +11,16 @@ from robotdiffuse.robots.fitting.sampled_links import NEAR_DISTANCE, Links
 from robotdiffuse.robots.joints import MOVING_KINDS, Joint
 from robotdiffuse.robots.robot import Robot
 
-ADJACENT, ALWAYS, NEVER, CHECKED = "adjacent", "always", "never", "checked"
-DEFAULT, POSE, LIMITS = "default", "pose", "limits"
-NAMED, BY_SRDF = "named", "srdf"
-"""Reasons given by the user: the pair was named when the robot was added, or an SRDF allows it."""
+ADJACENT = "adjacent"
+ALWAYS = "always"
+NEVER = "never"
+CHECKED = "checked"
+DEFAULT = "default"
+POSE = "pose"
+LIMITS = "limits"
+# Reasons given by the user: the pair was named when the robot was added, or an SRDF allows it.
+NAMED = "named"
+BY_SRDF = "srdf"
 ADJACENT_STRIDE = 10
 """One in this many samples is tested for adjacent links, which are allowed in any case."""
 MIN_LIMITS_COLLIDING = 0.2
@@ -86,7 +92,8 @@ def find_allowed_collisions(
     default = np.clip(np.zeros((1, len(links.joints))), links.lower, links.upper)
     q = links.random(settings.samples, rng)
     poses = links.poses(q)
-    default_poses, held_poses = links.poses(default), links.poses(links.named({})[None])
+    default_poses = links.poses(default)
+    held_poses = links.poses(links.named({})[None])
     named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
     adjacent = _adjacent(robot) if settings.assumptions else frozenset[frozenset[str]]()
 
@@ -137,7 +144,8 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
 
     wanted = frozenset((a, b))
     for start in starts:
-        q, step = start, 0.1 * (links.upper - links.lower)
+        q = start
+        step = 0.1 * (links.upper - links.lower)
         least = links.mesh_distance(links.poses(q[None], wanted), a, b)
         for _ in range(15):
             around = np.clip(q + step * rng.normal(size=(8, len(q))), links.lower, links.upper)
@@ -147,7 +155,8 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
             if distances[i] <= 0:
                 return True
             if distances[i] < least:
-                q, least = around[i], distances[i]
+                q = around[i]
+                least = distances[i]
             else:
                 step = step / 2
     return False

@@ -17,7 +17,8 @@ def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
     points = thickened(points)
     hull = ConvexHull(points)
     used, index = np.unique(hull.simplices, return_inverse=True)
-    vertices, faces = points[used], index.reshape(hull.simplices.shape)
+    vertices = points[used]
+    faces = index.reshape(hull.simplices.shape)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     inwards = np.einsum("fd,fd->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     faces[inwards] = faces[inwards][:, ::-1]

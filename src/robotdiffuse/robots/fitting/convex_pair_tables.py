@@ -33,7 +33,8 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
     with_spheres = [link for link in robot.link_names if link in robot.spheres]
     lever = motion_radii(robot)[with_spheres.index(far), list(joints)]
     slides = np.array(robot.prismatic)[list(joints)]
-    lower, upper = robot.lower[list(joints)], robot.upper[list(joints)]
+    lower = robot.lower[list(joints)]
+    upper = robot.upper[list(joints)]
     upper = np.where(slides, upper, np.minimum(upper, lower + TURN))
     columns = [[j.name for j in links.joints].index(robot.joint_names[joint]) for joint in joints]
     held = links.named({})
@@ -56,12 +57,14 @@ def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float
         axis = int((lever * edge * size).argmax())
         size = size.copy()
         size[axis] /= 2
-        low, parts = low[touch & ~given_up], parts[:, touch & ~given_up]
+        low = low[touch & ~given_up]
+        parts = parts[:, touch & ~given_up]
         low = np.concatenate([low, low + size * (np.arange(len(size)) == axis)])
         parts = np.tile(parts, 2)
         if (size <= 1).all():  # one contact decides a cell, so drop its other pairs
             is_open = apart[tuple(_cells(low, size)[0].T)]
-            low, parts = low[is_open], parts[:, is_open]
+            low = low[is_open]
+            parts = parts[:, is_open]
     names = tuple(robot.joint_names[joint] for joint in joints)
     return LinkPairTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), apart)
 

@@ -120,7 +120,8 @@ def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: 
         normals = normals[first]
     normals = np.concatenate([np.eye(3), -np.eye(3), normals[np.linalg.norm(normals, axis=1) > 0.5]])
     offsets = (hull.vertices @ normals.T).max(0) + SIMPLIFIED_GROWTH
-    chosen, middle = list(range(6)), hull.vertices.mean(0)
+    chosen = list(range(6))
+    middle = hull.vertices.mean(0)
     try:
         while True:
             halfspaces = np.column_stack([normals[chosen], -offsets[chosen]])
@@ -155,9 +156,11 @@ class Part:
     def halves(self, space: DistanceGrid, settings: PartSettings) -> list["Part"]:
         """The two parts on the sides of the plane that gives hulls of least volume; the part itself if too
         small to cut."""
-        low, size = self.hull.vertices.min(0), np.ptp(self.hull.vertices, axis=0)
+        low = self.hull.vertices.min(0)
+        size = np.ptp(self.hull.vertices, axis=0)
         points, apart = _thinned(self.points, space.pitch)
-        best, least = None, np.inf
+        best = None
+        least = np.inf
         for axis in sorted(np.flatnonzero(size > 6 * space.pitch), key=lambda axis: -size[axis]):
             for at in (*_wall_cuts(points[:, axis], space.pitch), *(low[axis] + CUT_FRACTIONS * size[axis])):
                 height = points[:, axis] - at
@@ -167,7 +170,8 @@ class Part:
                     edge[:, axis] = at  # approximates the intersection of surface and plane
                     volume += hull_volume(np.concatenate([side, edge]))
                 if volume < IMPROVEMENT * least:
-                    best, least = (int(axis), float(at)), volume
+                    best = (int(axis), float(at))
+                    least = volume
         halves = _sides(self.triangles, *best) if best else ()
         if best is None or not all(map(len, halves)):
             return [replace(self, concavity=0.0)]
@@ -212,15 +216,18 @@ def _sides(
 ) -> tuple[Float[ndarray, "a 3 3"], Float[ndarray, "b 3 3"]]:
     """Triangles cut by an axis-aligned plane: those below and those above it."""
     height = triangles[:, :, axis] - at
-    below, above = (height <= 0).all(1), (height >= 0).all(1)
-    crossing, height = triangles[~below & ~above], height[~below & ~above]
+    below = (height <= 0).all(1)
+    above = (height >= 0).all(1)
+    crossing = triangles[~below & ~above]
+    height = height[~below & ~above]
     # rotate corners so that the one alone on its side comes first
     negative = height < 0
     alone = np.where(negative.sum(1) == 1, negative.argmax(1), (~negative).argmax(1))
     turn = (alone[:, None] + np.arange(3)) % 3
     rows = np.arange(len(crossing))[:, None]
     (a, b, c), (x, y, z) = np.moveaxis(crossing[rows, turn], 1, 0), height[rows, turn].T[:, :, None]
-    ab, ac = a + (b - a) * (x / (x - y)), a + (c - a) * (x / (x - z))
+    ab = a + (b - a) * (x / (x - y))
+    ac = a + (c - a) * (x / (x - z))
     single = np.stack([a, ab, ac], axis=1)
     double = np.concatenate([np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)])
     low = x[:, 0] < 0

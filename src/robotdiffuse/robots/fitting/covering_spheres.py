@@ -18,16 +18,18 @@ LINK_TOLERANCES = SphereSettings()
 MAX_SPHERES = 100
 """Largest number of spheres per solid; if they do not suffice, they exceed the tolerance."""
 MAX_PIECES_PER_AXIS = 40
-BOUNDING_STEPS, EQUIDISTANT = 15, 0.999
-"""Steps of the search for a small sphere around points. It ends early if all points are at least at this
-fraction of the radius from the centre."""
+# Steps of the search for a small sphere around points. It ends early if all points are at least at this
+# fraction of the radius from the centre.
+BOUNDING_STEPS = 15
+EQUIDISTANT = 0.999
 
 
 def cover(mesh: ConvexMesh) -> Float[ndarray, "n 4"]:
     """Spheres [x y z radius, m] that cover surface and interior of a convex mesh."""
     axes = _axes(mesh.vertices)
     vertices = mesh.vertices @ axes.T
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
     whole = _around(vertices)
     if whole[3] - (high - low).min() / 2 <= _tolerance(high - low):
         spheres = whole[None]
@@ -51,7 +53,8 @@ def _tolerance(size: Float[ndarray, "3"]) -> float:
 def _axes(vertices: Float[ndarray, "v 3"]) -> Float[ndarray, "3 3"]:
     """Axes as rows: those of the mesh's frame, or the principal axes if a box along these is smaller."""
     principal = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
-    own, other = np.ptp(vertices, axis=0).prod(), np.ptp(vertices @ principal.T, axis=0).prod()
+    own = np.ptp(vertices, axis=0).prod()
+    other = np.ptp(vertices @ principal.T, axis=0).prod()
     return principal if other < 0.9 * own else np.eye(3)
 
 
@@ -73,7 +76,8 @@ def _slices(corners: Float[ndarray, "v 3"], axis: int, cuts: Float[ndarray, "c"]
     """The hull of `corners`, cut at coordinates along an axis: the corners of each slice."""
     slices = []
     for cut in cuts:
-        below, above = corners[corners[:, axis] < cut], corners[corners[:, axis] > cut]
+        below = corners[corners[:, axis] < cut]
+        above = corners[corners[:, axis] > cut]
         level = corners[corners[:, axis] == cut]
         if len(below) and len(above):
             share = ((cut - below[:, axis])[:, None] / (above[:, axis] - below[:, axis, None]))[..., None]

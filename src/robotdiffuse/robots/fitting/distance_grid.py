@@ -15,9 +15,10 @@ from robotdiffuse.robots.fitting.convex_hulls import planes_of
 
 MAX_SPLITS = 60
 """Largest number of times that a triangle is halved."""
-TIGHT_FRACTION, TIGHT_SLOPE = 0.125, 0.3
-"""At a tight place, parts may stick out by this fraction of the usual distance; the allowance grows by this
-slope with the distance from there."""
+# At a tight place, parts may stick out by this fraction of the usual distance; the allowance grows by this
+# slope with the distance from there.
+TIGHT_FRACTION = 0.125
+TIGHT_SLOPE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,8 @@ class DistanceGrid:
     def around(soups: list[Float[ndarray, "n 3 3"]], voxels: int, finest: float) -> "DistanceGrid":
         """The grid around triangles, with about this many voxels of at least the `finest` size [m]."""
         corners = np.concatenate(soups).reshape(-1, 3)
-        low, high = corners.min(0), corners.max(0)
+        low = corners.min(0)
+        high = corners.max(0)
         size = np.maximum(high - low, finest)
         pitch = max(float(np.prod(size) / voxels) ** (1 / 3), size.max() / 300, finest)
         origin = low - 2.5 * pitch
@@ -54,7 +56,8 @@ class DistanceGrid:
         near = np.argwhere((self.distance > 0) & (self.distance < 3 * concavity))
         far = KDTree(tight).query(self.origin + (near + 0.5) * self.pitch)[0]
         allowed = TIGHT_FRACTION * concavity + TIGHT_SLOPE * np.maximum(far - 2 * concavity, 0.0)
-        near, allowed = near[allowed < concavity], allowed[allowed < concavity]
+        near = near[allowed < concavity]
+        allowed = allowed[allowed < concavity]
         alone = np.zeros_like(self.distance)
         alone[tuple(near.T)] = self.distance[tuple(near.T)] * concavity / allowed
         return replace(self, distance=alone), replace(self, distance=np.maximum(alone, self.distance))
@@ -106,20 +109,24 @@ def split(triangles: Float[ndarray, "n 3 3"], size: "float | Float[ndarray, 'n']
 
 @kernel()
 def _split(triangles, squares):
-    out, count = np.empty((4 * len(triangles) + 64, 3, 3)), 0
+    out = np.empty((4 * len(triangles) + 64, 3, 3))
+    count = 0
     open_ones = np.empty((MAX_SPLITS + 2, 3, 3))
     for t in range(len(triangles)):
-        open_ones[0], left = triangles[t], 1
+        open_ones[0] = triangles[t]
+        left = 1
         while left > 0:
             left -= 1
-            longest, k = -1.0, 0
+            longest = -1.0
+            k = 0
             for i in range(3):
                 j = (i + 1) % 3
                 square = 0.0
                 for d in range(3):
                     square += (open_ones[left, i, d] - open_ones[left, j, d]) ** 2
                 if square > longest:
-                    longest, k = square, i
+                    longest = square
+                    k = i
             if longest <= squares[t] or left >= MAX_SPLITS:
                 if count == len(out):
                     out = np.concatenate((out, np.empty_like(out)))
@@ -127,11 +134,15 @@ def _split(triangles, squares):
                 count += 1
                 continue
             for d in range(3):
-                a, b = open_ones[left, k, d], open_ones[left, (k + 1) % 3, d]
+                a = open_ones[left, k, d]
+                b = open_ones[left, (k + 1) % 3, d]
                 c = open_ones[left, (k + 2) % 3, d]
                 middle = 0.5 * (a + b)
-                open_ones[left, 0, d], open_ones[left, 1, d], open_ones[left, 2, d] = a, middle, c
-                open_ones[left + 1, 0, d], open_ones[left + 1, 1, d] = middle, b
+                open_ones[left, 0, d] = a
+                open_ones[left, 1, d] = middle
+                open_ones[left, 2, d] = c
+                open_ones[left + 1, 0, d] = middle
+                open_ones[left + 1, 1, d] = b
                 open_ones[left + 1, 2, d] = c
             left += 2
     return out[:count].copy()

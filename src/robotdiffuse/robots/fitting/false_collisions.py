@@ -91,7 +91,8 @@ def measure_false_collisions(
         spheres = depth > 0
         for table in tables.get(frozenset((a, b)), ()):
             spheres &= ~table.at(*(q[:, column[name]] for name in table.joints))
-        parts, meshes = np.zeros(samples, dtype=bool), np.zeros(samples, dtype=bool)
+        parts = np.zeros(samples, dtype=bool)
+        meshes = np.zeros(samples, dtype=bool)
         for i in np.flatnonzero(spheres):
             parts[i] = links.collide(poses, a, b, int(i))
             if parts[i]:
@@ -110,8 +111,10 @@ def measure_false_collisions(
         wide = gaps >= np.sort(gaps)[
             : int(samples * NARROWEST_FRACTION * len(false_spheres) / max(spheres.sum(), 1)) + 1
         ].max(initial=0.0)
-        false_spheres, gaps = false_spheres[wide], gaps[wide]
-        T_base_a, T_base_b = poses[a][false_spheres], poses[b][false_spheres]
+        false_spheres = false_spheres[wide]
+        gaps = gaps[wide]
+        T_base_a = poses[a][false_spheres]
+        T_base_b = poses[b][false_spheres]
         at = np.einsum("nij,nj->ni", T_base_a[:, :3, :3], middle[false_spheres]) + T_base_a[:, :3, 3]
         on_b = np.einsum("nji,nj->ni", T_base_b[:, :3, :3], at - T_base_b[:, :3, 3])
         places = {a: _one_per_cube(middle[false_spheres], gaps), b: _one_per_cube(on_b, gaps)}
@@ -139,7 +142,8 @@ def _sticking_out(
     """Places where parts of two links overlap in configurations `rows`, each listed for the link whose true
     meshes are further from it, in that link's frame."""
     found: dict[str, list[ndarray]] = {link: [] for link in pair}
-    request, point = coal.DistanceRequest(), coal.Sphere(1e-6)
+    request = coal.DistanceRequest()
+    point = coal.Sphere(1e-6)
     for i in rows:
         for at in links.contacts(poses, *pair, int(i)):
             far = [
@@ -171,8 +175,10 @@ def _collide(
     T_b: ndarray,
 ) -> bool:
     """Whether surfaces of two links intersect; one inside the other is not detected."""
-    request, result = coal.CollisionRequest(), coal.CollisionResult()
-    place_a, place_b = coal_pose(T_a), coal_pose(T_b)
+    request = coal.CollisionRequest()
+    result = coal.CollisionResult()
+    place_a = coal_pose(T_a)
+    place_b = coal_pose(T_b)
     return any(
         coal.collide(one, place_a, other, place_b, request, result) for one in first for other in second
     )

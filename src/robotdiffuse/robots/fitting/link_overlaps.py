@@ -36,12 +36,14 @@ def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
     between."""
     found = []
     for joint in robot.joints:
-        above, T_above_parent = joint.parent, np.eye(4)
+        above = joint.parent
+        T_above_parent = np.eye(4)
         while above not in robot.meshes and above != robot.base:
             through = next(j for j in robot.joints if j.child == above)
             if through.kind in MOVING_KINDS:
                 break
-            above, T_above_parent = through.parent, through.T_parent_joint @ T_above_parent
+            above = through.parent
+            T_above_parent = through.T_parent_joint @ T_above_parent
         if link not in (above, joint.child) or not {above, joint.child} <= set(robot.meshes):
             continue
         endless = joint.kind == "continuous"
@@ -69,7 +71,8 @@ def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Float[ndarray, "n
             for T in other.T_link_neighbour:
                 local = (points[left] - T[:3, 3]) @ T[:3, :3]
                 near = ((local >= low) & (local <= high)).all(axis=1)
-                left, local = left[near], local[near]
+                left = left[near]
+                local = local[near]
                 left = left[within(local, *planes, -GAP)]
             found[left] = True
         return found

@@ -197,7 +197,8 @@ def prepare(
         again = measure_false_collisions(closer, surfaces, settings.samples, np.random.default_rng(seed))
         worst = max(false_collisions.by_spheres, settings.max_false_collisions)
         if again.by_parts < false_collisions.by_parts and again.by_spheres <= worst:
-            robot, false_collisions = closer, again
+            robot = closer
+            false_collisions = again
     measured = (
         measure_false_collisions(robot, surfaces, settings.samples, np.random.default_rng((seed, k)))
         for k in range(GRAZING_ROUNDS)
@@ -214,7 +215,8 @@ def _turning_reach(robot: Robot) -> float:
 
 
 def _report(robot: Robot, link: str) -> LinkReport:
-    meshes, spheres = robot.meshes[link], robot.spheres[link]
+    meshes = robot.meshes[link]
+    spheres = robot.spheres[link]
     out = float(stick_out(Solid.of(meshes, 0.0), spheres).max())
     return LinkReport(link, len(meshes), len(spheres), out, covered(meshes, spheres))
 
@@ -292,7 +294,8 @@ def with_finer_parts(
 
 def _with_tables(robot: Robot, pairs: set[tuple[str, str]], settings: PreparationSettings) -> Robot:
     """The robot with new tables over the joints between the given pairs of links."""
-    of_parts, tables = Links(robot), {table.links: table for table in robot.tables}
+    of_parts = Links(robot)
+    tables = {table.links: table for table in robot.tables}
     for pair in sorted(pairs):
         tables[pair] = joint_table(robot, of_parts, pair, settings.finest / 4)
     return replace(robot, tables=tuple(tables.values()))
@@ -341,6 +344,7 @@ def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
     T_base_link = links.poses(links.random(20, np.random.default_rng(0)))[link]
     if np.ptp(T_base_link[:, 2], axis=0).max() > 1e-6:
         return None
-    up, height = T_base_link[0, 2, :3], T_base_link[0, 2, 3]
+    up = T_base_link[0, 2, :3]
+    height = T_base_link[0, 2, 3]
     lowest = min(float((mesh.vertices @ up).min()) for mesh in robot.meshes[link])
     return up, min(-height, lowest - FLOOR_TOLERANCE)

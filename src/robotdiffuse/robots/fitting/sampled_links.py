@@ -116,12 +116,16 @@ class Links:
         for joint in self.robot.joints:
             if joint.kind not in MOVING_KINDS:
                 continue
-            leader, multiplier, offset = joint, 1.0, 0.0
+            leader = joint
+            multiplier = 1.0
+            offset = 0.0
             while leader.mimic is not None:
                 offset += multiplier * leader.mimic.offset
                 multiplier *= leader.mimic.multiplier
                 leader = by_name[leader.mimic.joint]
-            still, of_cosine, of_sine = np.eye(4), np.zeros((4, 4)), np.zeros((4, 4))
+            still = np.eye(4)
+            of_cosine = np.zeros((4, 4))
+            of_sine = np.zeros((4, 4))
             if joint.kind == "prismatic":
                 of_sine[:3, 3] = joint.axis
             else:
@@ -158,7 +162,8 @@ class Links:
         inside = ball_distances(poses[a][i], poses[b][i], self.inner[a], self.inner[b])
         if (inside < 0).any():
             return True
-        T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
+        T_a = coal_pose(poses[a][i])
+        T_b = coal_pose(poses[b][i])
         apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
         near = list(zip(*np.nonzero(apart <= 0), strict=True))
         hit = self._hit.get((a, b))
@@ -172,7 +177,8 @@ class Links:
     def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Float[ndarray, "n 3"]:
         """Points where convex parts of two links overlap in configuration i, one for each pair of parts
         [m]."""
-        T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
+        T_a = coal_pose(poses[a][i])
+        T_b = coal_pose(poses[b][i])
         apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
         found = []
         for m, n in zip(*np.nonzero(apart <= 0), strict=True):
@@ -184,7 +190,8 @@ class Links:
 
     def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
         """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
-        T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
+        T_a = coal_pose(poses[a][i])
+        T_b = coal_pose(poses[b][i])
         least = np.inf
         apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
         for k in apart.argsort(axis=None):

@@ -39,9 +39,10 @@ BURIED_DEPTH = 1e-9
 """Points deeper than this in another part are not on the surface of the union [m]."""
 EXCESS_TOLERANCE = 0.1
 """Largest excess radius that is accepted, as a fraction of the grid spacing."""
-COARSE_CELLS, FINE_CELLS = (5.0, 60_000), (8.0, 150_000)
-"""Cell sizes for choosing spheres and for the final fit: cells per radius of the disc that a sphere covers,
-and the largest number of cells."""
+# Cell sizes for choosing spheres and for the final fit: cells per radius of the disc that a sphere covers,
+# and the largest number of cells.
+COARSE_CELLS = (5.0, 60_000)
+FINE_CELLS = (8.0, 150_000)
 MAX_CROWD = 10
 """If a surface has room for so many times the cells that are allowed, they are not made: they would not fit
 into memory."""
@@ -129,7 +130,8 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> b
     Triangles that no single sphere contains are cut in four, until all are contained, or a corner is found
     outside all spheres, or triangles are smaller than SMALLEST_TRIANGLE.
     """
-    triangles, spheres = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), for_kernels(spheres)
+    triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    spheres = for_kernels(spheres)
     single = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
     while len(triangles):
         corners = triangles.reshape(-1, 3)
@@ -145,7 +147,9 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> b
         if len(triangles) and np.linalg.norm(np.ptp(triangles, axis=1), axis=1).min() < SMALLEST_TRIANGLE:
             return False
         a, b, c = np.moveaxis(triangles, 1, 0)
-        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        ab = (a + b) / 2
+        bc = (b + c) / 2
+        ca = (c + a) / 2
         quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
         triangles = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
     return True
@@ -174,14 +178,17 @@ class Cells:
         crowd = area / size**2 / most
         if crowd > MAX_CROWD:
             return Cells.of(solid, bounds, cut / np.sqrt(crowd), most)
-        soup, vertices, left_out = [], [], False
+        soup = []
+        vertices = []
+        left_out = False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
         boxes = [(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh in solid.meshes]
         for k, mesh in enumerate(solid.meshes):
             triangles = mesh.vertices[mesh.faces]
             triangles = split(triangles, size)
             hidden = np.zeros(len(triangles), dtype=bool)
-            low, high = triangles.min(1), triangles.max(1)
+            low = triangles.min(1)
+            high = triangles.max(1)
             for other, (lowest, highest) in enumerate(boxes):
                 if other != k:
                     asked = np.flatnonzero(((low >= lowest) & (high <= highest)).all(1) & ~hidden)
@@ -211,8 +218,10 @@ class Cells:
 
     def assigned(self, sizes: SphereSizeGrid, centers: Float[ndarray, "n 3"]) -> "_Assignment":
         count = len(self.corners)
-        owner, runner_up = np.empty(count, np.int64), np.empty(count, np.int64)
-        owner_excess, second_excess = np.empty(count), np.empty(count)
+        owner = np.empty(count, np.int64)
+        runner_up = np.empty(count, np.int64)
+        owner_excess = np.empty(count)
+        second_excess = np.empty(count)
         assign(
             self.points,
             self.corners,
@@ -281,7 +290,8 @@ def _farthest_apart(
 ) -> Float[ndarray, "k 3"]:
     """Up to `count` points with the largest excess, apart from each other."""
     order = np.argsort(-excess)[: max(1, int((excess > 0).sum()))]
-    points, chosen = points[order], []
+    points = points[order]
+    chosen = []
     while len(points) and len(chosen) < count:
         chosen.append(points[0])
         points = points[np.linalg.norm(points - points[0], axis=1) > ADDED_SPACING]
@@ -301,7 +311,9 @@ def _thin_out(
         given = cells.assigned(sizes, centers)
         loss = np.full(len(centers), -np.inf)
         np.maximum.at(loss, given.owner, given.second_excess)
-        dropped, moved, failures = np.zeros_like(kept), np.zeros_like(kept), 0
+        dropped = np.zeros_like(kept)
+        moved = np.zeros_like(kept)
+        failures = 0
         for i in np.argsort(loss):
             takers = np.unique(given.runner_up[given.owner == i])
             if kept[i] or moved[i] or moved[takers].any():
@@ -314,16 +326,19 @@ def _thin_out(
             part = cells.part(among[given.owner])
             rest, worst = _relax(sizes, part, centers[takers], settings.rounds, enough)
             if worst > enough:
-                kept[i], failures = True, failures + 1
+                kept[i] = True
+                failures = failures + 1
                 if failures == settings.tries:
                     break
                 continue
-            centers[takers], dropped[i] = rest, True
+            centers[takers] = rest
+            dropped[i] = True
             moved |= among
         if not dropped.any():
             break
         kept &= ~moved
-        centers, kept = centers[~dropped], kept[~dropped]
+        centers = centers[~dropped]
+        kept = kept[~dropped]
     return centers
 
 
@@ -347,13 +362,16 @@ def _without_holes(
     # every point is within half a cube's diagonal of a grid point
     half = np.sqrt(0.75) * solid.spacing
     is_open = gap > np.where(depth > 2 * half, -half, 0.0)
-    inside, depth, extra = inside[is_open], depth[is_open], []
+    inside = inside[is_open]
+    depth = depth[is_open]
+    extra = []
     while len(inside):
         deepest = int(depth.argmax())
         extra.append(np.append(inside[deepest], max(depth[deepest], half)))
         is_open = np.linalg.norm(inside - inside[deepest], axis=1) > extra[-1][3] - half
         is_open[deepest] = False
-        inside, depth = inside[is_open], depth[is_open]
+        inside = inside[is_open]
+        depth = depth[is_open]
     return np.concatenate([spheres, np.reshape(extra, (-1, 4))])
 
 

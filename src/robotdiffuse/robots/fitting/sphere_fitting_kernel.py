@@ -10,9 +10,11 @@ import numpy as np
 
 from robotdiffuse.core.kernels import kernel
 
-INITIAL_STEP, MIN_INITIAL_STEP, STEP_SHRINKAGE = 0.004, 0.0005, 0.8
-"""Initial step of the search for a centre [m]: in the first round, its lower bound, and its factor per
-round."""
+# Initial step of the search for a centre [m]: in the first round, its lower bound, and its factor per
+# round.
+INITIAL_STEP = 0.004
+MIN_INITIAL_STEP = 0.0005
+STEP_SHRINKAGE = 0.8
 MIN_STEP = 2e-4
 """The search for a centre ends at this step [m]."""
 OUTSIDE_GRID = -1.0
@@ -68,14 +70,20 @@ def within(points, normals, offsets, starts, depth):
 @kernel(fastmath=True)
 def max_radius_at(x, y, z, grid, origin, spacing):
     """Grid value interpolated at a point; outside the grid, negative and decreasing with the distance."""
-    u, v, w = (x - origin[0]) / spacing, (y - origin[1]) / spacing, (z - origin[2]) / spacing
+    u = (x - origin[0]) / spacing
+    v = (y - origin[1]) / spacing
+    w = (z - origin[2]) / spacing
     beyond = 0.0
     for value, count in ((u, grid.shape[0]), (v, grid.shape[1]), (w, grid.shape[2])):
         beyond = max(beyond, -value, value - (count - 1.001))
     if beyond > 0.0:
         return OUTSIDE_GRID - beyond * spacing
-    i, j, k = int(u), int(v), int(w)
-    u, v, w = u - i, v - j, w - k
+    i = int(u)
+    j = int(v)
+    k = int(w)
+    u = u - i
+    v = v - j
+    w = w - k
     low = (grid[i, j, k] * (1 - w) + grid[i, j, k + 1] * w) * (1 - v)
     low += (grid[i, j + 1, k] * (1 - w) + grid[i, j + 1, k + 1] * w) * v
     high = (grid[i + 1, j, k] * (1 - w) + grid[i + 1, j, k + 1] * w) * (1 - v)
@@ -95,7 +103,9 @@ def max_radii_at(centers, grid, origin, spacing):
 @kernel(fastmath=True)
 def squared_distance(a, i, b, j):
     """Squared distance between row i of a and row j of b."""
-    x, y, z = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
+    x = a[i, 0] - b[j, 0]
+    y = a[i, 1] - b[j, 1]
+    z = a[i, 2] - b[j, 2]
     return x * x + y * y + z * z
 
 
@@ -106,7 +116,10 @@ def assign(points, corners, centers, depths, owner, least, heir, second):
     `depths` are the largest radii of spheres at `centers`.
     """
     for c in range(len(corners)):
-        best, runner, mine, next_best = 1e9, 1e9, -1, -1
+        best = 1e9
+        runner = 1e9
+        mine = -1
+        next_best = -1
         for i in range(len(centers)):
             # most spheres are too far from the first corner already
             reach = runner + depths[i]
@@ -117,10 +130,17 @@ def assign(points, corners, centers, depths, owner, least, heir, second):
             far = max(far, squared_distance(points, corners[c, 2], centers, i))
             needed = math.sqrt(far) - depths[i]
             if needed < best:
-                runner, best, next_best, mine = best, needed, mine, i
+                runner = best
+                best = needed
+                next_best = mine
+                mine = i
             elif needed < runner:
-                runner, next_best = needed, i
-        owner[c], least[c], heir[c], second[c] = mine, best, next_best, runner
+                runner = needed
+                next_best = i
+        owner[c] = mine
+        least[c] = best
+        heir[c] = next_best
+        second[c] = runner
 
 
 @kernel(fastmath=True)
@@ -146,7 +166,8 @@ def greedy_cover(points, corners, places, depths):
             holds[c, i] = lacks <= least
         for i in range(len(places)):
             counts[i] += holds[c, i]
-    is_open, chosen = np.ones(len(corners), np.bool_), []
+    is_open = np.ones(len(corners), np.bool_)
+    chosen = []
     while counts.max() > 0:
         best = counts.argmax()
         chosen.append(best)
@@ -164,7 +185,9 @@ def enclosing(spheres):
     center = np.array([0.5 * (spheres[:, k].min() + spheres[:, k].max()) for k in range(3)])
     radius = 0.0
     for i in range(len(spheres)):
-        x, y, z = spheres[i, 0] - center[0], spheres[i, 1] - center[1], spheres[i, 2] - center[2]
+        x = spheres[i, 0] - center[0]
+        y = spheres[i, 1] - center[1]
+        z = spheres[i, 2] - center[2]
         radius = max(radius, math.sqrt(x * x + y * y + z * z) + spheres[i, 3])
     return center, radius
 
@@ -183,14 +206,17 @@ def relative(A, B, T):
 @kernel()
 def ball_distances(T_base_a, T_base_b, first, second):
     """Signed distances [a, b] between the balls of two sets, each set at its pose [4, 4] [m]."""
-    T, found = np.empty((3, 4)), np.empty((len(first), len(second)))
+    T = np.empty((3, 4))
+    found = np.empty((len(first), len(second)))
     relative(T_base_a, T_base_b, T)
     for j in range(len(second)):
         x = T[0, 0] * second[j, 0] + T[0, 1] * second[j, 1] + T[0, 2] * second[j, 2] + T[0, 3]
         y = T[1, 0] * second[j, 0] + T[1, 1] * second[j, 1] + T[1, 2] * second[j, 2] + T[1, 3]
         z = T[2, 0] * second[j, 0] + T[2, 1] * second[j, 1] + T[2, 2] * second[j, 2] + T[2, 3]
         for i in range(len(first)):
-            dx, dy, dz = first[i, 0] - x, first[i, 1] - y, first[i, 2] - z
+            dx = first[i, 0] - x
+            dy = first[i, 1] - y
+            dz = first[i, 2] - z
             far = math.sqrt(dx * dx + dy * dy + dz * dz)
             found[i, j] = far - first[i, 3] - second[j, 3]
     return found
@@ -205,7 +231,8 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
     are more than `apart` from each other, the depth is minus their distance. Overlaps up to `least` are not
     searched.
     """
-    depth, middle = np.full(len(T_base_a), least), np.zeros((len(T_base_a), 3))
+    depth = np.full(len(T_base_a), least)
+    middle = np.zeros((len(T_base_a), 3))
     a_center, a_radius = enclosing(first)
     b_center, b_radius = enclosing(second)
     T = np.empty((3, 4))
@@ -225,11 +252,15 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
             z = T[2, 0] * second[j, 0] + T[2, 1] * second[j, 1] + T[2, 2] * second[j, 2] + T[2, 3]
             # skip spheres too far from the first set to overlap more deeply
             reach = a_radius + second[j, 3] - depth[n]
-            dx, dy, dz = a_center[0] - x, a_center[1] - y, a_center[2] - z
+            dx = a_center[0] - x
+            dy = a_center[1] - y
+            dz = a_center[2] - z
             if reach <= 0.0 or dx * dx + dy * dy + dz * dz >= reach * reach:
                 continue
             for i in range(len(first)):
-                dx, dy, dz = first[i, 0] - x, first[i, 1] - y, first[i, 2] - z
+                dx = first[i, 0] - x
+                dy = first[i, 1] - y
+                dz = first[i, 2] - z
                 reach = first[i, 3] + second[j, 3] - depth[n]
                 if reach <= 0.0 or dx * dx + dy * dy + dz * dz >= reach * reach:
                     continue
@@ -237,7 +268,9 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
                 depth[n] = first[i, 3] + second[j, 3] - far
                 # from b's centre towards a's, to the middle of the two surfaces
                 along = (far + second[j, 3] - first[i, 3]) / 2 / max(far, 1e-9)
-                middle[n, 0], middle[n, 1], middle[n, 2] = x + along * dx, y + along * dy, z + along * dz
+                middle[n, 0] = x + along * dx
+                middle[n, 1] = y + along * dy
+                middle[n, 2] = z + along * dz
     return depth, middle
 
 
@@ -260,12 +293,15 @@ def gaps(points, spheres):
 def held_by_one(triangles, spheres):
     """Whether a single sphere contains each triangle [t]; and whether each corner [3 t] is outside all
     spheres."""
-    held, bare = np.zeros(len(triangles), np.bool_), np.ones(3 * len(triangles), np.bool_)
+    held = np.zeros(len(triangles), np.bool_)
+    bare = np.ones(3 * len(triangles), np.bool_)
     for t in range(len(triangles)):
         for i in range(len(spheres)):
-            inside, square = 0, spheres[i, 3] * spheres[i, 3]
+            inside = 0
+            square = spheres[i, 3] * spheres[i, 3]
             for k in range(3):
-                x, y = triangles[t, k, 0] - spheres[i, 0], triangles[t, k, 1] - spheres[i, 1]
+                x = triangles[t, k, 0] - spheres[i, 0]
+                y = triangles[t, k, 1] - spheres[i, 1]
                 z = triangles[t, k, 2] - spheres[i, 2]
                 if x * x + y * y + z * z <= square:
                     inside += 1
@@ -283,7 +319,9 @@ def excess_radius(x, y, z, own, count, grid, origin, spacing):
     """Excess radius of a sphere at a centre that contains the first `count` points of `own`."""
     far = 0.0
     for k in range(count):
-        dx, dy, dz = own[k, 0] - x, own[k, 1] - y, own[k, 2] - z
+        dx = own[k, 0] - x
+        dy = own[k, 1] - y
+        dz = own[k, 2] - z
         far = max(far, dx * dx + dy * dy + dz * dz)
     return math.sqrt(far) - max_radius_at(x, y, z, grid, origin, spacing)
 
@@ -293,14 +331,16 @@ def move_center(center, own, count, step, grid, origin, spacing, directions):
     """Pattern search for the centre of least excess radius, in place."""
     least = excess_radius(center[0], center[1], center[2], own, count, grid, origin, spacing)
     while step > MIN_STEP:
-        best, way = least - MIN_GAIN, -1
+        best = least - MIN_GAIN
+        way = -1
         for k in range(len(directions)):
             x = center[0] + step * directions[k, 0]
             y = center[1] + step * directions[k, 1]
             z = center[2] + step * directions[k, 2]
             value = excess_radius(x, y, z, own, count, grid, origin, spacing)
             if value < best:
-                best, way = value, k
+                best = value
+                way = k
         if way < 0:
             step /= 2
         else:
@@ -314,15 +354,21 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
 
     Returns the best centres found and their largest excess radius; ends early at `enough`.
     """
-    cells, count = len(corners), len(centers)
+    cells = len(corners)
+    count = len(centers)
     owner = np.empty(cells, np.int64)
-    least, heir, second = np.empty(cells), np.empty(cells, np.int64), np.empty(cells)
-    first, stamp = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
+    least = np.empty(cells)
+    heir = np.empty(cells, np.int64)
+    second = np.empty(cells)
+    first = np.empty(len(points), np.int64)
+    stamp = np.empty(len(points), np.int64)
     rim = np.empty(len(points), np.bool_)
     own = np.empty((len(points), 3))
-    order, ends = np.empty(cells, np.int64), np.empty(count + 1, np.int64)
+    order = np.empty(cells, np.int64)
+    ends = np.empty(count + 1, np.int64)
     centers = centers.copy()
-    best, best_value = centers.copy(), 1e9
+    best = centers.copy()
+    best_value = 1e9
     step = INITIAL_STEP
     for r in range(rounds + 1):
         assign(
@@ -330,7 +376,8 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
         )
         value = least.max()
         if value < best_value:
-            best, best_value = centers.copy(), value
+            best = centers.copy()
+            best_value = value
         if value <= enough or r == rounds:
             break
         # a point between cells of one owner matters only if it is a vertex of the mesh

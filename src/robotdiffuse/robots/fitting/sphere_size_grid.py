@@ -25,9 +25,10 @@ MIN_SPACING = 0.0015
 """Smallest spacing of a grid [m]."""
 MIN_PADDING = 0.03
 """Smallest padding of the grid around the link [m]: spheres may reach this far into a neighbour."""
-TIGHT_RADIUS, TIGHT_SLOPE = 0.015, 0.3
-"""A smaller tolerance applies within this distance of its place [m]; beyond, it grows by this much per
-metre."""
+# A smaller tolerance applies within this distance of its place [m]; beyond, it grows by this much per
+# metre.
+TIGHT_RADIUS = 0.015
+TIGHT_SLOPE = 0.3
 
 MIN_DEPTH = 5e-4
 """Lower bound on the inscribed radius of a link, for thin plates [m]."""
@@ -107,10 +108,12 @@ class Solid:
     def of(meshes: tuple[ConvexMesh, ...], tolerance: float) -> "Solid":
         """The solid, with a grid large enough for spheres that stick out by a tolerance [m]."""
         corners = np.concatenate([mesh.vertices for mesh in meshes])
-        low, high = corners.min(0), corners.max(0)
+        low = corners.min(0)
+        high = corners.max(0)
         beside = max(MIN_PADDING, tolerance)
         spacing = max(float(np.prod(high - low + 2 * beside) / GRID_POINTS) ** (1 / 3), MIN_SPACING)
-        low, high = low - beside - 2 * spacing, high + beside + 2 * spacing
+        low = low - beside - 2 * spacing
+        high = high + beside + 2 * spacing
         shape = np.ceil((high - low) / spacing).astype(int) + 1
         planes = stacked_planes(meshes)
         depth = plane_depths(_grid_points(shape, low, spacing), *planes).reshape(shape)
@@ -141,7 +144,8 @@ class Solid:
 
     def sphere_sizes(self, bounds: Bounds) -> SphereSizeGrid:
         """Largest radii of spheres within bounds."""
-        points, distance = self.points, self.distance.ravel()
+        points = self.points
+        distance = self.distance.ravel()
         allowed = np.full(len(points), bounds.tolerance)
         near = (distance > -bounds.tolerance) & (distance < 2 * bounds.tolerance)
         allowed[near] = bounds.tolerances(points[near])

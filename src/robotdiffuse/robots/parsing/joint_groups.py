@@ -12,13 +12,15 @@ from robotdiffuse.robots.robot import Robot
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """Matches names of gripper joints, if few joints come after them."""
-BOTH, ALL = "both", "all"
-"""Names of the group of all arms: of two, and of any number."""
+# Names of the group of all arms: of two, and of any number.
+BOTH = "both"
+ALL = "all"
 SUFFIX_CHARACTERS = "_-/0123456789 "
 """Characters stripped from the end of the common prefix of an arm's joint names."""
-MAX_FINGER_JOINTS, MAX_HAND_FINGER_JOINTS = 2, 3
-"""Largest number of movable joints per branch of a gripper: with two branches, such as two fingers, and with
-other numbers of branches."""
+# Largest number of movable joints per branch of a gripper: with two branches, such as two fingers, and with
+# other numbers of branches.
+MAX_FINGER_JOINTS = 2
+MAX_HAND_FINGER_JOINTS = 3
 MIN_ARM_JOINTS = 4
 """Smallest number of movable joints of an arm if there are several chains. After this many joints, three or
 more branches form a hand, however long its fingers are."""

@@ -98,7 +98,8 @@ def _changed(joint: Joint, fields: dict[str, float]) -> Joint:
         fields = fields | {"jerk": JERK_PER_ACCELERATION * fields["acceleration"]}
     if joint.kind == "continuous" and {"lower", "upper"} & fields.keys():
         joint = replace(joint, kind="revolute", lower=-math.pi, upper=math.pi)
-    lower, upper = fields.get("lower", joint.lower), fields.get("upper", joint.upper)
+    lower = fields.get("lower", joint.lower)
+    upper = fields.get("upper", joint.upper)
     if lower > upper:
         raise InputError(f"joint_limits of {joint.name}: min_position {lower} is above max_position {upper}")
     return replace(joint, **fields)

@@ -17,7 +17,8 @@ def moves_in_a_plane(joints: Sequence[Joint]) -> bool:
     moving = [joint for joint in joints if joint.kind != "fixed"]
     if sorted(joint.kind in ROTATING_KINDS for joint in moving) != [False, False, True]:
         return False
-    R, axes = np.eye(3), []
+    R = np.eye(3)
+    axes = []
     for joint in joints:
         R = R @ joint.T_parent_joint[:3, :3]
         if joint.kind != "fixed":

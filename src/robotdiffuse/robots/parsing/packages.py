@@ -36,7 +36,8 @@ class Packages:
         none."""
         if name in self.folders:
             return Path(self.folders[name])
-        ros, ament = _folders("ROS_PACKAGE_PATH"), _folders("AMENT_PREFIX_PATH")
+        ros = _folders("ROS_PACKAGE_PATH")
+        ament = _folders("AMENT_PREFIX_PATH")
         start = self.urdf.resolve().parent
         candidates = [
             *(root for root in ros if root.name == name),

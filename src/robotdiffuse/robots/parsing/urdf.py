@@ -100,7 +100,8 @@ class UrdfTree:
         """Parent joint of each link except the root."""
         self.children: dict[str, list[str]] = {}
         for name, element in self.elements.items():
-            parent, child = self._end(name, element, "parent"), self._end(name, element, "child")
+            parent = self._end(name, element, "parent")
+            child = self._end(name, element, "child")
             if child in self.parents:
                 raise InputError(
                     f"{self.path}: link {child} has two parent joints ({self.parents[child]}, {name}); a "
@@ -157,7 +158,8 @@ class UrdfTree:
         joints = self.below(base)
         names = [base, *(joint.child for joint in joints)]
         planned, ends = planned_joints(self.path, base, joints, tip, group, srdf)
-        meshes, inertias = self.geometry(names), self.inertias(names)
+        meshes = self.geometry(names)
+        inertias = self.inertias(names)
         robot = Robot(
             name=self.name,
             base=base,
@@ -332,7 +334,9 @@ class UrdfTree:
         followed = element.find("mimic")
         if followed is None:
             return None
-        leaders, leader, last = [name], followed, followed
+        leaders = [name]
+        leader = followed
+        last = followed
         while leader is not None:
             leaders.append(leader.get("joint", ""))
             if leaders[-1] not in self.elements or leaders[-1] in leaders[:-1]:
@@ -340,7 +344,8 @@ class UrdfTree:
                     f"{self.path}: joint {leaders[-2]} mimics {shown(leaders[-1])}; it must be another "
                     f"joint of the file that does not mimic it"
                 )
-            last, leader = leader, self.elements[leaders[-1]].find("mimic")
+            last = leader
+            leader = self.elements[leaders[-1]].find("mimic")
         if self.elements[leaders[-1]].get("type") == "fixed" or last is None:
             self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; treated as independent")
             return None
@@ -353,17 +358,20 @@ class UrdfTree:
         given: dict[str, float] = {}
         for what in ("lower", "upper", "velocity"):
             if limit is not None and limit.get(what) is not None:
-                text, most = limit.get(what, ""), MAX_RATE if what == "velocity" else MAX_COORDINATE
+                text = limit.get(what, "")
+                most = MAX_RATE if what == "velocity" else MAX_COORDINATE
                 given[what] = float(
                     numbers_of(self.path, text, 1, f"joint {joint.name}: {what} limit", most)[0]
                 )
         if joint.kind == "continuous":
-            given["lower"], given["upper"] = -CONTINUOUS_LIMIT, CONTINUOUS_LIMIT
+            given["lower"] = -CONTINUOUS_LIMIT
+            given["upper"] = CONTINUOUS_LIMIT
         if "lower" not in given and "upper" not in given:
             raise InputError(
                 f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
             )
-        lower, upper = given.get("lower", 0.0), given.get("upper", 0.0)
+        lower = given.get("lower", 0.0)
+        upper = given.get("upper", 0.0)
         if lower > upper:
             raise InputError(
                 f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}; exchange them"
@@ -414,7 +422,8 @@ class UrdfTree:
         return found
 
     def _inertia(self, element: ET.Element, what: str) -> Inertia:
-        mass, inertia = element.find("mass"), element.find("inertia")
+        mass = element.find("mass")
+        inertia = element.find("inertia")
         value = "" if mass is None else mass.get("value", "")
         mass = numbers_of(self.path, value, 1, what)[0]
         of = {} if inertia is None else inertia.attrib

@@ -27,7 +27,8 @@ def link_surfaces(
     `notes` receives a note on each mesh file that is turned or scaled. Raises InputError for elements without
     geometry, unknown shapes and damaged meshes.
     """
-    parts, name = [], link.get("name", "")
+    parts = []
+    name = link.get("name", "")
     for element in link.findall(kind):
         geometry = element.find("geometry")
         shape = next(iter(geometry), None) if geometry is not None else None

@@ -22,18 +22,22 @@ from robotdiffuse.visualization.live.session import dimensions
 
 POSE_RATE = 30.0
 """Poses of a motion that are precomputed per second."""
-RED, AMBER = (0xD6, 0x3B, 0x3B), (0xE0, 0x9A, 0x2F)
+RED = (0xD6, 0x3B, 0x3B)
+AMBER = (0xE0, 0x9A, 0x2F)
 GAMMA = 2.2
 SAFE_CLEARANCE = 0.05
 """Candidates with at least this clearance are green [m]."""
-EDGE_POINTS, MAX_EDGES = 6, 4000
-"""Points of the tool's trace along an edge of a tree; most edges drawn per tree, the first ones."""
+# Points of the tool's trace along an edge of a tree; most edges drawn per tree, the first ones.
+EDGE_POINTS = 6
+MAX_EDGES = 4000
 TREES = ("/trees/start", "/trees/goal")
 GHOST_OFFSET = 0.002
 """Offset of a see-through arm along its normals, so that it covers the solid arm at the same place [m];
 scaled by its opacity over GHOST_OPACITY."""
-TRACE_WIDTH, CANDIDATE_WIDTH, TREE_WIDTH = 0.0094, 0.0035, 0.0028
-"""Line widths, as fractions of the arm's reach."""
+# Line widths, as fractions of the arm's reach.
+TRACE_WIDTH = 0.0094
+CANDIDATE_WIDTH = 0.0035
+TREE_WIDTH = 0.0028
 GHOST_OPACITY = 0.3
 """Opacity of the start and goal arms."""
 HIGHLIGHT = 0.35
@@ -48,7 +52,8 @@ def add_surface(
     opacity: float | None = None,
 ) -> viser.MeshHandle:
     """Draw a surface in one colour."""
-    vertices, faces = surface.vertices.astype(np.float32), surface.faces.astype(np.uint32)
+    vertices = surface.vertices.astype(np.float32)
+    faces = surface.faces.astype(np.uint32)
     return server.scene.add_mesh_simple(name, vertices, faces, color=color, opacity=opacity)
 
 
@@ -89,7 +94,8 @@ class Arm:
             turns = Rotation.from_matrix(T_base_frame[:, :3, :3]).as_quat(scalar_first=True)
             with self._server.atomic():
                 for frame, T, wxyz in zip(self._frames, T_base_frame, turns, strict=True):
-                    frame.position, frame.wxyz = T[:3, 3], wxyz
+                    frame.position = T[:3, 3]
+                    frame.wxyz = wxyz
         if self.root.visible is not (T_base_frame is not None):
             self.root.visible = T_base_frame is not None
 
@@ -104,7 +110,8 @@ def place(node: Any, T: Float[ndarray, "4 4"]) -> None:
     """Move a node, without a message to browsers if it is there."""
     wxyz = quaternion_from_rotation(T[:3, :3])
     if not (np.allclose(node.position, T[:3, 3]) and np.allclose(node.wxyz, wxyz)):
-        node.position, node.wxyz = T[:3, 3], wxyz
+        node.position = T[:3, 3]
+        node.wxyz = wxyz
 
 
 class Obstacles:
@@ -131,7 +138,8 @@ class Obstacles:
 
     def _draw(self, obstacle: Drawable, selected: bool) -> Any:
         """A node in the obstacle's own frame."""
-        color, name = obstacle.color, obstacle.name
+        color = obstacle.color
+        name = obstacle.name
         if selected:
             r, g, b = (round(c + HIGHLIGHT * (255 - c)) for c in color)
             color = r, g, b
@@ -171,7 +179,8 @@ def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | No
 
 def draw_candidates(server: viser.ViserServer, arm: DrawnArm, candidates: Candidates | None) -> None:
     """Draw the tool traces of all candidates: red in collision, else amber to green by clearance."""
-    traces, colors = [], []
+    traces = []
+    colors = []
     if candidates is not None:
         traces = [arm.trace(q) for q in candidates.positions]
         colors = [candidate_color(clearance) for clearance in candidates.clearances]
@@ -188,7 +197,8 @@ def draw_trees(server: viser.ViserServer, arm: DrawnArm, trees: tuple[Tree, ...]
 
 def _edges(arm: DrawnArm, tree: Tree) -> list[Float[ndarray, "points 3"]]:
     children = np.flatnonzero(tree.parents >= 0)[:MAX_EDGES]
-    begin, end = tree.nodes[tree.parents[children]], tree.nodes[children]
+    begin = tree.nodes[tree.parents[children]]
+    end = tree.nodes[children]
     share = np.linspace(0, 1, EDGE_POINTS)[:, None]
     q = (begin[:, None] + share * (end - begin)[:, None]).astype(np.float64)
     return list(arm.tool_points(q.reshape(-1, arm.robot.dof)).reshape(-1, EDGE_POINTS, 3))

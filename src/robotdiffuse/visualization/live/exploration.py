@@ -57,16 +57,22 @@ from robotdiffuse.visualization.live.server import PageServer
 from robotdiffuse.visualization.live.session import INVALID, NO_MOTION, PENDING, VALID, Validity
 from robotdiffuse.visualization.live.threads import FRAME_RATE, Changes, LatestTask
 
-WAITING, CHOOSING, MOVING, ENDED = "waiting", "choosing", "moving", "ended"
-"""Phases: at rest until a visitor lets it go on, choosing a step, executing it, and after the last step."""
-PAUSED, STEPPING, RUNNING = "paused", "stepping", "running"
-"""What visitors want: a pause, one step and then a pause, or all steps."""
+# Phases: at rest until a visitor lets it go on, choosing a step, executing it, and after the last step.
+WAITING = "waiting"
+CHOOSING = "choosing"
+MOVING = "moving"
+ENDED = "ended"
+# What visitors want: a pause, one step and then a pause, or all steps.
+PAUSED = "paused"
+STEPPING = "stepping"
+RUNNING = "running"
 CLEAR_OPACITY = 0.6
 """Of predicted voxels, and of those that a look is to show."""
 UNKNOWN_OPACITY = 0.2
 """Of the boundary of unknown space, which is drawn where it faces the viewer: it never hides the arm."""
-CAMERA_SIZE, CAMERA_COLOR = 0.12, (40, 48, 58)
-"""Length of the pyramid of the camera on the arm [m], and its colour."""
+# Length of the pyramid of the camera on the arm [m], and its colour.
+CAMERA_SIZE = 0.12
+CAMERA_COLOR = (40, 48, 58)
 SPEEDS = (0.1, 10.0)
 """Bounds of the slider of the speed."""
 PROMISES = {
@@ -110,9 +116,11 @@ class ExplorationSession:
         self, problem: Problem, settings: ExplorerSettings, noise: bool, seed: int, speed: float = 1.0
     ) -> None:
         """Begins paused, at the problem's start."""
-        self.problem, self._seed = problem, seed
+        self.problem = problem
+        self._seed = seed
         self.on_change: Callable[[], None] = lambda: None
-        self._changed, self._run = threading.Condition(), 0
+        self._changed = threading.Condition()
+        self._run = 0
         self._state = ExplorationState(settings, noise, problem.start, speed=speed)
         self._task = LatestTask(self._explore, "explore")
 
@@ -199,18 +207,21 @@ class ExplorationSession:
 
     def _execute(self, run: int, explorer: RecordedExplorer) -> None:
         """Execute the last step, in which the views are those that were taken during its motion."""
-        act, number = explorer.acts[-1], len(explorer.acts) - 1
+        act = explorer.acts[-1]
+        number = len(explorer.acts) - 1
         before = [view for view in explorer.views if view.act < number]
         views = [*before[-1:], *(view for view in explorer.views if view.act == number)]
         self._update(run, phase=MOVING, acts=tuple(explorer.acts), known=views[0])
-        at, last = -READING_TIME, time.perf_counter()
+        at = -READING_TIME
+        last = time.perf_counter()
         while act.trajectory is not None and at < act.duration:
             if self._wait_while_paused(run):
                 last = time.perf_counter()
             time.sleep(1 / FRAME_RATE)
             now = time.perf_counter()
             speed = self._state.speed if at >= 0 else max(self._state.speed, 1.0)
-            at, last = min(at + speed * (now - last), act.duration), now
+            at = min(at + speed * (now - last), act.duration)
+            last = now
             if at > 0:
                 taken = [view for view in views if view.time <= act.begins + at]
                 q = act.trajectory.at(at).positions
@@ -242,7 +253,8 @@ class ExplorationPage:
         self.session = session
         self.server = server
         self._changes = Changes()
-        problem, robot = session.problem, session.problem.robot
+        problem = session.problem
+        robot = session.problem.robot
         server.add_stage(reach(robot))
         self._drawn = DrawnArm(robot)
         self._arm = Arm(server, "arm", self._drawn)
@@ -275,7 +287,9 @@ class ExplorationPage:
         self.server.stop()
 
     def _add_panel(self) -> None:
-        gui, session, state = self.server.gui, self.session, self.session.state
+        gui = self.server.gui
+        session = self.session
+        state = self.session.state
         self._badge = gui.add_html("")
         self._run = gui.add_button("Run", icon=viser.Icon.PLAYER_PLAY)
         self._step = gui.add_button("Next step", icon=viser.Icon.PLAYER_SKIP_FORWARD)
@@ -322,7 +336,8 @@ class ExplorationPage:
 
     def _draw(self) -> None:
         """Draw what has changed; only this task draws."""
-        state, explorer = self.session.state, self.session.state.explorer
+        state = self.session.state
+        explorer = self.session.state.explorer
         act = state.acts[-1] if state.acts else None
         under_way = act if state.phase == MOVING else None
         with self.server.atomic():
@@ -347,7 +362,8 @@ class ExplorationPage:
 
     def _show_camera(self, explorer: RecordedExplorer) -> None:
         """Attach the first camera to the arm."""
-        camera, robot = explorer.cameras[0], explorer.robot
+        camera = explorer.cameras[0]
+        robot = explorer.robot
         T = robot.T_frame_link(camera.link) @ camera.T_link_camera
         (width, height), fy = camera.size, camera.intrinsics[1]
         self.server.scene.add_camera_frustum(
@@ -419,7 +435,8 @@ def exploration_badge(state: ExplorationState) -> Validity:
         lines = () if state.acts else (first,)
         what = f"choosing step {len(state.acts) + 1}" if state.phase == CHOOSING else "not begun"
         return Validity(PENDING, what, (*lines, *_shares(state)))
-    act, number = state.acts[-1], len(state.acts)
+    act = state.acts[-1]
+    number = len(state.acts)
     headline = _title(number, act)
     if state.phase == ENDED and state.violation:
         return Validity(INVALID, f"collides in the true scene: {state.violation}", (headline,))

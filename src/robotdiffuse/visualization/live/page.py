@@ -58,8 +58,9 @@ from robotdiffuse.visualization.live.session import (
 )
 from robotdiffuse.visualization.live.threads import Changes, LatestTask, Player
 
-GIZMO_SIZE, SMALL_GIZMO_SIZE = 0.23, 0.16
-"""Sizes of gizmos, as fractions of the arm's reach."""
+# Sizes of gizmos, as fractions of the arm's reach.
+GIZMO_SIZE = 0.23
+SMALL_GIZMO_SIZE = 0.16
 BADGE_COLORS = {VALID: "#0f8f6f", INVALID: "#c92f2f", NO_MOTION: "#b26a00", PENDING: "#6b7684"}
 JOINT_COLORS = ("#4f7fd9", "#10a37f", "#d97b5c", "#8a63d2", "#c2a23a", "#4fa3b8", "#c96a9a", "#7a8794")
 """Colours of joints in the plot."""
@@ -118,8 +119,11 @@ class Page:
 
     def _draw(self) -> None:
         """Draw what has changed; only this task and the player draw."""
-        state, selected, new = self.session.state, self._selected, self._changes.new
-        problem, robot = state.problem, state.problem.robot
+        state = self.session.state
+        selected = self._selected
+        new = self._changes.new
+        problem = state.problem
+        robot = state.problem.robot
         if new("robot", robot):
             self._new_robot(robot)
         self._drawn.frames(problem.start)  # compiles here, since nothing is sent within the block
@@ -161,7 +165,8 @@ class Page:
         }
         for gizmo in self._gizmos:
             gizmo.handle.scale = gizmo.size * reach(robot)
-        problem, goal = self.session.state.problem, self.session.state.goal_configuration
+        problem = self.session.state.problem
+        goal = self.session.state.goal_configuration
         ends = np.stack([problem.start, problem.start if goal is None else goal])
         self.server.set_first_view(self._drawn, problem, ends)
         draw_trees(self.server, self._drawn, ())
@@ -264,7 +269,9 @@ class Panel:
     """The widgets of the control panel."""
 
     def __init__(self, server: viser.ViserServer, session: Session, callbacks: PanelCallbacks) -> None:
-        self._server, self._session, self._callbacks = server, session, callbacks
+        self._server = server
+        self._session = session
+        self._callbacks = callbacks
         gui = server.gui
         self._changes = Changes()
         self._badge = gui.add_html("")
@@ -304,7 +311,9 @@ class Panel:
     # tabs
 
     def _plan_tab(self) -> None:
-        gui, session, options = self._server.gui, self._session, self._session.state.options
+        gui = self._server.gui
+        session = self._session
+        options = self._session.state.options
         hints = {
             "follow": "Plan again after each change",
             "candidates": "Motions proposed by the network: red in collision, green from 5 cm clearance",
@@ -350,14 +359,16 @@ class Panel:
         self._callbacks.select(self._session.add_obstacle(self._new.value))
 
     def _files_tab(self) -> None:
-        gui, session = self._server.gui, self._session
+        gui = self._server.gui
+        session = self._session
         load = gui.add_upload_button("Load problem", icon=viser.Icon.UPLOAD, mime_type=".yaml,.yml,.json")
         save = gui.add_button("Save problem", icon=viser.Icon.DOWNLOAD)
         share = gui.add_button("Save replay", icon=viser.Icon.SHARE)
 
         @load.on_upload
         def _(event: viser.GuiEvent) -> None:
-            file, robot = load.value, session.state.problem.robot
+            file = load.value
+            robot = session.state.problem.robot
             self.guarded(event, lambda: session.open(uploaded_problem(file.content, file.name, robot)))
 
         save.on_click(lambda event: self.guarded(event, lambda: _send(event, *self._problem_file())))
@@ -428,7 +439,9 @@ class Panel:
         with self._joints_box:
             for name, low, high, turns in limits:
                 low, high = (-np.pi, np.pi) if turns else (float(low), float(high))
-                low, high = np.floor(100 * low) / 100, np.ceil(100 * high) / 100  # for short labels
+                # for short labels
+                low = np.floor(100 * low) / 100
+                high = np.ceil(100 * high) / 100
                 widget = self._server.gui.add_slider(name, min=low, max=high, step=0.001, initial_value=low)
                 self._on(widget, partial(self._move_joint, len(self._joints)))
                 self._joints.append(widget)
@@ -452,7 +465,8 @@ class Panel:
         self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
 
     def _show_plot(self, state: State) -> None:
-        robot, motion = state.problem.robot, state.motion
+        robot = state.problem.robot
+        motion = state.motion
         if motion is None or motion.trajectory is None:
             return
         data = plotted(robot, motion.trajectory, self._kind.value)

@@ -26,8 +26,9 @@ from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
 
 FLOOR_SIZE = 4.7
 """Edge length of the floor, as a multiple of the arm's reach."""
-VIEW_SIZE, VIEW_MARGINS = (900, 800), (0.06, 0.06)
-"""Window size for which the first view is chosen [pixels], and the fractions of its height left free."""
+# Window size for which the first view is chosen [pixels], and the fractions of its height left free.
+VIEW_SIZE = (900, 800)
+VIEW_MARGINS = (0.06, 0.06)
 LIGHTS = (2.0, (-2.0, -3.0, 5.0)), (1.1, (3.0, 2.0, 3.0)), (0.7, (-3.0, 3.0, 1.0))
 """Intensity and position of each light."""
 PANEL_OFFSET = 0.2

@@ -53,13 +53,15 @@ NEW_OBSTACLES: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
     "capsule": lambda center, size: Capsule(center, 0.75 * size, 2.5 * size),
 }
 """Makers of new obstacles, by kind, from their centre and the radius of a sphere of similar size [m]."""
-MIN_DIMENSION, MAX_DIMENSION = 0.01, 2.0
-"""Bounds of a dimension [m]."""
+# Bounds of a dimension [m].
+MIN_DIMENSION = 0.01
+MAX_DIMENSION = 2.0
 AXES = ("x", "y", "z")
 ORIENTED = (Box, Cylinder, Capsule, Mesh)
 """Shapes that can be rotated. Rotating a sphere has no effect, and point clouds store no pose."""
-NEW_POSITION, NEW_RADIUS = np.array([0.5, 0.0, 0.5]), 0.094
-"""Position of new obstacles and radius of a new sphere, as fractions of the arm's reach."""
+# Position of new obstacles and radius of a new sphere, as fractions of the arm's reach.
+NEW_POSITION = np.array([0.5, 0.0, 0.5])
+NEW_RADIUS = 0.094
 TREE_SETTINGS = {
     "robotdiffuse": "search.keep_trees=true",
     "aorrtc": "keep_trees=true",
@@ -79,8 +81,11 @@ FILE_FIELDS = ("file", "request", "views")
 MAX_SAMPLES = 1000
 """Most random configurations that are tried for a free start and goal."""
 NO_FILES = "the page reads no other files; open this problem with `robotdiffuse live PROBLEM`"
-VALID, INVALID, NO_MOTION, PENDING = "valid", "invalid", "none", "pending"
-"""Kinds of badges: green, red, no motion, not validated yet."""
+# Kinds of badges: green, red, no motion, not validated yet.
+VALID = "valid"
+INVALID = "invalid"
+NO_MOTION = "none"
+PENDING = "pending"
 COLLISIONS = ("scene_collision", "self_collision")
 
 
@@ -173,7 +178,8 @@ class Session:
     def open(self, problem: Problem) -> None:
         """Replace the problem; it may have another robot."""
         with self._lock:
-            old, new = self._state, _opened(problem, self._state.options)
+            old = self._state
+            new = _opened(problem, self._state.options)
             same = old.problem.robot is new.problem.robot
             self._state = replace(new, version=old.version, motion=old.motion if same else None)
             self._goal_task.submit(new.goal_pose)
@@ -184,7 +190,8 @@ class Session:
         with self._lock:
             if "planner" in changes:
                 PLANNERS.entry(changes["planner"])
-            before, options = self._state.options, replace(self._state.options, **changes)
+            before = self._state.options
+            options = replace(self._state.options, **changes)
             self._state = replace(self._state, options=options)
             if replace(before, trees=options.trees) != options:
                 self._changed()
@@ -296,7 +303,8 @@ class Session:
         """Find a configuration at the goal, close to the previous one."""
         state = self._state
         known = state.goal_configuration
-        robot, near = state.problem.robot, state.problem.start if known is None else known
+        robot = state.problem.robot
+        near = state.problem.start if known is None else known
         q = _configuration_at(robot, state.goal_frame, T_base_frame, near)
         with self._lock:
             if self._state.problem.robot is not robot:
@@ -315,7 +323,8 @@ class Session:
         if state.version != version:
             return
         result, failure, seconds = self._solve(state)
-        validation, now = None, self._state
+        validation = None
+        now = self._state
         same = now.problem.robot is state.problem.robot
         if same and result is not None and result.trajectory is not None:
             validation = _validated(now.problem, result, now.version)
@@ -338,7 +347,8 @@ class Session:
 
     def _solve(self, state: State) -> tuple[PlanResult | None, str, tuple[tuple[str, float], ...]]:
         """The planner's result, or why it failed, and the times of its stages."""
-        options, problem = state.options, state.problem
+        options = state.options
+        problem = state.problem
         try:
             planner = self._planners.get(options.planner)
             if planner is None:
@@ -387,7 +397,8 @@ def _opened(problem: Problem, options: PageOptions) -> State:
 
 def _target(problem: Problem) -> tuple[str, Float[ndarray, "4 4"], Float[ndarray, "dof"] | None]:
     """The link that represents the goal, its pose, and the configuration of a joint goal."""
-    goal, robot = problem.goal, problem.robot
+    goal = problem.goal
+    robot = problem.robot
     if isinstance(goal, AnyGoal):
         goal = goal.goals[0]
     if poses := poses_of(goal):
@@ -476,7 +487,8 @@ def validity(state: State) -> Validity:
         return Validity(PENDING, "not planned yet")
     if validation is None:
         return Validity(PENDING, "validating")
-    report, trajectory = validation.report, state.motion.trajectory
+    report = validation.report
+    trajectory = state.motion.trajectory
     assert trajectory is not None
     violation = report.violation
     if violation is None:
@@ -572,7 +584,8 @@ def _check_contained(data: object, robot: Robot) -> None:
     """Raises InputError if the data of a problem file names files."""
     if not isinstance(data, dict):
         return  # the problem reader rejects it
-    given, known = data.get("robot"), known_robots()
+    given = data.get("robot")
+    known = known_robots()
     if isinstance(given, str) and given not in known and given != robot.source:
         raise unknown_name("robot", given, known)
     if isinstance(data.get("scene"), str):

@@ -24,7 +24,8 @@ UR5_JOINTS = [
 
 def ur5_files(folder: Path, model: str, more: list[str]) -> Path:
     """A problem file of `ur5`, beside a MoveIt scene and request of a robot with further joints."""
-    names, zeros = [*UR5_JOINTS, *more], [0.0] * (6 + len(more))
+    names = [*UR5_JOINTS, *more]
+    zeros = [0.0] * (6 + len(more))
     here = {"joint_state": {"name": names, "position": zeros}}
     here["multi_dof_joint_state"] = {"joint_names": ["virtual_joint"]}
     goal = [{"joint_name": name, "position": 0.1} for name in UR5_JOINTS]
