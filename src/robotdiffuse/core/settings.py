@@ -154,9 +154,8 @@ class Settings:
         """
         if not isinstance(values, dict):
             raise InputError(f"{where} is {shown(values)}; it must be a table of settings")
-        # type: ignore[arg-type]
         hints = _hints(cls)
-        fields = {f.name: f for f in dataclasses.fields(cls)}
+        fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
         for name in values:
             if name not in fields:
                 raise InputError(

@@ -160,7 +160,7 @@ def run_ablation(
     configs = dict.fromkeys(ROWS[name].config for name in rows)
     trainings = [Training(config, seed) for config in configs for seed in range(settings.seeds)]
     evaluations: dict[tuple[Training | None, bool], Evaluation] = {}
-    with lock_folder(out), Workers(workers, STOP_TIMEOUT) as pool:
+    with lock_folder(out), Workers(workers, patience=STOP_TIMEOUT) as pool:
         if not (out / ENCODER / "encoder.json").exists():
             report(f"training {ENCODER}: {settings.encoder_samples:,} clouds")
             encoder = EncoderTraining(name=ENCODER, minutes=None, samples=settings.encoder_samples)

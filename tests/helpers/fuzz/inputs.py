@@ -294,7 +294,7 @@ def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
     def ask() -> None:
         worker.accept({"panda": load_robot("panda")}, ServeSettings(max_time_limit=0.1))
-        answer = worker.respond(1, what, body)
+        answer = worker.respond(what, body)
         if answer.code == 400:
             raise InputError(json.loads(answer.body)["error"])
         assert answer.code == 200, answer.body.decode()
