@@ -52,6 +52,8 @@ from robotdiffuse.robots.robot import Joint, Robot
 # Halvings of a step at most, and stretches at a time, to show that a frame keeps its speed.
 MAX_HALVINGS = 24
 MAX_OPEN = 100_000
+MIN_LINE_LENGTH = 1e-3
+"""Along shorter lines the frame turns in place [m]."""
 SAME_POSE = 1e-3
 """Poses at several goals may differ by this for a Cartesian line to end there [m] and in entries of R."""
 
@@ -214,7 +216,8 @@ def _body(constraint: Constraint) -> _Body:
 
 def _segment(start: ndarray, goal: ndarray) -> _Body:
     length = float(np.linalg.norm(goal - start))
-    return _Body((start + goal) / 2, _with_z((goal - start) / length), np.array([0.0, 0.0, length / 2]))
+    along = (goal - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    return _Body((start + goal) / 2, _with_z(along), np.array([0.0, 0.0, length / 2]))
 
 
 def _with_z(z: ndarray) -> Rotation:
@@ -248,15 +251,22 @@ def _angle_bounds(along: _FrameMotion, T_start: ndarray, T_goal: ndarray, chord:
     length = float(np.linalg.norm(way))
     turn = _rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
     whole = float(np.linalg.norm(turn))
-    share = np.clip((along.p - T_start[:3, 3]) @ way / length**2, 0.0, 1.0)
     axis = turn / whole if whole > 0 else np.array([0.0, 0.0, 1.0])
     K = cross_matrix(axis)
-    angles = (share * whole)[:, None, None]
+    if length < MIN_LINE_LENGTH:  # the frame turns in place: the nearest orientation on its way
+        turned = along.R @ T_start[:3, :3].T
+        sines = (turned * K).sum(axis=(1, 2))
+        cosines = -(turned * (K @ K)).sum(axis=(1, 2))
+        angles = np.clip(np.arctan2(sines, cosines), 0.0, whole)[:, None, None]
+        reach = 0.0
+    else:
+        share = np.clip((along.p - T_start[:3, 3]) @ way / length**2, 0.0, 1.0)
+        angles = (share * whole)[:, None, None]
+        reach = whole / length
     wanted = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
     # from the norm of the difference of rotations, which is accurate near 0 too
     chords = np.linalg.norm(along.R - wanted, axis=(1, 2))
     off = 2 * np.arcsin(np.clip(chords / np.sqrt(8), 0.0, 1.0))
-    reach = whole / length
     return (off[1:] + off[:-1] + along.turn + reach * along.went) / 2 + chord * (
         along.joints + reach * along.slack
     )

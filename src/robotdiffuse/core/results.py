@@ -79,6 +79,9 @@ class PlanResult:
     unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Lower and upper corner, in the base frame [m], of a box around the crossed unknown space that is most
     likely occupied; None if the motion crosses none."""
+    fraction: float | None = None
+    """Problems with a Cartesian line: how much of it can be followed from the start, 1 with a motion;
+    `reason` says what ends it there."""
     corner_deviations: tuple[float, ...] | None = field(default=None, repr=False)
     """How far the motion may leave each waypoint of the path [rad, joint-space L2]; None: the default of
     timing. Files do not hold it."""
@@ -219,6 +222,7 @@ READERS: dict[str, Callable[[str, Any], Any]] = {
     "confidence": _number,
     "swept_probability": _number,
     "unknown_region": lambda name, value: _rows(name, value, 2, 3),
+    "fraction": _number,
 }
 """Fields that files hold as they are, in this order, and what reads them."""
 NONE_ALLOWED = {"progress"} | {one.name for one in fields(PlanResult) if one.default is None}

@@ -123,6 +123,8 @@ class PlanningContext:
         """When the search began [s since the call]."""
         self._progress: list[tuple[float, float]] = []
         self._refused = ""
+        self.refused_at = 0.0, ""
+        """The part of the last refused motion up to its violation, and the violation's message."""
         self._ended: tuple[Status, str] | None = None
 
     @cached_property
@@ -237,17 +239,19 @@ class PlanningContext:
         notes: tuple[str, ...] = (),
         keeps: Callable[[ndarray], bool] = lambda _: True,
         deviations: Float[ndarray, "n"] | None = None,
+        trajectory: Trajectory | None = None,
     ) -> PlanResult | None:
         """Validate the path through the waypoints and time it; None if the path or its motion is refused.
 
         stage: the part of the planner that found the waypoints.
         notes: notes on this path, added to those of the call.
         keeps, deviations: as in `time_parameterize`.
+        trajectory: the motion along a path that is timed already.
         """
         began = self.elapsed
         try:
             with self.deadline():
-                result = self._finished(waypoints, stage, reason, notes, keeps, deviations)
+                result = self._finished(waypoints, stage, reason, notes, keeps, deviations, trajectory)
         except OutOfTimeError as error:
             self._ended = Status.TIMEOUT, self._too_short(error)
             return None
@@ -262,15 +266,16 @@ class PlanningContext:
         notes: tuple[str, ...],
         keeps: Callable[[ndarray], bool],
         deviations: Float[ndarray, "n"] | None,
+        trajectory: Trajectory | None,
     ) -> PlanResult | None:
         problem = self.problem
         path = Path(problem.robot.joint_names, np.asarray(waypoints, dtype=np.float64))
         report = self.validator.path(path)
         if report.violation is not None:
-            return self._refuse(report.violation)
+            return self._refuse(report.violation, float(len(path.positions) - 1))
         planning_time = self.elapsed
         motion = _TimedMotion(self.validator)
-        trajectory = time_parameterize(
+        trajectory = trajectory or time_parameterize(
             problem.robot,
             path,
             motion.valid,
@@ -285,7 +290,7 @@ class PlanningContext:
         if timed.violation is not None:
             if timed.violation.kind == "time":  # too long to validate, like any other motion of this problem
                 self._ended = Status.NO_PATH, timed.violation.message
-            return self._refuse(timed.violation)
+            return self._refuse(timed.violation, trajectory.duration)
         stops = ", ".join(f"{at:.3g} s" for at in trajectory.stops)
         if stops:
             notes = (*notes, f"the motion stops on its way, at {stops}: corners there could not be rounded")
@@ -327,8 +332,9 @@ class PlanningContext:
             return NO_EXTRA_LIMITS
         return ExtraLimits(pace, self.validator.dynamics)
 
-    def _refuse(self, violation: Violation) -> None:
+    def _refuse(self, violation: Violation, end: float) -> None:
         self._refused = violation.kind
+        self.refused_at = violation.time / end, violation.message
 
 
 def _least(*clearances: float | None) -> float:

@@ -131,6 +131,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
     name = "robotdiffuse"
     settings_class = RobotDiffuseSettings
     supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
+    follows_lines = True
 
     def prepare(self, robot: Robot) -> None:
         """Load the weights for the robot, if there are any."""

@@ -40,6 +40,9 @@ class Planner(ABC, Generic[PlannerSettings]):
     """PATH_CONSTRAINTS, CLEARANCE, both or none; requests for what it does not support are refused. `plan`
     handles everything else that a problem or a request may contain, for every planner."""
 
+    follows_lines: ClassVar[bool] = False
+    """Whether problems with a Cartesian line are first solved by `line_following.py`, without a search."""
+
     def __init__(self, settings: PlannerSettings | None = None) -> None:
         self.settings = self.settings_class() if settings is None else settings
 

@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError, distinct
-from robotdiffuse.core.transforms import inverse, rotation_angle, rotation_z_to, transform
+from robotdiffuse.core.transforms import inverse, rotation_about, rotation_angle, rotation_z_to, transform
 from robotdiffuse.core.types import (
     Configuration,
     Configurations,
@@ -57,7 +57,7 @@ POSE_TOLERANCE = 2e-6
 GOAL_MARGIN = 1e-3
 INNER_GOAL_FRACTION = 0.9
 MIN_LINE_LENGTH = 1e-3
-"""Minimum length of a Cartesian line [m]."""
+"""Along shorter lines, the orientation does not follow the position: the link turns in place [m]."""
 SAME_POSE_TOLERANCE = 1e-3
 """Maximum difference of the poses of a line's link at the goal configurations [m], [rad]."""
 
@@ -270,18 +270,25 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     T_goal = line_end(problem, line)
     way = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(way))
-    if length < MIN_LINE_LENGTH:
-        given, least = distinct(1e3 * length, 1e3 * MIN_LINE_LENGTH, digits=2)
-        raise InputError(
-            f"cartesian_line: {line.frame} is {given} mm from its goal position; a line must be at least "
-            f"{least} mm long"
-        )
-    place = transform(T_start[:3, 3] + way / 2, rotation_z_to(way / length))
+    place = transform(T_start[:3, 3] + way / 2, rotation_z_to(way / length if length > 0 else np.eye(3)[2]))
     half = np.array([0.0, 0.0, length / 2])
     rows = [_Row(DISTANCE, line.tolerance, line.tolerance, place, half, half)]
-    if line.angle is not None:
-        turn = _rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
-        rows.append(_Row(TURN, line.angle, line.angle, T_start, a=turn, b=way / length**2))
+    if line.angle is None:
+        return rows
+    turn = rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
+    whole = float(np.linalg.norm(turn))
+    if length < MIN_LINE_LENGTH and whole > 0:
+        # in place: the axis stays where it is, and an arm at right angles to it turns to either side of its
+        # middle by half the angle
+        axis = turn / whole
+        arm = rotation_z_to(axis)[:, 0]
+        middle = rotation_about(axis, whole / 2) @ arm
+        for held, direction, spread in ((axis, axis, 0.0), (arm, middle, whole / 2)):
+            limit = min(spread + line.angle, np.pi)
+            rows.append(_Row(CONE, limit, line.angle, a=T_start[:3, :3].T @ held, b=direction))
+    else:
+        share = way / length**2 if length > 0 else way
+        rows.append(_Row(TURN, line.angle, line.angle, T_start, a=turn, b=share))
     return rows
 
 
@@ -312,7 +319,7 @@ def line_end(problem: Problem, line: CartesianLine) -> Pose:
     raise InputError(f"cartesian_line of {line.frame}: the goal must determine its pose, but {why}")
 
 
-def _rotation_vector(rotation: Rotation) -> Vector:
+def rotation_vector(rotation: Rotation) -> Vector:
     """Axis times angle; accurate also near half a turn."""
     angle = rotation_angle(rotation)
     if angle < 1e-12:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import for_kernels, rigid_transform
@@ -108,9 +108,7 @@ def inverse_kinematics(
     if distance > _longest_reach(robot, chain, tool):
         return accepted
     target = np.array(T_base_frame, dtype=np.float64)
-    kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
-    arm = np.flatnonzero(~beside(robot, frame))
-    ik_chain = IKChain(robot.frame_offsets[arm], tool, kinds[arm], len(chain), lower[arm], upper[arm])
+    arm, joints = ik_chain(robot, frame, settings.limit_margin)
     parameters = IKParameters(
         settings.position_only,
         float(settings.rotation_weight),
@@ -128,7 +126,7 @@ def inverse_kinematics(
         before = len(accepted)
         while len(seeds) and len(accepted) < count:
             known = np.ascontiguousarray(accepted[:, arm])
-            new, used = solve_seeds(seeds, known, count - len(accepted), ik_chain, target, parameters)
+            new, used = solve_seeds(seeds, known, count - len(accepted), joints, target, parameters)
             seeds = seeds[used:]
             if len(arm) < robot.dof:
                 found = new
@@ -144,6 +142,16 @@ def inverse_kinematics(
         return accepted
     accepted = robot.nearest_turns(accepted, near)
     return accepted[np.argsort(np.linalg.norm(accepted - near, axis=1), kind="stable")]
+
+
+def ik_chain(robot: Robot, frame: str, limit_margin: float) -> tuple[Int[ndarray, "k"], IKChain]:
+    """The joints that move a link, or come after it, and their arrays, within the limits less a margin."""
+    arm = np.flatnonzero(~beside(robot, frame))
+    kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])[arm]
+    lower = robot.lower[arm] + limit_margin
+    upper = robot.upper[arm] - limit_margin
+    tool = for_kernels(robot.T_frame_link(frame))
+    return arm, IKChain(robot.frame_offsets[arm], tool, kinds, len(robot.chain(frame)), lower, upper)
 
 
 def random_seeds(

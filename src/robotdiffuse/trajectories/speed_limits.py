@@ -141,11 +141,11 @@ def time_line(
         if 2 * (limits[1] / jerk).max() > duration:  # then lower accelerations make a shorter motion
             share *= ACCELERATION_FACTOR
             continue
-        count = _row_count(duration, settings)
+        count = row_count(duration, settings)
         step = duration / count
         controls = sample_positions(line.arrays, grid, speeds, step * np.arange(count + 1))
         controls[-1] = line.waypoints[-1]
-        for window in _windows(step, limits[1], jerk):
+        for window in jerk_windows(step, limits[1], jerk):
             rows = spline_rows(controls, step, window)
             rows[1][0] = line.waypoints[0]
             if _keeps_jerk(rows, step, jerk):
@@ -158,7 +158,7 @@ def time_line(
             break
     times, q, v, a = best
     # The mean of motions within the extra limits may exceed them slightly.
-    slower = 1.0 if extra is NO_EXTRA_LIMITS else _extra_slowdown(extra, q, v, a)
+    slower = 1.0 if extra is NO_EXTRA_LIMITS else extra_slowdown(extra, q, v, a)
     return times * slower, q, v / slower, a / slower**2
 
 
@@ -181,7 +181,7 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
     first = line.knots[1]
     for share in START_SHARES:
         found = None
-        windows = _windows(step, share * acceleration, jerk)
+        windows = jerk_windows(step, share * acceleration, jerk)
         for window in windows:
             lead = 0.5 * (window + 1) * step * start_speed
             if lead >= first:
@@ -224,7 +224,7 @@ def stopping_distance(robot: Robot, settings: TimingSettings, velocity: JointVal
     return max(least, MIN_STOPPING_DISTANCE)
 
 
-def _windows(step: float, acceleration: JointValues, jerk: JointValues) -> list[int]:
+def jerk_windows(step: float, acceleration: JointValues, jerk: JointValues) -> list[int]:
     """Numbers of configurations over which `spline_rows` may average to keep the jerk limits, in the order
     tried; the last keeps them in any case."""
     enough = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
@@ -236,7 +236,7 @@ def _keeps_jerk(rows: Rows, step: float, jerk: JointValues) -> bool:
     return bool((np.abs(np.diff(rows[3], axis=0)) <= step * jerk).all())
 
 
-def _row_count(duration: float, settings: TimingSettings) -> int:
+def row_count(duration: float, settings: TimingSettings) -> int:
     """The number of equal parts into which the rows of a motion divide its duration.
 
     Raises OutOfTimeError if the deadline leaves no time for that many rows.
@@ -272,7 +272,7 @@ def _fastest_speeds(
         check_timing("the fastest speeds")
         # at the start the velocity is given: less than it cannot be asked for
         limits = np.minimum(velocity, np.maximum(share * velocity, at_start)), share**2 * acceleration
-        speeds = fastest_speeds(*_derivatives_and_limits(line, grid, *limits, extra), start_speed)
+        speeds = fastest_speeds(*derivatives_and_limits(line, grid, *limits, extra), start_speed)
         if start_speed and np.isnan(speeds).any():
             break
         slower = slowdown(line.arrays, grid, speeds, velocity, acceleration)
@@ -284,8 +284,8 @@ def _fastest_speeds(
     raise TooFastError(f"the motion cannot stop along the path from {start_speed:.3g} rad/s")
 
 
-def _derivatives_and_limits(
-    line: BlendedPolyline,
+def derivatives_and_limits(
+    line: Callable[[ndarray, int], ndarray],
     grid: Values,
     velocity: JointValues,
     acceleration: JointValues,
@@ -340,10 +340,10 @@ def _slow_to_extra_limits(line: BlendedPolyline, grid: Values, speeds: Values, e
     rates = first * np.sqrt(squared)[:, None]
     pull = (np.diff(speeds**2) / (2 * np.diff(grid)))[intervals]
     accelerations = first * pull[:, None] + line(s, 2) * squared[:, None]
-    return speeds / _extra_slowdown(extra, q, rates, accelerations)
+    return speeds / extra_slowdown(extra, q, rates, accelerations)
 
 
-def _extra_slowdown(extra: ExtraLimits, q: Configurations, v: JointRows, a: JointRows) -> float:
+def extra_slowdown(extra: ExtraLimits, q: Configurations, v: JointRows, a: JointRows) -> float:
     """How many times slower a motion must be, at least 1, to keep the extra limits."""
     slower = 1.0
     if extra.frame_speeds is not None:

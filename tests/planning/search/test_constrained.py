@@ -78,8 +78,9 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
     ],
 )
 def test_motions_keep_constraints_at_every_millimetre(
-    name: str, stage: str, constraints: list[Constraint], scene: rd.Scene
+    name: str, stage: str, constraints: list[Constraint], scene: rd.Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(rrt.RRTConnect, "follows_lines", False)
     made = problem(constraints, scene)
     result = load_planner(name).plan(made, time_limit=20.0)
     assert result.path is not None and result.trajectory is not None, result.reason

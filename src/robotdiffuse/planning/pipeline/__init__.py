@@ -1,12 +1,15 @@
 """What surrounds any planner: moving obstacles, waypoints, a start velocity, unknown space. Each takes the
 planner as an argument, and makes one or several attempts with it at a problem in its scene as it is."""
 
+from dataclasses import replace
 from typing import ClassVar, Protocol, runtime_checkable
 
 from robotdiffuse.core.deadline import OutOfTimeError
+from robotdiffuse.core.loading import loading
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
+from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.problem import Problem
 
 
@@ -15,6 +18,7 @@ class Solver(Protocol):
     """What the pipeline needs of a planner."""
 
     name: ClassVar[str]
+    follows_lines: ClassVar[bool]
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """Search from the start to a goal; see `planning.planner.Planner.solve`."""
@@ -25,12 +29,29 @@ def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResul
     """Plan from the problem's start to its goal, without its waypoints, moving obstacles, start velocity and
     unknown space, which the pipeline handles."""
     context = PlanningContext(solver.name, problem, request)
+    followed = None
     with context.deadline():
         try:
-            start_goal = usable_start_goal(context)
-            if isinstance(start_goal, PlanResult):
-                return start_goal
-            context.begin_search()
-            return solver.solve(context, start_goal)
+            if solver.follows_lines and any(isinstance(one, CartesianLine) for one in problem.constraints):
+                with loading():
+                    from robotdiffuse.planning.line_following import follow_line  # compiled code
+
+                followed = follow_line(context)
+                if followed is not None and followed.solved:
+                    return followed
+            result = _searched(solver, context)
         except OutOfTimeError as error:
-            return context.out_of_time(error)
+            result = context.out_of_time(error)
+    if followed is None:
+        return result
+    if result.solved:
+        return replace(result, fraction=1.0)
+    return replace(result, fraction=followed.fraction, reason=f"{result.reason}; {followed.reason}")
+
+
+def _searched(solver: Solver, context: PlanningContext) -> PlanResult:
+    start_goal = usable_start_goal(context)
+    if isinstance(start_goal, PlanResult):
+        return start_goal
+    context.begin_search()
+    return solver.solve(context, start_goal)

@@ -637,6 +637,7 @@ class AORRTC(Planner[AORRTCSettings]):
     name = "aorrtc"
     settings_class = AORRTCSettings
     supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
+    follows_lines = True
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -659,6 +660,7 @@ class RRTConnect(Planner[RRTConnectSettings]):
     name = "rrt_connect"
     settings_class = RRTConnectSettings
     supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
+    follows_lines = True
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""

@@ -1,0 +1,168 @@
+"""Straight lines of the tool, followed from the start by inverse kinematics from pose to pose.
+
+That takes milliseconds and gives smooth motions; where it ends early, the search under the constraint
+(`search/constrained.py`) goes on, and the result says how far the line was followed, and why no further.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.types import Status
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.problems.compiled_constraints import line_end, rotation_vector
+from robotdiffuse.problems.constraints import CartesianLine
+from robotdiffuse.problems.goals import JointGoal, PoseGoal
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.follow_kernel import follow
+from robotdiffuse.robots.ik_kernel import IKParameters
+from robotdiffuse.robots.inverse_kinematics import (
+    InverseKinematicsSettings,
+    ik_chain,
+    inverse_kinematics,
+)
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.trajectories.curve_timing import time_curve
+
+STAGE = "line"
+# Distance [m] and angle [rad] between poses of the line, and their number.
+STEP = 0.008
+TURN_STEP = 0.04
+MIN_STEPS = 6
+MAX_STEPS = 400
+MAX_JOINT_STEP = 0.25
+"""A joint that would move by more from one pose to the next has no way along the line [rad] or [m]."""
+LIMIT_MARGIN = 1e-3
+"""Distance that joints keep from their limits, for the curve between poses [rad] or [m]."""
+NEAR_LIMIT = 1e-2
+"""A joint this close to its limit is named as the reason for the end of a line [rad] or [m]."""
+OTHER_ENDS = 4
+"""Configurations of the end pose that motions are steered to where following from the start ends early."""
+HERE = 1e-5
+"""A link whose pose differs by less from the end of the line is there [m] and in entries of R."""
+SAME = 1e-5
+"""Largest difference from the configuration that a line is followed to, of each joint [rad] or [m]."""
+TOLERANCES = 1e-9, 1e-9
+"""Of the poses of a curve [m], [rad]: its second derivative takes them by the square of the steps."""
+ROUND = InverseKinematicsSettings(max_rounds=1)
+
+
+def follow_line(context: PlanningContext) -> PlanResult | None:
+    """The fastest of several motions that follow the line from the start and pass the validator; else a
+    result whose `fraction` and `reason` say how far that goes. None where the goal is several, or where the
+    link is."""
+    problem = context.problem
+    robot = context.problem.robot
+    if not isinstance(problem.goal, PoseGoal | JointGoal):
+        return None
+    line = next(one for one in problem.constraints if isinstance(one, CartesianLine))
+    T_end = line_end(problem, line)
+    T_start = link_pose(robot, problem.start, line.frame)
+    if np.abs(T_end - T_start).max() < HERE:
+        return None
+    targets = _poses(T_start, T_end)
+    fraction = 0.0
+    why = ""
+    found = list[Float[ndarray, "n dof"]]()
+
+    def tried(end: Float[ndarray, "dof"] | None) -> bool:
+        """Whether the line can be followed to an end."""
+        nonlocal fraction, why
+        rows = _followed(problem, line, targets, end)
+        done = (len(rows) - 1) / len(targets)
+        if done < 1.0:
+            if done >= fraction:
+                fraction = done
+                why = _obstruction(robot, rows[-1])
+        elif end is None or np.abs(rows[-1] - end).max() < SAME:
+            found.append(rows)
+        else:
+            why = why or "there the arm has another configuration than the goal"
+        return done == 1.0
+
+    if isinstance(problem.goal, JointGoal):
+        for end in robot.nearest_turns(problem.goal.positions, problem.start):
+            tried(end)
+    elif not tried(None):
+        only = replace(ROUND, position_only=line.angle is None)
+        ends = inverse_kinematics(
+            robot,
+            line.frame,
+            T_end,
+            OTHER_ENDS,
+            rng=context.rng,
+            settings=only,
+            near=problem.start,
+            rest=problem.start,
+        )
+        for end in ends:
+            tried(end)
+    timed = [time_curve(robot, rows, context.timing, context.beside) for rows in found]
+    for trajectory, rows in sorted(zip(timed, found, strict=True), key=lambda one: one[0].duration):
+        context.improved(float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum()))
+        result = context.finish(rows, STAGE, "solved along the straight line", trajectory=trajectory)
+        if result is not None:
+            return replace(result, fraction=1.0)
+        if context.ended:
+            break
+        done, message = context.refused_at
+        if done >= fraction:
+            fraction = done
+            why = message
+    why = f"from the start the line can be followed for {100 * fraction:.0f} %: {why}"
+    return replace(context.fail(Status.NO_PATH, why), fraction=fraction)
+
+
+def _poses(T_start: Float[ndarray, "4 4"], T_end: Float[ndarray, "4 4"]) -> Float[ndarray, "n 4 4"]:
+    """Poses along the line, evenly spaced, without the first."""
+    way = T_end[:3, 3] - T_start[:3, 3]
+    turn = rotation_vector(T_end[:3, :3] @ T_start[:3, :3].T)
+    angle = float(np.linalg.norm(turn))
+    count = max(np.linalg.norm(way) / STEP, angle / TURN_STEP, MIN_STEPS)
+    shares = np.linspace(0, 1, min(int(np.ceil(count)), MAX_STEPS) + 1)[1:]
+    axis = turn / angle if angle > 0 else np.eye(3)[2]
+    poses = [
+        transform(T_start[:3, 3] + share * way, rotation_about(axis, share * angle) @ T_start[:3, :3])
+        for share in shares
+    ]
+    return np.array([*poses[:-1], T_end])
+
+
+def _followed(
+    problem: Problem,
+    line: CartesianLine,
+    targets: Float[ndarray, "n 4 4"],
+    end: Float[ndarray, "dof"] | None,
+) -> Float[ndarray, "k dof"]:
+    """Configurations at the start and at these poses, as far as joints can follow; joints that do not move
+    the link go straight to the end, or stay."""
+    robot = problem.robot
+    start = problem.start
+    steer = end is not None
+    goal = start if end is None else end
+    arm, joints = ik_chain(robot, line.frame, LIMIT_MARGIN)
+    joints = joints._replace(
+        lower=np.minimum(joints.lower, np.minimum(start, goal)[arm]),
+        upper=np.maximum(joints.upper, np.maximum(start, goal)[arm]),
+    )
+    parameters = IKParameters(
+        line.angle is None, ROUND.rotation_weight, *TOLERANCES, ROUND.max_iterations, 0.0
+    )
+    rows = follow(start[arm], goal[arm], steer, MAX_JOINT_STEP, targets, joints, parameters)
+    q = start + np.linspace(0, 1, len(targets) + 1)[: len(rows), None] * (goal - start)
+    q[:, arm] = rows
+    return q
+
+
+def _obstruction(robot: Robot, q: Float[ndarray, "dof"]) -> str:
+    """Why no configuration follows this one along a line."""
+    room = np.where(robot.continuous, np.inf, np.minimum(q - robot.lower, robot.upper - q))
+    j = int(room.argmin())
+    if room[j] < NEAR_LIMIT:
+        return f"{robot.joint_names[j]} is at its limit there, {q[j]:.3f} rad"
+    return "the arm is at the edge of its reach there, or a joint would have to jump"

@@ -1,0 +1,133 @@
+"""Straight lines of the tool: motions lie on them at every millisecond, by forward kinematics of cubics
+through the rows; lines that end early say where and why."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+
+import robotdiffuse as rd
+from robotdiffuse.core.transforms import rotation_about, rotation_angle
+from robotdiffuse.planning.search.rrt import AORRTC
+from robotdiffuse.robots.kinematics import link_pose, link_poses
+from robotdiffuse.trajectories.speed_limits import jerk_limits
+
+PANDA = rd.load_robot("panda")
+HAND = "panda_hand"
+START = np.array([0.1, 0.2, 0.0, -2.0, 0.0, 2.2, 0.8])
+T_START = link_pose(PANDA, START, HAND)
+
+
+def moved(xyz: list[float], axis: list[float] | None = None, angle: float = 0.0) -> np.ndarray:
+    """The hand's pose at the start, moved and turned about its own origin, in the base's frame."""
+    T = T_START.copy()
+    T[:3, 3] += xyz
+    T[:3, :3] = rotation_about(np.array(axis or [0.0, 0.0, 1.0]), angle) @ T[:3, :3]
+    return T
+
+
+def planned(T_end: np.ndarray, scene: rd.Scene | None = None, **options) -> rd.PlanResult:
+    line = options.pop("line", rd.CartesianLine(HAND))
+    goal = options.pop("goal", rd.PoseGoal(HAND, T_end))
+    problem = rd.Problem(PANDA, scene or rd.Scene(), START, goal, constraints=[line])
+    return rd.plan(problem, **options)
+
+
+LINES = {
+    "down": moved([0, 0, -0.2]),
+    "aside and turned": moved([-0.1, 0.2, -0.05], [0.0, 0.6, 0.8], 0.7),
+    "half a millimetre": moved([0, 0, -0.0005]),
+    "turn in place": moved([0, 0, 0], [0.0, 0.0, 1.0], 0.9),
+    "tilt in place": moved([0, 0, 0], [1.0, 0.0, 0.0], -0.5),
+}
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_motion_is_on_the_line_at_every_millisecond(name: str) -> None:
+    T_end = LINES[name]
+    result = planned(T_end)
+    assert result.solved, result.reason
+    assert (result.stage, result.fraction) == ("line", 1.0)
+    t = result.trajectory
+    assert rd.verify(result.problem, t).valid
+    clock = np.arange(0.0, t.duration, 1e-3)
+    T = link_poses(PANDA, CubicHermiteSpline(t.times, t.positions, t.velocities)(clock), HAND)
+    way = T_end[:3, 3] - T_START[:3, 3]
+    turn = T_end[:3, :3] @ T_START[:3, :3].T
+    angle = rotation_angle(turn)
+    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    axis = axis / (np.linalg.norm(axis) or 1.0)
+    for at in T:
+        if np.linalg.norm(way) > 0:
+            share = (at[:3, 3] - T_START[:3, 3]) @ way / (way @ way)
+        else:
+            share = rotation_angle(at[:3, :3] @ T_START[:3, :3].T) / angle
+        assert -1e-3 < share < 1 + 1e-3
+        assert np.linalg.norm(at[:3, 3] - T_START[:3, 3] - share * way) < 2e-5
+        wanted = rotation_about(axis, share * angle) @ T_START[:3, :3]
+        assert rotation_angle(wanted.T @ at[:3, :3]) < 2e-4
+    # within limits, of which one is used, with few changes of the sign of an acceleration
+    jerks = np.abs(np.diff(t.accelerations, axis=0)) / np.diff(t.times)[:, None]
+    shares = [
+        (np.abs(t.velocities) / PANDA.velocity).max(),
+        (np.abs(t.accelerations) / PANDA.acceleration).max(),
+        (jerks / jerk_limits(PANDA)).max(),
+    ]
+    assert 0.95 < max(shares) <= 1 + 1e-6
+    strong = np.abs(t.accelerations) > 0.05 * np.abs(t.accelerations).max()
+    for column, kept in zip(t.accelerations.T, strong.T, strict=True):
+        assert (np.diff(np.sign(column[kept])) != 0).sum() <= 3
+
+
+def test_no_slower_than_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    followed = planned(LINES["down"], planner="aorrtc")
+    monkeypatch.setattr(AORRTC, "follows_lines", False)
+    searched = planned(LINES["down"], planner="aorrtc", time_limit=5.0)
+    assert searched.stage == "constrained_rrt_connect"
+    assert followed.duration <= 1.08 * searched.duration
+
+
+def test_configuration_at_the_end_is_reached() -> None:
+    end = PANDA.ik(LINES["down"], link=HAND, near=START)[0]
+    result = planned(LINES["down"], goal=rd.JointGoal(end))
+    assert result.stage == "line", result.reason
+    assert np.array_equal(result.path.positions[-1], result.trajectory.positions[-1])
+    assert np.abs(result.path.positions[-1] - end).max() < 1e-4
+
+
+def test_speed_of_the_hand() -> None:
+    result = planned(LINES["down"], line=rd.CartesianLine(HAND, speed=0.1))
+    t = result.trajectory
+    speeds = np.linalg.norm(np.diff(link_poses(PANDA, t.positions, HAND)[:, :3, 3], axis=0), axis=1)
+    assert 0.095 < (speeds / np.diff(t.times)).max() <= 0.1 * 1.001
+
+
+def test_line_out_of_reach_ends_where_the_arm_does() -> None:
+    result = planned(moved([0.6, 0, 0]), time_limit=0.3)
+    assert not result.solved
+    assert "from the start the line can be followed for" in result.reason
+    # the arm can follow 0.6 m for a part
+    place = moved([0.6 * (result.fraction or 0.0), 0, 0])
+    assert 0.1 < (result.fraction or 0.0) < 0.9
+    assert len(PANDA.ik(place, link=HAND, near=START))
+
+
+def test_line_into_a_box_ends_at_the_box() -> None:
+    table = rd.Box([0.5, 0.05, 0.05], [0.3, 0.3, 0.1], name="table")
+    result = planned(moved([0, 0, -0.3]), rd.Scene([table]), time_limit=0.3)
+    assert not result.solved and "table" in result.reason
+    # fingertips are 0.112 m below the hand's origin; the table's top is at 0.1 m
+    gap = T_START[2, 3] - 0.112 - 0.1
+    assert result.fraction == pytest.approx(gap / 0.3, abs=0.05)
+
+
+def test_certificates_hold_for_turns_in_place() -> None:
+    result = planned(LINES["tilt in place"])
+    certificate = rd.certify(result.problem, result.trajectory)
+    assert certificate is not None
+
+
+def test_link_that_is_at_the_end_already_stays() -> None:
+    """The spline through equal configurations was a traceback."""
+    result = planned(T_START)
+    assert result.solved, result.reason
+    assert result.path_length is not None and result.path_length < 1e-3
