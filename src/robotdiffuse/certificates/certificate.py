@@ -34,15 +34,26 @@ class Certificate(MotionProof):
         return one_line(self)
 
     def check(self, problem: Problem | None = None, at_most: Tolerances | None = None) -> Findings:
-        """Re-check everything for a problem, by default the one in the certificate.
+        """Check the whole proof again.
 
-        The tolerances of the proof must not exceed `at_most`, by default the validator's. See
-        `checker.check`.
+        Args:
+            problem: The problem that the motion is to solve; None: the one in the certificate.
+            at_most: Largest tolerances that the proof may use; None: those of the validator.
+
+        Returns:
+            What was checked, and each requirement that is not proved.
         """
         return check(self, problem, at_most or Tolerances())
 
     def save(self, file: str | FilePath) -> None:
-        """Write a .json file. Raises InputError for another ending or if the file cannot be written."""
+        """Write the certificate.
+
+        Args:
+            file: A file whose name ends in .json.
+
+        Raises:
+            InputError: For another ending, or a file that cannot be written.
+        """
         path = check_output(file, (".json",))
         record = {"is": FILE_MARK, "version": VERSION}
         for name, field in FIELDS.items():
@@ -51,7 +62,14 @@ class Certificate(MotionProof):
 
 
 def load_certificate(file: str | FilePath) -> Certificate:
-    """The certificate of a file. Raises InputError if the file cannot be read or holds no certificate."""
+    """Read a certificate.
+
+    Args:
+        file: A file that `Certificate.save` or `robotdiffuse verify --certificate` wrote.
+
+    Raises:
+        InputError: For a file that cannot be read or holds no certificate.
+    """
     record = read_json(file)
     if not is_certificate(record):
         raise InputError(f"{file} is not a certificate; write one by `robotdiffuse verify --certificate`")

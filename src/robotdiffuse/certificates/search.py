@@ -199,11 +199,18 @@ class NotValidError(InputError):
 
 
 def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT) -> Certificate:
-    """A certificate of a motion that the validator accepts with these settings.
+    """Prove that a motion is valid, in a form that a small separate program checks.
 
-    Raises `NotValidError`, an InputError, with the first violation if the validator rejects the motion.
-    Raises InputError for obstacles and requirements that certificates do not support, and if no proof of
-    reasonable size is found.
+    Args:
+        problem: The problem that the motion solves.
+        motion: A path, or a trajectory.
+        settings: Tolerances of the validator.
+
+    Raises:
+        NotValidError: If the validator rejects the motion; an InputError with the first violation.
+        InputError: For obstacles and requirements that certificates do not support, and if no proof of
+            reasonable
+            size is found.
     """
     check_problem(problem)
     check_motion("motion", motion, (Path, Trajectory))

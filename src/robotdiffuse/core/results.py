@@ -117,12 +117,17 @@ class PlanResult:
         return None if self.trajectory is None else len(self.trajectory.stops)
 
     def save(self, file: str | FilePath, problem: dict[str, Any] | None = None) -> None:
-        """Write .json (everything, with the problem as in a problem file) or .csv (the trajectory alone).
+        """Write the result.
 
-        problem: None: that of the result. A robot that is neither bundled nor read from a file cannot be
-        named; then the file holds no problem, and a note says so.
+        Args:
+            file: A .json file for everything, with the problem as in a problem file, or a .csv file for the
+                trajectory alone.
+            problem: The content of a problem file; None: the problem of the result. A robot that is neither
+                bundled
+                nor read from a file has no name; then the file holds no problem, and a note says so.
 
-        Raises InputError for another ending, a file that cannot be written, or .csv without a trajectory.
+        Raises:
+            InputError: For another ending, a file that cannot be written, or .csv without a trajectory.
         """
         path = check_output(file, (".json", ".csv"))
         if path.suffix.lower() == ".json":
@@ -140,7 +145,11 @@ class PlanResult:
             self.trajectory.save(path)
 
     def record(self, problem: dict[str, Any] | None = None) -> dict[str, Any]:
-        """The content of a result file as JSON values; `problem` as in a problem file."""
+        """The content of a result file, as JSON values.
+
+        Args:
+            problem: The content of a problem file, to include.
+        """
         return _record(self, problem)
 
 
@@ -154,10 +163,14 @@ class ResultFile:
 
 
 def load_result(file: str | FilePath) -> ResultFile:
-    """Read and check a result file (.json).
+    """Read and check a result file.
 
-    Raises InputError for a file that cannot be read and for fields that are missing, of the wrong shape or
-    not finite.
+    Args:
+        file: A .json file that `PlanResult.save` or `robotdiffuse plan --out` wrote.
+
+    Raises:
+        InputError: For a file that cannot be read, and for fields that are missing, of the wrong shape or not
+            finite.
     """
     planned = f"it is a problem; `robotdiffuse plan {file} --out result.json` makes a result of it"
     if FilePath(str(file)).suffix.lower() in PROBLEM_ENDINGS:

@@ -202,11 +202,18 @@ class Trajectory(Value):
         return np.where((self.accelerations[[0, -1]] == 0).all(axis=0), between, np.inf)
 
     def at(self, time: float | int | Float[ndarray, "n"]) -> State:
-        """The state at a time or at several [s].
+        """The state at a time or at several.
 
-        Positions are on the cubics, velocities are their derivatives; accelerations are linear between rows
-        and jerks are their slopes, at a row that of the step after it. At rows, the first three are the rows'
-        own. A trajectory of one row rests there. Raises InputError for a time outside of [0, duration].
+        Positions are on the cubics through the rows, velocities are their derivatives. Accelerations are
+        linear between
+        rows and jerks are their slopes, at a row that of the step after it. A trajectory of one row rests
+        there.
+
+        Args:
+            time: Time, or times [n], from 0 to the duration [s].
+
+        Raises:
+            InputError: For a time outside of the motion.
         """
         asked = numbers(time)
         if asked is None:
@@ -244,15 +251,21 @@ class Trajectory(Value):
         return (6 * mean - 4 * v[:-1] - 2 * v[1:]) / steps, (2 * v[:-1] + 4 * v[1:] - 6 * mean) / steps
 
     def resample(self, rate: float | int) -> "Trajectory":
-        """Rows of `at` at each multiple of 1 / `rate` [Hz], and the last row, which ends the motion.
+        """The motion with a row at each multiple of a sample time, and the last row.
 
-        Where the acceleration of the motion changes quickly, the cubics between fewer rows can need more of
-        it, or other ones. Then a motion from rest to rest is averaged: its rows lie on the uniform cubic
-        B-spline of these configurations, whose velocities and accelerations are means of the motion's. It
-        leaves the path by up to a sixth of the acceleration over rate², and lasts up to three steps longer.
+        Where the acceleration changes quickly, the cubics between fewer rows can need more of it. Then a
+        motion from
+        rest to rest is averaged: its rows lie on the uniform cubic B-spline of these configurations. It
+        leaves the path
+        by up to a sixth of the acceleration over rate², and lasts up to three steps longer. Validate the new
+        motion:
+        between its rows it may differ from this one.
 
-        Validate the new motion: between its rows it may differ from this one. Raises InputError for a rate
-        that is not in (0, MAX_SAMPLE_RATE].
+        Args:
+            rate: Rows in a second [Hz], above 0 and at most 100,000.
+
+        Raises:
+            InputError: For another rate.
         """
         check_sample_rate(rate)
         if len(self.times) == 1:
@@ -270,11 +283,18 @@ class Trajectory(Value):
         return Trajectory(self.joint_names, *spline_rows(state.positions, 1 / rate))
 
     def save(self, file: str | FilePath, rate: float | int | None = None) -> None:
-        """Write .json or .csv, by the file's ending; resampled at `rate` [Hz] if it is given.
+        """Write the motion.
+
         `robotdiffuse.interop.write_motion` writes the formats of ROS 2, Foxglove and Rerun.
 
-        The CSV header is time, then <joint>_position, <joint>_velocity and <joint>_acceleration. Raises
-        InputError for another ending or a file that cannot be written.
+        Args:
+            file: A .json or .csv file. The header of .csv is time, then <joint>_position, <joint>_velocity
+                and
+                <joint>_acceleration.
+            rate: Rows in a second [Hz]; None: the rows of the motion.
+
+        Raises:
+            InputError: For another ending, or a file that cannot be written.
         """
         path = check_output(file, (".json", ".csv"))
         if rate is not None:

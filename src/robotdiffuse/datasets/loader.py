@@ -164,11 +164,16 @@ class RopDataset(Dataset[dict[str, Tensor]]):
     def batches(
         self, batch_size: int, shuffle: bool = True, generator: torch.Generator | None = None
     ) -> Iterator[RopBatch]:
-        """One epoch of batches, prefetched by as many threads as PyTorch uses; the last batch may be smaller.
+        """One epoch of batches, prefetched by as many threads as PyTorch uses.
 
-        Rows are shuffled within blocks of 16 shards, and shards among blocks, so that reads are local. The
-        generator, on the CPU, draws order and clouds: the same state gives the same batches for any number of
-        threads. None: a generator made from `seed`, so that every call gives the same epoch.
+        Rows are shuffled within blocks of 16 shards, and shards among blocks, so that reads are local.
+
+        Args:
+            batch_size: Motions of a batch; the last batch may be smaller.
+            shuffle: Whether the order is random.
+            generator: Draws order and clouds, on the CPU: the same state gives the same batches for any
+                number of
+                threads. None: a generator made from `seed`, so that every call gives the same epoch.
         """
         if batch_size < 1:
             raise InputError(f"batch_size is {batch_size}; it must be at least 1")

@@ -122,15 +122,21 @@ def _image(header: dict[str, Any], view: DepthView) -> dict[str, Any]:
 def read_depth_views(
     file: str | Path, robot: Robot, topics: Sequence[str] | None = None, base: str | None = None
 ) -> Iterator[StampedView]:
-    """Read the depth images of an .mcap file, one after the other in the order of their log times, as views
-    that `Explorer.observe` takes.
+    """Read the depth images of a recording, as `Explorer.observe` takes them.
 
-    topics: of the images; None: all topics with depth images (32FC1 in m, 16UC1 in mm).
-    base: the frame of the arm's base in the file; None: `robot.base`.
+    They come in the order of their log times. Images must be rectified. The camera's pose and the arm's
+    configuration are interpolated to the stamp of each.
 
-    Images must be rectified. The camera's pose and the arm's configuration at an image's stamp are
-    interpolated. Raises InputError for a file that is damaged or holds no depth images, without joint states
-    or transforms within 0.1 s of an image, and for distorted or compressed images.
+    Args:
+        file: An .mcap file.
+        robot: The robot whose joint states it holds.
+        topics: Topics of the images; None: all with depth images (32FC1 in m, 16UC1 in mm).
+        base: The frame of the arm's base in the file; None: `robot.base`.
+
+    Raises:
+        InputError: For a file that is damaged or holds no depth images, images without joint states or
+            transforms
+            within 0.1 s, and distorted or compressed images.
     """
     path = input_file(file, largest=MAX_SIZE)
     with reading(file):

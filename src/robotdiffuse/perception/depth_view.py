@@ -109,7 +109,11 @@ class DepthView(Value):
         return in_camera @ self.T_base_camera[:3, :3].T + self.T_base_camera[:3, 3]
 
     def moved(self, T: Pose) -> "DepthView":
-        """The view after the rigid motion T of camera and points."""
+        """The view after a rigid motion of its camera and its points.
+
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+        """
         cloud = None if self.cloud is None else self.cloud @ T[:3, :3].T + T[:3, 3]
         return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud)
 
@@ -121,11 +125,22 @@ class DepthView(Value):
         configuration: Configuration | None = None,
         source: dict[str, str | float] | None = None,
     ) -> "DepthView":
-        """The depth image that a camera at `T_base_camera` has of a point cloud in the base frame [m].
+        """The depth image that a camera has of a point cloud.
 
         Each pixel holds its nearest point. The image covers the cloud, and its pixels are large enough that
-        most of them contain points. Points behind the camera are ignored. Raises InputError if no point is
-        in front of the camera.
+        most of
+        them contain points. Points behind the camera are ignored.
+
+        Args:
+            points: The cloud [n, 3] in the frame of the base [m].
+            T_base_camera: Pose of the optical frame [4, 4]: x right in the image, y down, z ahead.
+            configuration: Configuration of the arm at the exposure, by which its own points are removed;
+                None: the
+                start of the problem.
+            source: The file of the cloud, for problem files.
+
+        Raises:
+            InputError: If no point is in front of the camera.
         """
         T = cls(np.zeros((1, 1)), (1.0, 1.0, 0.0, 0.0), T_base_camera, configuration).T_base_camera
         in_camera = (points - T[:3, 3]) @ T[:3, :3]

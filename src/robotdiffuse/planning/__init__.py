@@ -129,13 +129,16 @@ MAX_LOADED = 8
 def load_planner(name: str, settings: object | None = None, weights: str | None = None) -> "Planner":
     """The planner of a name.
 
-    settings: of its own dataclass, or a table of those that differ from the defaults, such as {"range": 0.5};
-        None: the defaults.
-    weights: folder with weights for a learned planner, in place of those that come with the package. With
-    settings, name the folder there instead.
+    Args:
+        name: A name that `robotdiffuse planner list` shows.
+        settings: Those that differ from the defaults, such as {"range": 0.5}, or the planner's own dataclass.
+        weights: Folder with weights for a learned planner, in place of the bundled ones. With settings, name
+            the
+            folder there instead.
 
-    Raises InputError for an unknown name, for settings of another planner, for both settings and weights, for
-    weights that cannot be read, and for weights for a planner that takes none.
+    Raises:
+        InputError: For an unknown name, settings of another planner, both settings and weights, weights that
+            cannot be read, and weights for a planner that takes none.
     """
     if weights is not None:
         if settings is not None:
@@ -186,29 +189,46 @@ def plan(
     planner: str = DEFAULT_PLANNER,
     settings: "Settings | Mapping[str, object] | None" = None,
 ) -> "PlanResult":
-    """Plan a motion. The result holds a verified motion, or a status and a reason why there is none.
+    """Plan a motion.
 
-    problem: a `rd.Problem`; `rd.load_problem` reads one from a file.
-    time_limit: wall time for the call, without what is loaded once (code, weights, a robot's arrays) [s].
-    seed: seed of all random numbers, at least 0. The same seed gives the same path, unless time runs out.
-    until: "first" returns the first verified motion, "converged" searches on until more time hardly improves
-        it, "time_limit" until time runs out; planners that cannot improve a path return their first.
-    clearance: distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal and
-        passages allow it, up to 0.5 m [m]; where they do not, it is smaller, and a note says so. None: the
-        problem's, or 1 cm. The other planners have their own settings and refuse a clearance.
-    velocity_scaling, acceleration_scaling: parts of the robot's limits that the timed motion uses, from 0.001
-        to 1.
-    jerk: largest jerk of any joint of the timed motion [rad/s³], at least 0.01. None: the robot's jerk
-        limits, or 10 / s times the acceleration limit of joints without one; infinite: no limit.
-    objective: what aorrtc, rrt_connect and robotdiffuse minimize in calls that improve a path: "time", the
-        motion's duration, or "length" of the path in joint space.
-    planner: a name that `robotdiffuse planner list` lists. A planner is loaded once for its settings.
-    settings: of the planner: a table of those that differ from the defaults, such as {"range": 0.5}, or its
-        dataclass.
+    Args:
+        problem: The problem; `rd.load_problem` reads one from a file.
+        time_limit: Wall time of the call, without what is loaded once (code, weights, a robot's arrays) [s].
+        seed: Seed of all random numbers, at least 0. The same seed gives the same path, unless time runs out.
+        until: "first" returns the first verified motion, "converged" searches on until more time hardly
+            improves
+            it, "time_limit" until time runs out. Planners that cannot improve a path return their first.
+        clearance: Distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
+            and
+            passages allow it, up to 0.5 m [m]; where they do not, it is smaller, and a note says so. None:
+            the
+            problem's, or 1 cm. Other planners refuse a clearance.
+        velocity_scaling: Fraction of the velocity limits that the motion uses, from 0.001 to 1.
+        acceleration_scaling: Fraction of the acceleration limits that it uses, from 0.001 to 1.
+        jerk: Largest jerk of any joint [rad/s³], at least 0.01. None: the robot's jerk limits, or 10 / s
+            times
+            the acceleration limit of joints without one; infinite: no limit.
+        objective: What aorrtc, rrt_connect and robotdiffuse minimize: "time", the motion's duration, or
+            "length"
+            of the path in joint space.
+        planner: A name that `robotdiffuse planner list` shows. A planner is loaded once for its settings.
+        settings: Settings of the planner that differ from the defaults, such as {"range": 0.5}, or its
+            dataclass.
 
-    Raises InputError, one line, for arguments of the wrong type or out of bounds, unknown planners and
-    settings, and requests that the planner does not support. `planning.planner.Planner.plan` says what
-    problems may ask for.
+    Returns:
+        A result with a verified motion, or with a status and a reason why there is none.
+
+    Raises:
+        InputError: One line, for arguments of the wrong type or out of bounds, unknown planners and settings,
+            and
+            problems that the planner does not support.
+
+    Examples:
+        >>> ball = rd.Sphere([0.5, 0.0, 0.7], 0.2)
+        >>> start, goal = [-1, 0.3, 0, -1.8, 0, 2.1, 0.8], [1, 0.3, 0, -1.8, 0, 2.1, 0.8]
+        >>> problem = rd.Problem(rd.load_robot("panda"), rd.Scene([ball]), start, goal)
+        >>> rd.plan(problem, time_limit=10.0, until="first").status.value
+        'solved'
     """
     if settings is not None and not isinstance(settings, Settings | Mapping):
         raise InputError(

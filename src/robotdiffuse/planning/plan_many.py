@@ -43,23 +43,33 @@ def plan_many(
     progress: Callable[[int, int], object] | None = None,
     **request: Any,
 ) -> Iterator[PlanResult]:
-    """Yield the results of problems in their order, each as soon as those before it are there.
-
-    planner, settings, weights: as of `load_planner`.
-    workers: number of processes; None: one for each core.
-    cluster: "ray": the Ray cluster that RAY_ADDRESS names, or one started here, in place of processes;
-        problems of a lost node are planned again on another.
-    progress: called after each problem, in whatever order they end, with the numbers done and in all.
-    request: arguments of `rd.plan`, the same for all problems: time_limit, seed, until, ...
+    """Plan many problems in parallel.
 
     A problem that raises an error, or kills its process, has a result with status ERROR; the others continue.
-    On a cluster, a problem that kills its process ends the call.
-    Processes import the main script: without the line `if __name__ == "__main__":` above what it does, all
-    results have status ERROR. Each process compiles or loads its kernels before its first problem, outside
-    the time limit.
+    On a
+    cluster, a problem that kills its process ends the call. Each process loads its compiled code before its
+    first
+    problem, outside the time limit. Processes import the main script: without the line
+    `if __name__ == "__main__":` above what it does, all results have status ERROR.
 
-    Raises InputError at once for an unknown planner, settings or weights that do not fit it, unknown
-    arguments or arguments out of bounds, a number of workers below 1, and an unknown cluster.
+    Args:
+        problems: The problems.
+        planner: As of `load_planner`.
+        settings: As of `load_planner`.
+        weights: As of `load_planner`.
+        workers: Number of processes; None: one for each core.
+        cluster: "ray": the Ray cluster that RAY_ADDRESS names, or one started here, in place of processes.
+            Problems of a lost node are planned again on another.
+        progress: Called after each problem, in whatever order they end, with the numbers done and in all.
+        request: Arguments of `rd.plan`, the same for all problems: time_limit, seed, until, ...
+
+    Returns:
+        An iterator over the results in the order of the problems, each as soon as those before it are there.
+
+    Raises:
+        InputError: At once, for an unknown planner, settings or weights that do not fit it, unknown arguments
+            or
+            arguments out of bounds, a number of workers below 1, and an unknown cluster.
     """
     check_not_importing()
     if isinstance(problems, str) or not isinstance(problems, Iterable):

@@ -58,14 +58,20 @@ class ProblemEntry:
 
 
 def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) -> Problem:
-    """The problem in a .yaml, .yml or .json file, or the one at `index` (from 0) in a .jsonl file.
+    """Read a problem file.
 
-    File names in it are relative to its folder. `scene` may name a MoveIt planning scene, and `request` a
-    MoveIt motion plan request that replaces start and goal. Raises InputError, one line that names the file
-    and the field, for unknown or missing fields and shapes, values of the wrong type, and whatever `Problem`
-    does not accept.
+    Args:
+        file: A .yaml, .yml, .json or .jsonl file. File names in it are relative to its folder. `scene` may
+            name a
+            MoveIt planning scene, and `request` a motion plan request, which replaces start and goal.
+        index: The problem of a .jsonl file, from 0.
+        ignore_joints: Whether joints of MoveIt files that the robot does not have are noted, instead of
+            refused.
 
-    ignore_joints: joints of MoveIt files that the robot lacks are noted; otherwise they raise InputError.
+    Raises:
+        InputError: One line that names the file and the field, for unknown or missing fields and shapes,
+            values
+            of the wrong type, and whatever `rd.Problem` does not accept.
     """
     file = file_name(file, "problem file")
     check_type("index", index, Integral, "a whole number from 0 on")
@@ -115,11 +121,16 @@ def _lines(text: str) -> list[tuple[int, str]]:
 def problem_record(
     problem: Problem, folder: str | Path | None = None, robot: str | None = None
 ) -> dict[str, object]:
-    """The problem as the plain data of a problem file; numbers are kept exactly.
+    """The problem as the plain data of a problem file. Numbers are kept exactly.
 
-    robot: the bundled name, or the path to the URDF, to write; by default the one that it was loaded from.
-    folder: files in it or below it are named relative to it, others by their full path.
-    Raises InputError for a robot that is neither bundled nor loaded from a file.
+    Args:
+        problem: The problem.
+        folder: Files in it or below it are named relative to it, others by their full path.
+        robot: The name of the robot, or the path of its URDF, to write; None: the one that it was loaded
+            from.
+
+    Raises:
+        InputError: For a robot that is neither bundled nor loaded from a file.
     """
     if robot is None:
         robot = problem.robot.source or problem.robot.name

@@ -31,7 +31,11 @@ class JointGoal(Value):
         super().__post_init__()
 
     def moved(self, T: Pose) -> "JointGoal":
-        """The goal itself: configurations do not move."""
+        """The goal itself: configurations do not move.
+
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+        """
         return self
 
 
@@ -72,7 +76,11 @@ class PoseGoal(Value):
         super().__post_init__()
 
     def moved(self, T: Pose) -> "PoseGoal":
-        """The goal after the rigid motion T."""
+        """The goal after a rigid motion.
+
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+        """
         return replace(self, T_base_frame=T @ self.T_base_frame)
 
     @property
@@ -98,7 +106,11 @@ class PosesGoal(Value):
         object.__setattr__(self, "poses", tuple(poses))
 
     def moved(self, T: Pose) -> "PosesGoal":
-        """The goal after the rigid motion T."""
+        """The goal after a rigid motion.
+
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+        """
         return PosesGoal([pose.moved(T) for pose in self.poses])
 
     @property
@@ -124,7 +136,11 @@ class AnyGoal(Value):
         object.__setattr__(self, "goals", tuple(goals))
 
     def moved(self, T: Pose) -> "AnyGoal":
-        """The goals after the rigid motion T."""
+        """The goals after a rigid motion.
+
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+        """
         return AnyGoal(tuple(goal.moved(T) for goal in self.goals))
 
 

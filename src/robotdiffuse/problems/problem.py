@@ -397,10 +397,20 @@ class Problem(Value):
         goal: "ArrayLike | Goal | Sequence[OneGoal | ArrayLike]",
         **options: Unpack[ProblemOptions],
     ) -> "Problem":
-        """The problem of a robot whose base is at `T_world_base`, in the frame of the base.
+        """The problem of a robot on a base that stands elsewhere, given in the frame of the world.
 
-        Scene, poses of goals and waypoints, views, constraints and moving obstacles are given in the world's
-        frame and moved into the base's. Raises InputError as the constructor does.
+        Args:
+            T_world_base: Pose of the base [4, 4].
+            robot: The robot.
+            scene: Obstacles in the frame of the world, which are moved into that of the base. So are the
+                poses of
+                goals and waypoints, views, constraints and moving obstacles.
+            start: Start configuration [dof], or the name of a pose.
+            goal: As of `rd.Problem`.
+            options: Further fields of `rd.Problem`.
+
+        Raises:
+            InputError: As the constructor does.
         """
         T = rigid_transform("T_world_base", T_world_base)
         T_base_world = inverse(T)
@@ -421,13 +431,22 @@ class Problem(Value):
         return self.moving if T is None else tuple(one.moved(T) for one in self.moving)
 
     def clearance_at(self, q: ArrayLike) -> float | Values:
-        """Lower bound on the distance of the arm to obstacles and between its links [m], at most 1 m.
+        """Lower bound of the distance of the arm to obstacles and between its links.
 
-        q: a configuration [dof], or several [n, dof]. Positive: free of collision. The bound is of the
-        spheres that cover the links: it may be negative by some millimetres where the links are apart.
-        Distances to point clouds and meshes count as at most 0.3 m; moving obstacles are ignored.
+        The spheres that cover the links are measured, so the bound may be negative by some millimeters where
+        the
+        links are apart. Moving obstacles are ignored.
 
-        Returns a number, or one for each row. Raises InputError for q of the wrong shape.
+        Args:
+            q: A configuration [dof], or several [n, dof].
+
+        Returns:
+            The bound [m], one for each row; positive: free of collision. It is at most 1 m, to point clouds
+            and
+            meshes 0.3 m.
+
+        Raises:
+            InputError: For q of the wrong shape.
         """
         from robotdiffuse.collision import CollisionChecker  # compiled code
         from robotdiffuse.robots.kinematic_methods import configurations
@@ -440,12 +459,24 @@ class Problem(Value):
         return float(least[0]) if rows.ndim == 1 else least
 
     def is_free(self, q: ArrayLike | str) -> "StateValidity":
-        """Whether the arm is within its limits and free of collision at a configuration or a named pose.
+        """Whether the arm is within its limits and free of collision.
 
-        Decided by the exact meshes, as for starts and goals; moving obstacles and path constraints are
-        ignored. `if not (state := problem.is_free(q)): print(state.reason)`.
+        The exact meshes decide, as for starts and goals. Moving obstacles and path constraints are ignored.
 
-        Raises InputError for q of the wrong shape and for an unknown name.
+        Args:
+            q: A configuration [dof], or the name of a pose.
+
+        Returns:
+            A value that is true if the arm is free; else it has a `reason`.
+
+        Raises:
+            InputError: For q of the wrong shape, and for an unknown name.
+
+        Examples:
+            >>> scene = rd.Scene([rd.Sphere([0.5, 0, 0.5], 0.2)])
+            >>> problem = rd.Problem(rd.load_robot("panda"), scene, "ready", "extended")
+            >>> bool(problem.is_free("ready"))
+            False
         """
         from robotdiffuse.collision.exact_meshes import contact_message, contacts_at  # compiled code
 

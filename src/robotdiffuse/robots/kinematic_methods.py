@@ -13,12 +13,22 @@ from robotdiffuse.robots.robot import Robot
 
 
 def fk(robot: Robot, q: ArrayLike, link: str | None = None) -> ndarray:
-    """Forward kinematics: the pose of a link in the base frame, T_base_link.
+    """Forward kinematics: the pose of a link in the frame of the base.
 
-    q: a configuration [dof], or several [n, dof], of the planned joints [rad] or [m].
-    link: name of the link; None: the robot's tip.
+    Args:
+        robot: The robot.
+        q: A configuration [dof], or several [n, dof], of the planned joints [rad] or [m].
+        link: Name of the link; None: the tip of the robot.
 
-    Returns a matrix [4, 4], or [n, 4, 4]. Raises InputError for an unknown link or q of the wrong shape.
+    Returns:
+        T_base_link [4, 4], or [n, 4, 4].
+
+    Raises:
+        InputError: For an unknown link, or q of the wrong shape.
+
+    Examples:
+        >>> rd.load_robot("panda").fk([0, -0.785, 0, -2.356, 0, 1.571, 0.785])[:3, 3].round(2).tolist()
+        [0.31, 0.0, 0.59]
     """
     rows = configurations(robot, q)
     T = link_poses(robot, np.atleast_2d(rows), robot.tip if link is None else link)
@@ -26,10 +36,22 @@ def fk(robot: Robot, q: ArrayLike, link: str | None = None) -> ndarray:
 
 
 def jacobian(robot: Robot, q: ArrayLike, link: str | None = None) -> ndarray:
-    """Geometric Jacobian of a link: linear, then angular velocity, per unit of each joint's velocity.
+    """Geometric Jacobian of a link.
 
-    Both in the axes of the base frame; the linear one is of the link's origin [m/rad]. Arguments as of
-    `fk`. Returns a matrix [6, dof], or [n, 6, dof].
+    Its linear, then its angular velocity, for each unit of a joint's velocity. Both are in the axes of the
+    base; the
+    linear velocity is that of the link's origin.
+
+    Args:
+        robot: The robot.
+        q: A configuration [dof], or several [n, dof], of the planned joints [rad] or [m].
+        link: Name of the link; None: the tip of the robot.
+
+    Returns:
+        A matrix [6, dof], or [n, 6, dof].
+
+    Raises:
+        InputError: For an unknown link, or q of the wrong shape.
     """
     rows = configurations(robot, q)
     J = link_jacobians(robot, np.atleast_2d(rows), robot.tip if link is None else link)
@@ -45,16 +67,28 @@ def ik(
     near: ArrayLike | None = None,
     seed: int = 0,
 ) -> ndarray:
-    """Inverse kinematics: distinct configurations within the joint limits that bring a link to a pose.
+    """Inverse kinematics: configurations within the joint limits that bring a link to a pose.
 
-    pose: T_base_link [4, 4].
-    link: name of the link; None: the robot's tip.
-    count: largest number of configurations.
-    near: a configuration [dof]; results are sorted by their distance from it.
-    seed: of the random start configurations.
+    They may collide: see `Problem.is_free`.
 
-    Returns configurations [k, dof]: no rows if the pose was not reached. They may collide: see
-    `Problem.clearance_at`. Raises InputError for an unknown link and for a pose that is not rigid.
+    Args:
+        robot: The robot.
+        pose: T_base_link [4, 4].
+        link: Name of the link; None: the tip of the robot.
+        count: Largest number of configurations.
+        near: A configuration [dof]; results are sorted by their distance from it.
+        seed: Seed of the random starts.
+
+    Returns:
+        Distinct configurations [k, dof]; no rows if the pose was not reached.
+
+    Raises:
+        InputError: For an unknown link, and for a pose that is not rigid.
+
+    Examples:
+        >>> robot = rd.load_robot("panda")
+        >>> robot.ik(rd.pose([0.5, 0.1, 0.4], rpy=[3.1416, 0, 0]), count=3).shape
+        (3, 7)
     """
     from robotdiffuse.robots.inverse_kinematics import inverse_kinematics  # compiled code
 

@@ -109,11 +109,19 @@ class Robot(KinematicTree):
         )
 
     def with_locked(self, locked: dict[str, float]) -> "Robot":
-        """The robot with joints locked at values [rad] or [m], by name; planned joints can be locked too.
+        """The robot with joints held at values. Mimic joints follow.
 
-        Mimic joints follow. Values beyond the URDF's limits are accepted, since gripper openings in published
-        problems exceed them. Equal values give the same object. Raises InputError for an unknown or fixed
-        joint, a value that is not finite, or a value of a mimic joint that contradicts its leader.
+        Values beyond the URDF's limits are accepted, since gripper openings in published problems exceed
+        them. Equal
+        values give the same object.
+
+        Args:
+            locked: Values [rad] or [m] by the names of joints, which may be planned joints.
+
+        Raises:
+            InputError: For an unknown or fixed joint, a value that is not finite, or a value of a mimic joint
+                that
+                contradicts its leader.
         """
         movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
@@ -143,14 +151,27 @@ class Robot(KinematicTree):
         return self.bare or self
 
     def attach(self, shape: RigidShape, link: str, touch_links: Sequence[str] = ()) -> "Robot":
-        """The robot holding a shape, whose pose is given in the frame of the link.
+        """The robot holding an object.
 
-        The shape becomes a link with the shape's name, so goals may name it. Collision checks keep it clear
-        of obstacles and of all links, except links that move with it and `touch_links`. A curved shape is
-        replaced by a polyhedron around it that exceeds it by at most 2 % of its radius.
+        The object becomes a link of its name, so goals may name it. Collision checks keep it clear of
+        obstacles and of
+        all links but those that move with it.
 
-        Raises InputError for unknown links, a link that no planned joint moves, a name that is taken, and a
-        point cloud.
+        Args:
+            shape: The object, at its pose in the frame of the link. A curved shape is replaced by a
+                polyhedron around
+                it that exceeds it by at most 2 % of its radius.
+            link: The link that holds it.
+            touch_links: Further links that it may touch.
+
+        Raises:
+            InputError: For unknown links, a link that no planned joint moves, a name that is taken, and a
+                point cloud.
+
+        Examples:
+            >>> cup = rd.Cylinder([0, 0, 0.125], radius=0.03, height=0.1, name="cup")
+            >>> rd.load_robot("panda").attach(cup, "panda_hand").attached[0].name
+            'cup'
         """
         if not hasattr(shape, "solid"):
             raise InputError(f"attached is a {type(shape).__name__}; it must be a shape, e.g. rd.Box")
@@ -165,10 +186,19 @@ class Robot(KinematicTree):
         touch_links: Sequence[str] = (),
         name: str = TOOL,
     ) -> "Robot":
-        """The robot with a tool on a link: a frame that goals may name, and shapes in the frame of the link.
+        """The robot with a tool: a frame that goals may name, and shapes that are part of the arm.
 
-        The tool becomes the tip if no planned joint comes after its link. Shapes, `touch_links` and errors
-        are as in `attach`; InputError too if the robot has a tool already.
+        The tool becomes the tip if no planned joint comes after its link.
+
+        Args:
+            link: The link that carries it.
+            T_link_tool: Pose of the tool's frame [4, 4].
+            shapes: Its shapes, in the frame of the link.
+            touch_links: Links that the shapes may touch.
+            name: Name of the frame.
+
+        Raises:
+            InputError: As `attach` does, and if the robot has a tool already.
         """
         tools = [body.name for body in self.attached if body.tool]
         if tools:
@@ -179,8 +209,13 @@ class Robot(KinematicTree):
     def with_body(self, body: AttachedBody) -> "Robot":
         """The robot with a body attached; the same object for bodies of equal content.
 
-        Raises InputError for unknown links, a link that no planned joint moves, a name that a link has, and
-        shapes that cannot be held.
+        Args:
+            body: The held object or tool.
+
+        Raises:
+            InputError: For unknown links, a link that no planned joint moves, a name that a link has, and
+                shapes that
+                cannot be held.
         """
         what = TOOL if body.tool else "attached"
         moved = [link for link in self.link_names if self.link_frame(link) > 0]
@@ -201,9 +236,13 @@ class Robot(KinematicTree):
         return _with_body(self, BodyContent(body))
 
     def detach(self, name: str) -> "Robot":
-        """The robot without the held object or tool of that name.
+        """The robot without a held object or tool.
 
-        Raises InputError for an unknown name, and for a body that holds another one.
+        Args:
+            name: Its name.
+
+        Raises:
+            InputError: For an unknown name, and for a body that holds another one.
         """
         names = [body.name for body in self.attached]
         if name not in names:
@@ -219,8 +258,11 @@ class Robot(KinematicTree):
         return reduce(Robot.with_body, left, self.arm)
 
     def placed_in_world(self, T_world_base: Float[ndarray, "4 4"]) -> "Robot":
-        """The robot with a new base link, the world, that carries the old one: for pictures and
-        simulators."""
+        """The robot with a new base link, the world, that carries the old one: for pictures and simulators.
+
+        Args:
+            T_world_base: Pose of the old base [4, 4].
+        """
         name = "world"
         while name in self.link_names:
             name += "_"

@@ -113,10 +113,15 @@ class Mesh(PosedTriangles):
     ) -> "Mesh":
         """The mesh of a file that trimesh reads (.stl, .obj, .ply, .dae, .glb, ...).
 
-        xyz, wxyz: pose of the file's frame in the frame of the robot's base.
-        scale: metres per unit of the file: 0.001 for millimetres.
+        Args:
+            file: The file.
+            xyz: Position of the file's frame in the frame of the base [m].
+            wxyz: Its orientation, a quaternion.
+            scale: Meters for each unit of the file: 0.001 for millimeters.
+            name: Name of the obstacle, for messages and allowed contacts.
 
-        Raises InputError for a file that cannot be read and a scale that is not positive.
+        Raises:
+            InputError: For a file that cannot be read, or a scale that is not positive.
         """
         vertices, faces = read_triangles(file)
         scale = positive("mesh", "scale", scale)

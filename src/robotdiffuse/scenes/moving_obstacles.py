@@ -155,7 +155,14 @@ class MovingObstacle(Value):
         return float(track_speeds(*self.track, self.radius).max(initial=0.0))
 
     def pose(self, time: float) -> Float[ndarray, "4 4"]:
-        """T_base_shape at a time [s]; the pose at time 0 if the motion is unknown."""
+        """T_base_shape at a time.
+
+        Args:
+            time: Time since the motion begins [s].
+
+        Returns:
+            The pose [4, 4]; the one at time 0 if the motion is unknown.
+        """
         times, poses = self.track
         i = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, max(len(times) - 2, 0)))
         if len(times) == 1:
@@ -168,11 +175,19 @@ class MovingObstacle(Value):
         return transform(xyz, rotation_from_quaternion(_slerp(a, b, fraction)))
 
     def at(self, time: float) -> Shape:
-        """The shape with its pose at a time [s]; the one at time 0 if the motion is unknown."""
+        """The shape where it is at a time.
+
+        Args:
+            time: Time since the motion begins [s]. If the motion is unknown, the shape is where it begins.
+        """
         return self.shape.moved(self.pose(time) @ inverse(self.shape.T_base_shape))
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "MovingObstacle":
-        """The obstacle and its motion after the rigid motion T."""
+        """The obstacle and its motion after a rigid motion.
+
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+        """
         velocity = None if self.velocity is None else T[:3, :3] @ self.velocity
         poses = None if self.poses is None else T @ self.poses
         return replace(self, shape=self.shape.moved(T), velocity=velocity, poses=poses)

@@ -96,11 +96,19 @@ class Scene(Value):
         return cls(shapes_in(model, data, base))
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Scene":
-        """The scene after the rigid motion T."""
+        """The scene after a rigid motion.
+
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+        """
         return self.with_shapes([shape.moved(T) for shape in self.shapes])
 
     def with_shapes(self, shapes: Iterable[Shape]) -> "Scene":
-        """A scene of other shapes, with the allowed contacts of those that have the name of one of these."""
+        """A scene of other shapes, with the allowed contacts of those that have the name of one of these.
+
+        Args:
+            shapes: The obstacles.
+        """
         scene = Scene(shapes)
         if self.allowed_contacts:
             names = {shape.name for shape in scene.shapes}
@@ -109,7 +117,12 @@ class Scene(Value):
         return scene
 
     def may_touch(self, link: str, obstacle: str) -> bool:
-        """Whether contact of this link with this obstacle is allowed."""
+        """Whether a contact is allowed.
+
+        Args:
+            link: Name of a link or held object.
+            obstacle: Name of an obstacle.
+        """
         links = self._links_that_touch.get(obstacle, ())
         return links == ALL_LINKS or link in links
 
@@ -125,10 +138,20 @@ class Scene(Value):
         link: str | None = None,
         touch_links: Sequence[str] = (),
     ) -> tuple["Scene", Robot]:
-        """The scene without an obstacle that the robot grasps at configuration q, and the robot holding it.
+        """The robot takes an obstacle of the scene.
 
-        link: the link that it is attached to, by default the robot's tip; touch_links: as in `Robot.attach`.
-        Raises InputError for an unknown obstacle, and where `Robot.attach` does.
+        Args:
+            name: The obstacle.
+            robot: The robot.
+            q: Configuration at which it grasps the obstacle [dof].
+            link: The link that holds it; None: the tip of the robot.
+            touch_links: Further links that it may touch.
+
+        Returns:
+            The scene without the obstacle, and the robot holding it.
+
+        Raises:
+            InputError: For an unknown obstacle, and where `Robot.attach` does.
         """
         names = [shape.name for shape in self.shapes]
         if name not in names:
@@ -140,7 +163,19 @@ class Scene(Value):
         return left, robot.attach(held, link, touch_links)
 
     def detach(self, name: str, robot: Robot, q: Float[ndarray, "dof"]) -> tuple["Scene", Robot]:
-        """The scene with an object that the robot releases at configuration q, and the robot without it."""
+        """The robot puts a held object down.
+
+        Args:
+            name: The held object.
+            robot: The robot that holds it.
+            q: Configuration at which it releases the object [dof].
+
+        Returns:
+            The scene with the object, and the robot without it.
+
+        Raises:
+            InputError: For an unknown name.
+        """
         freed = robot.detach(name)
         [body] = [body for body in robot.attached if body.name == name]
         T_base_link = link_pose(robot, np.asarray(q, float), body.link)

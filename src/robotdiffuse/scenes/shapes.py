@@ -128,6 +128,11 @@ class Sphere(Shape):
         return transform(self.center)
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+        """The sphere after a rigid motion.
+
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+        """
         return replace(self, center=T[:3, :3] @ self.center + T[:3, 3])
 
     def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
@@ -348,14 +353,21 @@ class PointCloud(Shape):
         scale: float = 1.0,
         name: str = "point_cloud",
     ) -> "PointCloud":
-        """The cloud of a .ply, .pcd, .xyz, .csv, .npy or .npz file, or the occupied voxels of an octomap
-        (.bt), in the frame of the robot's base.
+        """The cloud of a file.
 
-        point_radius: radius of the sphere around each point [m]; None: 1 cm, around a voxel of an octomap.
-        scale: metres per unit of the file: 0.001 for millimetres.
+        Points that are not finite are left out, with a warning.
 
-        Points that are not finite are left out, with a warning. Raises InputError for a file that cannot be
-        read and a scale that is not positive.
+        Args:
+            file: A .ply, .pcd, .xyz, .csv, .npy or .npz file, or an octomap (.bt), of which the occupied
+                voxels are
+                taken; in the frame of the base.
+            point_radius: Radius of the sphere around each point [m]; None: 1 cm, or around a voxel of the
+                octomap.
+            scale: Meters for each unit of the file: 0.001 for millimeters.
+            name: Name of the obstacle, for messages and allowed contacts.
+
+        Raises:
+            InputError: For a file that cannot be read, or a scale that is not positive.
         """
         points, notes = read_points(file)
         for note in notes:
@@ -386,4 +398,9 @@ class PointCloud(Shape):
         return read_only(np.stack([low - self.point_radius, high + self.point_radius]))
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+        """The cloud after a rigid motion.
+
+        Args:
+            T: The rigid motion, a homogeneous transform [4, 4].
+        """
         return replace(self, points=self.points @ T[:3, :3].T + T[:3, 3], file=None)

@@ -50,10 +50,27 @@ CONTACT_KINDS = ("scene_collision", "self_collision")
 
 
 def verify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT) -> Report:
-    """Validate a motion for a problem: a trajectory as `verify_trajectory` does; a path with respect to
-    everything but moving obstacles, since it has no times.
+    """Validate a motion of any planner.
 
-    Raises InputError if the motion's joints are not those of the robot, or its shapes are wrong.
+    Args:
+        problem: The problem that the motion is to solve.
+        motion: A trajectory, which is checked as it will be executed, with its times and rates; or a path,
+            which is
+            checked for everything but moving obstacles, since it has no times.
+        settings: Tolerances of the validator.
+
+    Returns:
+        Whether the motion is valid, the first violation, and certified clearances.
+
+    Raises:
+        InputError: If the motion's joints are not those of the robot, or its shapes are wrong.
+
+    Examples:
+        >>> robot = rd.load_robot("panda")
+        >>> problem = rd.Problem(robot, rd.Scene(), "ready", "extended")
+        >>> line = np.stack([problem.start, problem.goal.positions[0]])
+        >>> rd.verify(problem, rd.Path(robot.joint_names, line)).valid
+        True
     """
     check_problem(problem)
     check_type("settings", settings, VerifySettings, "VerifySettings")

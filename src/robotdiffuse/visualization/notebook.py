@@ -27,13 +27,20 @@ class Replay:
 
 
 def show(result: PlanResult | ResultFile, problem: Problem | None = None, height: int = 560) -> Replay:
-    """The replay of a result, for the last line of a notebook cell; elsewhere in a cell, use
-    `display(rd.show(result))`. Without a motion: the start, the goal and the links that collide.
+    """The replay of a result, for the last line of a notebook cell.
 
-    problem: needed only if the result does not contain it; results of `plan`, and result files saved with
-    their problem, do. height: of the cell [pixels].
+    Elsewhere in a cell, use `display(rd.show(result))`. Without a motion it shows the start, the goal and the
+    links
+    that collide.
 
-    Raises InputError outside a notebook, and if the problem is unknown.
+    Args:
+        result: A result of `plan`, or a result file.
+        problem: Needed only if the result does not contain it; results of `plan`, and files saved with their
+            problem, do.
+        height: Height of the cell [pixels].
+
+    Raises:
+        InputError: Outside a notebook, and if the problem is unknown.
     """
     check_type("result", result, (PlanResult, ResultFile), "a result, as of rd.plan or rd.load_result")
     if problem is not None:

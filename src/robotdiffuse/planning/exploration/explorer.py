@@ -123,7 +123,14 @@ class Explorer:
 
     @locked
     def set_goal(self, goal: ArrayLike | Goal) -> None:
-        """The next goal: configurations, or poses as `rd.Problem` takes them. What was seen is kept."""
+        """Set the next goal. What was seen is kept.
+
+        Args:
+            goal: Configurations, or poses as `rd.Problem` takes them.
+
+        Raises:
+            InputError: For a goal that does not fit the robot.
+        """
         middle = 0.5 * (self.robot.lower + self.robot.upper)
         self._goal = Problem(self.robot, NOTHING, middle, goal).goal
         self._looks = 0
@@ -132,7 +139,15 @@ class Explorer:
 
     @locked
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
-        """Take a view into account; see `OccupancyMap.add`."""
+        """Take a view into account.
+
+        Args:
+            view: A depth image, with the pose of its camera and the configuration of the arm at the exposure.
+            stamp: Time of the exposure [s]; older evidence is forgotten after `max_age`.
+
+        Raises:
+            InputError: For a view that does not fit the robot.
+        """
         new_voxels = self.map.add(view, stamp)
         self._views.add(view, new_voxels)
         self._goal_seen.observe(view)
@@ -140,9 +155,13 @@ class Explorer:
 
     @locked
     def next(self, configuration: ArrayLike) -> Step:
-        """What the arm, at rest at a configuration, shall do next.
+        """What the arm, at rest, shall do next.
 
-        Raises InputError before `set_goal`, and for a configuration that is not one.
+        Args:
+            configuration: Where the arm is [dof].
+
+        Raises:
+            InputError: Before `set_goal`, and for a configuration that is not one.
         """
         if self._goal is None:
             raise InputError("there is no goal; call set_goal first")
@@ -171,15 +190,27 @@ class Explorer:
 
     @locked
     def wanted(self, path: Path) -> Voxels:
-        """The voxels that looks are to show: unknown ones that a tentative motion sweeps, and those of the
-        goal that must be seen."""
+        """The voxels that views are to show.
+
+        They are the unknown ones that a tentative motion sweeps, and those of a goal that must be seen.
+
+        Args:
+            path: The tentative motion.
+        """
         return swept_unseen(self.map, path) | self._goal_seen.wanted(path)
 
     @locked
     def stop(self, motion: Trajectory, time: float) -> Stop | None:
-        """How a motion under way ends early, if what was observed since `next` returned it is in its way;
-        None if it is not. time: when a new command takes effect, on the motion's clock [s]. After the stop,
-        ask `next` again. See `stopping.stop_before`.
+        """How a motion under way ends early, if what was observed since `next` returned it is in its way.
+
+        After the stop, ask `next` again.
+
+        Args:
+            motion: The motion under way.
+            time: When a new command takes effect, on the motion's clock [s].
+
+        Returns:
+            The earliest stop on the same path; None if nothing is in the way.
         """
         return stop_before(self.robot, self.scene, self._news, self._free, motion, time)
 

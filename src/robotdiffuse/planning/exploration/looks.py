@@ -220,15 +220,21 @@ def poses_around() -> list[Pose]:
 
 
 def next_view(problem: Problem, result: PlanResult, poses: Sequence[Pose] | None = None) -> NextView:
-    """The pose from which a camera like that of the first view sees most of the probability that the motion
-    of a result sweeps.
+    """The camera pose that shows most of what a motion may collide with.
 
-    poses: camera poses to choose from, T_base_camera each; None: `poses_around`.
+    It is the pose from which a camera like that of the first view sees most of the probability that the
+    motion
+    sweeps. A voxel counts by the chance that nothing hides it: neither what was seen, nor what is predicted,
+    nor the
+    arm at the start. With a policy other than "predicted", all swept unknown voxels count the same.
 
-    A voxel counts by the chance that nothing hides it: neither what was seen, nor what is predicted, nor the
-    arm at the problem's start. With a policy other than "predicted", all swept unknown voxels count the same.
+    Args:
+        problem: A problem with views.
+        result: The result that holds the motion.
+        poses: Camera poses T_base_camera [4, 4] to choose from; None: `poses_around`.
 
-    Raises InputError without views, without a motion and without poses.
+    Raises:
+        InputError: Without views, without a motion and without poses.
     """
     check_problem(problem)
     check_type("result", result, PlanResult, "a PlanResult, as of rd.plan")

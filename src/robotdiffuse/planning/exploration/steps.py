@@ -39,7 +39,15 @@ class ArmCamera(Value):
         super().__post_init__()
 
     def poses(self, robot: Robot, q: Configurations) -> Float[ndarray, "n 4 4"]:
-        """T_base_camera at configurations."""
+        """Poses of the camera at configurations of the arm.
+
+        Args:
+            robot: The robot that carries the camera.
+            q: Configurations [n, dof] of its planned joints [rad] or [m].
+
+        Returns:
+            T_base_camera of each [n, 4, 4].
+        """
         return link_poses(robot, q, self.link) @ self.T_link_camera
 
 

@@ -266,8 +266,13 @@ class Replanner:
     def set_goal(self, goal: ArrayLike | Goal) -> None:
         """Take the arm to another goal, from where its present motion ends.
 
-        The next steps search for the way. Raises InputError for a goal that is not usable in the static
-        scene; the old one stays then.
+        The next steps search for the way.
+
+        Args:
+            goal: As of `rd.Problem`.
+
+        Raises:
+            InputError: For a goal that is not usable in the static scene; the old one stays then.
         """
         rest = self._path.at(float(self._motion.s[-1]))
         problem = replace(self.problem, goal=goal)  # type: ignore[arg-type]
@@ -283,14 +288,18 @@ class Replanner:
 
     @locked
     def step(self, observation: Mapping[str, ArrayLike], now: float) -> Command:
-        """The motion from one period after `now` [s], given the obstacles as observed at `now`.
+        """The motion from one period after now, given the obstacles as observed now.
 
-        observation: T_base_obstacle [4, 4], or only the origin of the obstacle's frame [3], by name. An
-            obstacle that is missing may be anywhere that it can have reached since it was last seen.
-        now: time of the observation [s]; it must grow from step to step.
+        Args:
+            observation: T_base_obstacle [4, 4], or only the origin of the obstacle's frame [3], by name. An
+                obstacle
+                that is missing may be anywhere that it can have reached since it was last seen.
+            now: Time of the observation [s]; it must grow from step to step.
 
-        Raises InputError for unknown names, invalid poses, time that does not grow, and obstacles that were
-        faster than their maximum speed, which voids the guarantee.
+        Raises:
+            InputError: For unknown names, invalid poses, time that does not grow, and obstacles that were
+                faster than
+                their maximum speed, which voids the guarantee.
         """
         clock = numbers(now)
         if clock is None or clock.ndim != 0 or not np.isfinite(clock):
