@@ -24,6 +24,7 @@ from .planning.exploration.steps import ExplorerSettings as ExplorerSettings
 from .planning.plan_many import plan_many as plan_many
 from .planning.reactive.replanner import Replanner as Replanner
 from .planning.reactive.replanner import ReplannerSettings as ReplannerSettings
+from .planning.workspace import Workspace as Workspace
 from .problems.constraints import AxisCone as AxisCone
 from .problems.constraints import CartesianLine as CartesianLine
 from .problems.constraints import OnLine as OnLine

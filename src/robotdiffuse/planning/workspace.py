@@ -1,0 +1,255 @@
+"""What a program keeps between calls: a robot, its named obstacles and what it holds."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+from numpy.typing import ArrayLike
+
+from robotdiffuse.core.bounds import rigid_transform
+from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.transforms import inverse
+from robotdiffuse.planning import plan
+from robotdiffuse.problems.constraints import CartesianLine
+from robotdiffuse.problems.goals import Goal, PoseGoal
+from robotdiffuse.problems.problem import Problem, StateValidity
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Shape
+
+
+class Workspace:
+    """A robot among named obstacles, for programs that plan again and again.
+
+    All poses are in the frame of the world. Each call plans for the obstacles as they are then; what is
+    computed for a robot and its held objects is kept. A workspace belongs to one thread.
+
+    Args:
+        robot: The robot.
+        tip: The link that poses are of; None: the tip of the robot.
+        T_world_base: Pose of the robot's base [4, 4]; None: the base is the origin of the world.
+
+    Raises:
+        InputError: For an unknown link, and a pose that is not rigid.
+
+    Examples:
+        >>> space = rd.Workspace(rd.load_robot("panda"))
+        >>> space.add(rd.Sphere([0.5, 0.0, 0.7], 0.2, name="ball"))
+        >>> space.move("ball", rd.pose([0.5, 0.4, 0.7]))
+        >>> space.is_free("ready").reason
+        ''
+        >>> space.plan_line(space.pose("ready") @ rd.pose([0, 0, 0.1]), "ready").status.value
+        'solved'
+    """
+
+    def __init__(self, robot: Robot, tip: str | None = None, T_world_base: ArrayLike | None = None) -> None:
+        self.robot = robot
+        """The robot, with what it holds."""
+        self.tip = robot.tip if tip is None else tip
+        robot.link_frame(self.tip)
+        base = np.eye(4) if T_world_base is None else rigid_transform("T_world_base", T_world_base)
+        self._T_world_base: ndarray = base
+        self._T_base_world = inverse(base)
+        self.scene = Scene()
+        """The obstacles, in the frame of the base."""
+
+    @property
+    def obstacles(self) -> tuple[str, ...]:
+        """Names of the obstacles."""
+        return tuple(shape.name for shape in self.scene.shapes)
+
+    def add(self, *shapes: Shape) -> None:
+        """Add obstacles. One with the name of an obstacle that is there replaces it.
+
+        Args:
+            shapes: Shapes, meshes or point clouds, each with a name of its own.
+
+        Raises:
+            InputError: For anything but shapes, and for two of one name.
+        """
+        new = Scene(shapes).moved(self._T_base_world).shapes
+        names = [shape.name for shape in new]
+        if names != [shape.name for shape in shapes]:
+            raise InputError(
+                f"shapes are named {', '.join(shape.name for shape in shapes)}; names must differ"
+            )
+        kept = [shape for shape in self.scene.shapes if shape.name not in names]
+        self.scene = self.scene.with_shapes([*kept, *new])
+
+    def move(self, name: str, T_world_shape: ArrayLike) -> None:
+        """Move an obstacle.
+
+        Args:
+            name: Name of the obstacle.
+            T_world_shape: Pose of its frame [4, 4].
+
+        Raises:
+            InputError: For an unknown name, a pose that is not rigid, and a point cloud, which has no frame.
+        """
+        shape = self._obstacle(name)
+        T = self._T_base_world @ rigid_transform("T_world_shape", T_world_shape)
+        moved = shape.moved(T @ inverse(shape.T_base_shape))
+        self.scene = self.scene.with_shapes([moved if one is shape else one for one in self.scene.shapes])
+
+    def remove(self, *names: str) -> None:
+        """Remove obstacles.
+
+        Args:
+            names: Names of the obstacles; none: all.
+
+        Raises:
+            InputError: For an unknown name.
+        """
+        removed = {self._obstacle(name).name for name in names} or set(self.obstacles)
+        self.scene = self.scene.with_shapes([one for one in self.scene.shapes if one.name not in removed])
+
+    def allow(self, obstacle: str, links: Sequence[str] | str) -> None:
+        """Allow links to touch an obstacle, as fingers what they grasp.
+
+        Args:
+            obstacle: Name of the obstacle.
+            links: Names of links and held objects; "all"; or none, to allow no contact again.
+
+        Raises:
+            InputError: For an unknown obstacle.
+        """
+        contacts = dict(self.scene.allowed_contacts) | {self._obstacle(obstacle).name: links}
+        self.scene = Scene(
+            self.scene.shapes, {name: allowed for name, allowed in contacts.items() if allowed}
+        )
+
+    def attach(
+        self, name: str, q: ArrayLike | str, link: str | None = None, touch_links: Iterable[str] = ()
+    ) -> None:
+        """The robot takes an obstacle; from then on it is a link of the robot.
+
+        Args:
+            name: Name of the obstacle.
+            q: Configuration at which it is grasped [dof], or the name of a pose.
+            link: The link that holds it; None: the tip of the workspace.
+            touch_links: Further links that it may touch.
+
+        Raises:
+            InputError: For an unknown obstacle or link, and for a point cloud.
+        """
+        self._obstacle(name)
+        at = self._configuration(q)
+        self.scene, self.robot = self.scene.attach(
+            name, self.robot, at, self.tip if link is None else link, tuple(touch_links)
+        )
+
+    def detach(self, name: str, q: ArrayLike | str) -> None:
+        """The robot puts a held object down, which is an obstacle from then on.
+
+        Args:
+            name: Name of the object.
+            q: Configuration at which it is released [dof], or the name of a pose.
+
+        Raises:
+            InputError: For an unknown name.
+        """
+        self.scene, self.robot = self.scene.detach(name, self.robot, self._configuration(q))
+
+    def pose(self, q: ArrayLike | str, link: str | None = None) -> ndarray:
+        """The pose of a link.
+
+        Args:
+            q: A configuration [dof], or the name of a pose.
+            link: Name of the link; None: the tip of the workspace.
+
+        Returns:
+            T_world_link [4, 4].
+        """
+        return self._T_world_base @ self.robot.fk(self._configuration(q), link or self.tip)
+
+    def ik(self, pose: ArrayLike, near: ArrayLike | None = None, count: int = 10) -> ndarray:
+        """Configurations that bring the tip to a pose; they may collide.
+
+        Args:
+            pose: T_world_tip [4, 4].
+            near: A configuration [dof]; results are sorted by their distance from it.
+            count: Largest number of configurations.
+
+        Returns:
+            Distinct configurations [k, dof]; no rows if the pose is out of reach.
+        """
+        T = self._T_base_world @ rigid_transform("pose", pose)
+        return self.robot.ik(T, self.tip, near=near, count=count)
+
+    def is_free(self, q: ArrayLike | str) -> StateValidity:
+        """Whether the arm is within its limits and free of collision; see `Problem.is_free`.
+
+        Args:
+            q: A configuration [dof], or the name of a pose.
+        """
+        middle = 0.5 * (self.robot.lower + self.robot.upper)
+        return Problem(self.robot, self.scene, middle, middle).is_free(q)
+
+    def clearance(self, q: ArrayLike) -> float | ndarray:
+        """Lower bound of the distance to obstacles and between links; see `Problem.clearance_at`.
+
+        Args:
+            q: A configuration [dof], or several [n, dof].
+
+        Returns:
+            The bound [m], one for each row.
+        """
+        middle = 0.5 * (self.robot.lower + self.robot.upper)
+        return Problem(self.robot, self.scene, middle, middle).clearance_at(q)
+
+    def plan(self, goal: Any, start: ArrayLike | str, **request: Any) -> PlanResult:
+        """Plan a motion among the obstacles as they are now.
+
+        Args:
+            goal: A pose of the tip [4, 4] in the frame of the world, or a goal as of `rd.Problem` in that of
+                the base.
+            start: Start configuration [dof], or the name of a pose.
+            request: Arguments of `rd.plan`: time_limit, seed, until, ...
+
+        Returns:
+            A result with a verified motion, or with a status and a reason why there is none.
+        """
+        return plan(Problem(self.robot, self.scene, start, self._goal(goal)), **request)
+
+    def plan_line(
+        self,
+        pose: ArrayLike,
+        start: ArrayLike | str,
+        tolerance: float = 0.001,
+        angle: float = 0.05,
+        speed: float | None = None,
+        **request: Any,
+    ) -> PlanResult:
+        """Move the tip along a straight line, turning evenly.
+
+        Args:
+            pose: T_world_tip at the end [4, 4].
+            start: Start configuration [dof], or the name of a pose.
+            tolerance: Largest distance of the tip from the line [m].
+            angle: Largest deviation of its orientation [rad].
+            speed: Largest speed of the tip [m/s]; None: what the joints allow.
+            request: Arguments of `rd.plan`: time_limit, seed, ...
+
+        Returns:
+            A result; `fraction` says how much of the line can be followed, and `reason` why no more.
+        """
+        line = CartesianLine(self.tip, tolerance, angle, speed)
+        goal = self._goal(rigid_transform("pose", pose))
+        return plan(Problem(self.robot, self.scene, start, goal, constraints=[line]), **request)
+
+    def _goal(self, goal: Any) -> Any:
+        if isinstance(goal, str | Goal) or np.shape(goal) != (4, 4):
+            return goal
+        return PoseGoal(self.tip, self._T_base_world @ rigid_transform("goal", goal))
+
+    def _configuration(self, q: ArrayLike | str) -> ndarray:
+        middle = 0.5 * (self.robot.lower + self.robot.upper)
+        return Problem(self.robot, Scene(), q, middle).start
+
+    def _obstacle(self, name: str) -> Shape:
+        for shape in self.scene.shapes:
+            if shape.name == name:
+                return shape
+        raise unknown_name("obstacle", name, self.obstacles)

@@ -1,0 +1,104 @@
+"""A workspace: obstacles that come, move and go, held objects, lines, and a base that stands elsewhere."""
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.core.errors import InputError
+
+READY = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+LEFT = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+RIGHT = LEFT * [-1, 1, 1, 1, 1, 1, 1]
+T_WORLD_BASE = rd.pose([0.3, -0.2, 0.7], rpy=[0.0, 0.0, 0.5])
+
+
+def panda(**options: object) -> rd.Workspace:
+    return rd.Workspace(rd.load_robot("panda"), **options)  # type: ignore[arg-type]
+
+
+def test_motions_are_for_the_obstacles_as_they_are_then() -> None:
+    space = panda()
+    free = space.plan(RIGHT, LEFT, time_limit=10.0)
+    assert free.stage == "straight_line"
+    space.add(
+        rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"), rd.Box([0.5, 0.0, -0.2], [1.0, 1.0, 0.1], name="table")
+    )
+    assert space.obstacles == ("ball", "table")
+    around = space.plan(RIGHT, LEFT, time_limit=10.0)
+    assert around.solved and around.path_length > free.path_length + 0.1
+    assert rd.verify(rd.Problem(space.robot, space.scene, LEFT, RIGHT), around.trajectory).valid
+    space.move("ball", rd.pose([0.5, 0.0, 3.0]))
+    assert space.plan(RIGHT, LEFT, time_limit=10.0).stage == "straight_line"
+    space.add(rd.Sphere([0.5, 0.0, 0.6], 0.1, name="ball"))  # in place of the first
+    assert space.obstacles == ("table", "ball")
+    space.remove("ball")
+    assert space.obstacles == ("table",)
+    space.remove()
+    assert space.obstacles == ()
+
+
+def test_poses_are_in_the_world() -> None:
+    """The same scene and goal, in the frame of a base that stands elsewhere, give the same motion."""
+    here, there = panda(), panda(T_world_base=T_WORLD_BASE)
+    ball = rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball")
+    pose = here.pose(RIGHT)
+    assert np.allclose(there.pose(RIGHT), T_WORLD_BASE @ pose)
+    here.add(ball)
+    there.add(ball.moved(T_WORLD_BASE))
+    assert np.allclose(there.clearance(LEFT), here.clearance(LEFT))
+    assert np.allclose(there.ik(T_WORLD_BASE @ pose, near=RIGHT)[0], RIGHT, atol=1e-3)
+    one, other = (
+        space.plan(goal, LEFT, time_limit=10.0, planner="aorrtc", until="first")
+        for space, goal in ((here, pose), (there, T_WORLD_BASE @ pose))
+    )
+    assert np.allclose(one.path.positions[-1], other.path.positions[-1], atol=1e-4)
+    there.move("ball", T_WORLD_BASE @ rd.pose([0.5, 0.0, 0.6]))
+    assert np.allclose(there.scene.shapes[0].bounds, ball.bounds)
+
+
+def test_a_grasped_obstacle_moves_with_the_arm_until_it_is_put_down() -> None:
+    space = panda()
+    can = rd.Cylinder([0.5, -0.3, 0.06], radius=0.03, height=0.12, name="can")
+    space.add(rd.Box([0.5, 0.0, -0.05], [0.8, 1.2, 0.1], name="table"), can)
+    fingers = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
+    above = rd.pose([0.5, -0.3, 0.30], rpy=[np.pi, 0.0, 0.0])
+    grasp = rd.pose([0.5, -0.3, 0.18], rpy=[np.pi, 0.0, 0.0])
+    space.tip = "panda_hand"
+    first = space.plan(above, "ready", time_limit=10.0)
+    space.allow("can", fingers)
+    down = space.plan_line(grasp, first.path.positions[-1], time_limit=10.0)
+    assert down.solved and down.fraction == 1.0, down.reason
+    q = down.path.positions[-1]
+    space.attach("can", q, touch_links=fingers)
+    assert space.obstacles == ("table",)
+    assert not space.is_free(q)  # it stands on the table
+    space.allow("table", ["can"])
+    up = space.plan_line(above, q, time_limit=10.0)
+    assert up.solved, up.reason
+    space.detach("can", up.path.positions[-1])
+    held = next(shape for shape in space.scene.shapes if shape.name == "can")
+    lifted = held.bounds.mean(axis=0) - can.bounds.mean(axis=0)
+    assert np.allclose(lifted, [0.0, 0.0, 0.12], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda space: space.move("bal", np.eye(4)),
+            "unknown obstacle 'bal'; known: ball",
+        ),
+        (lambda space: space.move("ball", np.eye(3)), "T_world_shape is .*; it must be 4 x 4"),
+        (lambda space: space.remove("cup"), "unknown obstacle 'cup'"),
+        (lambda space: space.allow("cup", "all"), "unknown obstacle 'cup'"),
+        (lambda space: space.attach("cup", READY), "unknown obstacle 'cup'"),
+        (lambda space: space.add(*[rd.Sphere([1, 0, 0], 0.1, name="a")] * 2), "names must differ"),
+        (lambda space: space.plan(READY, READY[:3]), "start has 3 values; panda has 7 planned joints"),
+        (lambda space: rd.Workspace(space.robot, tip="nose"), "unknown link 'nose'"),
+    ],
+)
+def test_bad_input(call: object, message: str) -> None:
+    space = panda()
+    space.add(rd.Sphere([0.5, 0.0, 0.6], 0.2, name="ball"))
+    with pytest.raises(InputError, match=message):
+        call(space)  # type: ignore[operator]
