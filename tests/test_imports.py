@@ -26,7 +26,7 @@ ORDER = (
         "trajectories",
     ),
     "validation",
-    *("certificates", "interop", "datasets", "learning", "planning", "generation", "simulation"),
+    *("certificates", "interop", "datasets", "learning", "planning", "adapters", "generation", "simulation"),
     *("evaluation", "visualization", "server", "cli"),
 )
 """A package imports only itself and packages before it."""
@@ -35,7 +35,8 @@ APART = {
     "datasets": {"validation", "certificates", "interop"},
     "learning": {"validation", "certificates", "interop"},
     "planning": {"certificates", "interop"},
-    "generation": {"certificates", "interop"},
+    "adapters": {"certificates", "interop", "datasets", "learning"},
+    "generation": {"certificates", "interop", "adapters"},
     "simulation": {"certificates", "interop", "datasets", "learning", "planning", "generation"},
     "evaluation": {"certificates", "interop"},
     "visualization": {"generation", "simulation", "evaluation"},

@@ -50,7 +50,8 @@ class Workspace:
         self.tip = robot.tip if tip is None else tip
         robot.link_frame(self.tip)
         base = np.eye(4) if T_world_base is None else rigid_transform("T_world_base", T_world_base)
-        self._T_world_base: ndarray = base
+        self.T_world_base: ndarray = base
+        """Pose of the base."""
         self._T_base_world = inverse(base)
         self.scene = Scene()
         """The obstacles, in the frame of the base."""
@@ -162,7 +163,7 @@ class Workspace:
         Returns:
             T_world_link [4, 4].
         """
-        return self._T_world_base @ self.robot.fk(self._configuration(q), link or self.tip)
+        return self.T_world_base @ self.robot.fk(self._configuration(q), link or self.tip)
 
     def ik(self, pose: ArrayLike, near: ArrayLike | None = None, count: int = 10) -> ndarray:
         """Configurations that bring the tip to a pose; they may collide.

@@ -1,0 +1,292 @@
+"""MPlib's planner: `from robotdiffuse.adapters.mplib import Planner` in place of `from mplib import Planner`.
+
+Methods, arguments and results are those of MPlib 0.1 and 0.2, over `rd.Workspace`. Poses are seven numbers
+(x, y, z, and a quaternion w, x, y, z), objects with `p` and `q` such as `sapien.Pose`, or 4 x 4 matrices.
+Where MPlib says that a plan failed, `status` says why.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+from numpy.typing import ArrayLike
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.transforms import pose
+from robotdiffuse.planning.workspace import Workspace
+from robotdiffuse.problems.goals import JointGoal
+from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.robots.bodies import RigidShape
+from robotdiffuse.robots.fitting.add import add_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot_folder import ROBOT_FILE
+from robotdiffuse.robots.user_data_dir import user_robots
+from robotdiffuse.scenes.mesh import Mesh
+from robotdiffuse.scenes.shapes import Box, PointCloud, Sphere
+
+SUCCESS = "Success"
+CLOUD = "point_cloud"
+HELD = "attached"
+HELD_JOINT_STEP = 0.002  # grippers are held at multiples of this [rad] or [m]
+
+
+class Planner:
+    """Plans motions of a robot, as `mplib.Planner` does.
+
+    Args:
+        urdf: The robot's URDF, prepared on first use, in about a minute; or the name of a bundled robot.
+        move_group: The link that poses are of.
+        package_keyword_replacement: What stands in place of `package://` in the URDF.
+        srdf: SRDF with pairs of links that need no check; "": they are sampled.
+        user_link_names: Ignored: links have the names of the URDF.
+        user_joint_names: Joints in the order of `qpos`; none: the planned joints.
+        joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: those of the URDF.
+        joint_acc_limits: Their acceleration limits [rad/s²]; none: those of the robot.
+
+    Raises:
+        InputError: For files that cannot be read, unknown links and joints, and limits of the wrong number.
+    """
+
+    def __init__(
+        self,
+        urdf: str | Path,
+        move_group: str,
+        package_keyword_replacement: str = "",
+        srdf: str | Path = "",
+        user_link_names: Sequence[str] = (),
+        user_joint_names: Sequence[str] = (),
+        joint_vel_limits: ArrayLike = (),
+        joint_acc_limits: ArrayLike = (),
+        **_: Any,
+    ) -> None:
+        robot = _robot(urdf, move_group, srdf, package_keyword_replacement)
+        self.joint_names = tuple(user_joint_names) or robot.joint_names
+        missing = [name for name in robot.joint_names if name not in self.joint_names]
+        if missing:
+            raise InputError(f"user_joint_names lacks {', '.join(missing)}, which move {move_group}")
+        self._places = [self.joint_names.index(name) for name in robot.joint_names]
+        self.robot = _limited(robot, np.ravel(joint_vel_limits), np.ravel(joint_acc_limits))
+        self.workspace = Workspace(self.robot, move_group)
+        """Robot and obstacles; other obstacles than a point cloud are added here."""
+
+    def set_base_pose(self, pose: Any) -> None:
+        """Place the base in the world. Obstacles stay where they are in the world.
+
+        Args:
+            pose: T_world_base.
+        """
+        shapes = self.workspace.scene.moved(self.workspace.T_world_base).shapes
+        self.workspace = Workspace(self.workspace.robot, self.workspace.tip, matrix(pose))
+        self.workspace.add(*shapes)
+
+    def update_point_cloud(self, points: ArrayLike, resolution: float = 1e-3, name: str = CLOUD) -> None:
+        """Replace the point cloud.
+
+        Args:
+            points: Points [n, 3] in the frame of the world [m].
+            resolution: Radius of the sphere around each point [m].
+            name: Name of the cloud.
+        """
+        self.workspace.add(PointCloud(np.asarray(points, float), max(resolution, 1e-3), name=name))
+
+    def remove_point_cloud(self, name: str = CLOUD) -> bool:
+        """Remove a point cloud; returns whether there was one."""
+        present = name in self.workspace.obstacles
+        if present:
+            self.workspace.remove(name)
+        return present
+
+    def update_attached_box(self, size: ArrayLike, pose: Any, link_id: int = -1) -> None:
+        """Hold a box, in place of what was held.
+
+        Args:
+            size: Its edges [m].
+            pose: Its pose in the frame of the link.
+            link_id: Ignored: the move group holds it.
+        """
+        T = matrix(pose)
+        self._hold(Box(np.zeros(3), size, name=HELD).moved(T))
+
+    def update_attached_sphere(self, radius: float, pose: Any, link_id: int = -1) -> None:
+        """Hold a sphere; see `update_attached_box`."""
+        self._hold(Sphere(matrix(pose)[:3, 3], radius, name=HELD))
+
+    def update_attached_mesh(self, mesh_path: str | Path, pose: Any, link_id: int = -1) -> None:
+        """Hold a mesh; see `update_attached_box`."""
+        self._hold(Mesh.from_file(mesh_path, name=HELD).moved(matrix(pose)))
+
+    def detach_object(self, name: str = HELD, also_remove: bool = True) -> bool:
+        """Hold nothing; returns whether something was held."""
+        present = any(body.name == name for body in self.workspace.robot.attached)
+        if present:
+            self.workspace.robot = self.workspace.robot.detach(name)
+        return present
+
+    def IK(
+        self, goal_pose: Any, start_qpos: ArrayLike, mask: Any = None, n_init_qpos: int = 20, **_: Any
+    ) -> tuple[str, list[ndarray] | None]:
+        """Configurations that reach a pose and are free, those nearest to the start first.
+
+        Returns:
+            "Success" and the configurations, or the reason and None.
+        """
+        start = self._start(start_qpos)
+        found = self.workspace.ik(matrix(goal_pose), near=start, count=n_init_qpos)
+        free = [q for q in found if self.workspace.is_free(q)]
+        if free:
+            return SUCCESS, [self._qpos(q, start_qpos) for q in free]
+        why = "is out of reach" if not len(found) else f"collides: {self.workspace.is_free(found[0]).reason}"
+        return f"IK Failed! The pose of {self.workspace.tip} {why}", None
+
+    def plan_pose(
+        self, goal_pose: Any, current_qpos: ArrayLike, mask: Any = None, **options: Any
+    ) -> dict[str, Any]:
+        """Plan to a pose of the move group.
+
+        Args:
+            goal_pose: The pose, in the frame of the world, or of the base if `wrt_world` is False.
+            current_qpos: Where the robot is, as `user_joint_names` orders it.
+            mask: Ignored.
+            options: `time_step` [s] between rows (0.1), `planning_time` [s] (1), `wrt_world`; others of MPlib
+                are ignored.
+
+        Returns:
+            `status`, "Success" or the reason; and `time`, `position`, `velocity`, `acceleration`, `duration`.
+        """
+        return self._planned(self._in_world(goal_pose, options), current_qpos, options)
+
+    def plan_qpos(self, goal_qposes: Any, current_qpos: ArrayLike, **options: Any) -> dict[str, Any]:
+        """Plan to any of several configurations; see `plan_pose`."""
+        goals = np.atleast_2d(np.asarray(goal_qposes, float))
+        ends = goals if goals.shape[1] == self.robot.dof else goals[:, self._places]
+        return self._planned(JointGoal(ends), current_qpos, options)
+
+    def plan_screw(self, target_pose: Any, qpos: ArrayLike, *_: Any, **options: Any) -> dict[str, Any]:
+        """Move along a straight line, turning evenly; see `plan_pose`."""
+        start = self._start(qpos)
+        try:
+            result = self.workspace.plan_line(
+                self._in_world(target_pose, options), start, time_limit=options.get("planning_time", 1.0)
+            )
+        except InputError as error:
+            return {"status": f"screw plan failed: {error}"}
+        return self._rows(result, "screw plan failed", options)
+
+    plan_qpos_to_pose = plan_pose
+    plan_qpos_to_qpos = plan_qpos
+
+    def check_for_self_collision(self, qpos: ArrayLike) -> list[str]:
+        """What is wrong with a configuration without obstacles: no entry if it is free."""
+        start = self._start(qpos)
+        state = Workspace(self.workspace.robot, self.workspace.tip).is_free(start)
+        return [] if state else [state.reason]
+
+    def check_for_env_collision(self, qpos: ArrayLike, *_: Any, **_options: Any) -> list[str]:
+        """What is wrong with a configuration among the obstacles: no entry if it is free."""
+        start = self._start(qpos)
+        state = self.workspace.is_free(start)
+        return [] if state else [state.reason]
+
+    def _planned(self, goal: Any, qpos: ArrayLike, options: dict[str, Any]) -> dict[str, Any]:
+        start = self._start(qpos)
+        try:
+            result = self.workspace.plan(goal, start, time_limit=options.get("planning_time", 1.0))
+        except InputError as error:
+            return {"status": f"planning failed: {error}"}
+        return self._rows(result, "planning failed", options)
+
+    def _rows(self, result: PlanResult, failed: str, options: dict[str, Any]) -> dict[str, Any]:
+        """A motion as MPlib returns it: a row every `time_step`, and the last one."""
+        trajectory = result.trajectory
+        if trajectory is None:
+            return {"status": f"{failed}: {result.reason}"}
+        step = options.get("time_step", 0.1)
+        times = np.append(np.arange(0.0, trajectory.duration, step), trajectory.duration)
+        state = trajectory.at(times)
+        return {
+            "status": SUCCESS,
+            "time": times,
+            "position": state.positions,
+            "velocity": state.velocities,
+            "acceleration": state.accelerations,
+            "duration": trajectory.duration,
+        }
+
+    def _in_world(self, pose: Any, options: dict[str, Any]) -> ndarray:
+        T = matrix(pose)
+        return T if options.get("wrt_world", True) else self.workspace.T_world_base @ T
+
+    def _start(self, qpos: ArrayLike) -> ndarray:
+        """The planned joints of `qpos`. The other ones, such as fingers, are held where it has them."""
+        q = np.ravel(np.asarray(qpos, float))
+        if len(q) == self.robot.dof:
+            return q
+        if len(q) != len(self.joint_names):
+            names = ", ".join(self.joint_names)
+            raise InputError(f"qpos has {len(q)} values; it must have {len(self.joint_names)}: {names}")
+        values = dict(zip(self.joint_names, q.tolist(), strict=True))
+        held = {
+            name: round(values[name] / HELD_JOINT_STEP) * HELD_JOINT_STEP
+            for name in self.workspace.robot.locked
+            if name in values
+        }
+        self.workspace.robot = self.workspace.robot.with_locked(held)
+        return q[self._places]
+
+    def _qpos(self, q: ndarray, like: ArrayLike) -> ndarray:
+        """A configuration in the order of `qpos`, with its other joints."""
+        whole = np.ravel(np.array(like, float))
+        if len(whole) == len(q):
+            return q
+        whole[self._places] = q
+        return whole
+
+    def _hold(self, shape: RigidShape) -> None:
+        self.detach_object()
+        self.workspace.robot = self.workspace.robot.attach(shape, self.workspace.tip)
+
+
+def matrix(value: Any) -> ndarray:
+    """A pose as a homogeneous transform: of an object with `p` and `q`, seven numbers, or 4 x 4 numbers."""
+    if hasattr(value, "p") and hasattr(value, "q"):
+        value = [*np.ravel(value.p), *np.ravel(value.q)]
+    numbers = np.asarray(value, float)
+    if numbers.shape == (4, 4):
+        return numbers
+    if numbers.size != 7:
+        raise InputError(
+            f"a pose has {numbers.size} numbers; it must be x, y, z and a quaternion w, x, y, z, or 4 x 4"
+        )
+    flat = numbers.ravel()
+    return pose(flat[:3], wxyz=flat[3:])
+
+
+def _robot(urdf: str | Path, tip: str, srdf: str | Path, package: str) -> Robot:
+    """The prepared robot; prepared and stored, by the content of its files, if it is new."""
+    if str(urdf) in ROBOTS:
+        return load_robot(str(urdf))
+    content = Path(urdf).read_bytes() + (Path(srdf).read_bytes() if srdf else b"") + tip.encode()
+    folder = user_robots() / f"{Path(urdf).stem}-{hashlib.sha256(content).hexdigest()[:8]}"
+    if (folder / ROBOT_FILE).is_file():
+        return load_robot(folder)
+    packages: dict[str, str | Path] = {}
+    if package:
+        packages = {one.name: one for one in Path(package).iterdir() if one.is_dir()}
+    return add_robot(urdf, tip=tip, srdf=srdf or None, packages=packages, out=folder).robot
+
+
+def _limited(robot: Robot, velocity: ndarray, acceleration: ndarray) -> Robot:
+    """The robot with other limits of its planned joints."""
+    limits = dict[str, dict[str, float]]()
+    for field, values in (("velocity", velocity), ("acceleration", acceleration)):
+        if len(values) not in (0, robot.dof):
+            raise InputError(f"there are {len(values)} {field} limits; {robot.name} plans {robot.dof} joints")
+        for name, value in zip(robot.joint_names, values.tolist(), strict=False):
+            limits.setdefault(name, {})[field] = value
+    joints = tuple(replace(joint, **limits.get(joint.name, {})) for joint in robot.joints)
+    return replace(robot, joints=joints) if limits else robot

@@ -1,0 +1,109 @@
+"""MPlib's methods, with its arguments and results: motions reach what was asked, and failures say why."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.adapters.mplib import Planner, matrix
+from robotdiffuse.core.errors import InputError
+
+JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+QPOS = np.array([0.0, 0.4, 0.0, -2.0, 0.0, 2.4, 0.8, 0.04, 0.04])
+DOWN = [0.0, 1.0, 0.0, 0.0]
+HAND = "panda_hand"
+
+
+def planner(**options: object) -> Planner:
+    values = {"user_joint_names": JOINTS + FINGERS, "srdf": ""} | options
+    return Planner("panda", HAND, **values)  # type: ignore[arg-type]
+
+
+def tip(made: Planner, q: np.ndarray) -> np.ndarray:
+    return made.workspace.pose(q)
+
+
+def test_a_pose_is_reached_by_rows_of_one_time_step_within_the_limits_given() -> None:
+    made = planner(joint_vel_limits=np.full(7, 0.9), joint_acc_limits=np.full(7, 0.9))
+    goal = np.array([0.5, 0.2, 0.4, *DOWN])
+    result = made.plan_qpos_to_pose(goal, QPOS, time_step=0.05, planning_time=10.0, wrt_world=True)
+    assert result["status"] == "Success"
+    assert result["position"].shape == (len(result["time"]), 7)
+    assert np.allclose(result["position"][0], QPOS[:7])
+    assert np.allclose(np.diff(result["time"])[:-1], 0.05)
+    assert np.allclose(tip(made, result["position"][-1]), matrix(goal), atol=1e-3)
+    assert np.abs(result["velocity"]).max() <= 0.9 + 1e-6
+    assert np.abs(result["acceleration"]).max() <= 0.9 + 1e-6
+
+
+def test_both_versions_and_objects_with_p_and_q() -> None:
+    made = planner()
+    goal = SimpleNamespace(p=[0.5, 0.2, 0.4], q=DOWN)
+    by_pose = made.plan_pose(goal, QPOS, planning_time=10.0)
+    assert by_pose["status"] == "Success"
+    status, ends = made.IK(goal, QPOS)
+    assert status == "Success" and ends is not None and len(ends[0]) == 9
+    by_qpos = made.plan_qpos([ends[0]], QPOS, planning_time=10.0)
+    assert np.allclose(by_qpos["position"][-1], ends[0][:7], atol=1e-6)
+
+
+def test_a_screw_is_a_straight_line() -> None:
+    made = planner()
+    start = tip(made, QPOS[:7])
+    end = start.copy()
+    end[2, 3] -= 0.15
+    result = made.plan_screw(end, QPOS, time_step=0.02, use_point_cloud=False)
+    assert result["status"] == "Success"
+    places = np.array([tip(made, q)[:3, 3] for q in result["position"]])
+    assert np.allclose(places[:, :2], start[:2, 3], atol=1e-3)
+    assert np.allclose(places[-1], end[:3, 3], atol=1e-4)
+
+
+def test_obstacles_and_held_objects_count() -> None:
+    made = planner()
+    goal = np.array([0.5, 0.2, 0.4, *DOWN])
+    grid = np.mgrid[-0.1:0.1:5j, -0.1:0.1:5j, -0.1:0.1:5j].reshape(3, -1).T
+    made.update_point_cloud(grid + goal[:3], resolution=0.03)
+    assert made.check_for_env_collision(np.r_[made.workspace.ik(matrix(goal), near=QPOS[:7])[0], QPOS[7:]])
+    assert "collision" in made.plan_pose(goal, QPOS)["status"]
+    assert made.IK(goal, QPOS)[0].startswith("IK Failed!")
+    assert made.remove_point_cloud() and not made.remove_point_cloud()
+    made.update_attached_box([0.05, 0.05, 0.1], [0, 0, 0.15, 1, 0, 0, 0])
+    assert [body.name for body in made.workspace.robot.attached] == ["attached"]
+    assert made.check_for_self_collision(QPOS) == []
+    assert made.plan_pose(goal, QPOS, planning_time=10.0)["status"] == "Success"
+    assert made.detach_object() and not made.detach_object()
+
+
+def test_the_base_stands_in_the_world() -> None:
+    made = planner()
+    made.set_base_pose([0.3, -0.2, 0.7, 1, 0, 0, 0])
+    goal = np.array([0.8, 0.0, 1.1, *DOWN])
+    assert made.plan_pose(goal, QPOS, planning_time=10.0)["status"] == "Success"
+    relative = made.plan_pose(goal - [0.3, -0.2, 0.7, 0, 0, 0, 0], QPOS, wrt_world=False, planning_time=10.0)
+    assert np.allclose(tip(made, relative["position"][-1]), matrix(goal), atol=1e-3)
+
+
+def test_failures_say_why() -> None:
+    made = planner()
+    far = [2.0, 0.0, 0.5, *DOWN]
+    assert "no configuration" in made.plan_pose(far, QPOS)["status"]
+    assert "can be followed for" in made.plan_screw(far, QPOS, planning_time=0.2)["status"]
+    assert made.IK(far, QPOS) == (f"IK Failed! The pose of {HAND} is out of reach", None)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda made: made.plan_pose([0.5, 0, 0.4], QPOS), "a pose has 3 numbers"),
+        (lambda made: made.plan_pose([0.5, 0, 0.4, *DOWN], QPOS[:8]), "qpos has 8 values; it must have 9"),
+        (lambda made: planner(joint_vel_limits=[1.0]), "there are 1 velocity limits; panda plans 7 joints"),
+        (lambda made: planner(user_joint_names=JOINTS[1:]), "user_joint_names lacks panda_joint1"),
+        (lambda made: rd.Workspace(made.robot, "nose"), "unknown link 'nose'"),
+    ],
+)
+def test_bad_input(call: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        call(planner())  # type: ignore[operator]
