@@ -4,10 +4,8 @@ import ast
 import os
 import re
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -60,19 +58,6 @@ def apart_from_the_users_robots(tmp_path_factory: pytest.TempPathFactory) -> Ite
     """What tests prepare is not found by those after them, nor left to whoever runs them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path_factory.mktemp("robots")))
-        yield
-
-
-@pytest.fixture(autouse=True, scope="session")
-def time_limits_count_processor_time() -> Iterator[None]:
-    """Time limits of calls in this process count its processor time: a busy machine fails no test."""
-    from robotdiffuse.core import loading
-    from robotdiffuse.planning import context
-
-    clock = SimpleNamespace(perf_counter=time.process_time)
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (context, loading):
-            patch.setattr(module, "time", clock)
         yield
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
@@ -168,9 +169,10 @@ def drawables(scene: Scene, moving: Sequence[MovingObstacle] = ()) -> list[Drawa
 
 def own_frame(shape: Shape) -> Float[ndarray, "4 4"]:
     """The pose of a shape's own frame; of shapes without one, the middle of the bounds."""
-    if isinstance(shape, PointCloud):
+    try:
+        return shape.T_base_shape
+    except InputError:
         return transform(shape.bounds.mean(axis=0))
-    return shape.T_base_shape
 
 
 def _color(shape: Shape, own: Color) -> Color:

@@ -38,6 +38,16 @@ def test_a_pose_is_reached_by_rows_of_one_time_step_within_the_limits_given() ->
     assert np.abs(result["acceleration"]).max() <= 0.9 + 1e-6
 
 
+def test_limits_can_be_set_later() -> None:
+    made = planner()
+    assert np.array_equal(made.joint_vel_limits, np.ones(7))
+    made.joint_vel_limits = np.asarray(made.joint_vel_limits) * 0.5
+    made.joint_acc_limits = np.full(7, 2.0)
+    result = made.plan_pose([0.5, 0.2, 0.4, *DOWN], QPOS, planning_time=10.0)
+    assert np.abs(result["velocity"]).max() <= 0.5 + 1e-6
+    assert np.abs(result["acceleration"]).max() <= 2.0 + 1e-6
+
+
 def test_both_versions_and_objects_with_p_and_q() -> None:
     made = planner()
     goal = SimpleNamespace(p=[0.5, 0.2, 0.4], q=DOWN)

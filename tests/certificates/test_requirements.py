@@ -137,12 +137,12 @@ FORGED: dict[str, tuple[str, dict[str, Any], str]] = {
     "a narrower cone": (
         "cone",
         {"constraints": [rd.AxisCone(HAND, [0, 0, 1], [0, 0.3, -1], 0.1)]},
-        "is not shown to be kept",
+        "is not shown to keep its limit",
     ),
     "another line": (
         "line",
-        {"constraints": [rd.CartesianLine(HAND, 0.0005, 0.02, 0.2)]},
-        "is not shown to be kept",
+        {"constraints": [rd.CartesianLine("panda_link5", 0.0005, 0.02, 0.2)]},
+        "is not shown to keep its limit",
     ),
     "a slower line": ("line", {"constraints": [rd.CartesianLine(HAND, 0.002, 0.02, 0.1)]}, "moves at 0.2"),
 }

@@ -248,7 +248,7 @@ def test_a_planner_with_settings() -> None:
     calls = PlannerSpec.parse("aorrtc:until=time_limit:gain=0.01:clearance=0")
     assert calls.request()["until"] == "time_limit" and calls.request()["clearance"] == 0
     assert calls.load().settings == AORRTCSettings(gain=0.01)
-    with pytest.raises(InputError, match="unknown until 'soon'"):
+    with pytest.raises(InputError, match="until 'soon'; known: converged"):
         PlannerSpec.parse("aorrtc:until=soon")
     nested = PlannerSpec.parse("robotdiffuse:search.range=0.5:samples=4").load()
     assert isinstance(nested, RobotDiffuse)

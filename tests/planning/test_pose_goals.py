@@ -131,7 +131,7 @@ def test_a_pose_out_of_reach_is_named_alone() -> None:
     start, there = free()[:2]
     far = PoseGoal("left_gripper", transform(np.array([3.0, 0.0, 0.0])))
     goal = PosesGoal([far, *poses_at(baxter(), there, HANDS[1:]).poses])
-    result = rd.plan(rd.Problem(baxter(), rd.Scene(), start, goal))
+    result = rd.plan(rd.Problem(baxter(), rd.Scene(), start, goal), time_limit=60.0)
     assert result.status is Status.UNREACHABLE_GOAL
     assert result.reason.endswith("brings left_gripper to the pose at (3.000, 0.000, 0.000) m")
 

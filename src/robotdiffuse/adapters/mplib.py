@@ -45,8 +45,8 @@ class Planner:
         srdf: SRDF with pairs of links that need no check; "": they are sampled.
         user_link_names: Ignored: links have the names of the URDF.
         user_joint_names: Joints in the order of `qpos`; none: the planned joints.
-        joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: those of the URDF.
-        joint_acc_limits: Their acceleration limits [rad/s²]; none: those of the robot.
+        joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: 1, as in MPlib.
+        joint_acc_limits: Their acceleration limits [rad/s²]; none: 1, as in MPlib.
 
     Raises:
         InputError: For files that cannot be read, unknown links and joints, and limits of the wrong number.
@@ -70,9 +70,39 @@ class Planner:
         if missing:
             raise InputError(f"user_joint_names lacks {', '.join(missing)}, which move {move_group}")
         self._places = [self.joint_names.index(name) for name in robot.joint_names]
-        self.robot = _limited(robot, np.ravel(joint_vel_limits), np.ravel(joint_acc_limits))
+        ones = np.ones(robot.dof)
+        velocity = np.ravel(joint_vel_limits)
+        acceleration = np.ravel(joint_acc_limits)
+        self.robot = _limited(
+            robot, velocity if len(velocity) else ones, acceleration if len(acceleration) else 3.5 * ones
+        )
         self.workspace = Workspace(self.robot, move_group)
         """Robot and obstacles; other obstacles than a point cloud are added here."""
+
+    @property
+    def joint_vel_limits(self) -> ndarray:
+        """Velocity limits of the planned joints [rad/s]."""
+        return self.robot.velocity
+
+    @joint_vel_limits.setter
+    def joint_vel_limits(self, values: ArrayLike) -> None:
+        self._limit(np.ravel(values), self.robot.acceleration)
+
+    @property
+    def joint_acc_limits(self) -> ndarray:
+        """Acceleration limits of the planned joints [rad/s²]."""
+        return self.robot.acceleration
+
+    @joint_acc_limits.setter
+    def joint_acc_limits(self, values: ArrayLike) -> None:
+        self._limit(self.robot.velocity, np.ravel(values))
+
+    def _limit(self, velocity: ndarray, acceleration: ndarray) -> None:
+        self.robot = _limited(self.robot, velocity, acceleration)
+        held = self.workspace.robot.attached
+        self.workspace.robot = self.robot
+        for body in held:
+            self.workspace.robot = self.workspace.robot.with_body(body)
 
     def set_base_pose(self, pose: Any) -> None:
         """Place the base in the world. Obstacles stay where they are in the world.
@@ -284,9 +314,9 @@ def _limited(robot: Robot, velocity: ndarray, acceleration: ndarray) -> Robot:
     """The robot with other limits of its planned joints."""
     limits = dict[str, dict[str, float]]()
     for field, values in (("velocity", velocity), ("acceleration", acceleration)):
-        if len(values) not in (0, robot.dof):
+        if len(values) != robot.dof:
             raise InputError(f"there are {len(values)} {field} limits; {robot.name} plans {robot.dof} joints")
-        for name, value in zip(robot.joint_names, values.tolist(), strict=False):
+        for name, value in zip(robot.joint_names, values.tolist(), strict=True):
             limits.setdefault(name, {})[field] = value
     joints = tuple(replace(joint, **limits.get(joint.name, {})) for joint in robot.joints)
-    return replace(robot, joints=joints) if limits else robot
+    return replace(robot, joints=joints)

@@ -384,8 +384,8 @@ def _fail(call: Call, error: Exception) -> None:
 
 
 def on_this_machine(call: Callable[..., Any], calls: Sequence[tuple], workers: int) -> Results:
-    """`Workers.each` with processes for these calls only."""
-    with Workers(min(workers, len(calls))) as pool:
+    """`Workers.each` with processes for these calls only; one worker is this process."""
+    with Workers(min(workers, len(calls)) if workers > 1 else 0) as pool:
         yield from pool.each(call, calls)
 
 

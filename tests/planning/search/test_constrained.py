@@ -117,13 +117,13 @@ def test_validator_names_constraint_amount_and_place() -> None:
 
 def test_violations_at_start_and_goal_are_reported() -> None:
     tilted = START + np.array([0, 0, 0, 0, 0, 0.5, 0])
-    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), start=tilted))
+    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), start=tilted), 60.0)
     assert told.status is Status.INVALID_START
     assert "axis_cone of panda_hand is exceeded: 28.65 degrees, of 10 allowed" in told.reason
-    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=tilted))  # type: ignore[arg-type]
+    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=tilted), 60.0)  # type: ignore[arg-type]
     assert told.status is Status.INVALID_GOAL and "28.65 degrees" in told.reason
     pose = rd.PoseGoal(HAND, link_pose(PANDA, tilted, HAND))
-    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=pose))
+    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=pose), 60.0)
     assert told.status is Status.INVALID_GOAL and "28.65 degrees" in told.reason
 
 
