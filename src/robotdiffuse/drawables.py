@@ -168,11 +168,13 @@ def drawables(scene: Scene, moving: Sequence[MovingObstacle] = ()) -> list[Drawa
 
 
 def own_frame(shape: Shape) -> Float[ndarray, "4 4"]:
-    """The pose of a shape's own frame; of shapes without one, the middle of the bounds."""
+    """The pose of a shape's own frame; of clouds the middle of their bounds, else the base."""
+    if isinstance(shape, PointCloud):
+        return transform(shape.bounds.mean(axis=0))
     try:
         return shape.T_base_shape
     except InputError:
-        return transform(shape.bounds.mean(axis=0))
+        return np.eye(4)
 
 
 def _color(shape: Shape, own: Color) -> Color:

@@ -142,7 +142,7 @@ FORGED: dict[str, tuple[str, dict[str, Any], str]] = {
     "another line": (
         "line",
         {"constraints": [rd.CartesianLine("panda_link5", 0.0005, 0.02, 0.2)]},
-        "is not shown to keep its limit",
+        "they are not those of the problem",
     ),
     "a slower line": ("line", {"constraints": [rd.CartesianLine(HAND, 0.002, 0.02, 0.1)]}, "moves at 0.2"),
 }

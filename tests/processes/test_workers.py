@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -194,3 +195,17 @@ def test_shared_calls_of_a_script_that_processes_cannot_import_say_what_to_do(
         assert ended.stdout == "[(0, 1), (1, 2)]\n"
     else:
         assert ended.stdout.endswith('below the line: if __name__ == "__main__":\n')
+
+
+def slowly(seconds: float) -> None:
+    time.sleep(seconds)
+
+
+def test_calls_while_the_first_process_starts_wait_for_it() -> None:
+    """A call that came meanwhile started the process again: both read the answers of one connection."""
+    with Workers(1, slowly, (0.5,), keep_ready=True) as workers:
+        starting = threading.Thread(target=workers.start)
+        starting.start()
+        time.sleep(0.1)
+        assert [workers.submit(abs, -i) for i in range(3)][2].result(60) == 2
+        starting.join()

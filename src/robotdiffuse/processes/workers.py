@@ -286,6 +286,7 @@ class Workers:
         self._keep_ready = keep_ready
         self._calls: queue.SimpleQueue[Call | None] = queue.SimpleQueue()
         self._threads: list[threading.Thread] = []
+        self._begun = False
         self._closed = False
         self._not_started: NotStartedError | None = None
 
@@ -298,6 +299,7 @@ class Workers:
     def start(self) -> None:
         """Start to take calls. With `keep_ready`, returns when the first process is prepared, and raises what
         prevents that; the others follow."""
+        self._begun = True
         if self._keep_ready:
             self.workers[0].start()
         self._threads = [
@@ -331,7 +333,7 @@ class Workers:
         """The future of `call(*arguments)` in the next idle process; its exceptions are those of
         `Worker.call`."""
         submitted = Call(call, arguments, timeout)
-        if not self._threads:
+        if not self._begun:
             self.start()
         self._calls.put(submitted)
         return submitted
