@@ -25,7 +25,7 @@ import numpy as np
 
 CLIENT_TIMEOUT = 0.5
 """The server waits so long for a request, and for the next one of a connection [s]."""
-ACCESS = re.compile(r" (GET|POST|DELETE|PUT|HEAD|OPTIONS|[A-Z]+) \S* \d{3} \d+\.\d+ s ")
+ACCESS = re.compile(r" \d{3} \d+\.\d{3} s ")
 """A line of the server's access log."""
 LIMIT = 12.0
 """Most wall time until an answer is there or the connection is closed [s]: sending, the time limit of the
