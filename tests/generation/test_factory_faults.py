@@ -110,11 +110,11 @@ def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(
 ) -> None:
     def kill(done: int, _total: int) -> None:
         if done == SHARD:
-            (worker,) = multiprocessing.active_children()
+            worker = multiprocessing.active_children()[0]
             os.kill(worker.pid or 0, signal.SIGKILL)
 
     with pytest.raises(InputError, match=r"worker process was killed.*run the same command again$"):
-        generate(SETTINGS, tmp_path, progress=kill)
+        generate(SETTINGS, tmp_path, workers=2, progress=kill)
     assert 0 < shards(tmp_path) < SHARDS
     monkeypatch.setattr(factory, "on_this_machine", in_this_process)
     generate(SETTINGS, tmp_path)
