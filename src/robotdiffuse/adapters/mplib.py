@@ -6,8 +6,9 @@ Where MPlib says that a plan failed, `status` says why.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.transforms import pose
+from robotdiffuse.core.transforms import inverse, pose
 from robotdiffuse.planning.workspace import Workspace
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.robots import ROBOTS, load_robot
@@ -32,6 +33,7 @@ from robotdiffuse.scenes.shapes import Box, PointCloud, Sphere
 SUCCESS = "Success"
 CLOUD = "point_cloud"
 HELD = "attached"
+DEFAULT_ACCELERATION = 3.5  # with more, controllers of simulators lag behind [rad/s²]
 HELD_JOINT_STEP = 0.002  # grippers are held at multiples of this [rad] or [m]
 
 
@@ -46,7 +48,7 @@ class Planner:
         user_link_names: Ignored: links have the names of the URDF.
         user_joint_names: Joints in the order of `qpos`; none: the planned joints.
         joint_vel_limits: Velocity limits of the planned joints [rad/s]; none: 1, as in MPlib.
-        joint_acc_limits: Their acceleration limits [rad/s²]; none: 1, as in MPlib.
+        joint_acc_limits: Their acceleration limits [rad/s²]; none: 3.5 (MPlib: 1).
 
     Raises:
         InputError: For files that cannot be read, unknown links and joints, and limits of the wrong number.
@@ -74,7 +76,9 @@ class Planner:
         velocity = np.ravel(joint_vel_limits)
         acceleration = np.ravel(joint_acc_limits)
         self.robot = _limited(
-            robot, velocity if len(velocity) else ones, acceleration if len(acceleration) else 3.5 * ones
+            robot,
+            velocity if len(velocity) else ones,
+            acceleration if len(acceleration) else DEFAULT_ACCELERATION * ones,
         )
         self.workspace = Workspace(self.robot, move_group)
         """Robot and obstacles; other obstacles than a point cloud are added here."""
@@ -110,9 +114,9 @@ class Planner:
         Args:
             pose: T_world_base.
         """
-        shapes = self.workspace.scene.moved(self.workspace.T_world_base).shapes
-        self.workspace = Workspace(self.workspace.robot, self.workspace.tip, matrix(pose))
-        self.workspace.add(*shapes)
+        before = self.workspace
+        self.workspace = Workspace(before.robot, before.tip, matrix(pose))
+        self.workspace.scene = before.scene.moved(inverse(self.workspace.T_world_base) @ before.T_world_base)
 
     def update_point_cloud(self, points: ArrayLike, resolution: float = 1e-3, name: str = CLOUD) -> None:
         """Replace the point cloud.
@@ -167,10 +171,11 @@ class Planner:
         """
         start = self._start(start_qpos)
         found = self.workspace.ik(matrix(goal_pose), near=start, count=n_init_qpos)
-        free = [q for q in found if self.workspace.is_free(q)]
+        states = [self.workspace.is_free(q) for q in found]
+        free = [self._qpos(q, start_qpos) for q, state in zip(found, states, strict=True) if state]
         if free:
-            return SUCCESS, [self._qpos(q, start_qpos) for q in free]
-        why = "is out of reach" if not len(found) else f"collides: {self.workspace.is_free(found[0]).reason}"
+            return SUCCESS, free
+        why = f"collides: {states[0].reason}" if states else "is out of reach"
         return f"IK Failed! The pose of {self.workspace.tip} {why}", None
 
     def plan_pose(
@@ -188,24 +193,23 @@ class Planner:
         Returns:
             `status`, "Success" or the reason; and `time`, `position`, `velocity`, `acceleration`, `duration`.
         """
-        return self._planned(self._in_world(goal_pose, options), current_qpos, options)
+        goal = self._in_world(goal_pose, options)
+        return self._planned("planning failed", partial(self.workspace.plan, goal), current_qpos, options)
 
     def plan_qpos(self, goal_qposes: Any, current_qpos: ArrayLike, **options: Any) -> dict[str, Any]:
         """Plan to any of several configurations; see `plan_pose`."""
         goals = np.atleast_2d(np.asarray(goal_qposes, float))
         ends = goals if goals.shape[1] == self.robot.dof else goals[:, self._places]
-        return self._planned(JointGoal(ends), current_qpos, options)
+        plan = partial(self.workspace.plan, JointGoal(ends))
+        return self._planned("planning failed", plan, current_qpos, options)
 
     def plan_screw(self, target_pose: Any, qpos: ArrayLike, *_: Any, **options: Any) -> dict[str, Any]:
         """Move along a straight line, turning evenly; see `plan_pose`."""
-        start = self._start(qpos)
-        try:
-            result = self.workspace.plan_line(
-                self._in_world(target_pose, options), start, time_limit=options.get("planning_time", 1.0)
-            )
-        except InputError as error:
-            return {"status": f"screw plan failed: {error}"}
-        return self._rows(result, "screw plan failed", options)
+
+        def plan(start: ndarray, **request: Any) -> PlanResult:
+            return self.workspace.plan_line(self._in_world(target_pose, options), start, **request)
+
+        return self._planned("screw plan failed", plan, qpos, options)
 
     plan_qpos_to_pose = plan_pose
     plan_qpos_to_qpos = plan_qpos
@@ -222,16 +226,15 @@ class Planner:
         state = self.workspace.is_free(start)
         return [] if state else [state.reason]
 
-    def _planned(self, goal: Any, qpos: ArrayLike, options: dict[str, Any]) -> dict[str, Any]:
+    def _planned(
+        self, failed: str, plan: Callable[..., PlanResult], qpos: ArrayLike, options: dict[str, Any]
+    ) -> dict[str, Any]:
+        """A planned motion as MPlib returns it: a row every `time_step`, and the last one."""
         start = self._start(qpos)
         try:
-            result = self.workspace.plan(goal, start, time_limit=options.get("planning_time", 1.0))
+            result = plan(start, time_limit=options.get("planning_time", 1.0))
         except InputError as error:
-            return {"status": f"planning failed: {error}"}
-        return self._rows(result, "planning failed", options)
-
-    def _rows(self, result: PlanResult, failed: str, options: dict[str, Any]) -> dict[str, Any]:
-        """A motion as MPlib returns it: a row every `time_step`, and the last one."""
+            return {"status": f"{failed}: {error}"}
         trajectory = result.trajectory
         if trajectory is None:
             return {"status": f"{failed}: {result.reason}"}

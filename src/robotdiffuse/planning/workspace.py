@@ -185,8 +185,7 @@ class Workspace:
         Args:
             q: A configuration [dof], or the name of a pose.
         """
-        middle = 0.5 * (self.robot.lower + self.robot.upper)
-        return Problem(self.robot, self.scene, middle, middle).is_free(q)
+        return self._problem(self.scene).is_free(q)
 
     def clearance(self, q: ArrayLike) -> float | ndarray:
         """Lower bound of the distance to obstacles and between links; see `Problem.clearance_at`.
@@ -197,8 +196,7 @@ class Workspace:
         Returns:
             The bound [m], one for each row.
         """
-        middle = 0.5 * (self.robot.lower + self.robot.upper)
-        return Problem(self.robot, self.scene, middle, middle).clearance_at(q)
+        return self._problem(self.scene).clearance_at(q)
 
     def plan(self, goal: Any, start: ArrayLike | str, **request: Any) -> PlanResult:
         """Plan a motion among the obstacles as they are now.
@@ -246,8 +244,12 @@ class Workspace:
         return PoseGoal(self.tip, self._T_base_world @ rigid_transform("goal", goal))
 
     def _configuration(self, q: ArrayLike | str) -> ndarray:
+        return self._problem(Scene(), q).start
+
+    def _problem(self, scene: Scene, start: ArrayLike | str | None = None) -> Problem:
+        """A problem of which only scene and start matter."""
         middle = 0.5 * (self.robot.lower + self.robot.upper)
-        return Problem(self.robot, Scene(), q, middle).start
+        return Problem(self.robot, scene, middle if start is None else start, middle)
 
     def _obstacle(self, name: str) -> Shape:
         for shape in self.scene.shapes:

@@ -55,13 +55,14 @@ def time_curve(
     """
     curve = SmoothCurve(waypoints)
     grid = np.linspace(0.0, curve.knots[-1], GRID_INTERVALS + 1)
-    (velocity, acceleration), jerk = scaled_limits(robot, settings), jerk_limits(robot, settings)
+    widths = np.diff(grid)
+    velocity, acceleration = scaled_limits(robot, settings)
+    jerk = jerk_limits(robot, settings)
     best = None
     least = np.inf
     for share in ACCELERATION_SHARES:
         limits = derivatives_and_limits(curve, grid, velocity, share * acceleration, extra)
         speeds = fastest_speeds(*limits)
-        widths = np.diff(grid)
         ends = np.append(0.0, np.cumsum(2 * widths / (speeds[1:] + speeds[:-1])))
         count = row_count(ends[-1], settings)
         step = ends[-1] / count
