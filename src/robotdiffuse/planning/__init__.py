@@ -144,7 +144,7 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
         if settings is not None:
             raise InputError(f"planner {name} got settings and weights; name the weights in the settings")
         if PLANNERS.entry(name).kind == SEARCH:
-            learned = ", ".join(other for other, its in PLANNERS.items() if its.kind != SEARCH)
+            learned = ", ".join(candidate for candidate, its in PLANNERS.items() if its.kind != SEARCH)
             raise InputError(f"planner {name} has no weights; those that have: {learned}")
         settings = {"weights": str(file_name(weights, "weights"))}
     if isinstance(settings, Mapping):

@@ -72,8 +72,8 @@ class PlanRequest(Settings):
 
 def requested_clearance(problem: Problem, clearance: float | None) -> float:
     """The clearance of a call; if it gives none, the problem's, or the default one [m]."""
-    wanted = (clearance, problem.clearance, DEFAULT_CLEARANCE)
-    return next(value for value in wanted if value is not None)
+    choices = (clearance, problem.clearance, DEFAULT_CLEARANCE)
+    return next(value for value in choices if value is not None)
 
 
 @lru_cache
@@ -203,10 +203,10 @@ class PlanningContext:
         if self._ended:
             return self.fail(*self._ended)
         if self.remaining <= 0:
-            tried = (
+            default_reason = (
                 f"no path was found in {self.elapsed:.2f} s; a longer time limit or another seed may find one"
             )
-            return self.fail(Status.TIMEOUT, reason or tried)
+            return self.fail(Status.TIMEOUT, reason or default_reason)
         ended = f"the search ended after {self.elapsed:.2f} s without a path; another seed may find one"
         return self.fail(Status.NO_PATH, reason or ended)
 
@@ -223,8 +223,8 @@ class PlanningContext:
         before = (
             f"the search began after {self._prepared:.2f} s" if self._prepared else "before the search began"
         )
-        found = f", its first path came after {self.first_path_at:.2f} s" if self._progress else ""
-        return f"{limit}: there was no time for {error} after {self.elapsed:.2f} s; {before}{found}"
+        first_path_note = f", its first path came after {self.first_path_at:.2f} s" if self._progress else ""
+        return f"{limit}: there was no time for {error} after {self.elapsed:.2f} s; {before}{first_path_note}"
 
     @property
     def ended(self) -> bool:
@@ -297,10 +297,10 @@ class PlanningContext:
         scene = _least(report.scene_clearance, timed.scene_clearance)
         itself = _least(report.self_clearance, timed.self_clearance)
         # the time at which the search noted this length; the shorter paths that it noted were refused
-        whole = path.length
-        same = whole * 1e-3
-        longer = [(at, length) for at, length in self._progress if length > whole + same]
-        found = [at for at, length in self._progress if abs(length - whole) <= same]
+        final_length = path.length
+        tolerance = final_length * 1e-3
+        longer = [(at, length) for at, length in self._progress if length > final_length + tolerance]
+        times = [at for at, length in self._progress if abs(length - final_length) <= tolerance]
         return PlanResult(
             status=Status.SOLVED,
             reason=reason or f"solved by {stage}",
@@ -316,7 +316,7 @@ class PlanningContext:
             scene_clearance=scene,
             self_clearance=itself,
             notes=(*self.notes, *notes),
-            progress=(*longer, (found[0] if found else planning_time, whole)),
+            progress=(*longer, (times[0] if times else planning_time, final_length)),
             refused=self._refused,
         )
 

@@ -73,8 +73,8 @@ class ModelSampler(ExportedPlanner[SamplerSettings]):
 
         Raises InputError if the settings name weights of another robot, or ones that cannot be read.
         """
-        known = self.settings.weights or weights_for(self.network_name, robot)
-        return self.network(robot) if known else None
+        weights = self.settings.weights or weights_for(self.network_name, robot)
+        return self.network(robot) if weights else None
 
     def guidance_scale(self, model: "MotionModel") -> float:
         """Scale of classifier-free guidance for a model."""
@@ -175,8 +175,8 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         # where none is, the validator is asked about one once more, so that the result says what is wrong
         # with it
         for path in sorted(valid or every[-1:], key=lambda path: path.length):
-            how = f"solved by network: {reason}"
-            result = context.finish(path.positions, "network", how, keeps=context.keeps_constraints)
+            solved_reason = f"solved by network: {reason}"
+            result = context.finish(path.positions, "network", solved_reason, keeps=context.keeps_constraints)
             if result is not None:
                 return result
         return context.unsolved(reason)

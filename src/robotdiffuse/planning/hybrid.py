@@ -162,8 +162,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         )
         if model is not None or result.stage == "straight_line":
             return result
-        how = "search and smooth noise" if batches.drawn else "search alone"
-        note = f"there are no weights for {robot.name}; planned by {how}"
+        methods = "search and smooth noise" if batches.drawn else "search alone"
+        note = f"there are no weights for {robot.name}; planned by {methods}"
         return replace(result, notes=(*result.notes, note))
 
     def code(
@@ -243,8 +243,8 @@ class _Batches:
                 q = planner.noise(checker, *ends, rng)
             else:
                 q = planner.draw(model, checker, self._code, *ends, rng)
-        taken = self._take(q, "smooth_noise" if model is None else "network")
-        if model is not None and not taken and self._time_for("refinement"):
+        accepted = self._take(q, "smooth_noise" if model is None else "network")
+        if model is not None and not accepted and self._time_for("refinement"):
             with self._timed("refinement"):
                 q = planner.refine(checker, q)
             self._take(q, "refinement")

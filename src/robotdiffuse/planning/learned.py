@@ -79,6 +79,6 @@ def scene_clouds(
     """Random clouds of the scene's obstacles [m]; zeros if nothing is in the region."""
     clouds = np.zeros((count, points, 3), np.float32)
     for cloud in clouds:
-        found = sample_surface(checker.scene, points, rng, region)
-        cloud[: len(found)] = found
+        surface_points = sample_surface(checker.scene, points, rng, region)
+        cloud[: len(surface_points)] = surface_points
     return clouds

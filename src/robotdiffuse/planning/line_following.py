@@ -68,51 +68,51 @@ def follow_line(context: PlanningContext) -> PlanResult | None:
     targets = _poses(T_start, T_end)
     fraction = 0.0
     why = ""
-    found = list[Float[ndarray, "n dof"]]()
+    candidates = list[Float[ndarray, "n dof"]]()
 
     def tried(end: Float[ndarray, "dof"] | None) -> bool:
         """Whether the line can be followed to an end."""
         nonlocal fraction, why
         rows = _followed(problem, line, targets, end)
-        done = (len(rows) - 1) / len(targets)
-        if done < 1.0:
-            if done >= fraction:
-                fraction = done
+        fraction_followed = (len(rows) - 1) / len(targets)
+        if fraction_followed < 1.0:
+            if fraction_followed >= fraction:
+                fraction = fraction_followed
                 why = _obstruction(robot, rows[-1])
         elif end is None or np.abs(rows[-1] - end).max() < SAME:
-            found.append(rows)
+            candidates.append(rows)
         else:
             why = why or "there the arm has another configuration than the goal"
-        return done == 1.0
+        return fraction_followed == 1.0
 
     if isinstance(problem.goal, JointGoal):
         for end in robot.nearest_turns(problem.goal.positions, problem.start):
             tried(end)
     elif not tried(None):
-        only = replace(ROUND, position_only=line.angle is None)
+        round_settings = replace(ROUND, position_only=line.angle is None)
         ends = inverse_kinematics(
             robot,
             line.frame,
             T_end,
             OTHER_ENDS,
             rng=context.rng,
-            settings=only,
+            settings=round_settings,
             near=problem.start,
             rest=problem.start,
         )
         for end in ends:
             tried(end)
-    timed = [time_curve(robot, rows, context.timing, context.beside) for rows in found]
-    for trajectory, rows in sorted(zip(timed, found, strict=True), key=lambda one: one[0].duration):
+    timed = [time_curve(robot, rows, context.timing, context.beside) for rows in candidates]
+    for trajectory, rows in sorted(zip(timed, candidates, strict=True), key=lambda one: one[0].duration):
         context.improved(float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum()))
         result = context.finish(rows, STAGE, "solved along the straight line", trajectory=trajectory)
         if result is not None:
             return replace(result, fraction=1.0)
         if context.ended:
             break
-        done, message = context.refused_at
-        if done >= fraction:
-            fraction = done
+        fraction_followed, message = context.refused_at
+        if fraction_followed >= fraction:
+            fraction = fraction_followed
             why = message
     why = f"from the start the line can be followed for {100 * fraction:.0f} %: {why}"
     return replace(context.fail(Status.NO_PATH, why), fraction=fraction)

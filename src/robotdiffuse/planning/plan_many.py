@@ -79,10 +79,10 @@ def plan_many(
         check_problem(problem, f"problems[{i}]")
     if workers is not None and not (isinstance(workers, Integral) and workers >= 1):
         raise InputError(f"workers is {shown(workers)}; it must be a whole number, at least 1")
-    known = {field.name for field in fields(PlanRequest)}
-    unknown = set(request) - known
+    arguments = {field.name for field in fields(PlanRequest)}
+    unknown = set(request) - arguments
     if unknown:
-        raise InputError(f"unknown argument {shown(min(unknown))}; known: {', '.join(sorted(known))}")
+        raise InputError(f"unknown argument {shown(min(unknown))}; known: {', '.join(sorted(arguments))}")
     load_planner(planner, settings, weights)
     if cluster is not None:
         if cluster not in CLUSTERS:
@@ -98,9 +98,9 @@ def plan_many(
 
 def _reported(results: Results, total: int, progress: Callable[[int, int], object] | None) -> Results:
     with closing(results):
-        for done, result in enumerate(results, start=1):
+        for completed, result in enumerate(results, start=1):
             if progress is not None:
-                progress(done, total)
+                progress(completed, total)
             yield result
 
 
@@ -140,8 +140,8 @@ def _planned_on_cluster(
     calls = [
         (loaded, request, sent[i : i + PROBLEMS_PER_TASK]) for i in range(0, len(sent), PROBLEMS_PER_TASK)
     ]
-    with closing(CLUSTERS[cluster](_plan_on_node, calls)) as made:
-        for number, results in made:
+    with closing(CLUSTERS[cluster](_plan_on_node, calls)) as batches:
+        for number, results in batches:
             for i, result in enumerate(results, start=number * PROBLEMS_PER_TASK):
                 yield i, replace(result, problem=problems[i])
 
@@ -151,16 +151,16 @@ def _plan_on_node(
 ) -> list[PlanResult]:
     planner = load_planner(*loaded)
     warm = set[Robot]()
-    found = []
+    results = []
     for problem in problems:
         try:
             if problem.robot not in warm:
                 planner.warm_up(problem)
                 warm.add(problem.robot)
-            found.append(replace(planner.plan(problem, **vars(request)), problem=None))
+            results.append(replace(planner.plan(problem, **vars(request)), problem=None))
         except Exception as error:
-            found.append(_error(loaded[0], problem, f"{type(error).__name__}: {error}", request))
-    return found
+            results.append(_error(loaded[0], problem, f"{type(error).__name__}: {error}", request))
+    return results
 
 
 def _error(planner: str, problem: Problem, reason: str, request: PlanRequest) -> PlanResult:

@@ -78,10 +78,10 @@ class Planner(ABC, Generic[PlannerSettings]):
 
     def _plan(self, problem: Problem, request: PlanRequest) -> PlanResult:
         clearance = problem.clearance if request.clearance is None else request.clearance
-        for what, wanted in ((PATH_CONSTRAINTS, bool(problem.constraints)), (CLEARANCE, bool(clearance))):
-            if wanted and what not in self.supports:
-                able = ", ".join(planners_that_support(what))
-                raise InputError(f"planner {self.name} does not support {what}; these do: {able}")
+        for feature, needed in ((PATH_CONSTRAINTS, bool(problem.constraints)), (CLEARANCE, bool(clearance))):
+            if needed and feature not in self.supports:
+                able = ", ".join(planners_that_support(feature))
+                raise InputError(f"planner {self.name} does not support {feature}; these do: {able}")
         self.prepare(problem.robot)
         return pipeline_for(problem)(self, problem, request)
 

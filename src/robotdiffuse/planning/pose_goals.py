@@ -69,31 +69,35 @@ def pose_configurations(
     poses = poses_of(goal)
     together = PathConstraints(problem, poses, exact)
     solutions = [np.zeros((0, robot.dof))] * len(poses)
-    found = np.zeros((0, robot.dof))
+    configurations = np.zeros((0, robot.dof))
     reached = False
-    idle = 0
+    stale_rounds = 0
     for k in range(rounds):
         check_time("configurations of the goal pose")
-        most = count if k == 0 else SEEDS
+        seed_count = count if k == 0 else SEEDS
         # projection ends at the edges of the tolerances, so every other round keeps only a part of them
         aims = poses
         if k % 2:
             part = rng.uniform()
             aims = [_within(pose, part) for pose in poses]
-        new = [at_pose(problem, aim, most, rng, exact) for aim in aims]
+        new = [at_pose(problem, aim, seed_count, rng, exact) for aim in aims]
         solutions = [np.concatenate([before, more]) for before, more in zip(solutions, new, strict=True)]
         seeds = new[0] if len(poses) == 1 else _combined(problem, poses, solutions, rng)
         if len(poses) > 1 or problem.constraints:
             seeds = together.projected(np.concatenate([start[None], seeds]), TOLERANCE_FRACTION)
         reached = reached or len(seeds) > 0
         accepted = _accepted(robot.nearest_turns(seeds, start), accept)
-        before = len(found)
-        found = _distinct(np.concatenate([found, accepted]))[:count]
-        idle = 0 if len(found) > before else idle + 1
-        if len(found) >= count or (len(found) and idle >= PATIENCE) or (k >= REACH_ROUNDS and not reached):
+        before = len(configurations)
+        configurations = _distinct(np.concatenate([configurations, accepted]))[:count]
+        stale_rounds = 0 if len(configurations) > before else stale_rounds + 1
+        if (
+            len(configurations) >= count
+            or (len(configurations) and stale_rounds >= PATIENCE)
+            or (k >= REACH_ROUNDS and not reached)
+        ):
             break
-    nearer = _accepted(_pulled(together, found, start), accept)
-    every = np.concatenate([nearer, found])
+    nearer = _accepted(_pulled(together, configurations, start), accept)
+    every = np.concatenate([nearer, configurations])
     return _distinct(every[np.argsort(np.linalg.norm(every - start, axis=1), kind="stable")])[:count]
 
 
@@ -160,8 +164,8 @@ def _accepted(q: Configurations, accept: Accept | None) -> Configurations:
 
 def _distinct(q: Configurations) -> Configurations:
     """The configurations without those close to one before them."""
-    kept = q[:0]
+    unique = q[:0]
     for row in q:
-        if (np.abs(kept - row).max(axis=1, initial=0.0) > MIN_DIFFERENCE).all():
-            kept = np.concatenate([kept, row[None]])
-    return kept
+        if (np.abs(unique - row).max(axis=1, initial=0.0) > MIN_DIFFERENCE).all():
+            unique = np.concatenate([unique, row[None]])
+    return unique

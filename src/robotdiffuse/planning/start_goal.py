@@ -149,12 +149,12 @@ def images(robot: Robot, start: Configuration, goal: Configuration) -> list[Conf
     obstacle may block the short way.
     """
     nearest = goal - robot.whole_turns(goal - start)
-    found = [nearest]
+    images = [nearest]
     for j in np.flatnonzero(robot.continuous):
-        other = nearest.copy()
-        other[j] -= np.copysign(2 * np.pi, nearest[j] - start[j])
-        found.append(other)
-    return found
+        image = nearest.copy()
+        image[j] -= np.copysign(2 * np.pi, nearest[j] - start[j])
+        images.append(image)
+    return images
 
 
 def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
@@ -173,9 +173,9 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
         why = closeness(checker, context.problem.start)
         return context.fail(Status.INVALID_START, f"the start is too close to contact to plan from: {why}")
     if not start_goal.goals:
-        what = "the goal is" if len(goals) == 1 else f"all {len(goals)} goal configurations are"
+        subject = "the goal is" if len(goals) == 1 else f"all {len(goals)} goal configurations are"
         why = closeness(checker, goals[0])
-        return context.fail(Status.INVALID_GOAL, f"{what} too close to contact to plan to: {why}")
+        return context.fail(Status.INVALID_GOAL, f"{subject} too close to contact to plan to: {why}")
     return start_goal
 
 
@@ -205,17 +205,17 @@ def closeness(checker: CollisionChecker, q: Configuration) -> str:
     """A message that says where the covering spheres penetrate deepest, for a configuration whose meshes are
     free."""
     clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
-    worst = int(clearances.argmin())
-    link, other = [*((link, None) for link in checker.links), *checker.pairs][worst]
+    deepest = int(clearances.argmin())
+    link, partner = [*((link, None) for link in checker.links), *checker.pairs][deepest]
     with loading():
         from robotdiffuse.collision.exact_meshes import ExactCollision  # imports Coal, rarely needed
 
     exact = ExactCollision(checker.robot, checker.scene)
-    check = [frozenset(check) for check in exact.checks].index(frozenset((link, other)))
+    check = [frozenset(check) for check in exact.checks].index(frozenset((link, partner)))
     [distance], [obstacle] = exact.nearest(q[None], np.array([check]), np.array([np.inf]))
-    spheres = str(obstacle) if other is None else f"those of {other}"
+    spheres = str(obstacle) if partner is None else f"those of {partner}"
     return (
-        f"the covering spheres of {link} reach {-1e3 * float(clearances[worst]):.1f} mm into {spheres}, "
+        f"the covering spheres of {link} reach {-1e3 * float(clearances[deepest]):.1f} mm into {spheres}, "
         f"though the meshes are {1e3 * float(distance):.1f} mm apart"
     )
 
@@ -241,11 +241,11 @@ def _usable_goals(context: PlanningContext, checker: CollisionChecker) -> Config
     goals = _goals(context, context.problem.goal, checker)
     if isinstance(goals, PlanResult):
         return goals
-    held = [q for q in goals if _too_heavy(context, q) is None]
-    if not held:
+    holdable = [q for q in goals if _too_heavy(context, q) is None]
+    if not holdable:
         reason = f"the payload cannot be held at the goal: {_too_heavy(context, goals[0])}"
         return context.fail(Status.INVALID_GOAL, reason)
-    return goals if len(held) == len(goals) else np.stack(held)
+    return goals if len(holdable) == len(goals) else np.stack(holdable)
 
 
 def _too_heavy(context: PlanningContext, q: Configuration) -> str | None:
@@ -272,19 +272,19 @@ def _any_goals(
     for goal in goals:
         if free and context.elapsed > until:
             break
-        found = _first_try(context, goal, checker)
-        free += [found] if len(found) else []
+        result = _first_try(context, goal, checker)
+        free += [result] if len(result) else []
     if free:
         return np.concatenate(free)
     failures = list[PlanResult]()
     for goal in goals:
         if (free or failures) and context.elapsed > until:
             break
-        found = _goals(context, goal, checker)
-        if isinstance(found, PlanResult):
-            failures.append(found)
+        result = _goals(context, goal, checker)
+        if isinstance(result, PlanResult):
+            failures.append(result)
         else:
-            free.append(found)
+            free.append(result)
     if free:
         return np.concatenate(free)
     return replace(
@@ -296,12 +296,14 @@ def _first_try(context: PlanningContext, goal: OneGoal, checker: CollisionChecke
     """Free configurations of one of several goals, by little work."""
     if isinstance(goal, JointGoal):
         constraints = context.validator.constraints
-        kept = checker.free(goal.positions)
-        return goal.positions[kept if constraints is None else kept & constraints.satisfied(goal.positions)]
-    found = _pose_configurations()(
+        collision_free = checker.free(goal.positions)
+        return goal.positions[
+            collision_free if constraints is None else collision_free & constraints.satisfied(goal.positions)
+        ]
+    configurations = _pose_configurations()(
         context.problem, goal, context.rng, checker.free, count=FIRST_TRY_COUNT, rounds=1
     )
-    return _with_turns(context, found) if len(found) else found
+    return _with_turns(context, configurations) if len(configurations) else configurations
 
 
 def _free_goals(
@@ -310,23 +312,25 @@ def _free_goals(
     positions = goal.positions
     constraints = context.validator.constraints
     if constraints is not None:
-        kept = constraints.satisfied(positions)
-        if not kept.any():
-            what = "the goal does" if len(kept) == 1 else f"all {len(kept)} goal configurations do"
+        satisfied = constraints.satisfied(positions)
+        if not satisfied.any():
+            subject = (
+                "the goal does" if len(satisfied) == 1 else f"all {len(satisfied)} goal configurations do"
+            )
             wrong = constraints.worst_violation(positions[0])
             assert wrong is not None
-            reason = f"{what} not keep the constraints: {wrong.message}"
+            reason = f"{subject} not keep the constraints: {wrong.message}"
             return context.fail(Status.INVALID_GOAL, reason)
-        positions = positions[kept]
+        positions = positions[satisfied]
     free = checker.free(positions)
     if free.any():
         return positions[free]
     collisions = [_explained(context.problem.robot, context.problem.scene, q) for q in positions]
-    kept = [q for q, collision in zip(positions, collisions, strict=True) if collision is None]
-    if kept:
-        return np.stack(kept)
-    what = "the goal is" if len(collisions) == 1 else f"all {len(collisions)} goal configurations are"
-    return context.fail(Status.INVALID_GOAL, f"{what} in collision: {collisions[0]}")
+    usable = [q for q, collision in zip(positions, collisions, strict=True) if collision is None]
+    if usable:
+        return np.stack(usable)
+    subject = "the goal is" if len(collisions) == 1 else f"all {len(collisions)} goal configurations are"
+    return context.fail(Status.INVALID_GOAL, f"{subject} in collision: {collisions[0]}")
 
 
 def _pose_goals(
@@ -349,13 +353,15 @@ def _pose_goals(
     def distances(q: Configurations) -> Float[ndarray, "n"]:
         return np.linalg.norm(q - start, axis=1)
 
-    found = pose_configurations(problem, goal, rng, free)
+    configurations = pose_configurations(problem, goal, rng, free)
     note = ""
-    if not len(found) and not len(rejected):
+    if not len(configurations) and not len(rejected):
         for part in NEAR_POSE_FRACTIONS:
             near = part * DEFAULT.goal_distance, part * DEFAULT.goal_angle
-            found = pose_configurations(problem, goal, rng, free, rounds=NEAR_POSE_ROUNDS, exact=near)
-            if len(found) or len(rejected):
+            configurations = pose_configurations(
+                problem, goal, rng, free, rounds=NEAR_POSE_ROUNDS, exact=near
+            )
+            if len(configurations) or len(rejected):
                 note = (
                     f"no configuration reaches the goal pose exactly; the motion ends within "
                     f"{1e3 * near[0]:g} mm and {np.degrees(near[1]):.2g} degrees of it"
@@ -364,14 +370,16 @@ def _pose_goals(
     # meshes may be free where the covering spheres are not
     rejected = rejected[np.unique(np.round(rejected, 1), axis=0, return_index=True)[1]]
     rejected = rejected[np.argsort(distances(rejected), kind="stable")][:MAX_EXACT_GOALS]
-    if len(found):
-        rejected = rejected[distances(rejected) < distances(found[:1])]
+    if len(configurations):
+        rejected = rejected[distances(rejected) < distances(configurations[:1])]
     if len(rejected):
-        found = np.concatenate([_free_meshes(robot, scene, rejected)[:MAX_GRAZING_GOALS], found])
-    if len(found):
+        configurations = np.concatenate(
+            [_free_meshes(robot, scene, rejected)[:MAX_GRAZING_GOALS], configurations]
+        )
+    if len(configurations):
         if note:
             context.note(note)
-        return _with_turns(context, found)
+        return _with_turns(context, configurations)
     places = [", ".join(f"{value:.3f}" for value in pose.T_base_frame[:3, 3]) for pose in poses_of(goal)]
     named = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
     of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in named.items())
@@ -380,8 +388,8 @@ def _pose_goals(
         reached = pose_configurations(unconstrained, goal, rng)
         wrong = context.validator.constraints.worst_violation(reached[0]) if len(reached) else None
         if wrong is not None:
-            what = f"no configuration was found for {of_poses} that keeps the"
-            return context.fail(Status.INVALID_GOAL, f"{what} constraints, e.g. {wrong.message}")
+            prefix = f"no configuration was found for {of_poses} that keeps the"
+            return context.fail(Status.INVALID_GOAL, f"{prefix} constraints, e.g. {wrong.message}")
     if not len(rejected):
         several = poses_of(goal) if len(named) > 1 else ()
         alone = [pose.frame for pose in several if not len(pose_configurations(unconstrained, pose, rng))]

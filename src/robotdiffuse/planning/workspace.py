@@ -76,8 +76,8 @@ class Workspace:
             raise InputError(
                 f"shapes are named {', '.join(shape.name for shape in shapes)}; names must differ"
             )
-        kept = [shape for shape in self.scene.shapes if shape.name not in names]
-        self.scene = self.scene.with_shapes([*kept, *new])
+        remaining = [shape for shape in self.scene.shapes if shape.name not in names]
+        self.scene = self.scene.with_shapes([*remaining, *new])
 
     def move(self, name: str, T_world_shape: ArrayLike) -> None:
         """Move an obstacle.

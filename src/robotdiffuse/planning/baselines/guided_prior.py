@@ -146,15 +146,15 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
         """Of the samples that collide: segments in collision, length [rad] and waypoints."""
         batches = 0
         while context.remaining > 0:
-            drawn = self.draw(
+            trajectories = self.draw(
                 prior, start_goal.checker, start, goals, context.rng, lambda: context.remaining <= 0
             )
-            if drawn is None:
+            if trajectories is None:
                 break
             batches += 1
             attempts = [
                 (int((~motions_free(space, path)).sum()), float(path_length(path)), path)
-                for path in np.ascontiguousarray(drawn, np.float32)
+                for path in np.ascontiguousarray(trajectories, np.float32)
             ]
             for attempt in sorted(attempts, key=lambda attempt: attempt[:2]):
                 if attempt[0]:
@@ -227,8 +227,8 @@ def sample(
 def falling(rising: Int[ndarray, "steps"], most: int) -> Int[ndarray, "steps"]:
     """Rising levels in reverse order, with equal ones moved apart, up to `most`."""
     at = np.arange(len(rising))
-    apart = np.maximum.accumulate(rising - at) + at
-    return np.minimum(apart, most - at[::-1])[::-1].copy()
+    spaced = np.maximum.accumulate(rising - at) + at
+    return np.minimum(spaced, most - at[::-1])[::-1].copy()
 
 
 def shared_out(
@@ -256,8 +256,8 @@ def collision_gradient(
     count, waypoints, dof = q.shape
     shares = np.arange(1, between + 1, dtype=np.float32) / (between + 1)
     step = np.diff(q, axis=1)[:, :, None]
-    inner = q[:, :-1, None] + shares[:, None] * step
-    every = np.concatenate([q.reshape(-1, dof), inner.reshape(-1, dof)])
+    between_waypoints = q[:, :-1, None] + shares[:, None] * step
+    every = np.concatenate([q.reshape(-1, dof), between_waypoints.reshape(-1, dof)])
     squares, gradients = checker.cost_gradients(every, margin, self_margin)
     depth = np.sqrt(2 * squares)
     gradients = gradients / np.maximum(depth, np.float32(1e-6))[:, None]
@@ -267,7 +267,7 @@ def collision_gradient(
     if between:
         weight = np.float32(1 / between)
         costs = costs + weight * depth[at_waypoints:].reshape(count, -1).sum(1)
-        by_place = weight * gradients[at_waypoints:].reshape(inner.shape)
+        by_place = weight * gradients[at_waypoints:].reshape(between_waypoints.shape)
         by_frame[:, :-1] += ((1 - shares)[:, None] * by_place).sum(2)
         by_frame[:, 1:] += (shares[:, None] * by_place).sum(2)
     return costs, by_frame
@@ -359,8 +359,8 @@ def exponential_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "ste
     schedule.sampling_levels(steps)
     betas = np.geomspace(*EXPONENTIAL_BETAS, steps)
     alpha_bar = np.cumprod(1 - betas)[:-1]
-    wanted = 0.5 * np.log(alpha_bar / (1 - alpha_bar))
-    nearest = np.abs(schedule.half_log_snr[1:, None] - wanted).argmin(0) + 1
+    target_log_snr = 0.5 * np.log(alpha_bar / (1 - alpha_bar))
+    nearest = np.abs(schedule.half_log_snr[1:, None] - target_log_snr).argmin(0) + 1
     return falling(np.append(nearest, schedule.steps), schedule.steps)
 
 
@@ -401,9 +401,9 @@ def implicit_step(q: Trajectories, weight: float) -> Trajectories:
 
     It solves x = q - weight P x, the minimum of |x - q|² / 2 + weight x P x / 2 with fixed ends.
     """
-    inner, ends = _implicit(q.shape[1], weight)
+    interior_map, end_map = _implicit(q.shape[1], weight)
     moved = q.copy()
-    moved[:, 1:-1] = inner.astype(q.dtype) @ q[:, 1:-1] + ends.astype(q.dtype) @ q[:, [0, -1]]
+    moved[:, 1:-1] = interior_map.astype(q.dtype) @ q[:, 1:-1] + end_map.astype(q.dtype) @ q[:, [0, -1]]
     return moved
 
 
@@ -516,5 +516,5 @@ def quadratic_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps
     Raises InputError unless there are that many levels.
     """
     schedule.sampling_levels(steps)
-    wanted = schedule.steps * (np.arange(1, steps + 1) / steps) ** 2
-    return falling(np.maximum(wanted.round().astype(np.int64), 1), schedule.steps)
+    targets = schedule.steps * (np.arange(1, steps + 1) / steps) ** 2
+    return falling(np.maximum(targets.round().astype(np.int64), 1), schedule.steps)

@@ -66,24 +66,24 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         network = self.network(context.problem.robot)
         rng = context.rng
         best: _Motion | None = None
-        tried = 0
+        roll_outs = 0
         while best is None or context.remaining > 0:
-            count = self.settings.batch if tried else 1
-            for motion in self._roll_outs(context, network, start_goal, tried, count, rng):
+            count = self.settings.batch if roll_outs else 1
+            for motion in self._roll_outs(context, network, start_goal, roll_outs, count, rng):
                 if motion.free:
                     result = context.finish(motion.path(start_goal), "policy")
                     if result is not None:
                         return result
                 if best is None or motion.arrived > best.arrived:
                     best = motion
-            tried += count
+            roll_outs += count
         # the validator checks the meshes, which are smaller than the covering spheres: it may be valid after
         # all
         result = context.finish(best.path(start_goal), "policy")
         if result is not None:
             return result
-        what = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
-        return context.unsolved(f"{tried} roll-outs of the policy, the best of which {what}")
+        outcome = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
+        return context.unsolved(f"{roll_outs} roll-outs of the policy, the best of which {outcome}")
 
     def _roll_outs(
         self,

@@ -80,15 +80,15 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
         rounds = 0
         while rounds == 0 or context.remaining > 0:
             one = NeuralPlanning(context, start_goal, network, settings, context.rng)
-            found = one.best()
+            candidate = one.best()
             rounds += 1
-            if found.broken == 0:
-                result = context.finish(start_goal.complete(found.path), self.name, one.reason(rounds))
+            if candidate.broken == 0:
+                result = context.finish(start_goal.complete(candidate.path), self.name, one.reason(rounds))
                 if result is not None:
                     return result
                 settings = replace(settings, resolution=finer_resolution(settings.resolution))
-            elif found.broken < best.broken:
-                best = found
+            elif candidate.broken < best.broken:
+                best = candidate
         if len(best.path):
             result = context.finish(start_goal.complete(best.path), self.name)
             if result is not None:
@@ -148,8 +148,8 @@ class NeuralPlanning:
             paths = [self.contracted(path) for path in self.replan(paths)]
             free = [self.segments_free(path) for path in paths]
         if self.settings.hybrid and not any(f.all() for f in free):
-            least = int(np.argmin([(~f).sum() for f in free]))
-            paths = [self.contracted(self.search(paths[least]))]
+            best_index = int(np.argmin([(~f).sum() for f in free]))
+            paths = [self.contracted(self.search(paths[best_index]))]
             free = [self.segments_free(paths[0])]
         attempts = [
             Attempt(float((~f).sum()), float(path_length(path)), path)
@@ -158,8 +158,8 @@ class NeuralPlanning:
         return min(attempts, key=lambda attempt: attempt[:2])
 
     def reason(self, rounds: int) -> str:
-        how = " and RRT-Connect" if self.searched else ""
-        return f"solved by {MPNet.name}: round {rounds}, after {self.replanned} neural replannings{how}"
+        methods = " and RRT-Connect" if self.searched else ""
+        return f"solved by {MPNet.name}: round {rounds}, after {self.replanned} neural replannings{methods}"
 
     def between(
         self, starts: Configurations, goals: Configurations, one_will_do: bool = False
@@ -175,37 +175,42 @@ class NeuralPlanning:
         back = [[q] for q in goals]
         near = forth
         far = back
-        apart = list(range(len(starts)))
+        unconnected = list(range(len(starts)))
         for _ in range(self.settings.steps):
-            if not apart or self.context.remaining <= 0:
+            if not unconnected or self.context.remaining <= 0:
                 break
-            q, goal = (np.stack([rows[i][-1] for i in apart]) for rows in (near, far))
-            for i, state in zip(apart, self.next_states(q, goal), strict=True):
+            q, goal = (np.stack([rows[i][-1] for i in unconnected]) for rows in (near, far))
+            for i, state in zip(unconnected, self.next_states(q, goal), strict=True):
                 near[i].append(state)
-            met = [i for i in apart if self.segments_free(np.stack([near[i][-1], far[i][-1]]))[0]]
-            if one_will_do and any(self.segments_free(_joined(forth[i], back[i])).all() for i in met):
+            connected = [i for i in unconnected if self.segments_free(np.stack([near[i][-1], far[i][-1]]))[0]]
+            if one_will_do and any(self.segments_free(_joined(forth[i], back[i])).all() for i in connected):
                 break
-            apart = [i for i in apart if i not in met]
+            unconnected = [i for i in unconnected if i not in connected]
             near, far = far, near
         return [_joined(*rows) for rows in zip(forth, back, strict=True)]
 
     def replan(self, paths: list[Configurations]) -> list[Configurations]:
         """The paths without their states in collision, with new states where the straight line is not
         free."""
-        kept = [self.without_collisions(path) for path in paths]
+        free_states = [self.without_collisions(path) for path in paths]
         broken = [
-            (a, int(i)) for a, path in enumerate(kept) for i in np.flatnonzero(~self.segments_free(path))
+            (a, int(i))
+            for a, path in enumerate(free_states)
+            for i in np.flatnonzero(~self.segments_free(path))
         ]
         if not broken:
-            return kept
-        starts, goals = (np.stack([kept[a][i + end] for a, i in broken]) for end in (0, 1))
-        found = dict(zip(broken, self.between(starts, goals), strict=True))
+            return free_states
+        starts, goals = (np.stack([free_states[a][i + end] for a, i in broken]) for end in (0, 1))
+        connections = dict(zip(broken, self.between(starts, goals), strict=True))
         return [
             np.concatenate(
                 [path[:1]]
-                + [found[a, i][1:] if (a, i) in found else path[i + 1, None] for i in range(len(path) - 1)]
+                + [
+                    connections[a, i][1:] if (a, i) in connections else path[i + 1, None]
+                    for i in range(len(path) - 1)
+                ]
             )
-            for a, path in enumerate(kept)
+            for a, path in enumerate(free_states)
         ]
 
     def search(self, path: Configurations) -> Configurations:
@@ -213,10 +218,10 @@ class NeuralPlanning:
         free; as far as time allows."""
         self.searched = True
         path = self.without_collisions(path)
-        pieces = [path[:1]]
+        segments = [path[:1]]
         for (a, b), seen in zip(pairwise(path), self.segments_free(path), strict=True):
-            pieces.append(b[None] if seen else self.searched_between(a, b)[1:])
-        return np.concatenate(pieces)
+            segments.append(b[None] if seen else self.searched_between(a, b)[1:])
+        return np.concatenate(segments)
 
     def searched_between(self, a: Configuration, b: Configuration) -> Configurations:
         """A free path from a to b by RRT-Connect; the straight line if time runs out."""

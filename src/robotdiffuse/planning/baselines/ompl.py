@@ -211,12 +211,12 @@ class OmplPlanner(Planner[OmplSettings]):
         attempt = 0
         start, goals = start_goal.rows()
         nearest = float(np.linalg.norm(goals - start, axis=1).min())
-        enough = (1 + OPTIMAL) * max(nearest, SAME_STATE_DISTANCE)
+        target_length = (1 + OPTIMAL) * max(nearest, SAME_STATE_DISTANCE)
         best = None
         shortest = np.inf
         searched = np.inf
         search = _Search(context, start_goal, self, settings, attempt)
-        while search.run(shorter_than=max((1 - IMPROVEMENT) * searched, enough)):
+        while search.run(shorter_than=max((1 - IMPROVEMENT) * searched, target_length)):
             path = Path(problem.robot.joint_names, start_goal.complete(search.path()))
             searched = search.cost
             if path.length < shortest:
@@ -224,7 +224,7 @@ class OmplPlanner(Planner[OmplSettings]):
                     best = path.positions
                     shortest = path.length
                     context.improved(shortest)
-                    if searched <= enough:
+                    if searched <= target_length:
                         break
                 else:
                     settings = replace(settings, resolution=finer_resolution(settings.resolution))

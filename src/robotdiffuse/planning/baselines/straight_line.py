@@ -31,13 +31,13 @@ class StraightLine(Planner[StraightLineSettings]):
         """See `planning.planner.Planner`."""
         start, goals = start_goal.rows()
         order = np.argsort(np.linalg.norm(goals - start, axis=1))
-        tried = order[:1] if self.settings.goals == NEAREST else order
-        for goal in goals[tried]:
+        selected = order[:1] if self.settings.goals == NEAREST else order
+        for goal in goals[selected]:
             path = start_goal.complete(np.stack([start, goal]))
             result = context.finish(path, "straight_line", "solved by the straight line")
             if result is not None:
                 return result
             if context.ended:
                 break
-        plural = "line is" if len(tried) == 1 else f"lines to {len(tried)} goal configurations are"
+        plural = "line is" if len(selected) == 1 else f"lines to {len(selected)} goal configurations are"
         return context.unsolved(f"the straight {plural} refused")

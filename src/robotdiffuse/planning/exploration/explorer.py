@@ -222,10 +222,10 @@ class Explorer:
                 return Step(STUCK, "at the goal the arm reaches out of the map", policy)
             problem = replace(problem, goal=JointGoal(np.stack(goals)))
         if self.settings.see_goal:
-            found = self._goals(problem)
-            if isinstance(found, PlanResult):
-                return Step(STUCK, found.reason, policy)
-            problem = replace(problem, goal=JointGoal(self._goal_seen.best(problem.start, found)[None]))
+            joint_goals = self._goals(problem)
+            if isinstance(joint_goals, PlanResult):
+                return Step(STUCK, joint_goals.reason, policy)
+            problem = replace(problem, goal=JointGoal(self._goal_seen.best(problem.start, joint_goals)[None]))
         predicted = self.predicted() if policy == CHANCE else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = quick = self.settings.time_limit
@@ -280,28 +280,28 @@ class Explorer:
         if self._looks >= self.settings.max_looks:
             return Step(STUCK, f"{why}, after {self._looks} looks", policy)
         path = motion.path
-        tentative, wanted = self._least_unseen(problem) if path is None else (motion, self.wanted(path))
+        tentative, to_view = self._least_unseen(problem) if path is None else (motion, self.wanted(path))
         if tentative.path is None:
             return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
-        kept = None
+        safe_motion = None
         under = policy
         if policy == CHANCE and predicted is not None:
-            kept = self._with_confidence(tentative, predicted)
-        elif not wanted.any():
-            kept = self._within_seen_free(problem, tentative.path.positions, "as seen")
+            safe_motion = self._with_confidence(tentative, predicted)
+        elif not to_view.any():
+            safe_motion = self._within_seen_free(problem, tentative.path.positions, "as seen")
             under = STRICT
-        if kept is not None and self._may_go(kept, under):
-            return self._go(kept, under)
+        if safe_motion is not None and self._may_go(safe_motion, under):
+            return self._go(safe_motion, under)
         predicted = self.predicted() if predicted is None else predicted
         # a look has many ways: by chance, too, it takes one through space seen free if there is any
         policies = (STRICT, CHANCE) if self.settings.policy == CHANCE else (policy,)
         for under in policies:
-            way = self._way_to_look(problem, under, wanted, predicted)
+            way = self._way_to_look(problem, under, to_view, predicted)
             if way is not None:
                 stated = way.confidence if under == CHANCE else None
-                self._looked_for |= wanted
+                self._looked_for |= to_view
                 why += "; look at unseen space on the way"
-                return Step(LOOK, why, under, way, stated, wanted=wanted)
+                return Step(LOOK, why, under, way, stated, wanted=to_view)
         back = self._way_back(problem) if STRICT in policies else None
         if back is not None:
             return Step(LOOK, f"{why}; go back on the way in and look from there", STRICT, back)
@@ -335,9 +335,9 @@ class Explorer:
         if way is None or np.abs(way[-1] - problem.start).max() > AT_GOAL:
             return None
         for waypoints in first_parts(way[::-1]):
-            found = self._within_seen_free(problem, waypoints, "back on the way in")
-            if found is not None:
-                return found
+            motion = self._within_seen_free(problem, waypoints, "back on the way in")
+            if motion is not None:
+                return motion
         return None
 
     def _within_seen_free(self, problem: Problem, waypoints: Configurations, name: str) -> PlanResult | None:
@@ -352,8 +352,8 @@ class Explorer:
     def _along(self, problem: Problem, waypoints: Configurations, name: str) -> PlanResult | None:
         """The motion along waypoints, if the validator accepts it in the problem's scene; else None."""
         problem = replace(problem, goal=JointGoal(waypoints[-1:]))
-        found = self._context(problem, self.settings.time_limit).finish(waypoints, name, name)
-        return None if found is None else replace(found, problem=problem)
+        result = self._context(problem, self.settings.time_limit).finish(waypoints, name, name)
+        return None if result is None else replace(result, problem=problem)
 
     def _context(self, problem: Problem, limit: float, seed: int = 0) -> PlanningContext:
         return PlanningContext(self._planner.name, problem, PlanRequest(limit, seed, FIRST))
@@ -375,12 +375,12 @@ class Explorer:
             if result.path is None and not any(one.solved for one, _ in results):
                 avoiding = as_seen
                 result = self._planned(as_seen, self.settings.time_limit, seed)
-            wanted = ends if result.path is None else self.wanted(result.path)
-            results.append((result, wanted))
-            if result.path is not None and not wanted.any():
+            unseen = ends if result.path is None else self.wanted(result.path)
+            results.append((result, unseen))
+            if result.path is not None and not unseen.any():
                 break
-        found = [(one, wanted) for one, wanted in results if one.path is not None]
-        return min(found, key=lambda one: int(one[1].sum()), default=results[-1])
+        solved = [(one, unseen) for one, unseen in results if one.path is not None]
+        return min(solved, key=lambda one: int(one[1].sum()), default=results[-1])
 
     @property
     def _quick_limit(self) -> float:
@@ -418,13 +418,13 @@ class Explorer:
 
         to_goal: whether the problem's goal is the Explorer's, not where a look ends.
         """
-        asked = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
+        assumed_problem = replace(problem, unknown=PADDED if predicted is None else PREDICTED)
         goals = problem.goal.positions if to_goal and isinstance(problem.goal, JointGoal) else ()
         unknown = self._unknown((problem.start, *goals), predicted)
         above = None if predicted is None else predicted[:, :, LAYERS_BELOW:]
         request = PlanRequest(limit, self._seed, FIRST)
-        result = plan_with_unknown_space(self._planner, asked, request, above, unknown)
-        return replace(self._with_confidence(result, predicted, to_goal), problem=asked)
+        result = plan_with_unknown_space(self._planner, assumed_problem, request, above, unknown)
+        return replace(self._with_confidence(result, predicted, to_goal), problem=assumed_problem)
 
     def _with_confidence(
         self, motion: PlanResult, predicted: Probabilities | None, to_goal: bool = True

@@ -137,10 +137,10 @@ class GoalSeen:
 
     def best(self, start: Configuration, goals: Configurations) -> Configuration:
         """The goal of whose surface least is unseen."""
-        found = min(goals, key=lambda q: len(self.unseen(start, q)))
-        given = set(map(_key, goals))
-        self._unseen = {q: balls for q, balls in self._unseen.items() if q in given}
-        return found
+        best_goal = min(goals, key=lambda q: len(self.unseen(start, q)))
+        goal_keys = set(map(_key, goals))
+        self._unseen = {q: balls for q, balls in self._unseen.items() if q in goal_keys}
+        return best_goal
 
     def unseen(self, start: Configuration, q: Configuration) -> Points:
         """The centres of the balls at a configuration that nothing has shown to be free [m]. start: where the

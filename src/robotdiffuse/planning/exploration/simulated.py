@@ -98,8 +98,8 @@ class RecordedExplorer(Explorer):
         """See `Explorer.observe`."""
         super().observe(view, stamp)
         number = len(self.acts) - 1
-        known = self.map.occupied, self.map.free
-        self.views.append(RecordedView(self._time_of(view), number, view, self._camera_of(view), *known))
+        voxels = self.map.occupied, self.map.free
+        self.views.append(RecordedView(self._time_of(view), number, view, self._camera_of(view), *voxels))
 
     def next(self, configuration: ArrayLike) -> Step:
         """See `Explorer.next`."""
@@ -205,9 +205,9 @@ def simulated_explorer(
     if ignored:
         names = ", ".join(ignored)
         raise InputError(f"the problem has {names}, which explore does not support: remove {names}")
-    known = Scene([shape for shape in problem.scene.shapes if shape.name == FLOOR])
+    known_scene = Scene([shape for shape in problem.scene.shapes if shape.name == FLOOR])
     cameras = [wrist_camera(problem.robot)]
-    explorer = RecordedExplorer(problem.robot, cameras, known, FREE_ZONE, settings, seed)
+    explorer = RecordedExplorer(problem.robot, cameras, known_scene, FREE_ZONE, settings, seed)
     explorer.observe(camera_beside(problem, noise, seed))
     return explorer
 
@@ -261,11 +261,11 @@ def explore(
             return
         path = step.motion.path
         trajectory = step.motion.trajectory
-        asked = step.motion.problem
-        true = Problem(problem.robot, problem.scene, asked.start, asked.goal)
-        found = verify(true, path).violation
-        if found is None and trajectory is not None:
-            found = verify_trajectory(true, trajectory).violation
+        planned_problem = step.motion.problem
+        true = Problem(problem.robot, problem.scene, planned_problem.start, planned_problem.goal)
+        violation = verify(true, path).violation
+        if violation is None and trajectory is not None:
+            violation = verify_trajectory(true, trajectory).violation
         for camera in explorer.cameras:
             for at in _during(step.motion):
                 explorer.observe(taken(problem, camera, at, noise, rng))
@@ -276,8 +276,8 @@ def explore(
             size = (width, height)
             view = ray_cast(problem.scene, T, beside.intrinsics, size, problem.robot, q)
             explorer.observe(measured(view, np.inf, noise, rng))
-        yield Event(step, q, "" if found is None else found.message)
-        if found is not None:
+        yield Event(step, q, "" if violation is None else violation.message)
+        if violation is not None:
             return
 
 

@@ -72,13 +72,13 @@ def stop_before(
     """
     if not 0 <= time <= motion.duration:
         raise InputError(f"time is {shown(time)}; it must be in [0, {motion.duration:.4g}] s of the motion")
-    here = motion.at(time).positions
+    current = motion.at(time).positions
     end = motion.positions[-1]
-    seen = seen_shapes(views, robot, known, here, end[None])
+    seen = seen_shapes(views, robot, known, current, end[None])
     points = np.concatenate([np.zeros((0, 3)), *(shape.points for shape in seen)])
     appeared = PointCloud(points[_within(points, free)], APPEARED_PADDING, name="appeared")
-    validator = verifier(Problem(robot, known.with_shapes([*known.shapes, *seen, appeared]), here, end))
-    rest = np.concatenate([here[None], motion.positions[motion.times > time]])
+    validator = verifier(Problem(robot, known.with_shapes([*known.shapes, *seen, appeared]), current, end))
+    rest = np.concatenate([current[None], motion.positions[motion.times > time]])
     violation = validator.path(Path(robot.joint_names, rest)).violation
     if violation is None:
         return None
@@ -99,15 +99,15 @@ def _within(points: Points, free: Voxels) -> Bool[ndarray, "n"]:
 def braked(robot: Robot, motion: Trajectory, time: float) -> Trajectory:
     """The motion from a time on that rests as early as possible, on the same path and within the limits."""
     best = _rows(motion, time, motion.duration - time, 0.0, RAMPS[0])
-    rests = motion.duration
+    stop_time = motion.duration
     for delay in np.arange(0.0, motion.duration - time, BRAKING_DELAY):
         for braking, ramp in product(BRAKING_TIMES, RAMPS):
-            if time + delay + braking / 2 >= rests:
+            if time + delay + braking / 2 >= stop_time:
                 break
-            found = _rows(motion, time, float(delay), float(braking), ramp)
-            if _within_limits(robot, found):
-                best = found
-                rests = time + delay + braking / 2
+            candidate = _rows(motion, time, float(delay), float(braking), ramp)
+            if _within_limits(robot, candidate):
+                best = candidate
+                stop_time = time + delay + braking / 2
                 break
     return best
 
@@ -126,16 +126,16 @@ def _rows(motion: Trajectory, time: float, delay: float, braking: float, ramp: f
     slowing = np.zeros(count + 1)
     if braking > 0:
         u = np.clip((times - delay) / braking, 0.0, 1.0)
-        most = 1 / (1 - ramp)
-        left = 1 - u
+        peak = 1 / (1 - ramp)
+        remaining = 1 - u
         parts = [u < ramp, u <= 1 - ramp]
-        early = u - most * u**3 / (6 * ramp)
-        middle = u - most * (u**2 / 2 - ramp * u / 2 + ramp**2 / 6)
-        ways = [early, middle, 0.5 - most * left**3 / (6 * ramp)]
+        early = u - peak * u**3 / (6 * ramp)
+        middle = u - peak * (u**2 / 2 - ramp * u / 2 + ramp**2 / 6)
+        ways = [early, middle, 0.5 - peak * remaining**3 / (6 * ramp)]
         passed = np.where(times < delay, times, delay + braking * np.select(parts, ways[:2], ways[2]))
-        slower = [most * u**2 / (2 * ramp), most * (u - ramp / 2)]
-        speed = 1 - np.select(parts, slower, 1 - most * left**2 / (2 * ramp))
-        slowing = -np.select(parts, [most * u / ramp, most + 0 * u], most * left / ramp) / braking
+        slower = [peak * u**2 / (2 * ramp), peak * (u - ramp / 2)]
+        speed = 1 - np.select(parts, slower, 1 - peak * remaining**2 / (2 * ramp))
+        slowing = -np.select(parts, [peak * u / ramp, peak + 0 * u], peak * remaining / ramp) / braking
     q, v, a, _ = motion.at(np.minimum(time + passed, motion.duration))
     speed = speed[:, None]
     slowing = slowing[:, None]

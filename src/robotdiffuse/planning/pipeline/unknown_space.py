@@ -108,21 +108,21 @@ def plan_with_unknown_space(
         goals = _goals(context, as_seen)
         if isinstance(goals, PlanResult):
             return _with_notes(context, goals)
-        only = policy == OCCUPIED
+        occupied_only = policy == OCCUPIED
         for assumption in assumptions_of(problem, volume, predicted):
-            left = (1 - AS_SEEN_TIME_FRACTION) * limit - context.elapsed
-            if not only and left < MIN_TIME_FRACTION * limit:
+            search_time = (1 - AS_SEEN_TIME_FRACTION) * limit - context.elapsed
+            if not occupied_only and search_time < MIN_TIME_FRACTION * limit:
                 break
             assumed = with_assumption(problem, assumption, goals)
             compile_scene_for(problem.robot, assumed.scene)  # now, outside the assumption's time
-            left = (1 - AS_SEEN_TIME_FRACTION) * limit - context.elapsed
-            share = max(ASSUMPTION_TIME_FRACTION * left, MIN_TIME_FRACTION * limit)
-            until = limit if only else context.elapsed + share
+            search_time = (1 - AS_SEEN_TIME_FRACTION) * limit - context.elapsed
+            share = max(ASSUMPTION_TIME_FRACTION * search_time, MIN_TIME_FRACTION * limit)
+            until = limit if occupied_only else context.elapsed + share
             result = attempts.best(assumed, assumption.name, until)
-            if only and not result.solved:
+            if occupied_only and not result.solved:
                 why = "no motion keeps out of all space that no view saw"
                 return _with_notes(context, replace(result, reason=f"{why}: {result.reason}"))
-            if only or result.solved:
+            if occupied_only or result.solved:
                 return _with_notes(context, result, policy_note, _lesser(failed, assumption.name))
             failed.append(assumption.name)
     result = attempts.best(as_seen, AS_SEEN, limit)
@@ -143,8 +143,8 @@ def policy_for(problem: Problem) -> tuple[str, str]:
 
     if covers(problem.robot):
         return PREDICTED, ""
-    where = f"predicts up to {REACH:g} m from a Panda's shoulder; {problem.robot.name} reaches farther"
-    return PADDED, f"unknown space: {PADDED}, since the network {where}"
+    limitation = f"predicts up to {REACH:g} m from a Panda's shoulder; {problem.robot.name} reaches farther"
+    return PADDED, f"unknown space: {PADDED}, since the network {limitation}"
 
 
 def _lesser(failed: list[str], used: str) -> str:
@@ -170,17 +170,17 @@ def assumptions_of(
     predicted: the probability that each fine voxel is occupied, for the policy "predicted".
     """
     robot = problem.robot
-    known = problem.known_scene
+    known_scene = problem.known_scene
     policy, _ = policy_for(problem)
     if policy == PADDED:
         seen = [shape.points for shape in problem.scene.shapes if isinstance(shape, SeenPoints)]
         yield from padded_assumptions(np.concatenate([np.zeros((0, 3)), *seen]))
     elif policy == PREDICTED:
         assert predicted is not None
-        yield from predicted_assumptions(predicted, robot, known)
+        yield from predicted_assumptions(predicted, robot, known_scene)
     elif policy == OCCUPIED:
         assert volume is not None
-        yield occupied_assumption(volume, robot, known)
+        yield occupied_assumption(volume, robot, known_scene)
 
 
 def unknown_space_of(
@@ -238,34 +238,36 @@ class _Attempts:
         if self.unknown.probability is None:
             result = self._attempt(problem, until, request)
             return _Motion(result, assumption, self.unknown).result if result.solved else result
-        found = list[_Motion]()
-        while len(found) < MAX_FIRST_MOTIONS:
-            quick = replace(request, until=FIRST, seed=request.seed + len(found))
+        motions = list[_Motion]()
+        while len(motions) < MAX_FIRST_MOTIONS:
+            quick = replace(request, until=FIRST, seed=request.seed + len(motions))
             result = self._attempt(problem, until, quick)
-            if not result.solved and not found:
+            if not result.solved and not motions:
                 return result
             if not result.solved:
                 break
-            found.append(_Motion(result, assumption, self.unknown))
-            least = min(motion.risk or 0.0 for motion in found)
-            acceptable = ACCEPTABLE_RISK if len(found) >= MIN_FIRST_MOTIONS else NEGLIGIBLE_RISK
-            if self.context.elapsed >= until or least <= acceptable:
+            motions.append(_Motion(result, assumption, self.unknown))
+            lowest_risk = min(motion.risk or 0.0 for motion in motions)
+            acceptable = ACCEPTABLE_RISK if len(motions) >= MIN_FIRST_MOTIONS else NEGLIGIBLE_RISK
+            if self.context.elapsed >= until or lowest_risk <= acceptable:
                 break
         if request.until != FIRST and self.context.elapsed < until:
             result = self._attempt(problem, until, request)
-            found += [_Motion(result, assumption, self.unknown)] if result.solved else []
-        highest = max(motion.confidence for motion in found)
-        best = [motion for motion in found if motion.confidence >= highest - CONFIDENCE_TOLERANCE]
+            motions += [_Motion(result, assumption, self.unknown)] if result.solved else []
+        highest = max(motion.confidence for motion in motions)
+        best = [motion for motion in motions if motion.confidence >= highest - CONFIDENCE_TOLERANCE]
         chosen = min(best, key=lambda motion: motion.length)
         return replace(chosen.result, planning_time=self.context.elapsed)
 
     def _attempt(self, problem: Problem, until: float, request: PlanRequest) -> PlanResult:
-        whole = self.context.request
+        context_request = self.context.request
         began = self.context.elapsed
-        limit = max(until - began, MIN_TIME_FRACTION * whole.time_limit)
+        limit = max(until - began, MIN_TIME_FRACTION * context_request.time_limit)
         result = attempt(self.solver, problem, replace(request, time_limit=limit))
         progress = tuple((began + at, length) for at, length in result.progress)
-        return replace(result, planning_time=began + result.planning_time, progress=progress, seed=whole.seed)
+        return replace(
+            result, planning_time=began + result.planning_time, progress=progress, seed=context_request.seed
+        )
 
 
 class _Motion:

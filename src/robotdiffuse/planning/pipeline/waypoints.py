@@ -60,9 +60,9 @@ def plan_through_waypoints(solver: Solver, problem: Problem, request: PlanReques
         segments: list[PlanResult] = []
         start = problem.start
         for k, goal in enumerate(goals):
-            left = max(request.time_limit - context.elapsed, MIN_TIME_LIMIT) / (len(goals) - k)
+            segment_limit = max(request.time_limit - context.elapsed, MIN_TIME_LIMIT) / (len(goals) - k)
             segment = replace(problem, start=start, goal=goal, waypoints=(), blend=(), notes=())
-            of_segment = replace(request, time_limit=left, seed=request.seed + attempts)
+            of_segment = replace(request, time_limit=segment_limit, seed=request.seed + attempts)
             segments.append(attempt(solver, segment, of_segment))
             path = segments[-1].path
             if path is None:
@@ -112,22 +112,22 @@ def _without_stops(context: PlanningContext, segments: Sequence[PlanResult], fir
         blend=blend,
         notes=(),
     )
-    left = max(context.remaining, MIN_TIME_LIMIT)
-    request = replace(context.request, time_limit=left)
-    whole = PlanningContext(context.planner_name, part, request, len(segments))
-    corners, deviations = _corners(segments, whole.timing.corner_deviation)
+    remaining = max(context.remaining, MIN_TIME_LIMIT)
+    request = replace(context.request, time_limit=remaining)
+    combined = PlanningContext(context.planner_name, part, request, len(segments))
+    corners, deviations = _corners(segments, combined.timing.corner_deviation)
     for row, goal, radius in zip(corners, part.waypoints, blend, strict=True):
         deviations[row] = _deviation(part, path, int(row), goal, radius)
     clearances = [s.min_clearance for s in segments if s.min_clearance is not None]
-    kept = min(whole.clearance, *clearances)
-    closer = verifier(part, replace(DEFAULT, contact=max(kept, DEFAULT.contact)))
-    found = whole.finish(
+    clearance = min(combined.clearance, *clearances)
+    closer = verifier(part, replace(DEFAULT, contact=max(clearance, DEFAULT.contact)))
+    result = combined.finish(
         path.positions,
         context.planner_name,
         keeps=lambda q: closer.collision_free(replace(path, positions=q)),
         deviations=deviations,
     )
-    return None if found is None else found.trajectory
+    return None if result is None else result.trajectory
 
 
 def _corners(
@@ -244,13 +244,15 @@ def plan_from_start_velocity(solver: Solver, problem: Problem, request: PlanRequ
     deviations = np.full(len(waypoints), context.timing.corner_deviation)
     if result.corner_deviations is not None:
         deviations[2:] = result.corner_deviations[1:]
-    found = context.finish(waypoints, result.stage or solver.name, notes=notes, deviations=deviations)
-    if found is not None:
-        return found
+    verified_result = context.finish(
+        waypoints, result.stage or solver.name, notes=notes, deviations=deviations
+    )
+    if verified_result is not None:
+        return verified_result
     if context.ended:
         return context.unsolved()
     violation = context.validator.path(replace(result.path, positions=waypoints)).violation
-    what = "" if violation is None else f": {violation.message}"
+    details = "" if violation is None else f": {violation.message}"
     return context.fail(
-        Status.INVALID_START, f"the arm cannot stop from start_velocity without a collision{what}"
+        Status.INVALID_START, f"the arm cannot stop from start_velocity without a collision{details}"
     )

@@ -72,21 +72,21 @@ class ObservedObstacle:
             T = transform(xyz, T_before[:3, :3])
         else:
             T = rigid_transform(f"observation[{name!r}]", value)
-        most = self.obstacle.top_speed
+        max_speed = self.obstacle.top_speed
         velocity = self.obstacle.velocity
         if np.isfinite(self.time):
             passed = now - self.time
             moved = np.linalg.norm(T[:3, 3] - T_before[:3, 3])
             moved += self.obstacle.radius * rotation_angle(T_before[:3, :3].T @ T[:3, :3])
-            if moved > most * passed + OBSERVATION_ERROR:
-                way, allowed = distinct(float(moved), most * passed, digits=3)
+            if moved > max_speed * passed + OBSERVATION_ERROR:
+                way, allowed = distinct(float(moved), max_speed * passed, digits=3)
                 raise InputError(
                     f"observation[{name!r}] is {way} m from where it was {passed:.3g} s ago; its "
-                    f"maximum speed {most:g} m/s allows {allowed} m"
+                    f"maximum speed {max_speed:g} m/s allows {allowed} m"
                 )
             velocity = (T[:3, 3] - T_before[:3, 3]) / passed
         shape = self.obstacle.shape.moved(T @ inverse(T_before))
-        return ObservedObstacle(MovingObstacle(shape, max_speed=most), now, velocity)
+        return ObservedObstacle(MovingObstacle(shape, max_speed=max_speed), now, velocity)
 
     def anywhere(self) -> MovingObstacle:
         """The obstacle moving in any way from when it was last seen."""
@@ -110,10 +110,10 @@ class PredictedObstacles:
 
     def wider(self, margin: Float[ndarray, "obstacles"]) -> "PredictedObstacles":
         """The same obstacles, each inflated by a margin [m]."""
-        other = copy(self)
-        other.margin = self.margin + margin
-        other._collision = self._collision.inflated(margin)
-        return other
+        inflated = copy(self)
+        inflated.margin = self.margin + margin
+        inflated._collision = self._collision.inflated(margin)
+        return inflated
 
     def shapes(self, time: float) -> list[Shape]:
         """The obstacles at a time [s]."""
@@ -230,9 +230,9 @@ class Replanner:
             raise InputError(f"seed is {shown(seed)}; it must be a whole number, at least 0")
         if not problem.moving:
             raise InputError("problem.moving is empty; a Replanner needs moving obstacles")
-        for what in ("waypoints", "constraints", "payload"):
-            if getattr(problem, what):
-                raise InputError(f"problem.{what}: the replanner does not support it; rd.plan does")
+        for field in ("waypoints", "constraints", "payload"):
+            if getattr(problem, field):
+                raise InputError(f"problem.{field}: the replanner does not support it; rd.plan does")
         self.problem = problem
         self.settings = settings
         self.seed = seed
@@ -372,12 +372,12 @@ class Replanner:
         """The predicted obstacles, with the largest safety margin that the arm keeps now."""
         moving = [seen.straight_on(self._now) for seen in self._seen.values()]
         speeds = np.array([seen.obstacle.top_speed for seen in self._seen.values()])
-        here = self._path.at(float(self._motion.s[0]))
+        position = self._path.at(float(self._motion.s[0]))
         predicted = PredictedObstacles(self._robot, moving, self._now)
         for share in MARGIN_FRACTIONS:
-            wide = predicted.wider(share * SAFETY_MARGIN * speeds)
-            if wide.comes(here, self._now, self.settings.period) is None:
-                return wide
+            inflated = predicted.wider(share * SAFETY_MARGIN * speeds)
+            if inflated.comes(position, self._now, self.settings.period) is None:
+                return inflated
         return predicted
 
     def _choose_path(self, predicted: PredictedObstacles) -> bool:
@@ -385,15 +385,15 @@ class Replanner:
         predicted on the path that the arm is on."""
         rest_time = self._rest_time
         rest = self._path.at(float(self._motion.s[-1]))
-        ahead = self._path if self._next is None else self._next
-        clear = self._path_clear(predicted, ahead, self._next is None)
+        next_path = self._path if self._next is None else self._next
+        clear = self._path_clear(predicted, next_path, self._next is None)
         moving = not self._rests or self._motion.duration > 0
         leaves = self._left and self._next is None
-        if clear and (ahead.to_goal or moving) and not leaves:
+        if clear and (next_path.to_goal or moving) and not leaves:
             return clear
-        found = self._search(predicted, rest, rest_time)
-        if found is not None and self._path_clear(predicted, found, False):
-            self._next = found
+        candidate = self._search(predicted, rest, rest_time)
+        if candidate is not None and self._path_clear(predicted, candidate, False):
+            self._next = candidate
         elif not moving and predicted.comes(rest, rest_time, REST_TIME) is not None:
             self._next = self._evasion(predicted, rest, rest_time) or self._next
         return clear
@@ -489,8 +489,8 @@ class Replanner:
         for periods in DRIVING_PERIODS:
             extended = path.on_then_rest(s, speed, periods * settings.period)
             motion = self._filter.follow(path, extended)
-            rests = self._since + motion.duration
-            left_alone = clear or predicted.comes(motion.positions[-1], rests, REST_TIME) is None
+            end_time = self._since + motion.duration
+            left_alone = clear or predicted.comes(motion.positions[-1], end_time, REST_TIME) is None
             certified = grown.near(motion, self._since, settings.clearance) is None
             if certified and (left_alone or not path.to_goal):
                 self._motion = extended

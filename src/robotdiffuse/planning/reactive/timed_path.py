@@ -54,8 +54,8 @@ class SpeedProfile(NamedTuple):
     def rest(self, time: float) -> "SpeedProfile":
         """The rest of the motion from a time after the beginning on [s]."""
         s, speed = self.after(time)
-        ahead = self.s > s + 1e-12
-        return SpeedProfile(np.append(s, self.s[ahead]), np.append(speed, self.speeds[ahead]))
+        later = self.s > s + 1e-12
+        return SpeedProfile(np.append(s, self.s[later]), np.append(speed, self.speeds[later]))
 
     @property
     def duration(self) -> float:
@@ -156,9 +156,9 @@ class TimedPath:
 
     def remaining(self, s: float) -> Configurations:
         """Waypoints from s to the end, of the paths that follow too."""
-        ahead = self.line.waypoints[self.line.knots > s + MIN_LENGTH]
-        after = self.then.remaining(0.0)[1:] if self.then is not None else ahead[:0]
-        return np.concatenate([self.at(s)[None], ahead, after])
+        waypoints = self.line.waypoints[self.line.knots > s + MIN_LENGTH]
+        after = self.then.remaining(0.0)[1:] if self.then is not None else waypoints[:0]
+        return np.concatenate([self.at(s)[None], waypoints, after])
 
     def positions(self, motion: SpeedProfile, times: Float[ndarray, "n"]) -> Configurations:
         """Configurations at times after the beginning of a motion, which rests after its end [s]."""
@@ -226,8 +226,8 @@ class JerkFilter:
             self._origin = now
             return
         index = int(np.floor((now - self._origin) / self.step + GRID_TOLERANCE))
-        wanted = np.arange(max(self._index + 1, index + 1 - len(self._samples)), index + 1)
-        new = path.positions(motion, np.maximum(self._origin + wanted * self.step - since, 0.0))
+        steps = np.arange(max(self._index + 1, index + 1 - len(self._samples)), index + 1)
+        new = path.positions(motion, np.maximum(self._origin + steps * self.step - since, 0.0))
         self._samples = np.concatenate([self._samples, new])[-len(self._samples) :]
         self._index = index
         self._ago = max(now - self._origin - index * self.step, 0.0)

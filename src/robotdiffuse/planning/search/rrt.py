@@ -226,8 +226,8 @@ class AnytimeSearch:
         """
         if self.best is None:
             self._try_straight_lines()
-        enough = self.work + work
-        while self.best is None and self.work < enough and not self._stop():
+        work_limit = self.work + work
+        while self.best is None and self.work < work_limit and not self._stop():
             self._iterate()
             if self.best is None and self._tried >= self._tries:
                 self._lower_clearance(fallback)
@@ -235,11 +235,11 @@ class AnytimeSearch:
 
     def improve(self, work: float) -> None:
         """Search for shorter paths, for at most `work` more iterations, or until the path is optimal."""
-        enough = self.work + work
+        work_limit = self.work + work
         if self._untightened and self.best is not None:
             self.offer(self.best, self.stage)
             self._untightened = False
-        while not self.shortest and self.work < enough and not self._stop():
+        while not self.shortest and self.work < work_limit and not self._stop():
             self._iterate()
 
     def improves(self, gain: float, patience: int) -> bool:
@@ -316,12 +316,12 @@ class AnytimeSearch:
 
     def _iterate(self) -> None:
         """Run some iterations of a round, and offer the path that they find."""
-        most = self.settings.iterations
+        iterations = self.settings.iterations
         trees = self._trees
-        capacity = most + len(self.goals) + 2 * self.spare_nodes
+        capacity = iterations + len(self.goals) + 2 * self.spare_nodes
         if trees is None or self.work >= self._round_end or trees.sizes.max() + self.spare_nodes >= capacity:
             trees = self._trees = rrt_kernel.make_trees(self.start, self.goals, capacity)
-            self._round_end = self.work + most
+            self._round_end = self.work + iterations
         bound = np.float32(BOUND_FACTOR * self.length if self.bounded else np.inf)
         longest = np.float32(self.settings.range)
         path = rrt_kernel.search(
@@ -352,11 +352,11 @@ class ConstrainedSearch(AnytimeSearch):
 
         self._code = constrained
         self.spare_nodes = constrained.MAX_PIECES
-        kept = constraints.limits(TOLERANCE_FRACTION)
+        tolerances = constraints.limits(TOLERANCE_FRACTION)
         at_ends = constraints.values(np.stack([start, *start_goal.goal_leads])).max(axis=0) + END_MARGIN
-        kept = np.minimum(np.maximum(kept, at_ends), constraints.rows.limit)
+        tolerances = np.minimum(np.maximum(tolerances, at_ends), constraints.rows.limit)
         self.context = context
-        self.limits = constrained.make_limits(constraints.rows, kept)
+        self.limits = constrained.make_limits(constraints.rows, tolerances)
         self.cost = np.inf
         """Of the best path: its estimated duration [s]; its length [rad] if that is the objective."""
         self._speed_limits = scaled_limits(context.problem.robot, context.timing)
@@ -514,10 +514,10 @@ class _Validation:
 
     def _accepts_motion(self, candidate: Candidate) -> bool:
         start_goal = self.search.start_goal
-        most = self.context.timing.corner_deviation
+        max_deviation = self.context.timing.corner_deviation
         path = start_goal.complete(candidate.path)
         # the exact start or goal may be added beside the ends of the search
-        deviations = np.full(len(path), most)
+        deviations = np.full(len(path), max_deviation)
         begins = start_goal.start_lead
         assert begins is not None  # else there would be no path
         first = 1 if np.array_equal(begins, start_goal.start) else 2
@@ -527,14 +527,14 @@ class _Validation:
     def _finished(self, path: ndarray, stage: str, deviations: ndarray | None) -> PlanResult | None:
         """Validate and time a path, and keep its result."""
         search = self.search
-        wanted = self.context.clearance
+        target_clearance = self.context.clearance
         keeps = search.keeps_clearance
         notes = ()
-        if search.clearance < wanted:
-            kept = 100 * search.clearance
-            asked = 100 * wanted
+        if search.clearance < target_clearance:
+            used_cm = 100 * search.clearance
+            target_cm = 100 * target_clearance
             notes = (
-                f"searched with a clearance of {kept:.2g} cm, not {asked:.2g} cm: "
+                f"searched with a clearance of {used_cm:.2g} cm, not {target_cm:.2g} cm: "
                 "no path was found with that",
             )
         result = self.context.finish(path, stage, notes=notes, keeps=keeps, deviations=deviations)
@@ -569,8 +569,8 @@ def anytime(
     if request.objective == TIME and request.until != FIRST and not problem.constraints:
         straight = float(np.linalg.norm(search.goals - search.start, axis=1).min())
         several = problem.goal.goals if isinstance(problem.goal, AnyGoal) else (problem.goal,)
-        given = all(isinstance(goal, JointGoal) for goal in several)
-        longest = np.inf if given else MAX_DETOUR * straight
+        joint_goals_only = all(isinstance(goal, JointGoal) for goal in several)
+        longest = np.inf if joint_goals_only else MAX_DETOUR * straight
         search.motions = TimeOptimization(
             problem.robot, context.timing, search.start, search.goals, request.seed, longest
         )
@@ -591,10 +591,10 @@ def anytime(
 
     validation = _Validation(context, search)
     while search.first(fallback):
-        done = ended()
-        if done and motions is not None and validation.best is not None:
+        finished = ended()
+        if finished and motions is not None and validation.best is not None:
             break
-        if done or (context.validates_early and validation.due):
+        if finished or (context.validates_early and validation.due):
             if validation.run() and ended():
                 break
             if validation.best is None and context.remaining <= 0:
@@ -605,8 +605,8 @@ def anytime(
                 improve()
             if motions is not None:
                 share = ATTEMPTS_PER_ITERATION * search.work
-                wanted = share if searching else motions.attempts + ATTEMPTS_AFTER_SEARCH
-                while motions.attempts < wanted and context.remaining > 0 and motions.candidates:
+                attempts = share if searching else motions.attempts + ATTEMPTS_AFTER_SEARCH
+                while motions.attempts < attempts and context.remaining > 0 and motions.candidates:
                     motions.improve(search.space)
     validation.run_last()
     return replace(validation.best or context.unsolved(), trees=search.trees)
