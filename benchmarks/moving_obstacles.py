@@ -19,9 +19,9 @@ import numpy as np
 
 import robotdiffuse as rd
 from common import FIRST, header, parse, print_table, progress
+from robotdiffuse.baselines.lattice import DStarLiteSearch, DStarLiteSettings
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.planning.baselines.lattice import DStarLiteSearch, DStarLiteSettings
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.validator import PyBulletOracle
 

@@ -26,7 +26,8 @@ ORDER = (
         "trajectories",
     ),
     "validation",
-    *("certificates", "interop", "datasets", "learning", "planning", "adapters", "generation", "simulation"),
+    *("certificates", "interop", "datasets", "learning", "planning", "baselines", "adapters"),
+    *("generation", "simulation"),
     *("evaluation", "visualization", "server", "cli"),
 )
 """A package imports only itself and packages before it."""
@@ -35,20 +36,21 @@ APART = {
     "datasets": {"validation", "certificates", "interop"},
     "learning": {"validation", "certificates", "interop"},
     "planning": {"certificates", "interop"},
-    "adapters": {"certificates", "interop", "datasets", "learning"},
-    "generation": {"certificates", "interop", "adapters"},
-    "simulation": {"certificates", "interop", "datasets", "learning", "planning", "generation"},
+    "baselines": {"certificates", "interop"},
+    "adapters": {"certificates", "interop", "datasets", "learning", "baselines"},
+    "generation": {"certificates", "interop", "baselines", "adapters"},
+    "simulation": {"certificates", "interop", "datasets", "learning", "planning", "baselines", "generation"},
     "evaluation": {"certificates", "interop"},
-    "visualization": {"generation", "simulation", "evaluation"},
-    "server": {"certificates", "interop", "datasets", "learning", "generation", "simulation", "evaluation"}
-    | {"visualization"},
+    "visualization": {"baselines", "generation", "simulation", "evaluation"},
+    "server": {"certificates", "interop", "datasets", "learning", "baselines", "generation", "simulation"}
+    | {"evaluation", "visualization"},
 }
 """Packages before it that a package does without, so that it can be used, and understood, without them."""
 
 EXTRAS = {
     "pybullet": {"simulation"},
     "pybullet_data": {"simulation"},
-    "ompl": {"planning"},
+    "ompl": {"baselines"},
     "OpenEXR": {"perception"},
     "ray": {"processes"},
     "zarr": {"datasets"},

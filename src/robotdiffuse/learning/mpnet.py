@@ -4,7 +4,7 @@ A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging
 Learning-based and Classical Motion Planners", T-RO 2020. Enet is a contractive auto-encoder of the obstacles'
 point cloud. Pnet is a perceptron from (z, a configuration, the goal) to the next waypoint, learnt from the
 waypoints of planned paths in both directions. Its dropout stays on while it plans: that is where MPNet's
-randomness comes from. The planner around it is `planning.baselines.mpnet`.
+randomness comes from. The planner around it is `baselines.mpnet`.
 
 Differences from the paper:
 

@@ -25,7 +25,7 @@ CLEARANCE = "a requested clearance"
 
 
 def _entry(location: str, settings: str, kind: str, description: str, *supports: str) -> Entry:
-    return Entry(f"robotdiffuse.planning.{location}", description, settings, kind, frozenset(supports))
+    return Entry(f"robotdiffuse.{location}", description, settings, kind, frozenset(supports))
 
 
 def _ompl(algorithm: str, description: str) -> Entry:
@@ -36,7 +36,7 @@ PLANNERS = Registry(
     "planner",
     {
         "robotdiffuse": _entry(
-            "hybrid:RobotDiffuse",
+            "planning.hybrid:RobotDiffuse",
             "RobotDiffuseSettings",
             HYBRID,
             "AORRTC search first, then batches of the diffusion model too (the default)",
@@ -44,14 +44,14 @@ PLANNERS = Registry(
             CLEARANCE,
         ),
         "diffusion": _entry(
-            "diffusion:Diffusion",
+            "planning.diffusion:Diffusion",
             "DiffusionSettings",
             LEARNED,
             "the diffusion model alone: sampling under guidance; no search, no simplification",
             PATH_CONSTRAINTS,
         ),
         "aorrtc": _entry(
-            "search.rrt:AORRTC",
+            "planning.search.rrt:AORRTC",
             "AORRTCSettings",
             SEARCH,
             "AORRTC: anytime, asymptotically optimal RRT-Connect",
@@ -59,7 +59,7 @@ PLANNERS = Registry(
             CLEARANCE,
         ),
         "rrt_connect": _entry(
-            "search.rrt:RRTConnect",
+            "planning.search.rrt:RRTConnect",
             "RRTConnectSettings",
             SEARCH,
             "two trees grown towards each other, then simplification; restarts while time is left",
@@ -67,7 +67,7 @@ PLANNERS = Registry(
             CLEARANCE,
         ),
         "shared_tree_rrt_star": _entry(
-            "search.shared_tree:SharedTreeRRTStar",
+            "planning.search.shared_tree:SharedTreeRRTStar",
             "SharedTreeSettings",
             SEARCH,
             "the paper's planner for data: one tree, all goals, near-optimal, 5 cm away from obstacles",

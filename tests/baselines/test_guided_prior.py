@@ -18,20 +18,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from helpers.motion_stores import random_motions, write_motions
-from robotdiffuse.cli import main
-from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Status
-from robotdiffuse.learning.checkpoint import load_network, save_network
-from robotdiffuse.learning.denoisers import UNetSettings
-from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
-from robotdiffuse.learning.motion_network import MotionNetwork
-from robotdiffuse.learning.training.batches import Batches, TrajectoryData
-from robotdiffuse.learning.training.config import planner_training
-from robotdiffuse.learning.training.loop import Processes
-from robotdiffuse.learning.training.planner import PlannerLoss, model_settings, planning_success
-from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.planning.baselines.guided_prior import (
+from robotdiffuse.baselines.guided_prior import (
     EDMP,
     ENSEMBLE,
     MPD,
@@ -47,6 +34,19 @@ from robotdiffuse.planning.baselines.guided_prior import (
     shared_out,
     state_precision,
 )
+from robotdiffuse.cli import main
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
+from robotdiffuse.learning.checkpoint import load_network, save_network
+from robotdiffuse.learning.denoisers import UNetSettings
+from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
+from robotdiffuse.learning.motion_network import MotionNetwork
+from robotdiffuse.learning.training.batches import Batches, TrajectoryData
+from robotdiffuse.learning.training.config import planner_training
+from robotdiffuse.learning.training.loop import Processes
+from robotdiffuse.learning.training.planner import PlannerLoss, model_settings, planning_success
+from robotdiffuse.learning.weight_files import RobotIdentity
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene

@@ -12,13 +12,13 @@ import pytest
 pytest.importorskip("ompl")
 
 from helpers.box_arm import box_arm
+from robotdiffuse.baselines import ompl
+from robotdiffuse.baselines import ompl as planners
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import explain_collision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Status
-from robotdiffuse.planning.baselines import ompl
-from robotdiffuse.planning.baselines import ompl as planners
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose

@@ -8,6 +8,7 @@ import pytest
 import torch
 from numpy import ndarray
 
+from robotdiffuse.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import path_length
 from robotdiffuse.core.errors import InputError
@@ -21,7 +22,6 @@ from robotdiffuse.learning.mpnet import (
 )
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning
 from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.learned import scene_clouds
 from robotdiffuse.planning.start_goal import StartGoal

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from robotdiffuse.baselines.mpinets import MPiNets, MPiNetsSettings
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.learning.checkpoint import load_network, save_network
@@ -18,7 +19,6 @@ from robotdiffuse.learning.mpinets import (
 )
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.planning.baselines.mpinets import MPiNets, MPiNetsSettings
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose

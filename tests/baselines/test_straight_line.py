@@ -3,7 +3,7 @@
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.planning.baselines.straight_line import NEAREST, StraightLine, StraightLineSettings
+from robotdiffuse.baselines.straight_line import NEAREST, StraightLine, StraightLineSettings
 
 PANDA = rd.load_robot("panda")
 START = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])

@@ -10,12 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from helpers.box_arm import box_arm
-from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.motions import motions_free
-from robotdiffuse.collision.motions import search_space
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.types import Status
-from robotdiffuse.planning.baselines.lattice import (
+from robotdiffuse.baselines.lattice import (
     AStar,
     AStarSearch,
     AStarSettings,
@@ -26,6 +21,11 @@ from robotdiffuse.planning.baselines.lattice import (
     Outcome,
     lattice_moves,
 )
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
