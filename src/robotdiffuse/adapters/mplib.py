@@ -103,9 +103,9 @@ class Planner:
 
     def _limit(self, velocity: ndarray, acceleration: ndarray) -> None:
         self.robot = _limited(self.robot, velocity, acceleration)
-        held = self.workspace.robot.attached
+        bodies = self.workspace.robot.attached
         self.workspace.robot = self.robot
-        for body in held:
+        for body in bodies:
             self.workspace.robot = self.workspace.robot.with_body(body)
 
     def set_base_pose(self, pose: Any) -> None:
@@ -170,9 +170,9 @@ class Planner:
             "Success" and the configurations, or the reason and None.
         """
         start = self._start(start_qpos)
-        found = self.workspace.ik(matrix(goal_pose), near=start, count=n_init_qpos)
-        states = [self.workspace.is_free(q) for q in found]
-        free = [self._qpos(q, start_qpos) for q, state in zip(found, states, strict=True) if state]
+        solutions = self.workspace.ik(matrix(goal_pose), near=start, count=n_init_qpos)
+        states = [self.workspace.is_free(q) for q in solutions]
+        free = [self._qpos(q, start_qpos) for q, state in zip(solutions, states, strict=True) if state]
         if free:
             return SUCCESS, free
         why = f"collides: {states[0].reason}" if states else "is out of reach"
@@ -263,21 +263,21 @@ class Planner:
             names = ", ".join(self.joint_names)
             raise InputError(f"qpos has {len(q)} values; it must have {len(self.joint_names)}: {names}")
         values = dict(zip(self.joint_names, q.tolist(), strict=True))
-        held = {
+        locked = {
             name: round(values[name] / HELD_JOINT_STEP) * HELD_JOINT_STEP
             for name in self.workspace.robot.locked
             if name in values
         }
-        self.workspace.robot = self.workspace.robot.with_locked(held)
+        self.workspace.robot = self.workspace.robot.with_locked(locked)
         return q[self._places]
 
     def _qpos(self, q: ndarray, like: ArrayLike) -> ndarray:
         """A configuration in the order of `qpos`, with its other joints."""
-        whole = np.ravel(np.array(like, float))
-        if len(whole) == len(q):
+        qpos = np.ravel(np.array(like, float))
+        if len(qpos) == len(q):
             return q
-        whole[self._places] = q
-        return whole
+        qpos[self._places] = q
+        return qpos
 
     def _hold(self, shape: RigidShape) -> None:
         self.detach_object()

@@ -28,11 +28,11 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
     motion = Motion(for_kernels(q), motion_pieces.travel_along(q, validator.checks.motion_radii))
     end = float(motion.travel[-1])
     at = 0.0
-    found = list[Contact]()
+    contacts_in_order = list[Contact]()
     for _ in range(MAX_CONFIGURATIONS):
         low = motion_pieces.segment_at(motion.travel, at)[0]
-        here = motion_pieces.configurations(motion, np.array([at]))
-        rest = np.concatenate([here, q[low + 1 :]])
+        contact_configuration = motion_pieces.configurations(motion, np.array([at]))
+        rest = np.concatenate([contact_configuration, q[low + 1 :]])
         first = validator.sweep(rest).contact
         if first is None:
             break
@@ -41,10 +41,10 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
         part = first.at - int(first.at)
         ways = np.concatenate([[at], motion.travel[low + 1 :]])
         at = float(ways[row] + part * (ways[min(row + 1, len(ways) - 1)] - ways[row]))
-        at = _follow(exact, motion, at, contact, first, found)
+        at = _follow(exact, motion, at, contact, first, contacts_in_order)
         if at >= end:
             break
-    return found
+    return contacts_in_order
 
 
 def _follow(

@@ -65,18 +65,18 @@ def parts_of(robot: Robot) -> dict[str, tuple[Part, ...]]:
     for link in robot.link_names:
         frame = robot.link_frame(link)
         T = robot.T_frame_link(link)
-        found: list[Part] = []
+        convex_parts: list[Part] = []
         for mesh in robot.meshes.get(link, ()):
             vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
             center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
             radius = float(np.linalg.norm(vertices - center, axis=1).max())
-            found.append(Part(frame, vertices, mesh.faces, 0.0, center, radius))
-        if not found:
+            convex_parts.append(Part(frame, vertices, mesh.faces, 0.0, center, radius))
+        if not convex_parts:
             for x, y, z, radius in robot.spheres.get(link, np.zeros((0, 4))).tolist():
                 center = T[:3, :3] @ np.array([x, y, z]) + T[:3, 3]
-                found.append(Part(frame, center[None], np.zeros((0, 3), int), radius, center, radius))
-        if found:
-            parts[link] = tuple(found)
+                convex_parts.append(Part(frame, center[None], np.zeros((0, 3), int), radius, center, radius))
+        if convex_parts:
+            parts[link] = tuple(convex_parts)
     return parts
 
 

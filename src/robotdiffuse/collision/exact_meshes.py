@@ -136,14 +136,14 @@ def _tree(shape: Triangulated | PointCloud) -> coal.BVHModelOBBRSS:
     if isinstance(shape, PointCloud):
         # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
         vertices = shape.distinct_points
-        what = "points"
+        elements = "points"
         faces = np.repeat(np.arange(len(vertices))[:, None], 3, axis=1)
     else:
         vertices = shape.mesh.world_vertices
         faces = shape.mesh.faces
-        what = "triangles"
+        elements = "triangles"
     check_time(
-        f"the validator's tree over the {len(faces):,} {what} of {shape.name}",
+        f"the validator's tree over the {len(faces):,} {elements} of {shape.name}",
         TREE_SECONDS_PER_ELEMENT * len(faces),
     )
     return coal_surface(vertices, faces)
@@ -212,19 +212,21 @@ class ExactCollision:
         firsts = self._pieces[check.link]
         balls = _balls(self.robot)[check.link]
         if check.other is not None:
-            others = self._pieces[check.other]
+            partners = self._pieces[check.other]
             other_balls = _balls(self.robot)[check.other]
             return _Candidates(
                 firsts,
-                others,
+                partners,
                 lambda frames: kernel.pair_bounds(frames, *balls, *other_balls),
                 surface_pairs(self.robot).get(check),
             )
-        kept = [i for i, one in enumerate(self._obstacles) if not self.scene.may_touch(check.link, one.name)]
-        if not kept:
+        obstacle_indices = [
+            i for i, one in enumerate(self._obstacles) if not self.scene.may_touch(check.link, one.name)
+        ]
+        if not obstacle_indices:
             return _Candidates(firsts, (), lambda frames: np.zeros((len(frames), 0)))
-        boxes = self._boxes([self._solids[i] for i in kept])
-        obstacles = tuple(self._obstacles[i] for i in kept)
+        boxes = self._boxes([self._solids[i] for i in obstacle_indices])
+        obstacles = tuple(self._obstacles[i] for i in obstacle_indices)
         return _Candidates(firsts, obstacles, lambda frames: kernel.scene_bounds(frames, *balls, boxes))
 
     def _place(self, piece: _Piece, frames: ndarray) -> coal.Transform3s:
@@ -288,11 +290,11 @@ class ExactCollision:
             for candidate in lower.argsort().tolist():
                 if lower[candidate] >= best or best <= stop:
                     break
-                piece, other = candidates.pair(candidate)
-                distance = self._signed(piece, other, frames[i], best, depth=stop == -np.inf)
+                piece, partner = candidates.pair(candidate)
+                distance = self._signed(piece, partner, frames[i], best, depth=stop == -np.inf)
                 if distance < best:
                     best = distance
-                    names[i] = other.name if isinstance(other, _Obstacle) else self.checks[check].other
+                    names[i] = partner.name if isinstance(partner, _Obstacle) else self.checks[check].other
             distances[i] = best
             if best <= stop:
                 break
@@ -315,8 +317,8 @@ class ExactCollision:
             best = min(best, self._signed(*candidates.pair(candidate), frames, best, depth=True))
         if not -MAX_OVERLAP <= best < SURFACES_BELOW:
             return best
-        apart = candidates.surfaces.distance(frames, cutoff)
-        return best if apart is None else min(max(best, apart), cutoff)
+        surface_distance = candidates.surfaces.distance(frames, cutoff)
+        return best if surface_distance is None else min(max(best, surface_distance), cutoff)
 
     def link_distances(self, q: Float[ndarray, "dof"]) -> tuple[Distance, ...]:
         """Signed distance of every moving link to the nearest obstacle [m], infinite in an empty scene."""
@@ -332,11 +334,11 @@ class ExactCollision:
         """Signed distance of a link to the nearest obstacle [m] if the whole robot, with its base, is moved
         by T; that equals the distance to obstacles that move by the inverse of T."""
         frames = T @ forward_frames(self.robot, q[None])[0]
-        others = self._obstacles
+        obstacles = self._obstacles
         return min(
-            self._signed(piece, other, frames, np.inf, True)
+            self._signed(piece, obstacle, frames, np.inf, True)
             for piece in self._pieces[link]
-            for other in others
+            for obstacle in obstacles
         )
 
     def _all(self, q: ndarray, checks: range) -> tuple[Distance, ...]:
@@ -361,23 +363,23 @@ class ExactCollision:
             undecided = np.flatnonzero(~hit)
             lower = candidates.lower(frames[undecided])
             rows, columns = np.nonzero(lower <= 0)
-            apart = np.zeros(len(q), bool)  # by their surfaces
+            separated = np.zeros(len(q), bool)  # by their surfaces
             for row, column in zip(undecided[rows].tolist(), columns.tolist(), strict=True):
-                if hit[row] or apart[row]:
+                if hit[row] or separated[row]:
                     continue
-                piece, other = candidates.pair(column)
-                if isinstance(other, _Obstacle) and other.inflation > 0:
-                    hit[row] = self._signed(piece, other, frames[row], CLEAR_DISTANCE, depth=False) <= 0
+                piece, partner = candidates.pair(column)
+                if isinstance(partner, _Obstacle) and partner.inflation > 0:
+                    hit[row] = self._signed(piece, partner, frames[row], CLEAR_DISTANCE, depth=False) <= 0
                     continue
-                T_other = self._place(other, frames[row]) if isinstance(other, _Piece) else other.T
+                T_other = self._place(partner, frames[row]) if isinstance(partner, _Piece) else partner.T
                 T_piece = self._place(piece, frames[row])
                 result.clear()
-                coal.collide(piece.geometry, T_piece, other.geometry, T_other, self._collide, result)
+                coal.collide(piece.geometry, T_piece, partner.geometry, T_other, self._collide, result)
                 hit[row] = result.isCollision()
                 if hit[row] and candidates.surfaces is not None:
                     distance = self._grazing_distance(candidates, frames[row], CLEAR_DISTANCE, depth=False)
-                    apart[row] = distance > 0
-                    hit[row] = not apart[row]
+                    separated[row] = distance > 0
+                    hit[row] = not separated[row]
         return hit
 
 
@@ -405,5 +407,5 @@ def explain_collision(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> s
 
 def contact_message(robot: Robot, contact: Distance) -> str:
     """A contact in words."""
-    link, other, distance = contact
-    return describe_contact(link, str(other), -distance, other in robot.link_names)
+    link, partner, distance = contact
+    return describe_contact(link, str(partner), -distance, partner in robot.link_names)

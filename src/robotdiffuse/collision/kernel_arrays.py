@@ -139,10 +139,10 @@ def compile_robot(robot: Robot) -> RobotArrays:
         return arrays
     rows = [link for link in robot.link_names if link in robot.spheres]
     group_radii = motion_radii(robot)[[rows.index(link) for link in groups]]
-    found, tables = build_pair_tables(
+    pair_indices, tables = build_pair_tables(
         arrays, robot.lower, robot.upper, group_radii, _known_tables(robot, pairs, groups)
     )
-    return arrays._replace(pairs=found, pair_tables=tables)
+    return arrays._replace(pairs=pair_indices, pair_tables=tables)
 
 
 def _known_tables(
@@ -151,12 +151,12 @@ def _known_tables(
     """The robot's tables by index of the pair, for pairs that still have exactly the table's joints between
     them."""
     number = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}
-    found = {}
+    tables_by_pair = {}
     for table in robot.tables:
         between = tuple(robot.joint_names[joint] for joint in robot.joints_between(*table.links))
         if frozenset(table.links) in number and between == table.joints:
-            found[number[frozenset(table.links)]] = table
-    return found
+            tables_by_pair[number[frozenset(table.links)]] = table
+    return tables_by_pair
 
 
 class _Group(NamedTuple):
@@ -173,17 +173,17 @@ def _placed_groups(robot: Robot) -> dict[str, _Group]:
     """The groups by link. A robot that holds something reuses those of the bare arm."""
     placed = {} if robot.bare is None else dict(_placed_groups(robot.bare))
     links = [link for link in robot_groups(robot) if link not in placed]
-    whole = []
+    link_spheres = []
     parts = []
     for link in links:
         T = robot.T_frame_link(link)
         local = np.asarray(robot.spheres[link], np.float64)
         centres = local[:, :3] @ T[:3, :3].T + T[:3, 3]
-        whole.append(np.column_stack([centres, local[:, 3]]))
-        parts.append(_clusters(whole[-1]))
-    bounds = _bounding_spheres([*whole, *(part for of_link in parts for part in of_link)])
-    of_parts = iter(bounds[len(whole) :])
-    for link, spheres, rows, around in zip(links, whole, parts, bounds, strict=False):
+        link_spheres.append(np.column_stack([centres, local[:, 3]]))
+        parts.append(_clusters(link_spheres[-1]))
+    bounds = _bounding_spheres([*link_spheres, *(part for of_link in parts for part in of_link)])
+    of_parts = iter(bounds[len(link_spheres) :])
+    for link, spheres, rows, around in zip(links, link_spheres, parts, bounds, strict=False):
         placed[link] = _Group(spheres, rows, around, list(islice(of_parts, len(rows))))
     return placed
 
@@ -225,9 +225,9 @@ def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
     towards the farthest one)."""
     if not sets:
         return []
-    most = max(map(len, sets))
+    max_count = max(map(len, sets))
     each = np.arange(len(sets))
-    spheres = np.full((len(sets), most, 4), -np.inf)
+    spheres = np.full((len(sets), max_count, 4), -np.inf)
     for padded, real in zip(spheres, sets, strict=True):
         padded[: len(real)] = real
         padded[len(real) :, :3] = 0.0
@@ -303,9 +303,9 @@ def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
     base = -np.einsum("nij,ni->nj", R, T[:, :3, 3])
     low = np.maximum(-half, base - far)
     high = np.minimum(half, base + far)
-    kept = low < high
-    half[kept] = ((high - low) / 2)[kept]
-    centre = T[:, :3, 3] + np.einsum("nij,nj->ni", R, np.where(kept, (low + high) / 2, 0.0))
+    nonempty = low < high
+    half[nonempty] = ((high - low) / 2)[nonempty]
+    centre = T[:, :3, 3] + np.einsum("nij,nj->ni", R, np.where(nonempty, (low + high) / 2, 0.0))
     grown = FLOAT32_ROUNDING * (np.abs(centre).max(axis=1) + sizes.max(axis=1))
     sizes += grown[:, None] * (sizes > 0)
     half[:, :2] += sizes[:, 3:4]

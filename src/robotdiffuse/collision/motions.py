@@ -142,7 +142,7 @@ class ContinuousCollision:
         certified = np.full(2, CLEARANCE_CAP)
         hit: tuple[float, int] | None = None
         while len(todo.start):
-            found, rows, columns = kernel.rounds(
+            bounds, rows, columns = kernel.rounds(
                 self.arm,
                 self.scene_arrays,
                 self.solids,
@@ -156,10 +156,10 @@ class ContinuousCollision:
             )
             if not len(rows):
                 break
-            touched = self._ask(motion, found, rows, columns, best)
+            touched = self._ask(motion, bounds, rows, columns, best)
             if touched is not None:
-                hit, found = touched
-            todo = kernel.settle(self.checks, found, best, certified, self.tightness)
+                hit, bounds = touched
+            todo = kernel.settle(self.checks, bounds, best, certified, self.tightness)
         if hit is not None:
             return Sweep(self._contact(motion, *hit), 0.0, 0.0)
         return Sweep(None, *certified.tolist())
@@ -181,22 +181,22 @@ class ContinuousCollision:
         at = motion_pieces.configurations(motion, middle[rows])
         cutoffs = np.clip(travel + best[kinds], 2 * self.contact, CLEARANCE_CAP)
         distances, _ = self._exact.nearest(at, columns, cutoffs, stop=self.contact)
-        asked = int(np.isfinite(distances).sum())
-        touched = distances[asked - 1] <= self.contact
-        asked -= int(touched)
-        cells = rows[:asked], columns[:asked]
-        clearance[cells] = distances[:asked]
-        lower[cells] = np.maximum(lower[cells], distances[:asked] - travel[:asked])
-        np.minimum.at(best, kinds[:asked], distances[:asked])
+        computed = int(np.isfinite(distances).sum())
+        touched = distances[computed - 1] <= self.contact
+        computed -= int(touched)
+        cells = rows[:computed], columns[:computed]
+        clearance[cells] = distances[:computed]
+        lower[cells] = np.maximum(lower[cells], distances[:computed] - travel[:computed])
+        np.minimum.at(best, kinds[:computed], distances[:computed])
         if not touched:
             return None
-        row = int(rows[asked])
+        row = int(rows[computed])
         keep = row + int(todo.stop[row] - todo.start[row] > 2 * CONTACT_TRAVEL_TOLERANCE)
         todo.stop[row] = middle[row]
         clearance[row:] = lower[row:] = -np.inf
         parts = (todo.start, todo.stop, todo.undecided)
         rest = Round(Pieces(*(part[:keep] for part in parts)), *(part[:keep] for part in found[1:]))
-        return (float(middle[row]), int(columns[asked])), rest
+        return (float(middle[row]), int(columns[computed])), rest
 
     @cached_property
     def _exact(self) -> "ExactCollision":
@@ -215,14 +215,14 @@ class ContinuousCollision:
         checks = np.full(len(steps), check)
         cutoffs = np.full(len(steps), 2 * self.contact)
         distances, names = self._exact.nearest(motion_pieces.configurations(motion, steps), checks, cutoffs)
-        other = names[0]
-        left = [i for i, name in enumerate(names) if name != other or distances[i] > self.contact]
-        episode = distances[: left[0] if left else len(steps)]
+        partner = names[0]
+        separated = [i for i, name in enumerate(names) if name != partner or distances[i] > self.contact]
+        episode = distances[: separated[0] if separated else len(steps)]
         depth = max(0.0, -float(episode.min(initial=0)))
         low, share = motion_pieces.segment_at(motion.travel, at)
         if share == 0.0:  # the first of several equal waypoints
             low = int(np.searchsorted(motion.travel, at))
-        return Contact(checks_of(self.robot)[check], str(other), low + share, depth)
+        return Contact(checks_of(self.robot)[check], str(partner), low + share, depth)
 
 
 @once_per_robot
@@ -248,40 +248,40 @@ def _checks(robot: Robot) -> Checks:
     """The checks as arrays for compiled code. Motion radii of a pair are seen from the frame where the chains
     of both links part, which is the nearer link if both are on one chain."""
     groups, pairs = _groups(robot)
-    whole = with_covering_spheres(robot)
+    covered = with_covering_spheres(robot)
     parts = hulls_of(robot)[1]
-    links = [link for link in whole.link_names if link in whole.spheres]
-    radii = motion_radii(whole)
+    links = [link for link in covered.link_names if link in covered.spheres]
+    radii = motion_radii(covered)
     checks = checks_of(robot)
     kind = []
-    where = []
+    group_indices = []
     of_parts = []
     base = []
     common = []
     second = []
     of_checks = np.zeros((len(checks), robot.dof))
-    for k, (link, other) in enumerate(checks):
-        kind.append(SCENE if other is None else PAIR)
-        known = groups.get(link, -1) if other is None else pairs.get(frozenset((link, other)), -1)
-        where.append(known)
-        nearer, further = sorted((other or robot.base, link), key=robot.link_frame)
+    for k, (link, partner) in enumerate(checks):
+        kind.append(SCENE if partner is None else PAIR)
+        group_index = groups.get(link, -1) if partner is None else pairs.get(frozenset((link, partner)), -1)
+        group_indices.append(group_index)
+        nearer, farther = sorted((partner or robot.base, link), key=robot.link_frame)
         low = robot.link_frame(nearer)
-        high = robot.link_frame(further)
+        high = robot.link_frame(farther)
         shared = robot.moved_by[low] & robot.moved_by[high]
         for one, joints in (
             (nearer, robot.moved_by[low] & ~shared),
-            (further, robot.moved_by[high] & ~shared),
+            (farther, robot.moved_by[high] & ~shared),
         ):
             if joints.any():
                 of_checks[k, joints] = radii[links.index(one), joints]
         base.append(low)
         common.append(int(np.flatnonzero(shared).max(initial=-1)) + 1)
         second.append(int(np.flatnonzero(robot.moved_by[high] & ~shared)[0]) if common[-1] != low else 0)
-        others = range(0) if other is None else parts[nearer]
-        of_parts.append((parts[further].start, parts[further].stop, others.start, others.stop))
+        partner_parts = range(0) if partner is None else parts[nearer]
+        of_parts.append((parts[farther].start, parts[farther].stop, partner_parts.start, partner_parts.stop))
     return Checks(
         np.array(kind, np.int64),
-        np.array(where, np.int64),
+        np.array(group_indices, np.int64),
         np.array(of_parts, np.int64).reshape(-1, 4),
         np.array(base, np.int64),
         np.array(common, np.int64),

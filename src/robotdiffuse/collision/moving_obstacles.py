@@ -85,12 +85,12 @@ class MovingCollision:
         tasks = Tasks(ends[:1], ends[1:], every)
         hit = None
         while len(tasks.start):
-            bound, left = kernel.settle_tasks(
+            bound, open_tasks = kernel.settle_tasks(
                 self.links, self.tracks, times, q, tasks, self.contact, self.tightness, best
             )
             certified = min(certified, bound)
             halves = list[tuple[float, float, int, int]]()
-            for start, stop, link, o in left:
+            for start, stop, link, o in open_tasks:
                 if hit is not None and start >= hit[0]:
                     continue
                 time = (start + stop) / 2
@@ -114,9 +114,9 @@ class MovingCollision:
 
     def inflated(self, by: Float[ndarray, "obstacles"]) -> "MovingCollision":
         """A copy in which each obstacle is inflated by a distance [m], for `first_unproved_time`."""
-        other = copy(self)
-        other.tracks = self.tracks._replace(rounding=self.tracks.rounding + by)
-        return other
+        inflated = copy(self)
+        inflated.tracks = self.tracks._replace(rounding=self.tracks.rounding + by)
+        return inflated
 
     def first_unproved_time(
         self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"], least: float
@@ -128,10 +128,10 @@ class MovingCollision:
         times = for_kernels(times)
         q = for_kernels(q)
         tasks = Tasks(times[:1], times[-1:], every)
-        left = kernel.settle_tasks(
+        open_tasks = kernel.settle_tasks(
             self.links, self.tracks, times, q, tasks, least, 0.0, np.array([CLEARANCE_CAP])
         )[1]
-        return min((start for start, *_ in left), default=None)
+        return min((start for start, *_ in open_tasks), default=None)
 
     def _tasks(self, halves: list[tuple[float, float, int, int]]) -> Tasks:
         pairs = np.zeros((len(halves), len(self.link_names), len(self.moving)), np.bool_)
@@ -191,13 +191,13 @@ def _at(times: ndarray, rows: ndarray, time: float) -> Float[ndarray, "dof"]:
 @once_per_robot
 def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
     """Names of the moving links with geometry, and their arrays for compiled code."""
-    whole = with_covering_spheres(robot)
-    names = tuple(link for link in robot_groups(whole) if whole.link_frame(link) > 0)
-    rows = [link for link in whole.link_names if link in whole.spheres]
+    covered = with_covering_spheres(robot)
+    names = tuple(link for link in robot_groups(covered) if covered.link_frame(link) > 0)
+    rows = [link for link in covered.link_names if link in covered.spheres]
     spheres = []
     for link in names:
-        T = whole.T_frame_link(link)
-        local = np.asarray(whole.spheres[link], np.float64)
+        T = covered.T_frame_link(link)
+        local = np.asarray(covered.spheres[link], np.float64)
         spheres.append(np.column_stack([local[:, :3] @ T[:3, :3].T + T[:3, 3], local[:, 3]]))
     bounds = np.zeros((len(names), 4))
     for i, of_link in enumerate(spheres):
@@ -210,11 +210,11 @@ def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
         for_kernels(robot.frame_offsets),
         robot.kernel_parents,
         np.array(robot.prismatic, np.bool_),
-        np.array([whole.link_frame(link) for link in names], np.int64),
+        np.array([covered.link_frame(link) for link in names], np.int64),
         bounds,
         np.cumsum([0] + [len(of_link) for of_link in spheres]),
         np.concatenate(spheres) if spheres else np.zeros((0, 4)),
-        np.ascontiguousarray(motion_radii(whole)[[rows.index(link) for link in names]]),
+        np.ascontiguousarray(motion_radii(covered)[[rows.index(link) for link in names]]),
     )
     return names, links
 

@@ -89,9 +89,9 @@ def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[n
     near = _divide(triangles, reach / 4 if np.isfinite(reach) else np.inf, reach)
     # bisection ends with pieces of about a quarter of the squared spacing
     spacing = max(MESH_SPACING, float(np.sqrt(4 * _area(near) / MAX_POINTS)))
-    pieces = _divide(near, spacing, reach)
-    centres = pieces.mean(axis=1)
-    radii = np.linalg.norm(pieces - centres[:, None], axis=2).max(axis=1, initial=0.0)
+    triangle_parts = _divide(near, spacing, reach)
+    centres = triangle_parts.mean(axis=1)
+    radii = np.linalg.norm(triangle_parts - centres[:, None], axis=2).max(axis=1, initial=0.0)
     spheres = np.column_stack([centres, radii + 1e-4])
     return _join(spheres, spacing) if len(spheres) > MAX_POINTS else spheres
 
@@ -99,16 +99,16 @@ def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[n
 def _divide(triangles: Float[ndarray, "n 3 3"], spacing: float, reach: float) -> Float[ndarray, "m 3 3"]:
     """Pieces of the triangles near the robot with no edge longer than `spacing` [m], by halving longest
     edges."""
-    done = [np.zeros((0, 3, 3))]
+    finished = [np.zeros((0, 3, 3))]
     while len(triangles):
         edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
         near = np.linalg.norm(triangles.mean(axis=1), axis=1) <= reach + POINT_RANGE + edges.max(axis=1)
         triangles = triangles[near]
         edges = edges[near]
-        small = edges.max(axis=1) <= spacing
-        done.append(triangles[small])
-        triangles = triangles[~small]
-        edges = edges[~small]
+        short_enough = edges.max(axis=1) <= spacing
+        finished.append(triangles[short_enough])
+        triangles = triangles[~short_enough]
+        edges = edges[~short_enough]
         # edge i joins corners i - 1 and i; split the longest one
         longest = edges.argmax(axis=1)
         rows = np.arange(len(triangles))
@@ -117,7 +117,7 @@ def _divide(triangles: Float[ndarray, "n 3 3"], spacing: float, reach: float) ->
         c = triangles[rows, (longest + 1) % 3]
         middle = (a + b) / 2
         triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return np.concatenate(done)
+    return np.concatenate(finished)
 
 
 def _area(triangles: Float[ndarray, "n 3 3"]) -> float:
@@ -138,10 +138,10 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
         )
     cloud = cloud.astype(np.float32)
     radii = cloud[:, 3]
-    known = EXACT_RANGE + radius + float(radii.max())
-    low = cloud[:, :3].min(axis=0) - np.float32(known)
-    extent = (cloud[:, :3].max(axis=0) - low).astype(np.float64) + known
-    voxel = np.float32(max(known / VOXELS_PER_RANGE, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
+    exact_distance = EXACT_RANGE + radius + float(radii.max())
+    low = cloud[:, :3].min(axis=0) - np.float32(exact_distance)
+    extent = (cloud[:, :3].max(axis=0) - low).astype(np.float64) + exact_distance
+    voxel = np.float32(max(exact_distance / VOXELS_PER_RANGE, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
     shape = np.ceil(extent / voxel).astype(np.int32) + 1
     cells = (shape + 1) // 2
     index = ((cloud[:, :3] - low) / voxel).astype(np.int64)
@@ -159,7 +159,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     run[voxels[starts]] = np.arange(len(starts))
     ends = np.append(starts, len(points)).astype(np.int32)
     sizes = tuple(shape.tolist())
-    grid, nearest = make_grid(points, ends, run, low, voxel, sizes, band, np.float32(known))
+    grid, nearest = make_grid(points, ends, run, low, voxel, sizes, band, np.float32(exact_distance))
     frame = [*low, voxel, 2 * voxel, radii.max(), radii.min(), band, *shape, *cells]
     return PointGrid(
         points, by_sixteen(points, points[-1:]), first, grid, nearest, np.array(frame, np.float32)

@@ -42,15 +42,15 @@ class _Body:
         times. Points in front of an open component can count as inside."""
         low = self.triangles.min(axis=(0, 1))
         high = self.triangles.max(axis=(0, 1))
-        found = ((points >= low) & (points <= high)).all(axis=1)
-        for i in np.flatnonzero(found):
-            found[i] = any((np.bincount(self._crossed(points[i], ray)) % 2).any() for ray in RAYS)
-        return found
+        enclosed = ((points >= low) & (points <= high)).all(axis=1)
+        for i in np.flatnonzero(enclosed):
+            enclosed[i] = any((np.bincount(self._crossed(points[i], ray)) % 2).any() for ray in RAYS)
+        return enclosed
 
     def _crossed(self, point: Float[ndarray, "3"], ray: Float[ndarray, "3"]) -> Int[ndarray, "k"]:
         """Component of every triangle that a ray from a point crosses."""
         a, b, c = np.moveaxis(self.triangles - point, 1, 0)
-        sides = [np.cross(one, other) @ ray for one, other in ((a, b), (b, c), (c, a))]
+        sides = [np.cross(one, edge_end) @ ray for one, edge_end in ((a, b), (b, c), (c, a))]
         through = np.all([side >= 0 for side in sides], axis=0) | np.all([side < 0 for side in sides], axis=0)
         normal = np.cross(b - a, c - a)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -75,8 +75,8 @@ class SurfacePair:
         places = a.tree, coal_pose(T_a), b.tree, coal_pose(T_b)
         if coal.collide(*places, coal.CollisionRequest(), coal.CollisionResult()):
             return None
-        for body, T_body, other, T_other in ((a, T_a, b, T_b), (b, T_b, a, T_a)):
-            in_base = other.points @ T_other[:3, :3].T + T_other[:3, 3]
+        for body, T_body, other_body, T_other in ((a, T_a, b, T_b), (b, T_b, a, T_a)):
+            in_base = other_body.points @ T_other[:3, :3].T + T_other[:3, 3]
             if body.inside((in_base - T_body[:3, 3]) @ T_body[:3, :3]).any():
                 return None
         result = coal.DistanceResult()
@@ -89,15 +89,15 @@ class SurfacePair:
 def surface_pairs(robot: Robot) -> dict[Check, SurfacePair]:
     """The surfaces of each checked pair of grazing links."""
     bodies: dict[str, _Body] = {}
-    found = {}
+    surfaces = {}
     for check in checks_of(robot):
         if check.other is None or not surfaces_decide(robot, check):
             continue
         for link in (check.link, check.other):
             if link not in bodies:
                 bodies[link] = _body(robot, link)
-        found[check] = SurfacePair(bodies[check.link], bodies[check.other])
-    return found
+        surfaces[check] = SurfacePair(bodies[check.link], bodies[check.other])
+    return surfaces
 
 
 def _body(robot: Robot, link: str) -> _Body:

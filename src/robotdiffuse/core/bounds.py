@@ -48,10 +48,10 @@ class Value:
 
     def __post_init__(self) -> None:
         for name in (field.name for field in fields(self)):  # type: ignore[arg-type]
-            given = getattr(self, name)
-            kept = read_only(given)
-            if kept is not given:
-                object.__setattr__(self, name, kept)
+            value = getattr(self, name)
+            frozen = read_only(value)
+            if frozen is not value:
+                object.__setattr__(self, name, frozen)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         # arrays can be written to when they come out of a pickle or a deep copy
@@ -64,17 +64,17 @@ def read_only(value: T) -> T:
     if isinstance(value, ndarray):
         if not _writable(value):
             return value
-        kept = np.array(value)
-        kept.setflags(write=False)
-        return kept  # type: ignore[return-value]
+        frozen = np.array(value)
+        frozen.setflags(write=False)
+        return frozen  # type: ignore[return-value]
     if isinstance(value, tuple):
-        kept = [read_only(one) for one in value]
-        if all(a is b for a, b in zip(kept, value, strict=True)):
+        frozen = [read_only(one) for one in value]
+        if all(a is b for a, b in zip(frozen, value, strict=True)):
             return value
-        return value._make(kept) if hasattr(value, "_make") else tuple(kept)  # type: ignore
+        return value._make(frozen) if hasattr(value, "_make") else tuple(frozen)  # type: ignore
     if isinstance(value, dict):
-        kept = {key: read_only(one) for key, one in value.items()}
-        return value if all(kept[key] is value[key] for key in value) else kept  # type: ignore[return-value]
+        frozen = {key: read_only(one) for key, one in value.items()}
+        return value if all(frozen[key] is value[key] for key in value) else frozen  # type: ignore[return-value]
     return value
 
 
@@ -140,13 +140,13 @@ def rows(
     about the right shape, e.g. ", a column for each joint".
     """
     array = numbers(value)
-    wanted = f"it must be {count or 'n'} x {columns} finite numbers{meaning}"
+    requirement = f"it must be {count or 'n'} x {columns} finite numbers{meaning}"
     if array is None:
-        raise InputError(f"{name} is {shown(value)}; {wanted}")
+        raise InputError(f"{name} is {shown(value)}; {requirement}")
     if array.size == 0:
-        raise InputError(f"{name} is empty; {wanted}")
+        raise InputError(f"{name} is empty; {requirement}")
     if array.ndim != 2 or array.shape[1] != columns or count not in (None, len(array)):
-        raise InputError(f"{name} is {form(array)}; {wanted}")
+        raise InputError(f"{name} is {form(array)}; {requirement}")
     bad = np.flatnonzero(~(np.abs(array) <= most).all(axis=1))
     if len(bad):
         row = shown(array[bad[0]])
@@ -226,11 +226,11 @@ MAX_TEXT = 200
 
 def one_line(value: Any) -> str:
     """A dataclass as Name(field=value, ...) in one line; fields with their default are left out."""
-    found = []
+    fields_shown = []
     for field in fields(value):
         if field.repr and not _is_default(field.default, now := getattr(value, field.name)):
-            found.append(f"{field.name}={short(now)}")
-    text = f"{type(value).__name__}({', '.join(found)})"
+            fields_shown.append(f"{field.name}={short(now)}")
+    text = f"{type(value).__name__}({', '.join(fields_shown)})"
     return text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 4]}...)"
 
 
@@ -243,8 +243,8 @@ def short(value: Any) -> str:
     if isinstance(value, tuple | list) and not hasattr(value, "_fields"):
         if len(value) > MAX_ENTRIES:
             return f"<{len(value)} entries>"
-        inner = ", ".join(map(short, value))
-        return f"({inner},)" if len(value) == 1 else f"({inner})"
+        items = ", ".join(map(short, value))
+        return f"({items},)" if len(value) == 1 else f"({items})"
     if isinstance(value, dict):
         return f"<{len(value)} entries>"
     return " ".join(repr(value).split())

@@ -99,9 +99,9 @@ def shortened(text: str) -> str:
 
 def joined(names: Iterable[object], most: int = MAX_NAMES) -> str:
     """Names from a user's input as one line: the first `most`, each shortened, and how many more follow."""
-    short = [shortened(str(name)) for name in names]
-    more = f" and {len(short) - most} more" if len(short) > most else ""
-    return ", ".join(short[:most]) + more
+    short_names = [shortened(str(name)) for name in names]
+    more = f" and {len(short_names) - most} more" if len(short_names) > most else ""
+    return ", ".join(short_names[:most]) + more
 
 
 def repeated(names: Iterable[str]) -> list[str]:

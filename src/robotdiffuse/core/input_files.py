@@ -85,7 +85,7 @@ def input_file(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -
     if _closed.get():
         raise InputError(f"{named} is a file, and files are not read here: give its content instead")
     try:
-        found = os.stat(file)
+        status = os.stat(file)
         permitted = os.access(file, os.R_OK)
     except FileNotFoundError:
         raise InputError(f"{named} does not exist") from None
@@ -93,13 +93,13 @@ def input_file(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -
         raise InputError(f"{named} cannot be read: {error.strerror}") from None
     except ValueError:  # a NUL or half a surrogate pair in the name
         raise InputError(f"{named} cannot be read: no file can have this name") from None
-    if not stat.S_ISREG(found.st_mode):
-        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or a pipe"
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or a pipe"
         raise InputError(f"{named} cannot be read: it is {kind}; it must be a file")
     if not permitted:
         raise InputError(f"{named} cannot be read: permission denied")
-    if found.st_size > largest:
-        size = f"{found.st_size / MEGABYTE:.0f} MB"
+    if status.st_size > largest:
+        size = f"{status.st_size / MEGABYTE:.0f} MB"
         raise InputError(f"{named} is too large: it has {size}; at most {largest // MEGABYTE} MB are read")
     return Path(file)
 
@@ -135,10 +135,10 @@ def read_arrays(file: str | Path) -> dict[str, ndarray]:
                 return {"": np.lib.format.read_array(stream, allow_pickle=False)}
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
-            most = MAX_FILE_SIZE
-        if size > most:
+            size_limit = MAX_FILE_SIZE
+        if size > size_limit:
             raise InputError(
-                f"{file} unpacks to {size // MEGABYTE} MB; at most {most // MEGABYTE} MB are read"
+                f"{file} unpacks to {size // MEGABYTE} MB; at most {size_limit // MEGABYTE} MB are read"
             )
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
@@ -276,16 +276,16 @@ class _Composer:
                 values.append(self._node(depth + 1))
             loader.get_event()
             return values
-        found: dict[str, Any] = {}
+        mapping: dict[str, Any] = {}
         while not loader.check_event(yaml.MappingEndEvent):
             key = self._event()
             if not isinstance(key, yaml.ScalarEvent):
                 self._refuse(key, "a key is not a plain string")
-            if key.value in found:
+            if key.value in mapping:
                 self._refuse(key, f"{key.value} appears twice")
-            found[key.value] = self._node(depth + 1)
+            mapping[key.value] = self._node(depth + 1)
         loader.get_event()
-        return found
+        return mapping
 
     def _event(self) -> Any:
         event: Any = self.loader.get_event()
@@ -319,11 +319,11 @@ def _reason(error: yaml.YAMLError) -> str:
 
 
 def _object(pairs: list[tuple[str, Any]], where: str) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
         twice = repeated(name for name, _ in pairs)[0]
         raise InputError(f"{where} is not valid JSON: {shortened(twice)} appears twice")
-    return found
+    return mapping
 
 
 def _integer(digits: str, where: str) -> int:

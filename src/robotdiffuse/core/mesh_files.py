@@ -119,15 +119,15 @@ def _collada(content: bytes) -> tuple[bytes, str, float]:
             parent.remove(child)
     up = (root.findtext("asset/up_axis") or "Y_UP").strip()
     unit = root.find("asset/unit")
-    given = "1" if unit is None else unit.get("meter", "1")
+    unit_text = "1" if unit is None else unit.get("meter", "1")
     try:
-        metres = float(given)
+        metres = float(unit_text)
     except ValueError:
         metres = 0.0
     if up not in R_UP:
         raise InputError(f"its up_axis is {shown(up)}; it must be one of {', '.join(R_UP)}")
     if not 1e-9 < metres < 1e9:
-        raise InputError(f"its unit is {shown(given)} m; it must be a positive number")
+        raise InputError(f"its unit is {shown(unit_text)} m; it must be a positive number")
     if any(sum(map(int, (count.text or "").split())) > len(content) for count in root.iter("vcount")):
         raise InputError("a polygon has more corners than the file has bytes")
     weights = {

@@ -84,14 +84,14 @@ class JsonLines:
         if file is None or not file.is_file():
             return
         content = file.read_bytes()
-        whole = content[: content.rfind(b"\n") + 1]
-        for number, line in enumerate(whole.splitlines(), start=1):
+        complete_lines = content[: content.rfind(b"\n") + 1]
+        for number, line in enumerate(complete_lines.splitlines(), start=1):
             try:
                 self.rows.append(dict(json.loads(line)))
             except (ValueError, TypeError) as error:
                 raise InputError(f"{file}, line {number} is not a JSON object: {error}") from None
-        if whole != content:
-            self._without_cut_line = whole
+        if complete_lines != content:
+            self._without_cut_line = complete_lines
 
     def replace(self, rows: list[dict[str, Any]]) -> None:
         """Replace all rows, atomically."""
@@ -113,10 +113,10 @@ class JsonLines:
         file.parent.mkdir(parents=True, exist_ok=True)
         with file.open("ab", buffering=0) as stream:
             size = stream.seek(0, os.SEEK_END)
-            left = memoryview(line.encode())
+            unwritten = memoryview(line.encode())
             try:
-                while left:
-                    left = left[stream.write(left) :]
+                while unwritten:
+                    unwritten = unwritten[stream.write(unwritten) :]
                 os.fsync(stream.fileno())
             except BaseException:
                 stream.truncate(size)

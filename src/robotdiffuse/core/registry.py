@@ -50,8 +50,8 @@ imported: list[str] = []
 def added_entries() -> AddedEntries:
     """The entries that this program has added to the package's own, for `adopt_entries` in worker
     processes."""
-    found = {what: dict(table.items() - table.own.items()) for what, table in _tables.items()}
-    tables = {what: entries for what, entries in found.items() if entries}
+    added = {registry: dict(table.items() - table.own.items()) for registry, table in _tables.items()}
+    tables = {registry: entries for registry, entries in added.items() if entries}
     return AddedEntries(tables, tuple(imported))
 
 
@@ -59,8 +59,8 @@ def adopt_entries(added: AddedEntries) -> None:
     """Import the parent process's modules, and add its entries to all registries, those created later too."""
     import_modules(added.modules)
     _adopted.update(added.tables)
-    for what in _tables.keys() & added.tables.keys():
-        _tables[what].update(added.tables[what])
+    for registry in _tables.keys() & added.tables.keys():
+        _tables[registry].update(added.tables[registry])
 
 
 class Registry(dict[str, Entry]):
@@ -123,17 +123,17 @@ class Registry(dict[str, Entry]):
 
     def load(self, name: str) -> Any:
         """Import the class, function or value of an entry. Raises InputError as `entry` does."""
-        module, _, found = self.entry(name).location.partition(":")
-        return getattr(import_module(module), found)
+        module, _, attribute = self.entry(name).location.partition(":")
+        return getattr(import_module(module), attribute)
 
     def settings(self, name: str) -> type | None:
         """The settings class of an entry; None if it has none. Raises InputError as `entry` does."""
         entry = self.entry(name)
         if not entry.settings:
             return None
-        own = entry.location.partition(":")[0]
-        module, _, found = entry.settings.rpartition(":")
-        return getattr(import_module(module or own), found)
+        entry_module = entry.location.partition(":")[0]
+        module, _, attribute = entry.settings.rpartition(":")
+        return getattr(import_module(module or entry_module), attribute)
 
     def defaults(self, name: str) -> Any:
         """The default settings of an entry; None if it has none."""
@@ -148,9 +148,9 @@ class Registry(dict[str, Entry]):
         kind = self.load(name)
         if settings is None:
             return kind()
-        wanted = self.settings(name)
-        if wanted is None or not isinstance(settings, wanted):
-            takes = "takes none" if wanted is None else f"takes {wanted.__name__}"
+        expected = self.settings(name)
+        if expected is None or not isinstance(settings, expected):
+            takes = "takes none" if expected is None else f"takes {expected.__name__}"
             raise InputError(f"settings are {type(settings).__name__}; {self.what} {name} {takes}")
         return kind(settings)
 

@@ -265,10 +265,10 @@ def _plain(value: Any) -> Any:
 
 
 def _result(record: dict[str, Any]) -> PlanResult:
-    known = {status.value: status for status in Status}
-    if not isinstance(record["status"], str) or record["status"] not in known:
-        raise InputError(f"status is {shown(record['status'])}; known: {', '.join(known)}")
-    status = known[record["status"]]
+    statuses = {status.value: status for status in Status}
+    if not isinstance(record["status"], str) or record["status"] not in statuses:
+        raise InputError(f"status is {shown(record['status'])}; known: {', '.join(statuses)}")
+    status = statuses[record["status"]]
     solved = status is Status.SOLVED
     if record["verified"] is not solved:
         raise InputError(f"verified is {shown(record['verified'])}, but status is {shown(status.value)}")

@@ -161,19 +161,19 @@ class Settings:
                 raise InputError(
                     f"{where}.{shortened(str(name))} is not a setting; known: {', '.join(fields)}"
                 )
-        found: dict[str, Any] = {}
+        converted: dict[str, Any] = {}
         for name, field in fields.items():
             if name in values:
                 at = f"{where}.{name}"
                 # no settings are given, so the name in the other field need not be in a registry
                 kind = None if values[name] is None else _settings_class(hints[name], values, fields)
                 if kind is not None:
-                    found[name] = kind.from_json(values[name], at)
+                    converted[name] = kind.from_json(values[name], at)
                 else:
-                    found[name] = _converted(at, hints[name], values[name])
+                    converted[name] = _converted(at, hints[name], values[name])
             elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
                 raise InputError(f"{where}.{name} is missing")
-        return cls(**found)
+        return cls(**converted)
 
     def changed(self: Given, assignments: Iterable[str]) -> Given:
         """A copy with some settings replaced: "step=0.5", "guidance.margin=0.02"; values as in YAML.
@@ -181,13 +181,15 @@ class Settings:
         Raises InputError for text that is not NAME=VALUE, an unknown name (the message lists all settings)
         and a value of the wrong type or out of bounds.
         """
-        where = self.settings_name or type(self).__name__
-        known = {setting.name: setting.assignment for setting in self.describe()}
+        owner = self.settings_name or type(self).__name__
+        valid_assignments = {setting.name: setting.assignment for setting in self.describe()}
         values: dict[str, Any] = {}
         for text in assignments:
             name, equals, value = text.partition("=")
             if not equals or not name:
-                raise InputError(f"{shown(text)} is not NAME=VALUE; {where} has {', '.join(known.values())}")
+                raise InputError(
+                    f"{shown(text)} is not NAME=VALUE; {owner} has {', '.join(valid_assignments.values())}"
+                )
             try:
                 parsed = parse_yaml(value, name)
             except InputError:
@@ -203,12 +205,12 @@ class Settings:
 
         Raises InputError as `changed` does.
         """
-        known = [setting.assignment for setting in self.describe()]
-        return self._replaced(values, self.settings_name or type(self).__name__, known)
+        assignments = [setting.assignment for setting in self.describe()]
+        return self._replaced(values, self.settings_name or type(self).__name__, assignments)
 
     def _replaced(self: Given, values: Mapping[str, Any], where: str, known: list[str]) -> Given:
         hints = _hints(type(self))
-        found = {}
+        replaced = {}
         within = dict[str, dict[str, Any]]()
         for name, value in values.items():
             first, dot, rest = str(name).partition(".")
@@ -219,23 +221,23 @@ class Settings:
                 root, _, path = f"{where}.{name}".partition(".")
                 raise InputError(f"{root} has no setting {shown(path)}; it has {', '.join(known)}")
             else:
-                found[name] = _converted(f"{where}.{name}", hints[name], value)
+                replaced[name] = _converted(f"{where}.{name}", hints[name], value)
         for name, changes in within.items():
-            found[name] = getattr(self, name)._replaced(changes, f"{where}.{name}", known)
-        return dataclasses.replace(self, **found)  # type: ignore[type-var]
+            replaced[name] = getattr(self, name)._replaced(changes, f"{where}.{name}", known)
+        return dataclasses.replace(self, **replaced)  # type: ignore[type-var]
 
     def describe(self) -> list[Setting]:
         """All settings with their values, including nested ones."""
         hints = _hints(type(self))
         documents = field_docstrings(type(self))
-        found: list[Setting] = []
+        settings: list[Setting] = []
         for name, hint in hints.items():
             value = getattr(self, name)
             if isinstance(value, Settings):
-                found += [inner._replace(name=f"{name}.{inner.name}") for inner in value.describe()]
+                settings += [nested._replace(name=f"{name}.{nested.name}") for nested in value.describe()]
             else:
-                found.append(Setting(name, value, _rule(hint), documents.get(name, "")))
-        return found
+                settings.append(Setting(name, value, _rule(hint), documents.get(name, "")))
+        return settings
 
 
 @cache
@@ -312,11 +314,11 @@ def _check_mark(where: str, mark: Any, value: Any, owner: object) -> None:
         raise unknown_name(where, value, mark.names)
     elif isinstance(mark, SettingsOf) and owner is not None and value is not None:
         name = getattr(owner, mark.field)
-        wanted = mark.table.settings(name) if name in mark.table else None
-        if wanted is not None and type(value) is not wanted:
+        expected = mark.table.settings(name) if name in mark.table else None
+        if expected is not None and type(value) is not expected:
             raise InputError(
                 f"{mark.field} is {name}, but its settings are {type(value).__name__}; "
-                f"they must be {wanted.__name__}"
+                f"they must be {expected.__name__}"
             )
 
 
@@ -359,7 +361,7 @@ def _rule(hint: Any) -> str:
 
 def field_docstrings(kind: type) -> dict[str, str]:
     """The docstring below each field of a class and of its base classes."""
-    found: dict[str, str] = {}
+    docstrings: dict[str, str] = {}
     for cls in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(cls):
             continue
@@ -373,5 +375,5 @@ def field_docstrings(kind: type) -> dict[str, str]:
                 and isinstance(text.value, ast.Constant)
                 and isinstance(text.value.value, str)
             ):
-                found[field.target.id] = " ".join(text.value.value.split())
-    return found
+                docstrings[field.target.id] = " ".join(text.value.value.split())
+    return docstrings

@@ -92,11 +92,11 @@ class Table:
         places: set[tuple[int, int]] = set()
         for j, column in enumerate(self.columns):
             values = {i: _value(row[j]) for i, row in enumerate(self.rows)}
-            known = {i: value for i, value in values.items() if value == value}
-            if column.better and known:
-                best = (max if column.better == "more" else min)(known.values())
-                texts = {_text(self.rows[i][j], column) for i, value in known.items() if value == best}
-                level = [i for i in known if _text(self.rows[i][j], column) in texts]
+            finite = {i: value for i, value in values.items() if value == value}
+            if column.better and finite:
+                best = (max if column.better == "more" else min)(finite.values())
+                texts = {_text(self.rows[i][j], column) for i, value in finite.items() if value == best}
+                level = [i for i in finite if _text(self.rows[i][j], column) in texts]
                 places |= {(i, j) for i in level if 2 * len(level) <= len(self.rows)}
         return places
 
@@ -126,7 +126,7 @@ def terminal(table: Table) -> "RichTable":
     from rich.markup import escape
     from rich.table import Table as RichTable
 
-    made = RichTable(
+    rich_table = RichTable(
         title=escape(table.title) or None,
         title_justify="left",
         caption=escape("\n".join(table.notes)) or None,
@@ -137,13 +137,13 @@ def terminal(table: Table) -> "RichTable":
         padding=(0, 1),
     )
     for j, column in enumerate(table.columns):
-        made.add_column(escape(column.title), justify="left" if table.at_left(j) else "right")
+        rich_table.add_column(escape(column.title), justify="left" if table.at_left(j) else "right")
     for i, texts in enumerate(table.texts):
         marked = (
             f"[bold]{escape(t)}[/bold]" if (i, j) in table.best else escape(t) for j, t in enumerate(texts)
         )
-        made.add_row(*marked)
-    return made
+        rich_table.add_row(*marked)
+    return rich_table
 
 
 def show(*tables: Table, width: int | None = None) -> None:

@@ -215,24 +215,24 @@ class Trajectory(Value):
         Raises:
             InputError: For a time outside of the motion.
         """
-        asked = numbers(time)
-        if asked is None:
+        times = numbers(time)
+        if times is None:
             raise InputError(f"time is {shown(time)}; it must be a number or an array of numbers [s]")
-        outside = ~((asked >= -TIME_TOLERANCE) & (asked <= self.duration + TIME_TOLERANCE))
+        outside = ~((times >= -TIME_TOLERANCE) & (times <= self.duration + TIME_TOLERANCE))
         if outside.any():
-            wrong = float(asked[outside].flat[0])
-            given, _, end = distinct(wrong, 0.0, self.duration)
-            raise InputError(f"time is {given} s; it must be in [0, {end}]")
+            wrong = float(times[outside].flat[0])
+            time_text, _, end = distinct(wrong, 0.0, self.duration)
+            raise InputError(f"time is {time_text} s; it must be in [0, {end}]")
         if len(self.times) == 1:
             rows = (
-                np.broadcast_to(getattr(self, name)[0], (*asked.shape, self.positions.shape[1]))
+                np.broadcast_to(getattr(self, name)[0], (*times.shape, self.positions.shape[1]))
                 for name in ROWS
             )
             q, v, a = (row.copy() for row in rows)
             return State(q, v, a, np.zeros_like(q))
-        row = np.clip(np.searchsorted(self.times, asked, side="right") - 1, 0, len(self.times) - 2)
+        row = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         h = np.asarray(self.times[row + 1] - self.times[row])[..., None]
-        u = np.clip(np.asarray(asked - self.times[row])[..., None] / h, 0.0, 1.0)
+        u = np.clip(np.asarray(times - self.times[row])[..., None] / h, 0.0, 1.0)
         (q0, v0, a0), (q1, v1, a1) = (tuple(getattr(self, name)[i] for name in ROWS) for i in (row, row + 1))
         # Hermite's basis and its derivative
         rise = u * u * (3 - 2 * u)
@@ -275,10 +275,12 @@ class Trajectory(Value):
         state = self.at(times)
         rows = Trajectory(self.joint_names, times, state.positions, state.velocities, state.accelerations)
         start, end = rows.cubic_accelerations
-        most = np.abs(self.cubic_accelerations).max(axis=(0, 1))
+        max_acceleration = np.abs(self.cubic_accelerations).max(axis=(0, 1))
         off = np.maximum(np.abs(start - rows.accelerations[:-1]), np.abs(end - rows.accelerations[1:]))
-        as_strong = (np.maximum(np.abs(start), np.abs(end)) <= ACCELERATION_GAIN * most).all()
-        if self.velocities[[0, -1]].any() or (as_strong and (off <= ACCELERATION_SHARE * most).all()):
+        as_strong = (np.maximum(np.abs(start), np.abs(end)) <= ACCELERATION_GAIN * max_acceleration).all()
+        if self.velocities[[0, -1]].any() or (
+            as_strong and (off <= ACCELERATION_SHARE * max_acceleration).all()
+        ):
             return rows
         return Trajectory(self.joint_names, *spline_rows(state.positions, 1 / rate))
 
@@ -386,8 +388,8 @@ def check_motion_arrays(
         if name == "times":
             checked[name] = _times(where + name, value, count)
         else:
-            most = MAX_RATE if name in RATES else MAX_COORDINATE
-            checked[name] = rows(where + name, value, count, len(names), most, ", a column for each joint")
+            bound = MAX_RATE if name in RATES else MAX_COORDINATE
+            checked[name] = rows(where + name, value, count, len(names), bound, ", a column for each joint")
         count = len(checked[name])
     return tuple(names), checked
 

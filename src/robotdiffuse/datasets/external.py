@@ -146,9 +146,9 @@ def _write(
             raise InputError(f"{folder} holds data already; write into another folder")
         for index, first in enumerate(range(0, len(q), ROWS_PER_SHARD)):
             rows = range(first, min(first + ROWS_PER_SHARD, len(q)))
-            made = [measured_row(robot, scenes[i], packed[i : i + 1], q[i], i) for i in rows]
-            arrays = {name: np.stack([row[name] for row in made]) for name in made[0]}
-            write_shard(folder, index, arrays, {"tried": len(made), "solved": len(made)})
+            measured_rows = [measured_row(robot, scenes[i], packed[i : i + 1], q[i], i) for i in rows]
+            arrays = {name: np.stack([row[name] for row in measured_rows]) for name in measured_rows[0]}
+            write_shard(folder, index, arrays, {"tried": len(measured_rows), "solved": len(measured_rows)})
             progress(rows.stop, len(q))
         write_manifest(folder, manifest)
     return len(q)
@@ -184,12 +184,12 @@ def measured_row(
 
 
 def _positions(robot: Robot, i: int, path: object) -> ndarray:
-    given = path.positions if isinstance(path, Path | Trajectory) else path
-    q = numbers(given)
+    positions = path.positions if isinstance(path, Path | Trajectory) else path
+    q = numbers(positions)
     if q is None or q.ndim != 2 or q.shape[1] != robot.dof or len(q) < 2:
         names = ", ".join(robot.joint_names)
         raise InputError(
-            f"paths[{i}] is {shown(given)}; it must be n x {robot.dof} numbers, n at least 2: {names}"
+            f"paths[{i}] is {shown(positions)}; it must be n x {robot.dof} numbers, n at least 2: {names}"
         )
     beyond = np.maximum(robot.lower - q, q - robot.upper)
     beyond[:, robot.continuous] = 0
@@ -207,11 +207,11 @@ def _shared_floor(scenes: Sequence[Scene]) -> Box | None:
     floor = firsts[0]
     if not isinstance(floor, Box) or floor.name != "floor" or floor.wxyz[0] != 1:
         return None
-    same = (
+    shared = (
         isinstance(one, Box) and one.name == "floor" and np.array_equal(one.bounds, floor.bounds)
         for one in firsts
     )
-    return floor if all(same) else None
+    return floor if all(shared) else None
 
 
 # The layout of the paper's authors
@@ -292,23 +292,23 @@ def import_npz(
 
 def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[ndarray, "n 2 3"]]:
     """The motions, and the centres of the two spheres of each."""
-    wanted = {"x_train": (WAYPOINTS, DOF), "y_train": (CONDITION_NUMBERS,)}
+    row_shapes = {"x_train": (WAYPOINTS, DOF), "y_train": (CONDITION_NUMBERS,)}
     input_file(file, largest=sys.maxsize)
     try:
         with np.load(file, allow_pickle=False) as stored:
-            x, y = (np.asarray(stored[name], np.float32) for name in wanted)
+            x, y = (np.asarray(stored[name], np.float32) for name in row_shapes)
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from None
     except Exception as error:  # NumPy, zipfile and Python's tokenizer raise many types of exceptions
         raise InputError(f"{file} is no robot.npz: {shortened(str(error))}") from None
-    for (name, row), array in zip(wanted.items(), (x, y), strict=True):
+    for (name, row), array in zip(row_shapes.items(), (x, y), strict=True):
         if array.shape != (len(x), *row) or not len(x):
             shape = " x ".join(map(str, ("n", *row)))
             raise InputError(f"{file}: {name} has shape {array.shape}; it must be {shape}, with n at least 1")
         if not np.isfinite(array).all():
             raise InputError(f"{file}: {name} holds numbers that are not finite")
-    for name, stated, found in (("start", y[:, :DOF], x[:, 0]), ("goal", y[:, DOF : 2 * DOF], x[:, -1])):
-        off = np.abs(stated - found).max(axis=1)
+    for name, stated, actual in (("start", y[:, :DOF], x[:, 0]), ("goal", y[:, DOF : 2 * DOF], x[:, -1])):
+        off = np.abs(stated - actual).max(axis=1)
         if off.max() > END_TOLERANCE:
             end = "first" if name == "start" else "last"
             raise InputError(

@@ -200,19 +200,19 @@ def resample(
     n, stored = q.shape[:2]
     steps = np.linalg.norm(np.diff(q, axis=1), axis=2)
     at = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1, dtype=np.float64)], axis=1)
-    wanted = np.linspace(0.0, at[:, -1], waypoints, axis=1)
+    target_lengths = np.linspace(0.0, at[:, -1], waypoints, axis=1)
     # offsets make the rows one ascending list, for a single search
     row = 2.0 * at.max(initial=0.0) * np.arange(n)[:, None]
-    after = np.searchsorted((at + row).reshape(-1), (wanted + row).reshape(-1), side="right")
+    after = np.searchsorted((at + row).reshape(-1), (target_lengths + row).reshape(-1), side="right")
     after = np.clip(after.reshape(n, waypoints) - np.arange(n)[:, None] * stored, 1, stored - 1)
     low, high = (np.take_along_axis(at, i, 1)[..., None] for i in (after - 1, after))
     below, above = (np.take_along_axis(q, i[..., None], 1) for i in (after - 1, after))
-    into = wanted[..., None] - low
-    long = np.maximum(high - low, np.finfo(np.float64).tiny)
+    into = target_lengths[..., None] - low
+    interval = np.maximum(high - low, np.finfo(np.float64).tiny)
     if exact:
-        even = ((above.astype(np.float64) - below) / long * into + below).astype(q.dtype)
+        even = ((above.astype(np.float64) - below) / interval * into + below).astype(q.dtype)
     else:
-        even = below + (into / long).clip(0, 1).astype(q.dtype) * (above - below)
+        even = below + (into / interval).clip(0, 1).astype(q.dtype) * (above - below)
     even[:, 0] = q[:, 0]
     even[:, -1] = q[:, -1]
     return even

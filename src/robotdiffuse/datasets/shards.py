@@ -114,11 +114,11 @@ class Manifest(Settings):
 
     def check_robot(self, robot: Robot) -> None:
         """Raise InputError if the data were made with another robot."""
-        found = robot_fingerprint(robot)
-        if found != self.robot_fingerprint:
+        fingerprint = robot_fingerprint(robot)
+        if fingerprint != self.robot_fingerprint:
             raise InputError(
                 f"the data are of the robot {self.robot} with fingerprint {self.robot_fingerprint}; "
-                f"{robot.name} has {found}; use the robot of the data"
+                f"{robot.name} has {fingerprint}; use the robot of the data"
             )
 
 
@@ -272,13 +272,13 @@ def write_shard(
         "fingerprint": _shard_fingerprint(fingerprints),
         "counts": {name: int(counts[name]) for name in sorted(counts)},
     }
-    beside: str | None = None
+    scratch_folder: str | None = None
     try:
         FilePath(folder).mkdir(parents=True, exist_ok=True)
-        beside = tempfile.mkdtemp(prefix=f".{target.name}.", dir=folder)
-        fresh = FilePath(beside, "new")
-        old = FilePath(beside, "old")
-        group = zarr.open_group(fresh, mode="w", zarr_format=3, attributes=attributes)
+        scratch_folder = tempfile.mkdtemp(prefix=f".{target.name}.", dir=folder)
+        new_folder = FilePath(scratch_folder, "new")
+        old = FilePath(scratch_folder, "old")
+        group = zarr.open_group(new_folder, mode="w", zarr_format=3, attributes=attributes)
         for name, array in ready.items():
             group.create_array(
                 name,
@@ -294,12 +294,12 @@ def write_shard(
             )
         if target.exists():
             target.rename(old)
-        fresh.rename(target)
+        new_folder.rename(target)
     except OSError as error:
         raise write_error(target, error) from None
     finally:
-        if beside is not None:
-            shutil.rmtree(beside, ignore_errors=True)
+        if scratch_folder is not None:
+            shutil.rmtree(scratch_folder, ignore_errors=True)
 
 
 def _array_fingerprint(array: ndarray) -> str:
@@ -348,28 +348,28 @@ def _open(path: FilePath) -> Any:
 
 def _read_array(path: FilePath, group: Any, name: str) -> ndarray:
     dtype, row = ARRAYS[name]
-    where = f"shard {path}, array {name}"
+    location = f"shard {path}, array {name}"
     if not (path / name).is_dir():
-        raise InputError(f"{where}: missing")
-    with reading(where):
+        raise InputError(f"{location}: missing")
+    with reading(location):
         array = group[name]
-        found = (array.dtype.str, array.ndim)
-        wanted = (dtype, 1 + len(row))
-        if found != wanted:
+        actual = (array.dtype.str, array.ndim)
+        expected = (dtype, 1 + len(row))
+        if actual != expected:
             raise InputError(
-                f"{where} is {found[0]} with {found[1]} axes; it must be {dtype} with {wanted[1]}"
+                f"{location} is {actual[0]} with {actual[1]} axes; it must be {dtype} with {expected[1]}"
             )
         if not array.size:
             return array[...]
         chunk = path / name / array.metadata.encode_chunk_key((0,) * array.ndim)
         # zarr reads missing chunks as zeros
         if array.chunks != array.shape or not chunk.is_file():
-            raise InputError(f"{where} is damaged: a chunk is missing")
+            raise InputError(f"{location} is damaged: a chunk is missing")
         if name != "trajectories":
             return array[...]
         size = chunk.stat().st_size
         if size != array.nbytes:
-            raise InputError(f"{where} is damaged: its chunk has {size:,} bytes, not {array.nbytes:,}")
+            raise InputError(f"{location} is damaged: its chunk has {size:,} bytes, not {array.nbytes:,}")
         return np.memmap(chunk, dtype, "r", shape=array.shape)
 
 
@@ -378,8 +378,8 @@ def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> No
     for name, array in shard.arrays.items():
         row = tuple(getattr(manifest, s) if isinstance(s, str) else s for s in ARRAYS[name][1])
         if array.shape[1:] != row:
-            where = f"shard {shard_path(folder, shard.index)}, array {name}"
-            raise InputError(f"{where} has rows of shape {array.shape[1:]}; the manifest says {row}")
+            location = f"shard {shard_path(folder, shard.index)}, array {name}"
+            raise InputError(f"{location} has rows of shape {array.shape[1:]}; the manifest says {row}")
 
 
 def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard:
@@ -395,13 +395,13 @@ def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard
     group = _open(path)
     fingerprints = {}
     for name, array in shard.arrays.items():
-        where = f"shard {path}, array {name}"
+        location = f"shard {path}, array {name}"
         fingerprints[name] = _array_fingerprint(array)
         attributes = group[name].metadata.attributes
         if not isinstance(attributes, dict) or fingerprints[name] != attributes.get("fingerprint"):
-            raise InputError(f"{where} is damaged: its fingerprint is not the one that was written")
+            raise InputError(f"{location} is damaged: its fingerprint is not the one that was written")
         if name not in UNBOUNDED and not np.isfinite(array).all():
-            raise InputError(f"{where} holds numbers that are not finite")
+            raise InputError(f"{location} holds numbers that are not finite")
     if _shard_fingerprint(fingerprints) != shard.fingerprint:
         raise InputError(f"shard {path} is damaged: its fingerprint is not that of its arrays")
     return shard

@@ -74,8 +74,8 @@ class AORRTCSearch:
         `stop` returns True."""
         settings = self.settings
         search = self._search
-        most = settings.tries * (len(self._distances) + 2)
-        while search.best is None and search.work < most and not stop():
+        iteration_limit = settings.tries * (len(self._distances) + 2)
+        while search.best is None and search.work < iteration_limit and not stop():
             search.first(work=ITERATIONS_PER_STEP)
         while search.best is not None and not (search.shortest or stop()):
             if not search.improves(settings.gain, settings.patience):
@@ -88,8 +88,10 @@ class AORRTCSearch:
         """Set `best_goal`; a continuous joint may end whole turns from its given value."""
         end = self._ends.complete(path)[-1]
         turns = np.abs(self.goals - end) / TURN
-        apart = np.where(self._robot.continuous, np.abs(turns - np.round(turns)), turns).max(axis=1)
-        self.best_goal = int(apart.argmin())
+        max_joint_distance = np.where(self._robot.continuous, np.abs(turns - np.round(turns)), turns).max(
+            axis=1
+        )
+        self.best_goal = int(max_joint_distance.argmin())
         self.goals[self.best_goal] = end
 
     @property

@@ -160,13 +160,13 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
     """
     robot = load_robot(settings.robot)
     rows = settings.rows(index)
-    kept: list[Row] = []
+    solved_rows: list[Row] = []
     counts: Counts = dict.fromkeys(("tried", "solved", "thinned", "unsolved", "refused"), 0)
-    while len(kept) < rows:
+    while len(solved_rows) < rows:
         if counts["tried"] >= MAX_PROBLEMS_PER_ROW * rows + EXTRA_PROBLEMS:
             raise InputError(
-                f"only {len(kept)} of {counts['tried']} problems were solved for {robot.name}; a smaller "
-                f"safety_distance than {settings.search.safety_distance} m or other scenes may help"
+                f"only {len(solved_rows)} of {counts['tried']} problems were solved for {robot.name}; "
+                f"a smaller safety_distance than {settings.search.safety_distance} m or other scenes may help"
             )
         number = index * PROBLEMS_PER_SHARD + counts["tried"]
         counts["tried"] += 1
@@ -174,26 +174,26 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
         if isinstance(row, str):
             counts[row] += 1
         else:
-            kept.append(row)
+            solved_rows.append(row)
             counts["solved"] += 1
-    return {name: np.stack([row[name] for row in kept]) for name in kept[0]}, counts
+    return {name: np.stack([row[name] for row in solved_rows]) for name in solved_rows[0]}, counts
 
 
 def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     """Solve the problem of a number: its row, or thinned, unsolved or refused."""
     rng = np.random.default_rng([settings.seed, number])
-    family, drawn = draw(settings, robot, rng)
+    family, sample = draw(settings, robot, rng)
     # goals of continuous joints are moved by whole turns as near to the start as possible
-    goals = np.stack([robot.equivalent_configurations(q, drawn.start)[0] for q in drawn.goals])
-    drawn = replace(drawn, goals=goals)
-    checker = CollisionChecker(robot, drawn.scene)
+    goals = np.stack([robot.equivalent_configurations(q, sample.start)[0] for q in sample.goals])
+    sample = replace(sample, goals=goals)
+    checker = CollisionChecker(robot, sample.scene)
     space = search_space(checker, settings.search.resolution)
-    lines_free = [bool(motions_free(space, np.stack([drawn.start, goal]))[0]) for goal in goals]
+    lines_free = [bool(motions_free(space, np.stack([sample.start, goal]))[0]) for goal in goals]
     thinned = rng.random() >= settings.trivial_share
     if thinned and all(lines_free):
         return "thinned"  # for whichever goal a search chooses
     search: SharedTreeSearch | AORRTCSearch = SEARCHES.load(settings.planner)(
-        checker, drawn.start, drawn.goals, settings.search, random_state(settings.seed, number)
+        checker, sample.start, sample.goals, settings.search, random_state(settings.seed, number)
     )
     search.run()
     path = search.path()
@@ -203,24 +203,24 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     line_free = lines_free[search.best_goal]
     if thinned and line_free:
         return "thinned"
-    validator = Verifier(drawn.problem(robot), VerifySettings())
+    validator = Verifier(sample.problem(robot), VerifySettings())
     motion = _resampled(settings, robot, path, validator)
     if motion is None:
         return "refused"
     times, q = motion
-    q[0] = drawn.start
+    q[0] = sample.start
     q[-1] = goal
     if not validator.path(Path(robot.joint_names, q.astype(np.float64))).valid:
         return "refused"
     floor = list(settings.families.values())[family].floor
     return row_of(
-        PackedScenes.pack([drawn.scene], settings.slots, floor is not None),
+        PackedScenes.pack([sample.scene], settings.slots, floor is not None),
         q,
         checker.link_clearances(q).min(axis=1),
         search.goals,
         search.goal_costs,
         search.best_goal,
-        drawn.T_base_tip,
+        sample.T_base_tip,
         family,
         search.cost,
         search.safety_distance,
@@ -282,11 +282,11 @@ def generate(
         raise InputError(f"workers is {workers}; it must be at least 1")
     if cluster is not None and cluster not in CLUSTERS:
         raise unknown_name("cluster", cluster, CLUSTERS)
-    wanted = manifest_of(settings)
+    manifest = manifest_of(settings)
     with lock_folder(out):
         try:
             remove_leftovers(out)
-            _claim(wanted, out)
+            _claim(manifest, out)
             return _fill(settings, out, workers, cluster, progress)
         finally:
             remove_leftovers(out)
@@ -299,27 +299,27 @@ def _fill(
     cluster: str | None,
     progress: Callable[[int, int], None],
 ) -> int:
-    there = set(shard_indices(out))
-    missing = [index for index in range(settings.shards) if index not in there]
-    done = settings.trajectories - sum(settings.rows(index) for index in missing)
-    progress(done, settings.trajectories)
+    existing = set(shard_indices(out))
+    missing = [index for index in range(settings.shards) if index not in existing]
+    finished = settings.trajectories - sum(settings.rows(index) for index in missing)
+    progress(finished, settings.trajectories)
     if not missing:
         return settings.trajectories
     if cluster is None:
-        made = on_this_machine(make_shard, [(settings, index) for index in missing], workers)
+        shards = on_this_machine(make_shard, [(settings, index) for index in missing], workers)
     else:
         absolute = _as_absolute(settings)
-        here = _reproducibility_record(absolute)
-        made = CLUSTERS[cluster](_make_on_node, [(absolute, index, here) for index in missing])
+        local_record = _reproducibility_record(absolute)
+        shards = CLUSTERS[cluster](_make_on_node, [(absolute, index, local_record) for index in missing])
     # close it at once, so that workers stop when this is interrupted
-    with closing(made):
-        for number, (arrays, counts) in made:
+    with closing(shards):
+        for number, (arrays, counts) in shards:
             index = missing[number]
             # else zarr's threads would write files after the clean-up
             with delay_interrupts():
                 write_shard(out, index, arrays, counts)
-            done += settings.rows(index)
-            progress(done, settings.trajectories)
+            finished += settings.rows(index)
+            progress(finished, settings.trajectories)
     return settings.trajectories
 
 
@@ -330,10 +330,10 @@ def _as_absolute(settings: GenerationSettings) -> GenerationSettings:
 
 
 def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, str]) -> tuple[Arrays, Counts]:
-    for name, found in _reproducibility_record(settings).items():
-        if found != wanted[name]:
+    for name, actual in _reproducibility_record(settings).items():
+        if actual != wanted[name]:
             raise InputError(
-                f"a node of the Ray cluster has {name} {found}, this machine {wanted[name]}; their data may "
+                f"a node of the Ray cluster has {name} {actual}, this machine {wanted[name]}; their data may "
                 "differ: install the same on all"
             )
     return make_shard(settings, index)
@@ -376,9 +376,9 @@ def _claim(wanted: Manifest, out: FilePath) -> None:
             raise InputError(f"{out} holds shards but no {MANIFEST}; use another folder")
         write_manifest(out, wanted)
         return
-    found = read_manifest(out)
-    found.check_robot(load_robot(wanted.robot))
-    begun = _by_name(found.settings)
+    existing = read_manifest(out)
+    existing.check_robot(load_robot(wanted.robot))
+    begun = _by_name(existing.settings)
     for name, value in _by_name(wanted.settings).items():
         if begun.get(name) != value:
             raise InputError(
@@ -386,9 +386,9 @@ def _claim(wanted: Manifest, out: FilePath) -> None:
                 "another folder"
             )
     for name, value in wanted.versions.items():
-        if found.versions.get(name) != value:
+        if existing.versions.get(name) != value:
             raise InputError(
-                f"{out} was begun with {name} {found.versions.get(name)}; this is {value}, whose data may "
+                f"{out} was begun with {name} {existing.versions.get(name)}; this is {value}, whose data may "
                 "differ: use that version, or another folder"
             )
 
@@ -396,6 +396,6 @@ def _claim(wanted: Manifest, out: FilePath) -> None:
 def _by_name(settings: dict[str, Any]) -> dict[str, str]:
     """Settings as JSON texts, in which the order of a mix counts; those of the search as search.NAME."""
     search = settings.get("search")
-    inner = search if isinstance(search, dict) else {}
-    named = settings | {f"search.{name}": value for name, value in inner.items()}
+    search_settings = search if isinstance(search, dict) else {}
+    named = settings | {f"search.{name}": value for name, value in search_settings.items()}
     return {name: json.dumps(value) for name, value in named.items() if name != "search"}

@@ -55,7 +55,7 @@ def write_depth_views(robot: Robot, views: Mapping[str, Sequence[StampedView]], 
     stream = io.BytesIO()
     out = McapWriter(stream)
     ordered = sorted(
-        ((one.stamp, name, one.view) for name, taken in views.items() for one in taken),
+        ((one.stamp, name, one.view) for name, views_of_camera in views.items() for one in views_of_camera),
         key=lambda one: one[0],
     )
     for stamp, name, view in ordered:
@@ -152,10 +152,10 @@ def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> 
         states = _States(robot)
         transforms = TransformHistory()
         infos = {}
-        others = [
+        other_topics = [
             name for name, schema in kinds.items() if schema.name in (JOINT_STATE, TRANSFORMS, CAMERA_INFO)
         ]
-        for topic, at, message in messages_in(reader, kinds, others):
+        for topic, at, message in messages_in(reader, kinds, other_topics):
             kind = kinds[topic].name
             if kind == CAMERA_INFO:
                 infos.setdefault(_folder(topic), message)
@@ -164,30 +164,30 @@ def _read(path: Path, robot: Robot, topics: Sequence[str] | None, base: str) -> 
             else:
                 for one in message.transforms:
                     transforms.add(to_plain(one), static=topic.endswith("static"))
-        found = False
+        has_images = False
         for topic, at, message in messages_in(reader, kinds, images):
             if message.encoding not in ENCODINGS and topics is None:
                 continue
-            found = True
+            has_images = True
             stamp = _seconds(message, at)
-            where = f"the image of {topic} at {stamp:.3f} s"
-            T = transforms.at(base, message.header.frame_id, stamp, MAX_GAP, where)
+            location = f"the image of {topic} at {stamp:.3f} s"
+            T = transforms.at(base, message.header.frame_id, stamp, MAX_GAP, location)
             intrinsics = _intrinsics(topic, infos.get(_folder(topic)), message)
-            view = DepthView(_depth(where, message), intrinsics, T, states.at(stamp, where))
+            view = DepthView(_depth(location, message), intrinsics, T, states.at(stamp, location))
             yield StampedView(stamp, view)
-    if not found:
+    if not has_images:
         listed = ", ".join(f"{topic} ({schema.name})" for topic, schema in kinds.items()) or "none"
         raise InputError(f"{path} holds no depth images (32FC1 or 16UC1); topics: {listed}")
 
 
 def _image_topics(kinds: Mapping[str, Any], requested: Sequence[str] | None) -> list[str]:
-    found = [topic for topic, schema in kinds.items() if schema.name == IMAGE]
+    image_topics = [topic for topic, schema in kinds.items() if schema.name == IMAGE]
     for topic in requested or ():
-        if topic not in found:
+        if topic not in image_topics:
             raise InputError(
-                f"topic {topic!r} holds no images; topics of images: {', '.join(found) or 'none'}"
+                f"topic {topic!r} holds no images; topics of images: {', '.join(image_topics) or 'none'}"
             )
-    return found if requested is None else list(requested)
+    return image_topics if requested is None else list(requested)
 
 
 def _folder(topic: str) -> str:

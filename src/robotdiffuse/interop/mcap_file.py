@@ -167,20 +167,20 @@ def _scene(robot: Robot, obstacles: Sequence[Drawable]) -> SceneUpdate:
     for one in obstacles:
         if isinstance(one.shape, PointCloud):
             continue
-        drawn = entity(one.name, _frame(one, robot))
+        drawing = entity(one.name, _frame(one, robot))
         shape = one.fixed.shape
         match shape:
             case Box():
                 size = shape.size.tolist()
-                solid = drawn.cubes.add()
+                solid = drawing.cubes.add()
             case Sphere():
                 size = [2 * shape.radius] * 3
-                solid = drawn.spheres.add()
+                solid = drawing.spheres.add()
             case Cylinder():
                 size = [2 * shape.radius, 2 * shape.radius, shape.height]
-                solid = drawn.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+                solid = drawing.cylinders.add(bottom_scale=1.0, top_scale=1.0)
             case _:
-                _add_triangles(drawn, one.fixed.surface, one.color, OBSTACLE_OPACITY)
+                _add_triangles(drawing, one.fixed.surface, one.color, OBSTACLE_OPACITY)
                 continue
         _set(solid.size, size)
         _set(solid.pose.position, shape.T_base_shape[:3, 3].tolist())
@@ -236,7 +236,7 @@ def problem_in(file: Path) -> Problem | None:
     """The problem that `write` attached; None if there is none."""
     path = input_file(file)
     with reading(file), path.open("rb") as stream:
-        attached = {found.name: found.data for found in make_reader(stream).iter_attachments()}
+        attached = {attachment.name: attachment.data for attachment in make_reader(stream).iter_attachments()}
         if PROBLEM_ATTACHMENT not in attached:
             return None
         record = parse_json(attached[PROBLEM_ATTACHMENT].decode(), f"{file}, {PROBLEM_ATTACHMENT}")
@@ -298,13 +298,13 @@ def messages_in(
     if not topics:
         return
     stores = {topic: _typestore(kinds[topic]) for topic in topics}
-    for _, channel, found in reader.iter_messages(topics=topics):
-        allowed -= len(found.data)
+    for _, channel, record in reader.iter_messages(topics=topics):
+        allowed -= len(record.data)
         if allowed < 0:
             raise InputError(f"the messages of {', '.join(topics)} take more than {MAX_UNPACKED:,} bytes")
         store = stores[channel.topic]
         kind = kinds[channel.topic].name
-        yield channel.topic, found.log_time, store.deserialize_cdr(found.data, kind)
+        yield channel.topic, record.log_time, store.deserialize_cdr(record.data, kind)
 
 
 def _typestore(schema: Any) -> Any:

@@ -65,8 +65,8 @@ def checked_motion(
     Empty rates count as absent. Times are shifted to begin at 0; times that are all 0 count as absent. Raises
     InputError as `check_motion_arrays` does, and for times that do not increase.
     """
-    given = {"times": times, "velocities": velocities, "accelerations": accelerations}
-    arrays = {name: value for name, value in given.items() if not _empty(value)}
+    optional_fields = {"times": times, "velocities": velocities, "accelerations": accelerations}
+    arrays = {name: value for name, value in optional_fields.items() if not _empty(value)}
     joints, checked = check_motion_arrays(names, {"positions": positions, **arrays})
     if "times" not in checked:
         return RecordedMotion(joints, checked["positions"])
@@ -107,22 +107,22 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
     and for other joints that leave their locked values.
     """
     notes = list(motion.notes)
-    given = {name: j for j, name in enumerate(motion.joint_names)}
-    known = {joint.name for joint in robot.joints if joint.kind in MOVING_KINDS}
-    unknown = [name for name in given if name not in known]
-    absent = [name for name in robot.joint_names if name not in given]
+    columns = {name: j for j, name in enumerate(motion.joint_names)}
+    movable = {joint.name for joint in robot.joints if joint.kind in MOVING_KINDS}
+    unknown = [name for name in columns if name not in movable]
+    absent = [name for name in robot.joint_names if name not in columns]
     if absent or unknown:
         parts = [f"lacks {joined(absent, MAX_NAMES)}"] if absent else []
         parts += [f"has {joined(unknown, MAX_NAMES)}, which {robot.name} lacks"] if unknown else []
         right = joined(robot.joint_names, MAX_NAMES)
         raise InputError(f"the motion {' and '.join(parts)}; the robot's joints are {right}")
-    for name in given:
+    for name in columns:
         if name not in robot.joint_names:
-            _check_locked(motion.positions[:, given[name]], name, robot)
-    extra = [name for name in given if name not in robot.joint_names]
+            _check_locked(motion.positions[:, columns[name]], name, robot)
+    extra = [name for name in columns if name not in robot.joint_names]
     if extra:
         notes.append(f"{joined(extra, MAX_NAMES)} stay at their locked values")
-    order = [given[name] for name in robot.joint_names]
+    order = [columns[name] for name in robot.joint_names]
     if order != sorted(order):
         notes.append("joints were reordered by name")
     q = motion.positions[:, order]
@@ -145,16 +145,17 @@ def motion_of_robot(motion: RecordedMotion, robot: Robot) -> RobotMotion:
 
 
 def _check_locked(values: Values, name: str, robot: Robot) -> None:
-    held = robot.locked.get(name, 0.0)
+    locked_value = robot.locked.get(name, 0.0)
     low = float(values.min())
     high = float(values.max())
     if high - low > STATIONARY_TOLERANCE + LOCKED_TOLERANCE:
         raise InputError(
-            f"the motion moves {name} from {low:.6g} to {high:.6g}, which the problem locks at {held:.6g}"
+            f"the motion moves {name} from {low:.6g} to {high:.6g}, "
+            f"which the problem locks at {locked_value:.6g}"
         )
-    if max(abs(low - held), abs(high - held)) > LOCKED_TOLERANCE:
+    if max(abs(low - locked_value), abs(high - locked_value)) > LOCKED_TOLERANCE:
         raise InputError(
-            f"the motion has {name} at {low:.6g}, the problem locks it at {held:.6g}: "
+            f"the motion has {name} at {low:.6g}, the problem locks it at {locked_value:.6g}: "
             f"write `locked: {{{name}: {low:.6g}}}` in the problem if that is right"
         )
 
@@ -179,9 +180,9 @@ def _mean_accelerations(motion: Trajectory) -> JointRows:
 def problem_of_motion(motion: RecordedMotion, robot: Robot, scene: Scene) -> Problem:
     """The problem in a scene whose start and goal are those of a motion; its other joints are locked at their
     first values."""
-    held = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
-    held -= set(robot.joint_names)
-    at = {name: float(motion.positions[0, j]) for j, name in enumerate(motion.joint_names) if name in held}
+    movable = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
+    movable -= set(robot.joint_names)
+    at = {name: float(motion.positions[0, j]) for j, name in enumerate(motion.joint_names) if name in movable}
     robot = robot.with_locked(at)
     motion = replace(motion, notes=())
     q = motion_of_robot(motion, robot).motion.positions
@@ -240,8 +241,8 @@ def _motion(record: Any) -> RecordedMotion:
     if "trajectory" in record:
         return _only(record["trajectory"])
     if "joint_trajectory" in record:
-        other = record.get("multi_dof_joint_trajectory") or {}
-        if isinstance(other, Mapping) and other.get("points"):
+        multi_dof = record.get("multi_dof_joint_trajectory") or {}
+        if isinstance(multi_dof, Mapping) and multi_dof.get("points"):
             raise InputError(
                 "multi_dof_joint_trajectory has points; only arms on a fixed base can be validated"
             )
@@ -281,9 +282,9 @@ def _joint_trajectory(record: Mapping[str, Any]) -> RecordedMotion:
         _seconds(f"points[{i}].time_from_start", p.get("time_from_start", 0)) for i, p in enumerate(points)
     ]
     for name in ("velocities", "accelerations"):
-        given = [len(row) > 0 for row in rows[name]]
-        if any(given) and not all(given):
-            raise InputError(f"points[{given.index(False)}] has no {name}, but others do")
+        has_values = [len(row) > 0 for row in rows[name]]
+        if any(has_values) and not all(has_values):
+            raise InputError(f"points[{has_values.index(False)}] has no {name}, but others do")
     return checked_motion(
         _list(record.get("joint_names")), rows["positions"], times, rows["velocities"], rows["accelerations"]
     )
@@ -297,9 +298,9 @@ def _seconds(where: str, value: Any) -> float:
     """Seconds of a ROS 2 (sec, nanosec) or ROS 1 (secs, nsecs) duration, or of a plain number."""
     parts: tuple[Any, Any] = (value, 0)
     if isinstance(value, Mapping):
-        for whole, rest in (("sec", "nanosec"), ("secs", "nsecs")):
-            if whole in value:
-                parts = (value[whole], value.get(rest, 0))
+        for seconds_name, rest in (("sec", "nanosec"), ("secs", "nsecs")):
+            if seconds_name in value:
+                parts = (value[seconds_name], value.get(rest, 0))
     if not all(isinstance(part, int | float) and not isinstance(part, bool) for part in parts):
         raise InputError(f"{where} is {shown(value)}; it must be a duration: sec and nanosec")
     return float(parts[0]) + 1e-9 * float(parts[1])
@@ -345,24 +346,24 @@ def _table(text: str) -> RecordedMotion:
             except ValueError:
                 raise InputError(f"line {number}: {name} is {shown(cell)}; it must be a number") from None
     times: list[float] | None = None
-    columns_of: dict[str, dict[str, list[float]]] = {what: {} for what in KINDS.values()}
+    columns_of: dict[str, dict[str, list[float]]] = {quantity: {} for quantity in KINDS.values()}
     for name, column in zip(header, columns, strict=True):
         if name.lower() in TIMES and times is None:
             times = column
             continue
         joint, _, kind = name.rpartition("_")
-        what = KINDS.get(kind, "positions")
+        quantity = KINDS.get(kind, "positions")
         joint = joint if kind in KINDS else name
-        if joint in columns_of[what]:
+        if joint in columns_of[quantity]:
             raise InputError(f"the header has {shown(name)} more than once")
-        columns_of[what][joint] = column
+        columns_of[quantity][joint] = column
     names = list(columns_of["positions"])
-    for what in ("velocities", "accelerations"):
-        if columns_of[what] and sorted(columns_of[what]) != sorted(names):
-            raise InputError(f"the header has {what} of other joints than positions")
+    for quantity in ("velocities", "accelerations"):
+        if columns_of[quantity] and sorted(columns_of[quantity]) != sorted(names):
+            raise InputError(f"the header has {quantity} of other joints than positions")
     table = {
-        what: [list(r) for r in zip(*(c[n] for n in names), strict=True)] if c else None
-        for what, c in columns_of.items()
+        quantity: [list(r) for r in zip(*(c[n] for n in names), strict=True)] if c else None
+        for quantity, c in columns_of.items()
     }
     return checked_motion(names, table["positions"], times, table["velocities"], table["accelerations"])
 

@@ -49,17 +49,17 @@ def _motion(recording: rr.RecordingStream, problem: Problem, trajectory: Traject
     robot = problem.robot
     times = trajectory.times
     frames = max(int(np.ceil(times[-1] * FPS)), 1) + 1
-    shown = np.unique(np.searchsorted(times, np.linspace(0, times[-1], frames)).clip(0, len(times) - 1))
-    at = rr.TimeColumn(TIMELINE, duration=times[shown])
+    frame_rows = np.unique(np.searchsorted(times, np.linspace(0, times[-1], frames)).clip(0, len(times) - 1))
+    at = rr.TimeColumn(TIMELINE, duration=times[frame_rows])
     for link in robot.link_names:
-        _send_poses(recording, f"robot/{link}", at, link_poses(robot, trajectory.positions[shown], link))
+        _send_poses(recording, f"robot/{link}", at, link_poses(robot, trajectory.positions[frame_rows], link))
     for moving in problem.moving:
-        _send_poses(recording, _entity(moving.name), at, [moving.pose(t) for t in times[shown].tolist()])
+        _send_poses(recording, _entity(moving.name), at, [moving.pose(t) for t in times[frame_rows].tolist()])
     every = rr.TimeColumn(TIMELINE, duration=times)
     for j, name in enumerate(trajectory.joint_names):
-        for what in ("positions", "velocities"):
-            columns = rr.Scalars.columns(scalars=getattr(trajectory, what)[:, j])
-            recording.send_columns(f"joints/{name}/{what}", [every], columns)
+        for quantity in ("positions", "velocities"):
+            columns = rr.Scalars.columns(scalars=getattr(trajectory, quantity)[:, j])
+            recording.send_columns(f"joints/{name}/{quantity}", [every], columns)
 
 
 def _send_poses(recording: rr.RecordingStream, entity: str, at: rr.TimeColumn, poses: Iterable[Pose]) -> None:

@@ -70,8 +70,8 @@ def typestore() -> Typestore:
 def to_message(kind: str, record: Mapping[str, Any]) -> Any:
     """A message from plain data; missing fields are empty or zero."""
     store = typestore()
-    known = store.fielddefs[kind][1]
-    return store.types[kind](**{name: _value(of, record.get(name)) for name, of in known})
+    field_types = store.fielddefs[kind][1]
+    return store.types[kind](**{name: _value(of, record.get(name)) for name, of in field_types})
 
 
 def _value(definition: Any, value: Any) -> Any:
@@ -134,13 +134,13 @@ def choose_topic(topics: Mapping[str, str], requested: str | None, where: str) -
             raise InputError(f"{where}: topic {requested!r} holds no motion; topics: {listed}")
         return requested
     for kind in kinds:
-        found = [topic for topic, of in motions.items() if of == kind]
-        if len(found) > 1:
+        candidates = [topic for topic, of in motions.items() if of == kind]
+        if len(candidates) > 1:
             raise InputError(
-                f"{where}: several topics hold motions: {', '.join(found)}; choose one with --topic"
+                f"{where}: several topics hold motions: {', '.join(candidates)}; choose one with --topic"
             )
-        if found:
-            return found[0]
+        if candidates:
+            return candidates[0]
     raise InputError(f"{where} holds no motion; topics: {listed}; known types: {', '.join(kinds)}")
 
 
@@ -167,8 +167,8 @@ def motion_from_messages(kind: str, messages: list[tuple[int, Any]], where: str)
             raise InputError(f"{where}: joint state {i} has other joints than the first")
         column_of = {name: k for k, name in enumerate(state["name"])}
         order = [column_of[name] for name in names]
-        for what, column in rows.items():
-            column.append([state[what][k] for k in order] if len(state[what]) == len(names) else [])
+        for quantity, column in rows.items():
+            column.append([state[quantity][k] for k in order] if len(state[quantity]) == len(names) else [])
     velocities = rows["velocity"] if all(rows["velocity"]) else None
     first = stamps[0]
     with reading(where):

@@ -62,8 +62,8 @@ class DepthView(Value):
             raise InputError(f"view.depth is {form}; it must be an image of height x width")
         intrinsics = vector("view", "intrinsics", _four_intrinsics(self.intrinsics), 4, MAX_RATE)
         if min(intrinsics[:2]) < MIN_FOCAL_LENGTH:
-            least = f"fx and fy must be at least {MIN_FOCAL_LENGTH:g} [pixels]"
-            raise InputError(f"view.intrinsics is {shown(intrinsics)}; {least}")
+            requirement = f"fx and fy must be at least {MIN_FOCAL_LENGTH:g} [pixels]"
+            raise InputError(f"view.intrinsics is {shown(intrinsics)}; {requirement}")
         configuration = self.configuration
         if configuration is not None:
             array = numbers(configuration)
@@ -145,14 +145,14 @@ class DepthView(Value):
         T = cls(np.zeros((1, 1)), (1.0, 1.0, 0.0, 0.0), T_base_camera, configuration).T_base_camera
         in_camera = (points - T[:3, 3]) @ T[:3, :3]
         z = in_camera[:, 2]
-        ahead = z > 1e-3
-        if not ahead.any():
+        in_front = z > 1e-3
+        if not in_front.any():
             raise InputError(
                 f"view.points: none of {len(points)} is in front of the camera; is T_base_camera (x right, y"
                 " down, z ahead) right, and are the points in the base frame?"
             )
-        z = z[ahead]
-        slopes = in_camera[ahead, :2] / z[:, None]
+        z = z[in_front]
+        slopes = in_camera[in_front, :2] / z[:, None]
         low, high = np.percentile(slopes, (0.1, 99.9), axis=0)
         span = np.maximum(high - low, 1e-3)
         pixel = max(np.sqrt(2 * span.prod() / len(z)), span[0] / MAX_CLOUD_WIDTH, span[1] / MAX_CLOUD_HEIGHT)
@@ -221,12 +221,12 @@ class DepthNoise(Settings, name="depth_noise"):
         lost = self._grazed(view)
         for axis in (0, 1):
             # of two neighbours with an edge between them, the first becomes a flying pixel
-            other = clean.take(np.arange(1, clean.shape[axis] + 1), axis, mode="clip")
-            both = np.isfinite(clean) & np.isfinite(other)
-            apart = np.where(both, other, 0.0) - np.where(both, clean, 0.0)
-            edge = np.abs(apart) > self.edge
+            neighbor = clean.take(np.arange(1, clean.shape[axis] + 1), axis, mode="clip")
+            both = np.isfinite(clean) & np.isfinite(neighbor)
+            step = np.where(both, neighbor, 0.0) - np.where(both, clean, 0.0)
+            edge = np.abs(step) > self.edge
             flies = edge & (rng.random(clean.shape) < self.flying)
-            depth[flies] = clean[flies] + rng.random(int(flies.sum())) * apart[flies]
+            depth[flies] = clean[flies] + rng.random(int(flies.sum())) * step[flies]
             lost |= edge & (rng.random(clean.shape) < self.edge_missing)
         seen = np.isfinite(depth) & (depth > 0)
         depth[seen] += self.spread * depth[seen] ** 2 * rng.standard_normal(int(seen.sum()))
@@ -240,8 +240,8 @@ class DepthNoise(Settings, name="depth_noise"):
         depth = np.where(np.isfinite(view.depth) & (view.depth > 0), view.depth, np.nan).astype(np.float64)
         steepness = np.zeros_like(depth)
         for axis, focal in ((1, view.intrinsics[0]), (0, view.intrinsics[1])):
-            ahead = np.diff(depth, axis=axis, append=np.nan)
-            behind = np.diff(depth, axis=axis, prepend=np.nan)
+            forward = np.diff(depth, axis=axis, append=np.nan)
+            backward = np.diff(depth, axis=axis, prepend=np.nan)
             # the smaller difference: across an edge, the other one lies on the surface
-            steepness += (focal * np.fmin(np.abs(ahead), np.abs(behind)) / depth) ** 2
+            steepness += (focal * np.fmin(np.abs(forward), np.abs(backward)) / depth) ** 2
         return np.sqrt(steepness) * np.tan(self.grazing) > 1

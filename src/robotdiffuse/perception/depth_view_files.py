@@ -125,8 +125,8 @@ def read_views(entries: object, folder: Path) -> tuple[tuple[DepthView, ...], tu
         try:
             views.append(_view(f"views[{i}]", entry, folder, notes))
         except InputError as error:
-            where = "" if str(error).startswith(f"views[{i}]") else f"views[{i}]: "
-            raise InputError(f"{where}{error}") from None
+            prefix = "" if str(error).startswith(f"views[{i}]") else f"views[{i}]: "
+            raise InputError(f"{prefix}{error}") from None
     return tuple(views), tuple(notes)
 
 

@@ -198,11 +198,11 @@ class ViewMemory:
     @property
     def views(self) -> list[DepthView]:
         """The kept views."""
-        return [kept.view for kept in self._kept]
+        return [memory.view for memory in self._kept]
 
     def volume(self) -> ObservedVolume:
         """What the kept views together tell of each voxel of 4 cm."""
-        return merged([kept.volume for kept in self._kept])
+        return merged([memory.volume for memory in self._kept])
 
     def points(self, free: Voxels) -> Points:
         """The mean of the points that the kept views observed in each cell of a grid [m]; see `seen_points`.
@@ -210,7 +210,7 @@ class ViewMemory:
         Stray points are left out: those in the free voxels of a map, since more views see through them, and
         with noise those of one view that have no other point near: surfaces show more.
         """
-        every = np.concatenate([kept.points for kept in self._kept]).astype(np.float64)
+        every = np.concatenate([memory.points for memory in self._kept]).astype(np.float64)
         _, cell, counts = np.unique(_cells(every), return_inverse=True, return_counts=True)
         sums = [np.bincount(cell, every[:, axis], len(counts)) for axis in range(3)]
         points = np.stack(sums, axis=1) / counts[:, None]
@@ -218,7 +218,7 @@ class ViewMemory:
         inside = MAP.contains(at)
         stray = np.zeros(len(points), np.bool_)
         stray[inside] = free[tuple(at[inside].T)]
-        if any(filtered(kept.view).spread for kept in self._kept):
+        if any(filtered(memory.view).spread for memory in self._kept):
             once = counts == 1
             distances, _ = KDTree(points).query(points[once], k=2, distance_upper_bound=ALONE_DISTANCE)
             stray[once] |= np.isinf(distances[:, 1])

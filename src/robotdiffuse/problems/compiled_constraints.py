@@ -276,16 +276,16 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     if line.angle is None:
         return rows
     turn = rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
-    whole = float(np.linalg.norm(turn))
-    if length < MIN_LINE_LENGTH and whole > 0:
+    total_angle = float(np.linalg.norm(turn))
+    if length < MIN_LINE_LENGTH and total_angle > 0:
         # in place: the axis stays where it is, and an arm at right angles to it turns to either side of its
         # middle by half the angle
-        axis = turn / whole
+        axis = turn / total_angle
         arm = rotation_z_to(axis)[:, 0]
-        middle = rotation_about(axis, whole / 2) @ arm
-        for held, direction, spread in ((axis, axis, 0.0), (arm, middle, whole / 2)):
+        middle = rotation_about(axis, total_angle / 2) @ arm
+        for link_axis, direction, spread in ((axis, axis, 0.0), (arm, middle, total_angle / 2)):
             limit = min(spread + line.angle, np.pi)
-            rows.append(_Row(CONE, limit, line.angle, a=T_start[:3, :3].T @ held, b=direction))
+            rows.append(_Row(CONE, limit, line.angle, a=T_start[:3, :3].T @ link_axis, b=direction))
     else:
         share = way / length**2 if length > 0 else way
         rows.append(_Row(TURN, line.angle, line.angle, T_start, a=turn, b=share))
@@ -310,8 +310,8 @@ def line_end(problem: Problem, line: CartesianLine) -> Pose:
             if robot.link_frame(pose.frame) == robot.link_frame(line.frame) and not pose.tolerant:
                 between = inverse(robot.T_frame_link(pose.frame)) @ robot.T_frame_link(line.frame)
                 return pose.T_base_frame @ between
-        what = " and of ".join(pose.frame for pose in poses)
-        why = f"it is a pose of {what}, which is not rigidly connected to {line.frame}"
+        frames = " and of ".join(pose.frame for pose in poses)
+        why = f"it is a pose of {frames}, which is not rigidly connected to {line.frame}"
         if any(robot.link_frame(pose.frame) == robot.link_frame(line.frame) for pose in poses):
             why = "it has tolerances"
     else:

@@ -45,27 +45,28 @@ class FrameConstraint(Value):
         """Checks each field by its name: link, vectors, directions, and scalars within their bounds."""
         for field in fields(self):
             name = field.name
-            given: Any = getattr(self, name)
-            where = f"{self.kind}.{name}"
-            if name == "frame" and not isinstance(given, str):
-                raise InputError(f"{where} is {shown(given)}; it must be the name of a link")
+            content: Any = getattr(self, name)
+            location = f"{self.kind}.{name}"
+            if name == "frame" and not isinstance(content, str):
+                raise InputError(f"{location} is {shown(content)}; it must be the name of a link")
             if name in ("point", "low", "high", *DIRECTION_FIELDS):
-                row = vector(self.kind, name, given, 3)
+                row = vector(self.kind, name, content, 3)
                 length = float(np.linalg.norm(row))
                 if name in DIRECTION_FIELDS and length < 1e-6:
-                    raise InputError(f"{where} is {shown(row)}; it must not be zero")
-                given = row if name not in DIRECTION_FIELDS or abs(length - 1) < 1e-15 else row / length
-            if name in SCALAR_BOUNDS and not (given is None and NoneType in get_args(field.type)):
+                    raise InputError(f"{location} is {shown(row)}; it must not be zero")
+                content = row if name not in DIRECTION_FIELDS or abs(length - 1) < 1e-15 else row / length
+            if name in SCALAR_BOUNDS and not (content is None and NoneType in get_args(field.type)):
                 low, high, unit = SCALAR_BOUNDS[name]
-                value = numbers(given)
+                value = numbers(content)
                 if value is None or value.ndim != 0 or not low <= value <= high:
                     raise InputError(
-                        f"{where} is {shown(given)}; it must be a number from {low:g} to {high:.6g} [{unit}]"
+                        f"{location} is {shown(content)}; "
+                        f"it must be a number from {low:g} to {high:.6g} [{unit}]"
                     )
-                given = float(value)
+                content = float(value)
             if name == "T_base_box":
-                given = BASE_FRAME if given is None else rigid_transform(where, given)
-            object.__setattr__(self, name, read_only(given))
+                content = BASE_FRAME if content is None else rigid_transform(location, content)
+            object.__setattr__(self, name, read_only(content))
 
     def moved(self: Self, T: Pose) -> Self:
         """The constraint after the rigid motion T."""

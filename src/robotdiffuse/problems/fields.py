@@ -111,21 +111,21 @@ WRITTEN_DECIMALS = 12
 
 def _fields_of(kind: type) -> tuple[dict[str, Schema], list[str]]:
     """The fields of the entry of a shape or constraint, and those that it must have."""
-    found: dict[str, Schema] = {}
+    schemas: dict[str, Schema] = {}
     for field in fields(kind):
-        found |= (
+        schemas |= (
             POSE if field.name in ("wxyz", "T_base_box") else {field.name: VALUES.get(field.name, NUMBER)}
         )
-    return found, [field.name for field in fields(kind) if field.default is MISSING]
+    return schemas, [field.name for field in fields(kind) if field.default is MISSING]
 
 
 def _entry_schema(kind: type[Shape] | type[Constraint]) -> Schema:
-    known, required = _fields_of(kind)
+    field_schemas, required = _fields_of(kind)
     content = FILE_CONTENT.get(kind.kind)
     if content is None:
-        return _object(known, *required)
+        return _object(field_schemas, *required)
     in_file = ["file", *(name for name in required if name not in content)]
-    return _object(known) | {"anyOf": [{"required": required}, {"required": in_file}]}
+    return _object(field_schemas) | {"anyOf": [{"required": required}, {"required": in_file}]}
 
 
 def read_pose(where: str, data: object) -> Pose:
@@ -193,17 +193,17 @@ def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str
         name = _text("tool.name", tool.get("name", TOOL))
         robot = robot.with_tool(link, pose_of("tool", tool), shapes.shapes, _touch_links("tool", tool), name)
     attached = values.get("attached")
-    for where, entry in entries_of("attached", attached or [], "objects, each with a link"):
+    for location, entry in entries_of("attached", attached or [], "objects, each with a link"):
         if not isinstance(entry, dict) or "link" not in entry:
             raise InputError(
-                f"{where} is {shown(entry)}; it must be a shape with its link, e.g. "
+                f"{location} is {shown(entry)}; it must be a shape with its link, e.g. "
                 "{link: panda_hand, box: {...}}"
             )
         shape = {key: value for key, value in entry.items() if key not in ("link", "touch_links")}
-        with located(where):
-            held = _one_shape(where, shape, folder, notes)
-            touch = _touch_links(where, entry)
-            robot = robot.attach(held, _text(f"{where}.link", entry["link"]), touch)
+        with located(location):
+            attached_shape = _one_shape(location, shape, folder, notes)
+            touch = _touch_links(location, entry)
+            robot = robot.attach(attached_shape, _text(f"{location}.link", entry["link"]), touch)
     return robot
 
 
@@ -275,9 +275,11 @@ def read_goal(where: str, data: object, setting: Setting) -> Goal:
 
 def _pose_goal(where: str, value: object, scene: Scene, frame: object = None) -> PoseGoal:
     """The goal of a pose entry. frame: the link, if the entry itself does not name it."""
-    known = GOAL_POSE if frame is None else {name: GOAL_POSE[name] for name in GOAL_POSE if name != "frame"}
-    required = [name for name in ("frame", "xyz", "wxyz") if name in known]
-    pose = {"frame": frame, **check_fields(where, value, required, known)}
+    pose_fields = (
+        GOAL_POSE if frame is None else {name: GOAL_POSE[name] for name in GOAL_POSE if name != "frame"}
+    )
+    required = [name for name in ("frame", "xyz", "wxyz") if name in pose_fields]
+    pose = {"frame": frame, **check_fields(where, value, required, pose_fields)}
     T = pose_of(where, pose)
     if "relative_to" in pose:
         shapes = {shape.name: shape for shape in scene.shapes}
@@ -303,8 +305,8 @@ def goal_entry(goal: Goal) -> dict[str, Any]:
 
 def _pose_goal_entry(pose: PoseGoal) -> dict[str, Any]:
     tolerances = {name: getattr(pose, name) for name in TOLERANCES}
-    given = {name: value.tolist() for name, value in tolerances.items() if value is not None}
-    return {**pose_entry(pose.T_base_frame), **given}
+    tolerance_entry = {name: value.tolist() for name, value in tolerances.items() if value is not None}
+    return {**pose_entry(pose.T_base_frame), **tolerance_entry}
 
 
 def _constraint(where: str, entry: object) -> Constraint:
@@ -313,12 +315,12 @@ def _constraint(where: str, entry: object) -> Constraint:
             f"{where} is {shown(entry)}; it must be one constraint, e.g. {{axis_cone: {{...}}}}; known: "
             f"{', '.join(CONSTRAINTS)}"
         )
-    [(name, given)] = entry.items()
+    [(name, raw_fields)] = entry.items()
     if name not in CONSTRAINTS:
         raise unknown_name(f"constraint in {where}:", name, CONSTRAINTS)
-    known, required = _fields_of(CONSTRAINTS[name])
+    field_schemas, required = _fields_of(CONSTRAINTS[name])
     at = f"{where}.{name}"
-    values = dict(check_fields(at, given, required, known))
+    values = dict(check_fields(at, raw_fields, required, field_schemas))
     posed = {key: values.pop(key) for key in ("xyz", "wxyz") if key in values}
     if posed:
         values["T_base_box"] = pose_of(at, posed)
@@ -353,12 +355,12 @@ def _moving(where: str, entry: object, setting: Setting) -> MovingObstacle:
             f"{where} has the fields {', '.join(map(str, entry))}; it must have one shape of "
             f"{', '.join(SHAPES)}, and a motion of {', '.join(MOTION_FIELDS)}"
         )
-    held = _one_shape(where, shape, setting.folder, [])
+    obstacle_shape = _one_shape(where, shape, setting.folder, [])
     with located(where):
         if "poses" in motion:
             poses = entries_of("poses", motion["poses"], "{xyz, wxyz}")
             motion["poses"] = [read_pose(*pose) for pose in poses]
-        return MovingObstacle(held, **motion)
+        return MovingObstacle(obstacle_shape, **motion)
 
 
 def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, object]:

@@ -85,8 +85,8 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
         if not 0 <= index < len(lines):
             raise InputError(f"index is {index}; {file} holds {len(lines)} problems, counted from 0")
         number, line = lines[index]
-        where = f"{file}, line {number}"
-        return _problem(where, parse_json(line, where), file.parent, ignore_joints=ignore_joints)
+        location = f"{file}, line {number}"
+        return _problem(location, parse_json(line, location), file.parent, ignore_joints=ignore_joints)
     if index != 0:
         raise InputError(f"index is {index}; {file} holds one problem, and only .jsonl files hold more")
     data = parse_json(text, str(file)) if file.suffix.lower() == ".json" else parse_yaml(text, str(file))
@@ -107,8 +107,8 @@ def load_problems(file: str | Path, ignore_joints: bool = False) -> list[Problem
         return [ProblemEntry(file.stem, load_problem(file, ignore_joints=ignore_joints))]
     entries = []
     for number, line in _lines(read_text(file)):
-        where = f"{file}, line {number}"
-        problem = _problem(where, parse_json(line, where), file.parent, ignore_joints=ignore_joints)
+        location = f"{file}, line {number}"
+        problem = _problem(location, parse_json(line, location), file.parent, ignore_joints=ignore_joints)
         entries.append(ProblemEntry(f"{file.stem}:{number}", problem))
     return entries
 
@@ -251,7 +251,7 @@ def _moveit_problem(scene_file: Path, robot: Robot | None, ignore_joints: bool) 
 
 def _linkable(robot: Robot, request: MoveItRequest | None) -> tuple[str, ...]:
     """Names of the robot's links and of what it holds at the start."""
-    return (*robot.link_names, *(held.name for held in (request.attached if request else ())))
+    return (*robot.link_names, *(attached.name for attached in (request.attached if request else ())))
 
 
 def _requested(
@@ -263,12 +263,17 @@ def _requested(
     robot = robot.with_locked({name: value for name, value in request.start.items() if name in unplanned})
     notes = [*request.notes, *notes]
     for joint in robot.joints:
-        given = request.start.get(joint.name)
+        start_value = request.start.get(joint.name)
         locked = robot.locked.get(joint.name)
-        if joint.mimic is None or given is None or locked is None or abs(locked - given) <= MIMIC_SLACK:
+        if (
+            joint.mimic is None
+            or start_value is None
+            or locked is None
+            or abs(locked - start_value) <= MIMIC_SLACK
+        ):
             continue
         implied = f"planned at {locked:g}, which {joint.mimic.joint} implies"
-        notes.append(f"start_state: {joint.name} is {given:g}; {implied}")
+        notes.append(f"start_state: {joint.name} is {start_value:g}; {implied}")
 
     def values(where: str, positions: dict[str, float]) -> list[float]:
         missing = [name for name in robot.joint_names if name not in positions]
@@ -277,8 +282,8 @@ def _requested(
         return [positions[name] for name in robot.joint_names]
 
     start = values("start_state", request.start)
-    for held in request.attached:
-        robot = held.held_by(robot, start)
+    for attached in request.attached:
+        robot = attached.held_by(robot, start)
     if request.pose_goal is not None:
         goal: Goal = PoseGoal(*request.pose_goal)
     else:

@@ -133,9 +133,9 @@ class CaseFile:
 
         Problems that are not in the file yet are generated, validated, searched and added.
         """
-        found: list[dict[str, Any]] = []
+        case_rows: list[dict[str, Any]] = []
         numbers = itertools.count()
-        while len(found) < count:
+        while len(case_rows) < count:
             number = next(numbers)
             row = self._rows.get(f"{family}/{number}")
             if row is None:
@@ -145,10 +145,10 @@ class CaseFile:
             if search is not None and not (row["trivial"] or row["searched"]):
                 row = self._add(row | {"searched": True, "reference": search(_case(row).problem)})
             if search is None or _is_hard(row):
-                found.append(row)
-                if len(found) % REPORT_EVERY == 0 or len(found) == count:
-                    report(f"problems: {len(found)} of {count} of {family}")
-        return [_case(row) for row in found]
+                case_rows.append(row)
+                if len(case_rows) % REPORT_EVERY == 0 or len(case_rows) == count:
+                    report(f"problems: {len(case_rows)} of {count} of {family}")
+        return [_case(row) for row in case_rows]
 
     def _add(self, row: dict[str, Any]) -> dict[str, Any]:
         self._lines.append(row)

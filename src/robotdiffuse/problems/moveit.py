@@ -150,13 +150,13 @@ class MoveItFrames(dict[str, ndarray]):
         name = frame_name(where, entry)
         if name in self:
             return self[name]
-        known = [frame for frame in self if frame]
+        frame_names = [frame for frame in self if frame]
         if self.lost:
             raise InputError(
                 f"frame_id of {where} is {shown(name)}, and the pose of the robot's base in it is unknown: "
-                f"{self.lost}; known frames: {', '.join(known)}"
+                f"{self.lost}; known frames: {', '.join(frame_names)}"
             )
-        raise unknown_name(f"frame_id of {where}:", name, known)
+        raise unknown_name(f"frame_id of {where}:", name, frame_names)
 
 
 def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
@@ -167,22 +167,24 @@ def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
     """
     if mapping_of(SCENE, data, "robot_state").get("attached_collision_objects"):
         raise InputError("attached_collision_objects are for the start_state of a request")
-    where = "multi_dof_joint_state"
-    floating = mapping_of(SCENE, data, "robot_state", where)
-    transforms = list_of(f"{where}.", floating, "transforms")
+    location = "multi_dof_joint_state"
+    floating = mapping_of(SCENE, data, "robot_state", location)
+    transforms = list_of(f"{location}.", floating, "transforms")
     if len(transforms) > 1:
-        raise InputError(f"{where} has {len(transforms)} transforms; it must have one, of the robot's root")
+        raise InputError(
+            f"{location} has {len(transforms)} transforms; it must have one, of the robot's root"
+        )
     T_own_root = np.eye(4)
     if transforms:
-        T_own_root = pose_of(f"{where}.transforms[0]", transforms[0], "translation", "rotation")
-    named = frame_name(where, floating)
+        T_own_root = pose_of(f"{location}.transforms[0]", transforms[0], "translation", "rotation")
+    named = frame_name(location, floating)
     root = "" if robot is None else robot.root or robot.base
     frames = MoveItFrames(robot, T_own_root, ("", "world" if named in ("", root) else named))
-    for where, entry in mappings_of("", mapping_of(SCENE, data), "fixed_frame_transforms"):
+    for location, entry in mappings_of("", mapping_of(SCENE, data), "fixed_frame_transforms"):
         child = str(entry.get("child_frame_id", "")).removeprefix("/")
-        T = pose_of(f"{where}.transform", entry.get("transform"), "translation", "rotation")
+        T = pose_of(f"{location}.transform", entry.get("transform"), "translation", "rotation")
         if not frames.lost and child not in frames.links:
-            frames[child] = frames.of(where, entry) @ T
+            frames[child] = frames.of(location, entry) @ T
     return frames
 
 
@@ -197,13 +199,13 @@ def moveit_scene(
     world = mapping_of(SCENE, data, "world")
     shapes = _octomap(mapping_of("world", world, "octomap"), frames)
     for i, entry in enumerate(list_of("world.", world, "collision_objects")):
-        given = mapping_of(f"collision object {i}", entry)
-        with located(f"collision object {given.get('id', i)}"):
-            shapes.extend(object_shapes(given, frames, folder))
+        object_entry = mapping_of(f"collision object {i}", entry)
+        with located(f"collision object {object_entry.get('id', i)}"):
+            shapes.extend(object_shapes(object_entry, frames, folder))
     names = dict.fromkeys(shape.name for shape in shapes)
     allowed = matrix_contacts(mapping_of(SCENE, data, MATRIX), names, links)
-    given = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
-    return Scene(shapes, (*allowed.items(), *given))
+    object_entry = Scene(shapes, contacts).allowed_contacts  # type: ignore[arg-type]
+    return Scene(shapes, (*allowed.items(), *object_entry))
 
 
 def matrix_contacts(
@@ -217,9 +219,9 @@ def matrix_contacts(
     """
     matrix = mapping_of(MATRIX, matrix)
     names, rows, default_names, defaults = (
-        list_of(f"{MATRIX}.", matrix, f"{part}entry_{what}")
+        list_of(f"{MATRIX}.", matrix, f"{part}entry_{column}")
         for part in ("", "default_")
-        for what in ("names", "values")
+        for column in ("names", "values")
     )
     # a row may be a list or a message AllowedCollisionEntry
     rows = [
@@ -228,38 +230,38 @@ def matrix_contacts(
     if any(len(one) != len(names) for one in (rows, *rows)):
         raise InputError(f"{MATRIX} has {len(names)} entry_names; entry_values must be square, of this size")
     pairs = {
-        (str(one), str(other)): bool(value)
+        (str(one), str(partner)): bool(value)
         for one, row in zip(names, rows, strict=True)
-        for other, value in zip(names, row, strict=True)
+        for partner, value in zip(names, row, strict=True)
     }
     default = dict(zip(map(str, default_names), map(bool, defaults), strict=False))
 
     def allowed(link: str, obstacle: str) -> bool:
-        given = [default[name] for name in (link, obstacle) if name in default]
-        return pairs.get((link, obstacle), bool(given) and all(given))
+        defaults = [default[name] for name in (link, obstacle) if name in default]
+        return pairs.get((link, obstacle), bool(defaults) and all(defaults))
 
-    found = {
+    touch_links = {
         obstacle: tuple(
             link for link in links if allowed(link, OCTOMAP if obstacle == "octomap" else obstacle)
         )
         for obstacle in obstacles
     }
-    return {obstacle: touching for obstacle, touching in found.items() if touching}
+    return {obstacle: touching for obstacle, touching in touch_links.items() if touching}
 
 
 def _octomap(entry: dict[str, Any], frames: MoveItFrames) -> list[Shape]:
     """The occupied voxels of an OctomapWithPose as a cloud of spheres around them; none without data."""
-    where = "world.octomap"
-    message = mapping_of(where, entry, "octomap")
-    data = list_of(f"{where}.octomap.", message, "data")
+    location = "world.octomap"
+    message = mapping_of(location, entry, "octomap")
+    data = list_of(f"{location}.octomap.", message, "data")
     if not data:
         return []
     if not message.get("binary"):
-        raise InputError(f"{where} is not binary; publish it as a binary octomap (octomap_binary)")
-    numbers = vector(f"{where}.octomap", "data", data, len(data)).astype(np.int64)
-    edge = float(vector(f"{where}.octomap", "resolution", [message.get("resolution")], 1)[0])
-    T = frames.of(where, entry) @ pose_of(f"{where}.origin", entry.get("origin") or NO_POSE)
-    with located(where):
+        raise InputError(f"{location} is not binary; publish it as a binary octomap (octomap_binary)")
+    numbers = vector(f"{location}.octomap", "data", data, len(data)).astype(np.int64)
+    edge = float(vector(f"{location}.octomap", "resolution", [message.get("resolution")], 1)[0])
+    T = frames.of(location, entry) @ pose_of(f"{location}.origin", entry.get("origin") or NO_POSE)
+    with located(location):
         voxels = occupied_voxels((numbers % 256).astype(np.uint8).tobytes(), edge)
         return [PointCloud(voxels, cover_radius(edge), name="octomap").moved(T)]
 
@@ -283,21 +285,21 @@ def object_shapes(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> 
             raise InputError(
                 f"has {len(parts)} {plural} and {len(poses)} {key}_poses; it must be one for each"
             )
-        for i, ((where, part), pose) in enumerate(zip(parts, poses, strict=True)):
+        for i, ((location, part), pose) in enumerate(zip(parts, poses, strict=True)):
             T = T_base_object @ pose_of(f"{key}_poses[{i}]", pose)
             if key == "plane":
-                shapes.append(_plane(vector(where, "coef", part.get("coef"), 4), name).moved(T))
+                shapes.append(_plane(vector(location, "coef", part.get("coef"), 4), name).moved(T))
                 continue
             placed = T[:3, 3], quaternion_from_rotation(T[:3, :3]), name
             if key == "mesh":
-                shapes.append(Mesh(*_triangles(where, part, folder), *placed[:2], name=name))
+                shapes.append(Mesh(*_triangles(location, part, folder), *placed[:2], name=name))
                 continue
             kind = part.get("type")
             kind = TYPE_NUMBERS.get(kind, kind) if isinstance(kind, int) else kind
             if not isinstance(kind, str) or kind not in PRIMITIVES:
-                raise unknown_name(f"type of {where}:", kind, PRIMITIVES)
+                raise unknown_name(f"type of {location}:", kind, PRIMITIVES)
             count, build = PRIMITIVES[kind]
-            shapes.append(build(vector(where, "dimensions", part.get("dimensions"), count), *placed))
+            shapes.append(build(vector(location, "dimensions", part.get("dimensions"), count), *placed))
     return shapes
 
 
@@ -400,10 +402,10 @@ def joint_notes(
     if ignore_joints:
         return (f"{where}: ignored {joined(lacking)}, which {robot.name} lacks",)
     of_model = f" (robot_model_name is {shortened(model)})" if model not in ("", robot.name) else ""
-    own = joined(name for name, kind in kinds.items() if kind in MOVING_KINDS)
+    movable = joined(name for name, kind in kinds.items() if kind in MOVING_KINDS)
     raise InputError(
         f"{where} has values of {joined(lacking)}, movable joints that {robot.name} lacks{of_model}; its own "
-        f"are {own}: give the robot that is meant, or ignore these joints (--ignore-joints, "
+        f"are {movable}: give the robot that is meant, or ignore these joints (--ignore-joints, "
         f"ignore_joints=True)"
     )
 
@@ -468,17 +470,17 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
         if data.get(name):
             raise InputError(f"{name} is not supported; leave it out")
     notes = []
-    for what in ("velocity", "acceleration"):
-        name = f"max_{what}_scaling_factor"
+    for quantity in ("velocity", "acceleration"):
+        name = f"max_{quantity}_scaling_factor"
         share = float(vector("request", name, [data.get(name) or 0], 1)[0])  # 0 means 1 in MoveIt
         if not 0 <= share <= 1:
             raise InputError(f"{name} is {shown(data[name])}; it must be a number from 0 to 1")
         if 0 < share < 1:
-            notes.append(f"the request's {name} {share:g} is ignored: plan with {what}_scaling={share:g}")
+            notes.append(f"the request's {name} {share:g} is ignored: plan with {quantity}_scaling={share:g}")
     state = mapping_of(REQUEST, data, "start_state")
     attached = tuple(
-        _attached(where, entry, frames, folder)
-        for where, entry in mappings_of("", state, "attached_collision_objects")
+        _attached(location, entry, frames, folder)
+        for location, entry in mappings_of("", state, "attached_collision_objects")
     )
     start = joint_state(state, "start_state")
     velocity = list_of("", mapping_of("start_state", state, "joint_state"), "velocity")
@@ -521,7 +523,7 @@ def _joint_goal(where: str, goal: dict[str, Any]) -> dict[str, float]:
 
 def _pose_goal(where: str, goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray]:
     places, turns = (
-        mappings_of(f"{where}.", goal, f"{what}_constraints") for what in ("position", "orientation")
+        mappings_of(f"{where}.", goal, f"{kind}_constraints") for kind in ("position", "orientation")
     )
     if len(places) != 1 or len(turns) != 1 or goal.get("joint_constraints"):
         raise InputError(f"{where} must have one position and one orientation constraint, and no others")

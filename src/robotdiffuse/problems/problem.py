@@ -64,8 +64,8 @@ def depth_views(robot: Robot, views: object) -> tuple[DepthView, ...]:
 def path_constraints(robot: Robot, constraints: object) -> tuple[Constraint, ...]:
     kinds = tuple(CONSTRAINTS.values())
     if not isinstance(constraints, list | tuple) or not all(isinstance(one, kinds) for one in constraints):
-        known = ", ".join(f"rd.{kind.__name__}" for kind in kinds)
-        raise InputError(f"constraints is {shown(constraints)}; it must be a list of {known}")
+        constructors = ", ".join(f"rd.{kind.__name__}" for kind in kinds)
+        raise InputError(f"constraints is {shown(constraints)}; it must be a list of {constructors}")
     for i, one in enumerate(constraints):
         _check_planned_joint_moves(robot, f"constraints[{i}].frame", one.frame)
     return tuple(constraints)
@@ -86,19 +86,19 @@ def blend_radii(value: object, count: int) -> tuple[float, ...]:
     blends = numbers(value)
     if blends is not None and blends.ndim == 0 and count:
         blends = np.full(count, blends)
-    given = blends is not None and blends.size > 0
-    if given and not count:
+    has_blends = blends is not None and blends.size > 0
+    if has_blends and not count:
         raise InputError(f"blend is {shown(value)}; there are no waypoints")
     if (
         blends is None
-        or (given and blends.shape != (count,))
+        or (has_blends and blends.shape != (count,))
         or not ((blends == 0) | ((blends >= MIN_BLEND) & (blends <= MAX_BLEND))).all()
     ):
         raise InputError(
             f"blend is {shown(value)}; it must be one number for all {count} waypoints, or one for each: 0 "
             f"to stop there, or from {MIN_BLEND:g} to {MAX_BLEND:g}"
         )
-    return tuple(blends.tolist()) if given else (0.0,) * count
+    return tuple(blends.tolist()) if has_blends else (0.0,) * count
 
 
 def _check_planned_joint_moves(robot: Robot, field: str, frame: str) -> None:
@@ -112,10 +112,10 @@ def _check_planned_joint_moves(robot: Robot, field: str, frame: str) -> None:
 
 def check_contacts(robot: Robot, scene: Scene) -> None:
     """Raises InputError for allowed contacts of links that the robot lacks."""
-    known = {*robot.link_names}
+    link_names = {*robot.link_names}
     for obstacle, links in scene.allowed_contacts:
         for link in () if links == ALL_LINKS else links:
-            if link not in known:
+            if link not in link_names:
                 raise unknown_name(f"link in allowed_contacts of {obstacle}:", link, robot.link_names)
 
 
@@ -146,8 +146,8 @@ def velocity_at_start(robot: Robot, value: object, notes: list[str]) -> JointVal
         name = robot.joint_names[j]
         limit = robot.velocity[j]
         if abs(velocity[j] - within[j]) > VELOCITY_SLACK * limit:
-            given, _, most = distinct(velocity[j], -limit, limit)
-            raise InputError(f"start_velocity: {name} is {given}; its velocity limit is {most}")
+            velocity_text, _, limit_text = distinct(velocity[j], -limit, limit)
+            raise InputError(f"start_velocity: {name} is {velocity_text}; its velocity limit is {limit_text}")
         notes.append(f"start_velocity: {name} clamped from {velocity[j]!r} to its limit {within[j]!r}")
         velocity[j] = within[j]
     return velocity if (np.abs(velocity) >= MIN_RATE).any() else None
@@ -186,10 +186,10 @@ def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
     parts = dict[int, str]()
     for pose in goal.poses:
         _check_planned_joint_moves(robot, f"{field}.poses", pose.frame)
-        other = parts.setdefault(robot.link_frame(pose.frame), pose.frame)
-        if other != pose.frame:
+        linked = parts.setdefault(robot.link_frame(pose.frame), pose.frame)
+        if linked != pose.frame:
             raise InputError(
-                f"{field}.poses: {other} and {pose.frame} are one rigid part; give the pose of one of them"
+                f"{field}.poses: {linked} and {pose.frame} are one rigid part; give the pose of one of them"
             )
 
 
@@ -222,8 +222,10 @@ def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float
     within = float(np.clip(value, joint.lower, joint.upper))
     if abs(value - within) > LIMIT_SLACK:
         hint = " (angles are in radians)" if unit == "rad" and abs(value) > 2 * np.pi else ""
-        given, lower, upper = distinct(value, joint.lower, joint.upper)
-        raise InputError(f"{field}: {joint.name} is {given} {unit}; its limits are {lower} to {upper}{hint}")
+        value_text, lower, upper = distinct(value, joint.lower, joint.upper)
+        raise InputError(
+            f"{field}: {joint.name} is {value_text} {unit}; its limits are {lower} to {upper}{hint}"
+        )
     if value != within:
         notes.append(f"{field}: {joint.name} clamped from {float(value)!r} to its limit {within!r} {unit}")
     return within
@@ -360,10 +362,10 @@ class Problem(Value):
             from robotdiffuse.perception.seen_points import seen_shapes  # compiled code
 
             goal = checked["goal"]
-            known = self.known_scene
+            known_scene = self.known_scene
             goals = goal.positions if isinstance(goal, JointGoal) else checked["start"][None]
-            seen = seen_shapes(checked["views"], self.robot, known, checked["start"], goals)
-            checked["scene"] = known.with_shapes([*known.shapes, *seen])
+            seen = seen_shapes(checked["views"], self.robot, known_scene, checked["start"], goals)
+            checked["scene"] = known_scene.with_shapes([*known_scene.shapes, *seen])
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         super().__post_init__()
@@ -414,10 +416,10 @@ class Problem(Value):
         """
         T = rigid_transform("T_world_base", T_world_base)
         T_base_world = inverse(T)
-        given = {name: moved(value, T_base_world) for name, value in options.items()}
+        moved_options = {name: moved(value, T_base_world) for name, value in options.items()}
         scene = moved(scene, T_base_world)
         goal = moved(goal, T_base_world)
-        return cls(robot, scene, start, goal, T_world_base=T, **given)  # type: ignore[arg-type]
+        return cls(robot, scene, start, goal, T_world_base=T, **moved_options)  # type: ignore[arg-type]
 
     def standing(self) -> tuple[Robot, Scene]:
         """The robot and the scene in the world's frame, for pictures and simulators."""
@@ -455,8 +457,8 @@ class Problem(Value):
         checker = CollisionChecker(self.robot, self.scene)
         batch = np.atleast_2d(rows)
         each = np.hstack([checker.link_clearances(batch), checker.pair_clearances(batch)])
-        least = each.min(axis=1, initial=1.0).astype(np.float64)
-        return float(least[0]) if rows.ndim == 1 else least
+        clearances = each.min(axis=1, initial=1.0).astype(np.float64)
+        return float(clearances[0]) if rows.ndim == 1 else clearances
 
     def is_free(self, q: ArrayLike | str) -> "StateValidity":
         """Whether the arm is within its limits and free of collision.
@@ -495,8 +497,8 @@ class Problem(Value):
     @property
     def known_scene(self) -> Scene:
         """The scene as it was given: without the points that the views observed."""
-        known = [shape for shape in self.scene.shapes if not isinstance(shape, SeenPoints)]
-        return self.scene if len(known) == len(self.scene.shapes) else self.scene.with_shapes(known)
+        shapes = [shape for shape in self.scene.shapes if not isinstance(shape, SeenPoints)]
+        return self.scene if len(shapes) == len(self.scene.shapes) else self.scene.with_shapes(shapes)
 
     load: ClassVar[Callable[..., "Problem"]]
     """`problems.files.load_problem`, assigned by the package: files import problems, not the reverse."""
@@ -506,10 +508,10 @@ class Problem(Value):
 
 def check_problem(problem: object, field: str = "problem") -> None:
     """InputError for anything but a Problem, with what to call for the name of a file."""
-    how = "e.g. rd.Problem(robot, scene, start, goal)"
+    hint = "e.g. rd.Problem(robot, scene, start, goal)"
     if isinstance(problem, str | PurePath):
-        how = f"rd.load_problem({shown(str(problem))}) reads one from a file"
-    check_type(field, problem, Problem, f"a Problem: {how}")
+        hint = f"rd.load_problem({shown(str(problem))}) reads one from a file"
+    check_type(field, problem, Problem, f"a Problem: {hint}")
 
 
 def check_clearance(value: object) -> float:
@@ -529,14 +531,14 @@ def check_unknown(field: str, value: object) -> str:
 
 def _check_combinations(checked: dict[str, Any]) -> None:
     """Raises InputError for fields that cannot be combined."""
-    given = {name for name, value in checked.items() if value is not None and not _is_empty(value)}
+    given_fields = {name for name, value in checked.items() if value is not None and not _is_empty(value)}
     if not any(checked["blend"]):
-        given.discard("blend")
+        given_fields.discard("blend")
     if any(isinstance(constraint, CartesianLine) for constraint in checked["constraints"]):
-        given.add("cartesian_line")
-    for one, other, advice in EXCLUSIVE_FIELDS:
-        if one in given and other in given:
-            raise InputError(f"{one} cannot be combined with {other}{advice}")
+        given_fields.add("cartesian_line")
+    for one, excluded, advice in EXCLUSIVE_FIELDS:
+        if one in given_fields and excluded in given_fields:
+            raise InputError(f"{one} cannot be combined with {excluded}{advice}")
 
 
 def _is_empty(value: object) -> bool:

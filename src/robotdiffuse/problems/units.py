@@ -34,14 +34,14 @@ def unit_notes(problem: Problem) -> tuple[str, ...]:
     large = np.flatnonzero(extents.max(axis=1) > MAX_EXTENT)
     notes = [_size_note(shapes[i], extents[i]) for i in large]
     notes += [_view_note(i, view, reach) for i, view in enumerate(problem.views)]
-    found = tuple(note for note in notes if note)
+    messages = tuple(note for note in notes if note)
     solid = [not _is_empty(shape) for shape in shapes]
     away = _distances(bounds[solid])
-    if not found and len(away) and away.min() > reach and not (seen or problem.views or problem.moving):
-        what = f"all {len(away)} obstacles are" if len(away) > 1 else f"the obstacle {shapes[0].name} is"
-        where = f"beyond the arm's reach of {reach:.1f} m, at least {away.min():.1f} m from its base"
-        found = (f"check the units: {what} {where}; {ADVICE}",)
-    return found
+    if not messages and len(away) and away.min() > reach and not (seen or problem.views or problem.moving):
+        subject = f"all {len(away)} obstacles are" if len(away) > 1 else f"the obstacle {shapes[0].name} is"
+        distance_text = f"beyond the arm's reach of {reach:.1f} m, at least {away.min():.1f} m from its base"
+        messages = (f"check the units: {subject} {distance_text}; {ADVICE}",)
+    return messages
 
 
 def arm_in_cloud_note(robot: Robot, scene: Scene, q: Configuration) -> str:
@@ -51,11 +51,12 @@ def arm_in_cloud_note(robot: Robot, scene: Scene, q: Configuration) -> str:
     counts = [_points_within(cloud.points, spheres) for cloud in clouds]
     if max(counts, default=0) < MIN_POINTS_IN_ARM:
         return ""
-    most = int(np.argmax(counts))
+    densest = int(np.argmax(counts))
+    cloud = clouds[densest]
     return (
-        f"check the cloud: {counts[most]} of {len(clouds[most].points)} points of {clouds[most].name} are "
-        "within the arm. Remove the arm's own points, or give the cloud as a view; else check its frame (the "
-        f"robot's base) and its units: {ADVICE}"
+        f"check the cloud: {counts[densest]} of {len(cloud.points)} points of {cloud.name} are within "
+        "the arm. Remove the arm's own points, or give the cloud as a view; else check its frame (the robot's base) "
+        f"and its units: {ADVICE}"
     )
 
 

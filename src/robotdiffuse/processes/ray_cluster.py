@@ -23,17 +23,17 @@ def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
 
     See `ray_cluster`. The nodes need this package, and files under the same paths.
     """
-    left = list(enumerate(calls))[::-1]
+    pending = list(enumerate(calls))[::-1]
     running = {}
     with ray_cluster() as ray:
         task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_on_node)
-        while left or running:
-            most = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
-            while left and len(running) < most:
-                number, arguments = left.pop()
+        while pending or running:
+            max_running = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
+            while pending and len(running) < max_running:
+                number, arguments = pending.pop()
                 running[task.remote(added_entries(), call, arguments)] = number
-            done, _ = ray.wait(list(running), num_returns=1)
-            for reference in done:
+            finished, _ = ray.wait(list(running), num_returns=1)
+            for reference in finished:
                 yield running.pop(reference), ray.get(reference)
 
 

@@ -157,29 +157,29 @@ class Worker:
         Raises EndedError if the process ends or is closed, OverrunError after the timeout, and
         NotStartedError if it could not start.
         """
-        given = pickle.dumps((call, arguments))
+        message = pickle.dumps((call, arguments))
         self.start()
-        return self._ask(given, timeout, stop)
+        return self._ask(message, timeout, stop)
 
     def _ask(self, given: bytes, timeout: float, stop: Callable[[], bool] = lambda: False) -> Any:
         if self._running is None:
             raise EndedError("closed")
         process, connection = self._running
         due = time.monotonic() + timeout
-        told = False
+        cancelled = False
         self._number += 1
         try:
             connection.send((self._number, given))
             while True:
-                left = due - time.monotonic()
-                if left <= 0:
+                remaining = due - time.monotonic()
+                if remaining <= 0:
                     self.end(0.0)
                     raise OverrunError("because its call took too long")
-                if not told and stop():
-                    told = True
+                if not cancelled and stop():
+                    cancelled = True
                     due = min(due, time.monotonic() + CANCEL_TIMEOUT)
                     connection.send((self._number, None))
-                if connection.poll(min(left, CHECK_INTERVAL)):
+                if connection.poll(min(remaining, CHECK_INTERVAL)):
                     answer, renew = connection.recv()
                     if not isinstance(answer, float):
                         break
@@ -188,8 +188,8 @@ class Worker:
             process.join(TERMINATE_TIMEOUT)
             self.end(0.0)
             code = process.exitcode or 0
-            how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
-            raise EndedError("closed" if self._closed else how) from None
+            exit_text = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
+            raise EndedError("closed" if self._closed else exit_text) from None
         if renew:
             self.end(0.0)
         result, error = pickle.loads(answer)
@@ -362,15 +362,15 @@ class Workers:
         At most one call more than there are processes is running or queued. Raises InputError if a process is
         killed from outside, e.g. when memory runs out.
         """
-        left = list(enumerate(calls))[::-1]
+        pending = list(enumerate(calls))[::-1]
         running = {}
-        while left and not self.workers:
-            number, arguments = left.pop()
+        while pending and not self.workers:
+            number, arguments = pending.pop()
             yield number, call(*arguments)
         try:
-            while left or running:
-                while left and len(running) < len(self.workers) + 1:
-                    number, arguments = left.pop()
+            while pending or running:
+                while pending and len(running) < len(self.workers) + 1:
+                    number, arguments = pending.pop()
                     running[self.submit(call, *arguments)] = number
                 for job in wait(running, return_when=FIRST_COMPLETED).done:
                     yield running.pop(job), job.result()
@@ -437,18 +437,18 @@ class _Process:
         """Receive calls and cancellations; exit when the parent dies, even if it is killed."""
         with suppress(EOFError, OSError):
             while True:
-                number, given = self.connection.recv()
-                if given is None:
+                number, message = self.connection.recv()
+                if message is None:
                     self.cancelled = number
                 else:
-                    self.calls.put((number, given))
+                    self.calls.put((number, message))
         os._exit(1)
 
     def run(self) -> None:
         while True:
-            self.running, given = self.calls.get()
+            self.running, message = self.calls.get()
             try:
-                call, arguments = pickle.loads(given)
+                call, arguments = pickle.loads(message)
                 answer = pickle.dumps((call(*arguments), None))
             except BaseException as error:
                 answer = _failure(error)
@@ -466,8 +466,8 @@ def _main(connection: Connection) -> None:
     threading.Thread(target=_this.receive, daemon=True).start()
     _this.send(0.0)
     try:
-        _, given = _this.calls.get()
-        entries, prepare, arguments = pickle.loads(given)
+        _, message = _this.calls.get()
+        entries, prepare, arguments = pickle.loads(message)
         adopt_entries(entries)
         _this.send(pickle.dumps((prepare(*arguments), None)))
     except BaseException:  # it could not run any call

@@ -163,10 +163,10 @@ def _simulate(
         states = bullet.getJointStates(body, world.joints)
         positions[k] = [state[0] for state in states]
         # a step detects contacts at its beginning
-        for link, other, distance in world.touching():
-            new = ReplayContact(link, other, float(times[k - 1]), -distance)
-            known = contacts.get((link, other), new)
-            contacts[link, other] = replace(known, depth=max(known.depth, new.depth))
+        for link, partner, distance in world.touching():
+            new = ReplayContact(link, partner, float(times[k - 1]), -distance)
+            previous = contacts.get((link, partner), new)
+            contacts[link, partner] = replace(previous, depth=max(previous.depth, new.depth))
     return positions, tuple(contacts.values())
 
 

@@ -113,8 +113,8 @@ class World:
         """Pairs of links that are checked against each other."""
         for i, a in enumerate(solid):
             for b in solid[i + 1 :]:
-                apart = robot.link_frame(a) != robot.link_frame(b)
-                if apart and frozenset((a, b)) not in robot.allowed_collisions:
+                separate_frames = robot.link_frame(a) != robot.link_frame(b)
+                if separate_frames and frozenset((a, b)) not in robot.allowed_collisions:
                     self.pairs.append((a, b))
                 else:
                     bullet.setCollisionFilterPair(self.body, self.body, self.links[a], self.links[b], 0)
@@ -143,9 +143,9 @@ class World:
         for body in self.obstacles.values():
             self.bullet.removeBody(body)
         self.scene = scene
-        drawn = drawables(scene, moving)
-        self._moving = [one for one in drawn if one.moving is not None]
-        self.obstacles = {one.name: self._add(one) for one in drawn}
+        scene_drawables = drawables(scene, moving)
+        self._moving = [one for one in scene_drawables if one.moving is not None]
+        self.obstacles = {one.name: self._add(one) for one in scene_drawables}
         for link, index in self.links.items():
             for name, body in self.obstacles.items():
                 if self.robot.link_frame(link) == 0 or scene.may_touch(link, name):
@@ -297,9 +297,9 @@ def mass_properties(
         return MIN_MASS, np.zeros(3), MIN_INERTIA * np.eye(3)
     center = sum((mass * at for mass, at, _ in parts), np.zeros(3)) / total
     inertia = MIN_INERTIA * np.eye(3)
-    for mass, at, own in parts:
+    for mass, at, own_inertia in parts:
         arm = at - center
-        inertia = inertia + own + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        inertia = inertia + own_inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return total, center, inertia
 
 
@@ -403,8 +403,8 @@ class DepthCamera(Settings, name="camera"):
     def rays(self) -> Float[ndarray, "height width 3"]:
         """Vectors from the camera through each pixel, in the base frame, 1 m long along the optical axis."""
         slope = np.tan(self.field_of_view / 2)
-        wide = slope * self.width / self.height
-        x = (2 * (np.arange(self.width) + SAMPLE_OFFSET[0]) / self.width - 1) * wide
+        half_width = slope * self.width / self.height
+        x = (2 * (np.arange(self.width) + SAMPLE_OFFSET[0]) / self.width - 1) * half_width
         y = (1 - 2 * (np.arange(self.height) + SAMPLE_OFFSET[1]) / self.height) * slope
         return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=-1) @ self.rotation.T
 
@@ -475,11 +475,11 @@ def point_cloud(
     for name in without:
         if name not in world.obstacles:
             raise unknown_name("obstacle in without:", name, world.obstacles)
-    kept = [body for name, body in world.obstacles.items() if name not in without]
+    visible_bodies = [body for name, body in world.obstacles.items() if name not in without]
     clouds = [np.zeros((0, 3))]
     for camera in cameras:
         depth, bodies = _capture(world, camera)
-        seen = np.isin(bodies, kept) & (rng.random(bodies.shape) >= camera.dropout)
+        seen = np.isin(bodies, visible_bodies) & (rng.random(bodies.shape) >= camera.dropout)
         rays = camera.rays()[seen]
         lengths = np.linalg.norm(rays, axis=1)
         distances = depth[seen] * lengths + camera.noise * rng.standard_normal(len(rays))

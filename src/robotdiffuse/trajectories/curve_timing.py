@@ -59,7 +59,7 @@ def time_curve(
     velocity, acceleration = scaled_limits(robot, settings)
     jerk = jerk_limits(robot, settings)
     best = None
-    least = np.inf
+    shortest_duration = np.inf
     for share in ACCELERATION_SHARES:
         limits = derivatives_and_limits(curve, grid, velocity, share * acceleration, extra)
         speeds = fastest_speeds(*limits)
@@ -88,10 +88,10 @@ def time_curve(
                 slower = max(slower, extra_slowdown(extra, q, v / slower, a / slower**2) * slower)
             duration = slower * clock[-1]
             shortest = min(shortest, duration)
-            if duration < least:
-                least = duration
+            if duration < shortest_duration:
+                shortest_duration = duration
                 best = Trajectory(robot.joint_names, slower * clock, q, v / slower, a / slower**2)
-        if shortest > least:
+        if shortest > shortest_duration:
             break
     assert best is not None
     return best

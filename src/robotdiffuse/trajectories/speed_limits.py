@@ -180,7 +180,7 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
     direction = line.directions[0]
     first = line.knots[1]
     for share in START_SHARES:
-        found = None
+        candidate = None
         windows = jerk_windows(step, share * acceleration, jerk)
         for window in windows:
             lead = 0.5 * (window + 1) * step * start_speed
@@ -188,8 +188,8 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
                 break
             widths = line.half_widths.copy()
             widths[:1] = np.minimum(widths[:1], first - lead)
-            ahead = np.concatenate([line.waypoints[:1] + lead * direction, line.waypoints[1:]])
-            rest = BlendedPolyline(ahead, widths)
+            led_waypoints = np.concatenate([line.waypoints[:1] + lead * direction, line.waypoints[1:]])
+            rest = BlendedPolyline(led_waypoints, widths)
             grid = timing_grid(rest, settings)
             try:
                 speeds = _fastest_speeds(rest, grid, velocity, share * acceleration, start_speed)
@@ -201,11 +201,11 @@ def _moving_start(robot: Robot, line: BlendedPolyline, settings: TimingSettings,
             rows = spline_rows(controls, step, window, start_speed * direction)
             if window == windows[-1] or _keeps_jerk(rows, step, jerk):
                 rows[1][0] = line.waypoints[0]
-                found = rows
+                candidate = rows
                 break
-        if best is not None and (found is None or found[0][-1] >= best[0][-1]):
+        if best is not None and (candidate is None or candidate[0][-1] >= best[0][-1]):
             break
-        best = found
+        best = candidate
     if best is None:
         raise TooFastError(f"the motion cannot stop along the path from {start_speed:.3g} rad/s")
     return best
@@ -216,19 +216,19 @@ def stopping_distance(robot: Robot, settings: TimingSettings, velocity: JointVal
     acceleration = scaled_limits(robot, settings)[1]
     speed = float(np.linalg.norm(velocity))
     moving = velocity != 0
-    most = float((acceleration[moving] * speed / np.abs(velocity[moving])).min())
+    max_acceleration = float((acceleration[moving] * speed / np.abs(velocity[moving])).min())
     window = 2 * float((acceleration / jerk_limits(robot, settings)).max())
     delays = [0.5 * share * window + 2 * settings.sample_time for share in START_SHARES]
-    braking = [speed**2 / (2 * BRAKING_FRACTION * share * most) for share in START_SHARES]
-    least = min(speed * delay + length for delay, length in zip(delays, braking, strict=True))
-    return max(least, MIN_STOPPING_DISTANCE)
+    braking = [speed**2 / (2 * BRAKING_FRACTION * share * max_acceleration) for share in START_SHARES]
+    shortest = min(speed * delay + length for delay, length in zip(delays, braking, strict=True))
+    return max(shortest, MIN_STOPPING_DISTANCE)
 
 
 def jerk_windows(step: float, acceleration: JointValues, jerk: JointValues) -> list[int]:
     """Numbers of configurations over which `spline_rows` may average to keep the jerk limits, in the order
     tried; the last keeps them in any case."""
-    enough = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
-    return sorted({1, *(int(np.ceil(fraction * enough)) for fraction in WINDOW_FRACTIONS), enough})
+    jerk_window = max(int(np.ceil(2 * (acceleration / jerk).max() / step)), 1)
+    return sorted({1, *(int(np.ceil(fraction * jerk_window)) for fraction in WINDOW_FRACTIONS), jerk_window})
 
 
 def _keeps_jerk(rows: Rows, step: float, jerk: JointValues) -> bool:
@@ -299,10 +299,10 @@ def derivatives_and_limits(
     """
     first = line(grid, 1)
     second = line(grid, 2)
-    least, most = symmetric_bounds(acceleration, len(grid))
+    lowest, highest = symmetric_bounds(acceleration, len(grid))
     if extra is NO_EXTRA_LIMITS:
-        return first, second, grid, velocity, least, most
-    columns = [(first, second, velocity, least, most)]
+        return first, second, grid, velocity, lowest, highest
+    columns = [(first, second, velocity, lowest, highest)]
     if extra.frame_speeds is not None:
         speeds = extra.frame_speeds.speeds(line(grid, 0), first)
         endless = np.full_like(speeds, np.inf)
@@ -321,10 +321,10 @@ def derivatives_and_limits(
         bend = torques(q, first, second) - gravity
         endless = np.full(len(limits), np.inf)
         columns.append((pull / limits, bend / limits, endless, low / limits, high / limits))
-    first, second, velocity, least, most = (
+    first, second, velocity, lowest, highest = (
         np.concatenate(rows, axis=-1) for rows in zip(*columns, strict=True)
     )
-    return first, second, grid, velocity, least, most
+    return first, second, grid, velocity, lowest, highest
 
 
 def _slow_to_extra_limits(line: BlendedPolyline, grid: Values, speeds: Values, extra: ExtraLimits) -> Values:
@@ -353,9 +353,9 @@ def extra_slowdown(extra: ExtraLimits, q: Configurations, v: JointRows, a: Joint
         # all torque but gravity's grows with the square of the speed
         gravity = extra.dynamics.holding_torques(q)
         limits = extra.dynamics.limits
-        own = extra.dynamics.torques(q, v, a) - gravity
-        room = np.maximum(limits - np.sign(own) * gravity, MIN_TORQUE_SHARE * limits)
-        slower = max(slower, float(np.sqrt((np.abs(own) / room).max(initial=1.0))))
+        motion_torques = extra.dynamics.torques(q, v, a) - gravity
+        room = np.maximum(limits - np.sign(motion_torques) * gravity, MIN_TORQUE_SHARE * limits)
+        slower = max(slower, float(np.sqrt((np.abs(motion_torques) / room).max(initial=1.0))))
     return slower
 
 

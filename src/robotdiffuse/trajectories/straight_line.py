@@ -38,5 +38,7 @@ def straight_line_time(
         speed_up = np.where(a * a >= j * v, a / v + j / a, 2 * np.sqrt(j / v))
         speed_up = np.where((a == 0) & (j == 0), 0.0, speed_up)
         ramp = j / a
-        short = np.where(2 * j * j <= a**3, ramp + np.sqrt(ramp * ramp + 4 * a), 4 * np.cbrt(j / 2))
-        return np.where(distance.max(axis=-1) == 0, 0.0, np.where(speed_up <= v, v + speed_up, short))
+        triangular_time = np.where(2 * j * j <= a**3, ramp + np.sqrt(ramp * ramp + 4 * a), 4 * np.cbrt(j / 2))
+        return np.where(
+            distance.max(axis=-1) == 0, 0.0, np.where(speed_up <= v, v + speed_up, triangular_time)
+        )

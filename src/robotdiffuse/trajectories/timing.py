@@ -82,9 +82,9 @@ def time_parameterize(
     rows = _distinct(path.positions)
     if len(rows) == 1:
         return _resting_trajectory(path, settings)
-    most = _largest_deviations(rows, settings, deviations)
-    given = path.positions[rows], most[1:-1]
-    return _round_and_time(robot, path, *given, valid, free, settings, keeps, start_speed, extra)[1]
+    max_deviations = _largest_deviations(rows, settings, deviations)
+    corners = path.positions[rows], max_deviations[1:-1]
+    return _round_and_time(robot, path, *corners, valid, free, settings, keeps, start_speed, extra)[1]
 
 
 def rounded_corners(
@@ -102,10 +102,10 @@ def rounded_corners(
     corner [rad]. Corners at the path's rows `stops` are not rounded."""
     _check_limits(robot)
     rows = _distinct(path.positions)
-    most = _largest_deviations(rows, settings, deviations)
-    most[np.searchsorted(rows, stops, side="right") - 1] = 0.0
-    given = path.positions[rows], most[1:-1]
-    return given[0], _round_and_time(robot, path, *given, valid, free, settings, keeps, 0.0, extra)[0]
+    max_deviations = _largest_deviations(rows, settings, deviations)
+    max_deviations[np.searchsorted(rows, stops, side="right") - 1] = 0.0
+    corners = path.positions[rows], max_deviations[1:-1]
+    return corners[0], _round_and_time(robot, path, *corners, valid, free, settings, keeps, 0.0, extra)[0]
 
 
 def _largest_deviations(
@@ -191,11 +191,11 @@ def _shrunk(
 
 
 def _check_limits(robot: Robot) -> None:
-    for what in ("velocity", "acceleration"):
-        for name, limit in zip(robot.joint_names, getattr(robot, what), strict=True):
+    for rate in ("velocity", "acceleration"):
+        for name, limit in zip(robot.joint_names, getattr(robot, rate), strict=True):
             if not limit >= MIN_RATE:
                 raise InputError(
-                    f"{robot.name}: the {what} limit of {name} is {limit}; it must be at least {MIN_RATE:g}"
+                    f"{robot.name}: the {rate} limit of {name} is {limit}; it must be at least {MIN_RATE:g}"
                 )
 
 
@@ -203,13 +203,13 @@ def _distinct(positions: Configurations) -> Int[ndarray, "m"]:
     """Indices of rows that differ from the previous one; the first and the last row are always kept."""
     if (np.linalg.norm(positions[1:] - positions[:-1], axis=1) > SAME_WAYPOINT_DISTANCE).all():
         return np.arange(len(positions))
-    kept = [0]
+    distinct = [0]
     for i in range(1, len(positions)):
-        if np.linalg.norm(positions[i] - positions[kept[-1]]) > SAME_WAYPOINT_DISTANCE:
-            kept.append(i)
-    if len(kept) > 1:
-        kept[-1] = len(positions) - 1
-    return np.array(kept)
+        if np.linalg.norm(positions[i] - positions[distinct[-1]]) > SAME_WAYPOINT_DISTANCE:
+            distinct.append(i)
+    if len(distinct) > 1:
+        distinct[-1] = len(positions) - 1
+    return np.array(distinct)
 
 
 def _resting_trajectory(path: Path, settings: TimingSettings) -> Trajectory:
@@ -230,12 +230,12 @@ def _time_segments(
 ) -> Trajectory:
     """The motion as one piece per part between stops; it stops where a deviation is zero."""
     stops = [0, *(np.flatnonzero(deviations == 0) + 1), len(waypoints) - 1]
-    pieces = []
+    segments = []
     for a, b in pairwise(stops):
         part = waypoints[a : b + 1]
         line = BlendedPolyline(part, half_widths(part, deviations[a : b - 1]))
-        pieces.append(time_line(robot, line, settings, 0.0 if pieces else start_speed, extra))
-    return Trajectory(path.joint_names, *_joined(pieces))
+        segments.append(time_line(robot, line, settings, 0.0 if segments else start_speed, extra))
+    return Trajectory(path.joint_names, *_joined(segments))
 
 
 def _joined(pieces: Sequence[tuple[ndarray, ...]]) -> tuple[ndarray, ...]:
@@ -310,42 +310,42 @@ class StopGraph:
         length = self.line.length
         corners = line.knots[1:-1]
         widths = line.half_widths
-        found = [0.0, *corners[deviations == 0], length]
+        stops = [0.0, *corners[deviations == 0], length]
         for s in np.linspace(0.0, length, PATH_PARTS + 1)[1:-1]:
             within = np.flatnonzero(np.abs(s - corners) < widths)
             for i in within[:1]:
                 s = corners[i] + np.copysign(widths[i], s - corners[i])
-            if min(abs(s - other) for other in found) > MIN_DISTANCE:
-                found.append(float(s))
-        return np.sort(np.array(found))
+            if min(abs(s - stop) for stop in stops) > MIN_DISTANCE:
+                stops.append(float(s))
+        return np.sort(np.array(stops))
 
     def _between(self, robot: Robot, settings: TimingSettings, i: int, j: int) -> list[Motion]:
         """The motions from stop i to stop j and back, at each speed factor."""
         line, (low, high) = self.line, self.stops[[i, j]]
-        inner = np.flatnonzero((line.knots > low + MIN_DISTANCE) & (line.knots < high - MIN_DISTANCE))
+        interior = np.flatnonzero((line.knots > low + MIN_DISTANCE) & (line.knots < high - MIN_DISTANCE))
         ends = line(np.array([low, high]), 0)
         part = BlendedPolyline(
-            np.concatenate([ends[:1], line.waypoints[inner], ends[1:]]), line.half_widths[inner - 1]
+            np.concatenate([ends[:1], line.waypoints[interior], ends[1:]]), line.half_widths[interior - 1]
         )
         times, q, v, a = time_line(robot, part, settings, extra=self._extra)
         q = q.copy()
         q[[0, -1]] = ends
-        found = []
+        motions = []
         for factor in SPEED_FACTORS:
             ticks = max(int(np.ceil(times[-1] / factor / self.step - 1e-9)), 1)
             slower = ticks * self.step / times[-1]
             rows = times * slower, q, v / slower, a / slower**2
             back = rows[0][-1] - rows[0][::-1], q[::-1], -rows[2][::-1], rows[3][::-1]
-            found += [Motion(i, j, ticks, rows), Motion(j, i, ticks, back)]
-        return found
+            motions += [Motion(i, j, ticks, rows), Motion(j, i, ticks, back)]
+        return motions
 
     def sample(self, radii: JointValues, travel: float) -> tuple[Values, Configurations]:
         """Values of s, and the configurations there, between which no point of the arm moves further than
         `travel` [m]. All stops are among them. `radii` as of `motion_radii`."""
         parts = []
         for low, high in zip(self.stops[:-1], self.stops[1:], strict=True):
-            fine = self.line(np.linspace(low, high, 33), 0)
-            way = float((np.abs(np.diff(fine, axis=0)) @ radii).sum())
+            samples = self.line(np.linspace(low, high, 33), 0)
+            way = float((np.abs(np.diff(samples, axis=0)) @ radii).sum())
             parts.append(np.linspace(low, high, max(int(np.ceil(way / travel)), 1) + 1)[:-1])
         s = np.concatenate([*parts, self.stops[-1:]])
         return s, self.line(s, 0)
@@ -361,11 +361,11 @@ class StopGraph:
         """Motions one after the other; an integer in `way` is a wait of one time step."""
         q = self.line(self.stops[:1], 0)
         a = way[0].rows[3][:1] if way and not isinstance(way[0], int) else 0 * q
-        pieces = [(np.zeros(1), q, 0 * q, a)]
+        segments = [(np.zeros(1), q, 0 * q, a)]
         for part in way:
             if isinstance(part, int):
-                q = np.repeat(pieces[-1][1][-1:], 2, axis=0)
-                pieces.append((np.array([0.0, self.step]), q, 0 * q, 0 * q))
+                q = np.repeat(segments[-1][1][-1:], 2, axis=0)
+                segments.append((np.array([0.0, self.step]), q, 0 * q, 0 * q))
             else:
-                pieces.append(part.rows)
-        return Trajectory(self.joint_names, *_joined(pieces))
+                segments.append(part.rows)
+        return Trajectory(self.joint_names, *_joined(segments))

@@ -49,7 +49,7 @@ def rate_violations(
     The motion must begin at `start_velocity` [dof], by default at rest, and end at rest. A limit of 0 means
     that the robot gives none: then the rates must only agree with each other.
     """
-    found: dict[str, Violation] = {}
+    first_violations: dict[str, Violation] = {}
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
         for check in _checks(robot, cubics or Cubics(trajectory), settings, begins):
@@ -61,12 +61,14 @@ def rate_violations(
             beyond = np.where(wrong, np.nan_to_num(check.off - check.allowed, nan=np.inf), 0.0)
             j = int(beyond[i].argmax())
             time = float(trajectory.times[i])
-            if check.kind not in found or time < found[check.kind].time:
+            if check.kind not in first_violations or time < first_violations[check.kind].time:
                 name = robot.joint_names[j]
                 rate = abs(float(check.rates[i, j]))
                 message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
-                found[check.kind] = Violation(check.kind, time, message, name, None, float(beyond[i, j]))
-    return list(found.values())
+                first_violations[check.kind] = Violation(
+                    check.kind, time, message, name, None, float(beyond[i, j])
+                )
+    return list(first_violations.values())
 
 
 class _Check(NamedTuple):
@@ -98,8 +100,10 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     nothing = settings.rate_slack * np.where(robot.velocity > 0, robot.velocity, _peak(v, mean))
 
     def limited(kind: str, what: str, rates: ndarray, limit: ndarray, allowed: ndarray) -> _Check:
-        known = allowed if (limit > 0).all() else np.where(limit > 0, allowed, np.inf)
-        return _Check(kind, what, rates, np.abs(rates), known, lambda _, j: f"its limit {limit[j]:.6g}")
+        allowed_rates = allowed if (limit > 0).all() else np.where(limit > 0, allowed, np.inf)
+        return _Check(
+            kind, what, rates, np.abs(rates), allowed_rates, lambda _, j: f"its limit {limit[j]:.6g}"
+        )
 
     at_ends = np.zeros_like(v)
     at_ends[0], at_ends[-1] = np.abs(v[0] - begins), np.abs(v[-1])
@@ -108,31 +112,33 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         rule = "but the motion is to begin at the problem's start_velocity and end at rest"
     yield _Check("rest", "velocity", v, at_ends, nothing, lambda *_: rule)
 
-    most = robot.velocity
+    limits = robot.velocity
     onwards = "mean velocity from here to the next row"
-    yield limited("jump", onwards, mean, most, settings.jump * most + blur)
+    yield limited("jump", onwards, mean, limits, settings.jump * limits + blur)
     # Velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step.
     onwards = "velocity by its positions from here to the next row"
-    yield limited("velocity", onwards, cubics.extremes.velocity, most, share * most + 1.5 * blur)
-    yield limited("velocity", "velocity", v, most, share * most)
+    yield limited("velocity", onwards, cubics.extremes.velocity, limits, share * limits + 1.5 * blur)
+    yield limited("velocity", "velocity", v, limits, share * limits)
 
     around = _padded(2 * begins - mean[:1], mean, -mean[-1:])
     length = _padded(step[:1], step, step[-1:])
     unsure = _padded(blur[:1], blur, blur[-1:])
-    apart = (length[1:] + length[:-1]) / 2
-    second = (around[1:] - around[:-1]) / apart
-    unsure = (unsure[1:] + unsure[:-1]) / apart
-    most = robot.acceleration
+    spacing = (length[1:] + length[:-1]) / 2
+    second = (around[1:] - around[:-1]) / spacing
+    unsure = (unsure[1:] + unsure[:-1]) / spacing
+    limits = robot.acceleration
     peaks = cubics.extremes.acceleration
     bent = 6 * blur / step
-    yield limited("acceleration", "mean acceleration by its positions", second, most, share * most + unsure)
-    yield limited("acceleration", "acceleration by its positions", peaks, most, share * most + bent)
-    yield limited("acceleration", "mean acceleration by its velocities", change, most, share * most)
-    yield limited("acceleration", "acceleration", a, most, share * most)
+    yield limited(
+        "acceleration", "mean acceleration by its positions", second, limits, share * limits + unsure
+    )
+    yield limited("acceleration", "acceleration by its positions", peaks, limits, share * limits + bent)
+    yield limited("acceleration", "mean acceleration by its velocities", change, limits, share * limits)
+    yield limited("acceleration", "acceleration", a, limits, share * limits)
 
     # Rows may miss the peaks of the acceleration, but not by half.
-    own = np.maximum(_peak(a, second, change), settings.rate_slack * robot.acceleration)
-    strongest = np.where(most > 0, np.minimum(share * most, 2 * own), 2 * own)
+    measured = np.maximum(_peak(a, second, change), settings.rate_slack * robot.acceleration)
+    strongest = np.where(limits > 0, np.minimum(share * limits, 2 * measured), 2 * measured)
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
     """Allowed difference between mean velocities and the means of the rows' velocities."""
@@ -156,7 +162,7 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         outside = np.maximum(low - a, a - high)
         if begins.any():
             outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
-        near = settings.rate_agreement * np.where(most > 0, np.minimum(most, own), own)
+        near = settings.rate_agreement * np.where(limits > 0, np.minimum(limits, measured), measured)
         yield _Check(
             "rates",
             "acceleration",
@@ -171,10 +177,10 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
     times = trajectory.times
     resolution = settings.limit_slack
     onwards = "mean velocity from an earlier row to here"
-    most = robot.velocity
-    first, span = _worst_earlier_row(times, q, (times - times[0])[:, None] * share * most)
+    limits = robot.velocity
+    first, span = _worst_earlier_row(times, q, (times - times[0])[:, None] * share * limits)
     moved = _change_since(q, first) / span
-    yield limited("velocity", onwards, moved, most, share * most + 2 * resolution / span)
+    yield limited("velocity", onwards, moved, limits, share * limits + 2 * resolution / span)
 
     stated_positions = _cumulative(step * (v[1:] + v[:-1]) / 2)
     allowed = _cumulative(step * possible)
@@ -190,11 +196,11 @@ def _checks(robot: Robot, cubics: Cubics, settings: VerifySettings, begins: Join
         lambda i, j: f"but its velocities give {stated[i, j]:.6g}",
     )
 
-    most = robot.acceleration
+    limits = robot.acceleration
     for window in AVERAGING_WINDOWS:
         second, unsure = _second_differences(trajectory, begins, window, resolution, nothing)
-        what = f"mean acceleration by its positions over {1e3 * window:g} ms and more"
-        yield limited("acceleration", what, second, most, share * most + unsure)
+        description = f"mean acceleration by its positions over {1e3 * window:g} ms and more"
+        yield limited("acceleration", description, second, limits, share * limits + unsure)
 
 
 def _cumulative(steps: JointRows) -> JointRows:
@@ -215,13 +221,13 @@ def _worst_earlier_row(
     first = np.broadcast_to(rows, way.shape)
     for signed in (way, -way):
         room = signed - allowed
-        least = np.minimum.accumulate(room, axis=0)
-        at = np.maximum.accumulate(np.where(room <= least, rows, 0), axis=0)
+        min_room = np.minimum.accumulate(room, axis=0)
+        at = np.maximum.accumulate(np.where(room <= min_room, rows, 0), axis=0)
         # shifted by one row to exclude the row itself
-        least = _padded(room[:1], least[:-1])
+        min_room = _padded(room[:1], min_room[:-1])
         at = _padded(first[:1], at[:-1])
-        first = np.where(room - least > beyond, at, first)
-        beyond = np.maximum(beyond, room - least)
+        first = np.where(room - min_room > beyond, at, first)
+        beyond = np.maximum(beyond, room - min_room)
     return first, np.maximum(times[:, None] - times[first], MIN_TIME)
 
 
@@ -247,10 +253,10 @@ def _second_differences(
     high = np.searchsorted(clock, times + window)
     before = (times - clock[low])[:, None]
     after = (clock[high] - times)[:, None]
-    apart = (before + after) / 2
+    spacing = (before + after) / 2
     outside = (low == 0).astype(float) + (high == len(clock) - 1)
     unsure = 2 * resolution * (1 / before + 1 / after) + outside[:, None] * nothing
-    return ((rows[high] - q) / after - (q - rows[low]) / before) / apart, unsure / apart
+    return ((rows[high] - q) / after - (q - rows[low]) / before) / spacing, unsure / spacing
 
 
 def _padded(*rows: ndarray) -> ndarray:

@@ -109,12 +109,12 @@ def goal_error(
     rpy = goal.rpy_tolerance
     slack = settings.goal_slack
     if xyz is None:
-        there = distance <= max(settings.goal_distance, blend)
+        at_goal = distance <= max(settings.goal_distance, blend)
     else:
         beyond = np.maximum(np.abs(T_goal_end[:3, 3]) - xyz - slack, 0.0)
-        there = bool(np.linalg.norm(beyond) <= blend)
+        at_goal = bool(np.linalg.norm(beyond) <= blend)
     turned = angle <= settings.goal_angle if rpy is None else _turned(T_goal_end[:3, :3], rpy, slack)
-    if there and turned:
+    if at_goal and turned:
         return None
     more = "" if xyz is None and rpy is None else ", which is beyond its tolerances"
     message = (
@@ -187,13 +187,13 @@ def _near(
         return (np.linalg.norm(differences, axis=2) <= reach).any(axis=0)
     xyz = goal.xyz_tolerance
     room = settings.goal_distance if xyz is None else float(np.linalg.norm(xyz + settings.goal_slack))
-    apart = link_origins(robot, q, goal.frame) - goal.T_base_frame[:3, 3]
-    return np.linalg.norm(apart, axis=1) <= room + blend
+    offsets = link_origins(robot, q, goal.frame) - goal.T_base_frame[:3, 3]
+    return np.linalg.norm(offsets, axis=1) <= room + blend
 
 
 def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
     """Whether roll, pitch and yaw are within the tolerance, in either of their two representations."""
     roll, pitch, yaw = rpy_from_rotation(rotation)
-    other = np.array([roll + np.pi, np.pi - pitch, yaw + np.pi])
-    ways = np.array([roll, pitch, yaw]), (other + np.pi) % (2 * np.pi) - np.pi
+    alternative = np.array([roll + np.pi, np.pi - pitch, yaw + np.pi])
+    ways = np.array([roll, pitch, yaw]), (alternative + np.pi) % (2 * np.pi) - np.pi
     return any((np.abs(way) <= tolerance + slack).all() for way in ways)

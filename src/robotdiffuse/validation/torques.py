@@ -60,9 +60,9 @@ def trajectory_pieces(trajectory: Trajectory) -> Pieces:
     h = cubics.steps
     change = np.abs(extremes.end - extremes.start)
     pull = np.stack([extremes.acceleration, change, np.zeros_like(change)])
-    most = extremes.velocity
-    speed = np.stack([most, h * pull[0], h * change])
-    farthest = _farthest(trajectory.positions) + h * most / 2
+    max_velocities = extremes.velocity
+    speed = np.stack([max_velocities, h * pull[0], h * change])
+    farthest = _farthest(trajectory.positions) + h * max_velocities / 2
     return Pieces(cubics.states, Stretches(farthest, h * speed, speed, pull))
 
 
@@ -73,8 +73,8 @@ def static_pieces(q: Configurations) -> Pieces:
     still = np.zeros((3, *step.shape))
 
     def states(piece: ndarray, share: ndarray) -> States:
-        there = q[piece] + share[:, None] * step[piece]
-        return there, 0 * there, 0 * there
+        configurations = q[piece] + share[:, None] * step[piece]
+        return configurations, 0 * configurations, 0 * configurations
 
     v = still.copy()
     v[0] = np.abs(step)
@@ -116,8 +116,8 @@ def first_beyond(
     beyond: list[ndarray] = [np.zeros((0, len(allowed)))]
     while len(piece):
         bulge = bends[piece] * (high - low)[:, None] ** 2 / 8
-        most = np.maximum(at_low, at_high)
-        open_ = most + bulge > allowed
+        bound = np.maximum(at_low, at_high)
+        open_ = bound + bulge > allowed
         begun = (at_low > allowed).any(axis=1)
         goes_on = (at_high > allowed).any(axis=1)
         unsure = np.minimum(bulge, RESOLUTION * limits)
@@ -126,9 +126,9 @@ def first_beyond(
         lost = (open_ & last).any(axis=1)
         wrong = np.flatnonzero(over | lost)
         places.append(piece[wrong] + np.where(over & ~begun, high, low)[wrong])
-        beyond.append((np.where(most > allowed, most, most + unsure) - allowed)[wrong])
-        coarse = over & (begun != goes_on) & (high - low > PLACE_RESOLUTION)
-        halved = open_.any(axis=1) & (coarse | ~(over | lost))
+        beyond.append((np.where(bound > allowed, bound, bound + unsure) - allowed)[wrong])
+        unresolved = over & (begun != goes_on) & (high - low > PLACE_RESOLUTION)
+        halved = open_.any(axis=1) & (unresolved | ~(over | lost))
         piece = piece[halved]
         low = low[halved]
         high = high[halved]

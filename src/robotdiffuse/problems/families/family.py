@@ -119,9 +119,9 @@ def sample_until_found(
     """The first problem that `draw` returns. Each call tries one scene; None means it has no free start or
     goal."""
     for _ in range(MAX_SCENES):
-        drawn = draw()
-        if drawn is not None:
-            return drawn
+        problem = draw()
+        if problem is not None:
+            return problem
     raise InputError(
         f"no free start and goal in {MAX_SCENES} scenes of {type(family).__name__} for {robot.name}: its tip "
         f"{robot.tip} does not reach the targets of these scenes"
@@ -135,15 +135,15 @@ def uniform_configurations(
 
     They are uniform within the joint limits. There are fewer if MAX_BATCHES batches contain no more.
     """
-    found = np.zeros((0, robot.dof))
+    configurations = np.zeros((0, robot.dof))
     for _ in range(MAX_BATCHES):
         q = robot.unwound(rng.uniform(robot.lower, robot.upper, (BATCH_SIZE, robot.dof)))
         xyz = link_origins(robot, q, robot.tip)
         q = q[((xyz >= region[0]) & (xyz <= region[1])).all(axis=1)]
-        found = np.concatenate([found, q[checker.free(q)] if len(q) else q])
-        if len(found) >= count:
+        configurations = np.concatenate([configurations, q[checker.free(q)] if len(q) else q])
+        if len(configurations) >= count:
             break
-    return found[:count]
+    return configurations[:count]
 
 
 def reaching_configurations(

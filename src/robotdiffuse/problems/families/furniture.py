@@ -284,22 +284,22 @@ class Surface:
 
     def spots(self, numbers: tuple[int, int], size: Range, rng: Generator) -> list[Region]:
         """Random free regions, as high as they are wide, where the hand points down."""
-        found: list[Region] = []
+        regions: list[Region] = []
         for _ in range(count(numbers, rng)):
             half = rng.uniform(*size) / 2
             (x, y), top = self.place(half, half, rng), self.height + 2 * half
             low = (x - half, y - half, self.height)
             high = (x + half, y + half, top)
-            found.append(self.frame.region(low, high, DOWN))
-        return found
+            regions.append(self.frame.region(low, high, DOWN))
+        return regions
 
     def loose_objects(self, settings: Furniture, rng: Generator) -> list[Box | Sphere]:
         """The random loose objects of the settings."""
-        found: list[Box | Sphere] = []
+        objects: list[Box | Sphere] = []
         for _ in range(count(settings.objects, rng)):
             loose = LooseObject(settings, rng)
-            found.append(loose.placed(self.frame, *self.place(loose.half, loose.half, rng), self.height))
-        return found
+            objects.append(loose.placed(self.frame, *self.place(loose.half, loose.half, rng), self.height))
+        return objects
 
 
 def is_free(square: Rectangle, taken: list[Rectangle]) -> bool:
@@ -444,12 +444,12 @@ class Crate(Furniture):
     def build(self, rng: Generator) -> Build:
         shapes: list[Box | Sphere] = []
         regions: list[Region] = []
-        taken: list[Rectangle] = []
+        occupied: list[Rectangle] = []
         for _ in range(count(self.crates, rng)):
             x, y = rng.uniform(*self.length, 2) / 2
             h = rng.uniform(*self.height)
             t = rng.uniform(*self.thickness)
-            frame = _free_place(self, float(np.hypot(x + t, y + t)), taken, rng)
+            frame = _free_place(self, float(np.hypot(x + t, y + t)), occupied, rng)
             low = 0.0
             if rng.random() < self.raised_share:
                 low = rng.uniform(*self.block_height)
@@ -465,11 +465,11 @@ class Crate(Furniture):
             regions.append(frame.region((-x, -y, bottom), (x, y, top), DOWN))
         for _ in range(count(self.spots, rng)):
             half = rng.uniform(*self.spot_size) / 2
-            frame = _free_place(self, float(np.sqrt(2) * half), taken, rng)
+            frame = _free_place(self, float(np.sqrt(2) * half), occupied, rng)
             regions.append(frame.region((-half, -half, 0.0), (half, half, 2 * half), DOWN))
         for _ in range(count(self.objects, rng)):
             loose = LooseObject(self, rng)
-            frame = _free_place(self, loose.half, taken, rng)
+            frame = _free_place(self, loose.half, occupied, rng)
             shapes.append(loose.placed(frame, 0.0, 0.0, 0.0))
         return shapes, regions
 
@@ -551,8 +551,8 @@ class Table(Furniture):
             for x, y in ((0.0, -side), (0.0, side - w), (length - w, -side), (length - w, side - w)):
                 shapes.append(frame.box((x, y, 0.0), (x + w, y + w, under), "leg"))
             if under > MIN_TABLE_HEIGHT:
-                inner = side - w
-                regions.append(frame.region((0.0, -inner, 0.0), (length / 2, inner, under), AHEAD))
+                half_width = side - w
+                regions.append(frame.region((0.0, -half_width, 0.0), (length / 2, half_width, under), AHEAD))
         surface = Surface(frame, length, side, height)
         kind = rng.random()
         top = height + rng.uniform(*self.divider_height)

@@ -129,14 +129,16 @@ class Rop(Ranges):
     def _by_position(
         self, robot: Robot, scene: Scene, checker: CollisionChecker, goals: int, _: str, rng: Generator
     ) -> SampledProblem | None:
-        found = []
+        reached_per_pose = []
         for count in (1, goals):
             T_base_tip = np.eye(4)
             T_base_tip[:3, 3] = rng.uniform(*self.region)
-            found.append(reaching_configurations(robot, T_base_tip, count, checker, rng, POSITION_IK))
-            if not len(found[-1]):
+            reached_per_pose.append(
+                reaching_configurations(robot, T_base_tip, count, checker, rng, POSITION_IK)
+            )
+            if not len(reached_per_pose[-1]):
                 return None
-        (start,), reached = found
+        (start,), reached = reached_per_pose
         return SampledProblem(
             scene, start, reached, link_pose(robot, reached[0].astype(np.float64), robot.tip)
         )
@@ -161,8 +163,8 @@ class Rop(Ranges):
             return SampledProblem(scene, start, goal[None], T_base_tip)
         reached = goal[None].astype(np.float32)
         if goals > 1:
-            others = reaching_configurations(robot, T_base_tip, goals - 1, checker, rng)
-            reached = np.concatenate([reached, others])
+            additional = reaching_configurations(robot, T_base_tip, goals - 1, checker, rng)
+            reached = np.concatenate([reached, additional])
         return SampledProblem(scene, start.astype(np.float32), reached, T_base_tip)
 
 

@@ -64,10 +64,10 @@ class ScaledFamily:
     def draw(
         self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION
     ) -> SampledProblem:
-        drawn = self.family.draw(_panda_sized(robot), rng, goals, target)
-        T_base_tip = drawn.T_base_tip.copy()
+        sample = self.family.draw(_panda_sized(robot), rng, goals, target)
+        T_base_tip = sample.T_base_tip.copy()
         T_base_tip[:3, 3] *= self.scale
-        return replace(drawn, scene=_scene(drawn.scene, self.scale), T_base_tip=T_base_tip)
+        return replace(sample, scene=_scene(sample.scene, self.scale), T_base_tip=T_base_tip)
 
 
 @once_per_robot
