@@ -55,8 +55,8 @@ def arm_in_cloud_note(robot: Robot, scene: Scene, q: Configuration) -> str:
     cloud = clouds[densest]
     return (
         f"check the cloud: {counts[densest]} of {len(cloud.points)} points of {cloud.name} are within "
-        "the arm. Remove the arm's own points, or give the cloud as a view; else check its frame (the robot's base) "
-        f"and its units: {ADVICE}"
+        "the arm. Remove the arm's own points, or give the cloud as a view; else check its frame (the "
+        f"robot's base) and its units: {ADVICE}"
     )
 
 
