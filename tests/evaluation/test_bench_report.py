@@ -3,7 +3,6 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -238,8 +237,6 @@ def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) 
     curves = {curve.planner: curve for curve in whole.curves}
     assert curves["mpnet"].end == 10.0
     assert curves["ompl_rrt_star"].found.tolist() == [0.05, 0.5, 5.0]
-    assert curves["ompl_rrt_star"].anytime
-    assert not curves["mpnet"].anytime
     # best known 2: first paths of 4, the second of the three at 0.5 s; 3 from 0.75 s on
     star = curves["ompl_rrt_star"]
     assert star.times[0] == pytest.approx(0.5, rel=0.06)
@@ -272,12 +269,14 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
         "robotdiffuse: hybrid": "–",
         "robotdiffuse: hybrid, restarted": "1",
         "rrt_connect": "–",
-        "rrt_connect, restarted": "1.125",
-        "ompl_aorrtc": "1.000",
+        "rrt_connect, restarted": "1.125 (1.125 to 1.125)",
+        "ompl_aorrtc": "1.000 (1.000 to 1.000)",
     }
     assert cells(table, "ComScore")["rrt_connect, restarted"] == "–"
     tenth = bench_report.main_table(section, section.comparisons[0], bench.reference)
-    assert cells(tenth, "joint length / robotdiffuse: hybrid, restarted")["rrt_connect, restarted"] == "1.200"
+    assert cells(tenth, "joint length / robotdiffuse: hybrid, restarted")[
+        "rrt_connect, restarted"
+    ].startswith("1.200 ")
     plain = read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
     assert len(plain.records) == 4
     alone = Bench(
@@ -287,7 +286,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     table = bench_report.main_table(section, section.main, alone.reference)
     assert cells(table, "joint length / robotdiffuse: hybrid") == {
         "robotdiffuse: hybrid": "1",
-        "rrt_connect": "1.200 †",
+        "rrt_connect": "1.200 (1.200 to 1.200) †",
     }
     assert bench_report.UNEQUAL_NOTE in table.notes
 
@@ -306,9 +305,9 @@ def test_a_call_that_used_up_its_time_stands_for_its_restarts(tmp_path: Path) ->
 
 def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: Path) -> None:
     names = [f"rop/{i}" for i in range(3)]
-    first = [solved("robotdiffuse", n, 1.0, [(0.05, 2.0)], run="a", load=1.5) for n in names]
-    same = [solved("rrt_connect", n, 1.0, [(0.05, 2.0)], run="a", load=2.25) for n in names]
-    other = [solved("mpd", n, 1.0, [(0.05, 2.0)], run="b", load=0.5) for n in names]
+    first = [solved("robotdiffuse", n, 1.0, [(0.05, 2.0)], run="a", workers=2, load=1.5) for n in names]
+    same = [solved("rrt_connect", n, 1.0, [(0.05, 2.0)], run="a", workers=2, load=2.25) for n in names]
+    other = [solved("mpd", n, 1.0, [(0.05, 2.0)], run="b", workers=1, load=0.5) for n in names]
     folder = write(tmp_path / "run", [*first, *same, *other])
     runs = [
         RUN | {"planners": [], "time_limit": 1.0, "count": 3, "run": r, "workers": w}
@@ -319,31 +318,16 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
     (section,) = comparison.sections(bench, [1.0])
     table = bench_report.main_table(section, section.main, bench.reference)
     assert cells(table, "timed") == {
-        "robotdiffuse: hybrid": "run 1, 2 at once",
-        "rrt_connect": "run 1, 2 at once",
-        "mpd": "run 2, 1 at once",
+        "robotdiffuse: hybrid": "run a, 2 at once",
+        "rrt_connect": "run a, 2 at once",
+        "mpd": "run b, 1 at once",
     }
     assert "Not all rows were timed alike" in table.notes[0]
     bench = read_bench(folder, ["robotdiffuse", "rrt_connect"])
     (section,) = comparison.sections(bench, [1.0])
     table = bench_report.main_table(section, section.main, bench.reference)
     assert table.columns[-1].heading == "ComScore"
-    assert table.notes[0] == "All rows were timed alike: run 1, 2 at once; load average 1.5 to 2.2."
-
-
-def test_runs_that_noted_nothing_with_their_calls_are_told_by_what_they_called(tmp_path: Path) -> None:
-    names = [f"rop/{i}" for i in range(3)]
-    records = [solved(p, n, 1.0, [(0.05, 2.0)]) for p in ("robotdiffuse", "mpd") for n in names]
-    folder = write(tmp_path / "run", records)
-    run = RUN | {"planners": ["robotdiffuse"], "time_limit": 1.0, "count": 3, "workers": 2}
-    with (folder / "runs.jsonl").open("a") as stream:
-        stream.write(json.dumps(run) + "\n")
-    (section,) = comparison.sections(read_bench(folder), [1.0])
-    table = bench_report.main_table(section, section.main, "robotdiffuse")
-    assert cells(table, "timed") == {
-        "robotdiffuse: hybrid": "run 1 or 2, 1 or 2 at once",
-        "mpd": "run 1, 1 at once",
-    }
+    assert table.notes[0] == "All rows were timed alike: run a, 2 at once; load average 1.5 to 2.2."
 
 
 def test_planners_are_called_what_they_are() -> None:
@@ -374,7 +358,6 @@ def test_a_metric_is_declared_in_one_place(
     page = report.page
     assert re.search(r"<th[^>]*>waypoint count kilo</th>", page)
     assert re.search(r"<td[^>]*>0.0030</td>", page)
-    assert ">waypoint count [kilo], less is better<" in page
 
 
 @pytest.mark.slow
@@ -404,16 +387,11 @@ def test_the_command_writes_everything(
 def test_no_legend_or_name_is_clipped() -> None:
     """Names of planners with settings ended at the edge of a plot."""
     pytest.importorskip("matplotlib")
-    figures: list[Any] = []
-
-    def fill(figure: Any) -> None:
-        figures.append(figure)
-        figure.text(0.9, 0.5, "robotdiffuse:search.range=0.5+restarts")
-
-    svg = ElementTree.fromstring(plots.draw(fill, plots.HALF, 2.0))
-    (text,) = figures[0].texts
-    end = text.get_window_extent().x1 * 72 / figures[0].dpi
-    assert end > 72 * plots.HALF and float(svg.attrib["viewBox"].split()[2]) >= end
+    sizes = []
+    for name in ("a", "robotdiffuse:search.range=0.5+restarts"):
+        svg = plots.draw(lambda figure, name=name: figure.text(0.9, 0.5, name))
+        sizes.append(float(ElementTree.fromstring(svg).attrib["viewBox"].split()[2]))
+    assert sizes[1] > sizes[0] + 50
 
 
 def test_what_is_shown_is_hard_or_failed(small: Path) -> None:

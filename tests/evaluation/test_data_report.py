@@ -30,6 +30,11 @@ def rows():
     return random_motions(ARM, 11)
 
 
+def trivial_shares(rows):
+    free = [[row["line_free"] for row in rows if row["family"] == family] for family in (0, 1)]
+    return [np.mean(each) for each in free]
+
+
 def test_figures(tmp_path, rows):
     write_motions(tmp_path, ARM, rows, shard=4)
     found = read_figures(tmp_path)
@@ -37,16 +42,24 @@ def test_figures(tmp_path, rows):
     assert (found.trajectories, found.manifest.trajectories, found.shards) == (11, 11, 3)
     assert facts(found)[:2] == [("motions", "11"), ("waypoints, evenly spaced in length", "220")]
     assert found.counts == {"tried": 17, "solved": 11, "unsolved": 3, "refused": 0, "thinned": 3}
-    assert found.success == pytest.approx(11 / 14)
     assert sum(found.splits.values()) == 11 and list(found.splits) == ["train", "validation", "test"]
     _, families, spreads = tables(found)
     assert [row[:2] for row in families.rows] == [("rop", 6), ("rop_dense", 5)]
     lengths = [costs.mean(), *np.quantile(costs, [0, 0.05, 0.5, 0.95, 1])]
     assert spreads.texts[0] == ["length [rad]", *(f"{length:.3f}" for length in lengths)]
     assert spreads.texts[1][1:] == ["1.000"] * 6
-    assert found.trivial == pytest.approx(7 / 11)
-    assert found.safety_distance == pytest.approx(0.05) and found.kept == found.kept_throughout == 1.0
-    assert found.goals_reached == 1
+    assert families.columns[5].heading == "trivial"
+    assert [row[5] for row in families.rows] == [pytest.approx(x) for x in trivial_shares(rows)]
+    assert [sum(row[k] for k in range(5, 9)) for row in families.rows] == pytest.approx([1, 1])
+    assert [sum(row[k] for k in range(9, 13)) for row in families.rows] == pytest.approx([1, 1])
+    assert found.safety_distance == pytest.approx(0.05)
+    assert [text for _, text in facts(found)[4:]] == [
+        "78.6 %; of 17 tried 3 unsolved, 0 refused, 3 thinned",  # 11 of 14
+        "100.0 %",
+        "100.0 %",
+        "1.0",
+        "63.6 %",  # 7 of 11
+    ]
     assert found.bytes == sum(f.stat().st_size for f in tmp_path.glob("*.zarr/**/*") if f.is_file())
 
 
@@ -69,7 +82,7 @@ def test_page(tmp_path, rows):
     write_motions(data, ARM, rows)
     write_page(data, file, ARM)
     page = file.read_text("utf-8")
-    assert page.count("<svg") == 4
+    assert page.count("<svg") == 3
     for text in (
         "arm &lt;1&gt;",
         "rop_dense",

@@ -17,7 +17,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.settings import Count, OneOf, Settings
-from robotdiffuse.core.tables import Column, Table
+from robotdiffuse.core.tables import Column, Figure, Table
 from robotdiffuse.datasets.shards import read_manifest
 from robotdiffuse.evaluation.comparison import Mean
 from robotdiffuse.evaluation.methods import (
@@ -28,11 +28,11 @@ from robotdiffuse.evaluation.methods import (
     without_network,
 )
 from robotdiffuse.evaluation.metrics import Kinematics
-from robotdiffuse.evaluation.paper import paper_report, share_cells, straight_line_shares
+from robotdiffuse.evaluation.paper import paper_report, straight_line_shares
 from robotdiffuse.evaluation.problem_sets import hard_cases
-from robotdiffuse.evaluation.report import Report, interval
+from robotdiffuse.evaluation.report import Report, share_cell
 from robotdiffuse.evaluation.runs import Record, run_all
-from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.training.config import CONFIGS, EncoderTraining, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
@@ -284,13 +284,13 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
     several = settings.seeds > 1
     columns = (
         *("row", "guided"),
-        *(Column("single", "%", ".1f", "more", scale=100.0), "95 %"),
+        Column("single", "%", better="more"),
         Column("best", "%", ".1f", "more", scale=100.0),
-        *(Column("collision", "%", ".1f", "less", scale=100.0), "95 %"),
+        Column("collision", "%", better="less"),
         Column("length", "m", ".3f", "less"),
         Column("to first", "", ".3f", "less"),
         Column("CPU", "ms", ".0f", "less", scale=1000.0),
-        *(Column("unguided", "%", ".1f", "more", scale=100.0), "95 %"),
+        Column("unguided", "%", better="more"),
         *(("each seed",) if several else ()),
         *("paper: suc", "col", "len", "s"),
     )
@@ -303,13 +303,13 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
         row = (
             result.name,
             "yes" if evaluation is result.guided else "no",
-            *_share(evaluation.single),
+            _share(evaluation.single),
             float(evaluation.best.mean()),
-            *_share(evaluation.collided),
+            _share(evaluation.collided),
             Mean.of(evaluation.length).value,
             Mean.of(evaluation.length / first.length).value,
             float(np.median(evaluation.seconds)),
-            *_share(result.alone.single),
+            _share(result.alone.single),
             *((by_seed,) if several else ()),
             *paper,
         )
@@ -319,18 +319,19 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
 
 def straight_line_table(problems: int) -> Table:
     """No planner under the authors' own draw, beside the paper's rows of Table 2."""
-    rows = [(f"paper: {name}", float(row.paper[0] or 0), "") for name, row in ROWS.items()]
+    printed = {name: row.paper[0] or 0.0 for name, row in ROWS.items()}
+    rows = [(f"paper: {name}", Figure(f"{success}", success / 100)) for name, success in printed.items()]
     for obstacles, family in LINE_FAMILIES.items():
         for goals, free in straight_line_shares(problems, family).items():
             name = f"no planner: straight line to {goals}, {obstacles}"
-            rows.append((name, *share_cells(free, problems)))
-    columns = ("row", Column("success", "%", ".1f"), "95 %")
-    rows.sort(key=lambda row: row[1])
+            rows.append((name, share_cell(free / problems, wilson_interval(free, problems))))
+    columns = ("row", Column("success", "%"))
+    rows.sort(key=lambda row: row[1].value)
     return Table.of(
         f"No planner among the paper's rows: {problems} problems drawn", columns, rows, LINE_NOTES
     )
 
 
-def _share(values: Float[ndarray, "n"]) -> tuple[float, str]:
-    """Mean of shares, and its 95 % interval in per cent."""
-    return float(values.mean()), interval(*bootstrap_interval(values), scale=100.0)
+def _share(values: Float[ndarray, "n"]) -> Figure:
+    """Mean of shares, with its 95 % interval."""
+    return share_cell(float(values.mean()), bootstrap_interval(values))

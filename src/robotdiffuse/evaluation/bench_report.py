@@ -2,9 +2,9 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +16,7 @@ from robotdiffuse.evaluation.comparison import (
     FAILURES,
     Bench,
     Comparison,
+    Curve,
     Row,
     Section,
     base_name,
@@ -26,15 +27,14 @@ from robotdiffuse.evaluation.comparison import (
 )
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases
-from robotdiffuse.evaluation.report import Report, interval
+from robotdiffuse.evaluation.report import Report, interval, share_cell
 from robotdiffuse.evaluation.runs import CRASHED, OVERRAN, RAISED, RESTARTED, Record
-from robotdiffuse.evaluation.statistics import Paired, wilson_interval
+from robotdiffuse.evaluation.statistics import Paired
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, SEARCH
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure as PlotFigure
 
 UNEQUAL = " †"
@@ -64,7 +64,7 @@ NOTES = (
     "ComScore: as in the paper, from success, collision, length and time until the planner returns, each "
     "from 0 for the worst row of the table to 1 for the best. It depends on the rows of the table; those "
     "with restarts are left out. `robotdiffuse reproduce table1` computes it among the paper's rows.",
-    "Quality: means over the solved problems of the motions that the calls returned. clearance: a lower "
+    "Quality: means, with 95 % intervals, over the solved problems of the returned motions. clearance: a lower "
     "bound, to obstacles (scene), of the arm to itself (self), and the smaller of the two. over straight "
     "line: duration over the least time along the straight line, obstacles and limits of jerk aside. stops: "
     "times that the whole arm rests on the way. peak and mean jerk: of the joint where it is largest. "
@@ -116,13 +116,17 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
         *map(_metric, comparison.metrics),
         (Column("memory", "MB", ".0f", "less"), lambda row: row.memory),
     )
+    families: Spec = [
+        (Column(family), lambda row, family=family: share_cell(*row.families[family]))
+        for family in comparison.rows[0].families
+    ]
     pairs: Spec = (
         _of_pair("alone solves", lambda pair: pair.a_only),
         _of_pair("reference alone", lambda pair: pair.b_only),
         _of_pair("both", lambda pair: pair.both),
         _of_pair("neither", lambda pair: pair.neither),
         _of_pair("p of success", lambda pair: probability(pair.p_success)),
-        *_ratio(comparison, reference),
+        _ratio(comparison, reference),
         _of_pair("p of joint length", lambda pair: probability(pair.p_length) if pair.both else None),
     )
     failures: Spec = (
@@ -134,6 +138,7 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
         _table(f"Quality of the motions; {name}", comparison.rows, quality),
         _table(f"Against {named(reference)}, in pairs; {name}", others, pairs),
         _table(f"Failures by reason; {name}", comparison.rows, failures),
+        _table(f"Success by family [%]; {name}", comparison.rows, families),
     ]
     return [table for table in made if table.rows and len(table.columns) > 2]
 
@@ -141,11 +146,10 @@ def tables(section: Section, comparison: Comparison, reference: str) -> list[Tab
 def main_table(section: Section, comparison: Comparison, reference: str) -> Table:
     """The paper's columns, with intervals and the ratio of lengths to those of the reference."""
     spec: Spec = (
-        (Column("success", "%", ".1f", "more", scale=100.0), lambda row: row.success),
-        (Column("95 %"), lambda row: interval(*row.success_interval, scale=100.0)),
+        (Column("success", "%", better="more"), lambda row: share_cell(row.success, row.success_interval)),
         (Column("collision", "%", ".1f", "less", scale=100.0), lambda row: row.collision),
         (Column("link length", "m", ".2f"), lambda row: row.link_length),
-        *_ratio(comparison, reference),
+        _ratio(comparison, reference),
         _metric(METRICS["duration"]),
         (Column("first", "s", better="less"), lambda row: seconds(row.first)),
         (Column("returns", "s", better="less"), lambda row: seconds(row.returned)),
@@ -168,35 +172,28 @@ def _table(heading: str, rows: Sequence[Row], spec: Spec) -> Table:
     return Table.of(heading, ["planner", *(column for column, _ in spec)], cells)
 
 
-def _ratio(comparison: Comparison, reference: str) -> Spec:
-    reference_row = comparison.row(reference)
-    restarted = {plain_name(row.planner) for row in comparison.rows if row.planner.endswith(RESTARTED)}
-
-    def mark(row: Row) -> str | None:
-        """The sign behind a figure; None if the figure is not shown."""
-        if row.full and (reference_row is None or reference_row.full):
-            return ""
-        return None if row.planner in restarted else UNEQUAL
+def _ratio(comparison: Comparison, reference: str) -> tuple[Column, Callable[[Row], Cell]]:
+    """A column with the ratio of lengths to those of the reference and its interval; none for a planner
+    whose restarts have it."""
+    full = {row.planner: row.full for row in comparison.rows}
 
     def ratio(row: Row) -> Cell:
+        pair = row.paired
         if row.planner == reference:
             return "1"
-        sign = mark(row)
-        if row.paired is None or row.paired.ratio is None or sign is None:
+        sign = "" if row.full and full.get(reference, True) else UNEQUAL
+        if pair is None or pair.ratio_interval is None or (sign and row.planner + RESTARTED in full):
             return None
-        return Figure(f"{row.paired.ratio:.3f}{sign}", row.paired.ratio)
+        ends = interval(*pair.ratio_interval, digits=3)
+        return Figure(f"{pair.ratio:.3f} ({ends}){sign}", pair.ratio or 0.0)
 
-    def ends(row: Row) -> Cell:
-        pair = None if mark(row) is None else row.paired
-        return pair and pair.ratio_interval and interval(*pair.ratio_interval, digits=3)
-
-    return (Column(f"joint length / {named(reference)}"), ratio), (Column("95 % "), ends)
+    return Column(f"joint length / {named(reference)}"), ratio
 
 
 def _metric(metric: Metric) -> tuple[Column, Callable[[Row], Cell]]:
     """A column with the mean of a metric over the solved problems."""
-    column = Column(metric.heading, metric.unit, metric.format, metric.better, scale=metric.scale)
-    return column, lambda row: row.measures[metric.name].value
+    column = Column(metric.heading, metric.unit, better=metric.better)
+    return column, lambda row: row.measures[metric.name].cell(metric)
 
 
 def _of_pair(heading: str, of: Callable[[Paired], Cell]) -> tuple[Column, Callable[[Row], Cell]]:
@@ -211,117 +208,49 @@ def probability(p: float) -> str:
 # Plots
 
 
-def is_learned(planner: str) -> bool:
-    """Whether a planner has a network, whatever its weights, settings and restarts."""
-    entry = PLANNERS.get(base_name(planner))
-    return entry is not None and entry.kind != SEARCH
-
-
-def colors_of(planners: Sequence[str]) -> dict[str, str]:
-    """Colours of planners, the same with restarts or without."""
-    names = list(dict.fromkeys(map(plain_name, planners)))
-    return {name: f"C{names.index(plain_name(name))}" for name in planners}
-
-
 def success_over_time(section: Section, planners: Sequence[str]) -> str:
-    """Draw the share of problems solved over time on a logarithmic axis, as in the paper's figure."""
+    """Draw the share of problems solved over time, as in the paper's figure."""
 
-    def fill(axes: "Axes") -> None:
-        first = min((c.found[0] for c in section.curves if len(c.found)), default=0.1)
-        plots.time_axis(axes, first, max(c.end for c in section.curves))
-        for curve in (curve for curve in section.curves if curve.planner == plain_name(curve.planner)):
-            shares = 100 * np.arange(len(curve.found) + 1) / curve.calls
-            times = [axes.get_xlim()[0], *curve.found, curve.end]
-            axes.step(times, [*shares, shares[-1]], where="post", **_stroke(curve.planner, planners))
-        axes.set_ylim(-1.5, 101.5)
-        plots.percent_axis(axes)
+    def steps(curve: Curve) -> tuple[ndarray, ndarray]:
+        solved = np.arange(len(curve.found) + 1)
+        return np.append(curve.found, curve.end), np.append(solved[1:], solved[-1]) / curve.calls
 
-    return _over_time(fill)
+    curves = [curve for curve in section.curves if curve.planner == plain_name(curve.planner)]
+    return _over_time(curves, planners, "solved", steps)
 
 
 def length_over_time(section: Section, planners: Sequence[str]) -> str:
-    """Draw the median length over time: a line for planners that improve their paths, else a point."""
-
-    def fill(axes: "Axes") -> None:
-        curves = [curve for curve in section.curves if len(curve.times)]
-        first = min((curve.times[0] for curve in curves), default=0.1)
-        plots.time_axis(axes, first, max((curve.end for curve in section.curves), default=1.0))
-        longest = max((float(np.quantile(curve.ratios, 0.9)) for curve in curves), default=1.5)
-        top = 1 + 1.12 * min(max(longest - 1, 0.1), 2.0)
-        for curve in curves:
-            stroke = _stroke(curve.planner, planners)
-            if curve.anytime:
-                axes.plot(curve.times, curve.ratios, **stroke)
-            else:
-                axes.plot(curve.times[0], min(float(curve.ratios[-1]), top), "o", **stroke)
-        axes.set_ylim(1 - 0.035 * (top - 1), top)
-        axes.set_ylabel("joint length / best known")
-
-    return _over_time(fill)
+    """Draw the median length over time."""
+    of = "joint length / best known"
+    return _over_time(section.curves, planners, of, lambda curve: (curve.times, curve.ratios))
 
 
-def _over_time(fill: "Callable[[Axes], None]") -> str:
-    """Curves of planners, with their names beside them."""
+def _over_time(
+    curves: Sequence[Curve],
+    planners: Sequence[str],
+    label: str,
+    of: Callable[[Curve], tuple[ndarray, ndarray]],
+) -> str:
+    """Curves of planners, solid with a network and dashed for search; restarts have the planner's colour."""
+    names = list(dict.fromkeys(map(plain_name, planners)))
 
-    def draw(figure: "PlotFigure") -> None:
+    def fill(figure: "PlotFigure") -> None:
         axes = figure.subplots()
-        fill(axes)
-        axes.legend(**plots.LEGEND_BESIDE)
-
-    return plots.draw(draw, plots.HALF, 3.7)
-
-
-def _stroke(planner: str, planners: Sequence[str]) -> dict[str, Any]:
-    """The style of a planner's line: solid with a network, dashed for search."""
-    return {
-        "label": planner,
-        "color": colors_of(planners)[planner],
-        "linestyle": "-" if is_learned(planner) else "--",
-        "linewidth": 2.4 if planner == DEFAULT_PLANNER else 1.35,
-    }
-
-
-def families(comparisons: Sequence[Comparison], planners: Sequence[str]) -> str:
-    """Draw the success of every planner on every family of problems [%], with 95 % intervals."""
-    panels: dict[str, dict[str, plots.Interval]] = {}
-    for row in (row for comparison in comparisons for row in comparison.rows):
-        for family, (solved, calls) in row.families.items():
-            low, high = wilson_interval(solved, calls)
-            panel = panels.setdefault(f"{family} ({calls})", {})
-            panel[row.planner] = (100 * solved / calls, 100 * low, 100 * high)
-    return plots.intervals(planners, panels, colors_of(planners))
-
-
-def failures(comparison: Comparison) -> str:
-    """Draw stacked bars of the failed calls by reason, in percent of all calls."""
-    shares = {
-        reason: [100 * row.failures[reason] / len(comparison.keys) for row in comparison.rows]
-        for reason in FAILURES
-        if any(row.failures[reason] for row in comparison.rows)
-    }
-    planners = [row.planner for row in comparison.rows]
-    height = 0.258 * len(planners) + 0.85
-    return plots.draw(
-        lambda figure: plots.stacked_bars(figure.subplots(), planners, shares), plots.HALF, height
-    )
-
-
-def metrics(comparison: Comparison, planners: Sequence[str]) -> str:
-    """Draw a panel for each metric of motions: the means of all planners with their 95 % intervals."""
-    panels = {}
-    for metric in comparison.metrics:
-        better = f", {metric.better} is better" if metric.better else ""
-        heading = f"{metric.heading}{f' [{metric.unit}]' if metric.unit else ''}{better}"
-        panel: dict[str, plots.Interval] = {}
-        for row in comparison.rows:
-            mean, half = row.measures[metric.name]
-            panel[row.planner] = (
-                metric.scale * mean,
-                metric.scale * (mean - half),
-                metric.scale * (mean + half),
+        for curve in curves:
+            entry = PLANNERS.get(base_name(curve.planner))
+            axes.plot(
+                *of(curve),
+                drawstyle="steps-post",
+                label=curve.planner,
+                color=f"C{names.index(plain_name(curve.planner))}",
+                linestyle="--" if entry is None or entry.kind == SEARCH else "-",
             )
-        panels[heading] = panel
-    return plots.intervals([row.planner for row in comparison.rows], panels, colors_of(planners))
+        axes.set(xscale="log", xlabel="time [s]", ylabel=label)
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.minorticks_off()
+        figure.legend(loc="outside right upper")
+
+    return plots.draw(fill, width=9.0)
 
 
 # The report
@@ -346,9 +275,7 @@ def bench_report(bench: Bench, parts: Sequence[Section], replays: str | None = N
             calls = f"share of {section.curves[0].calls} calls"
             caption = f"Success over time, {calls}; planners with a network solid, search dashed"
             report.plot(f"success_{file}.svg", caption, success_over_time(section, planners))
-            caption = (
-                "Length over time, median over the best known, of non-trivial problems; points: one path"
-            )
+            caption = "Length over time, median over the best known, of non-trivial problems"
             report.plot(f"length_{file}.svg", caption, length_over_time(section, planners))
         for comparison in section.comparisons:
             main, *others = tables(section, comparison, bench.reference)
@@ -357,16 +284,6 @@ def bench_report(bench: Bench, parts: Sequence[Section], replays: str | None = N
                 report.add(plain(missing_line(comparison)))
             for table in others:
                 report.table(table, level=4)
-        main = section.main
-        report.plot(
-            f"metrics_{file}.svg", f"Quality within {main.limit:g} s, 95 % intervals", metrics(main, planners)
-        )
-        report.plot(f"failures_{file}.svg", f"Failed calls within {main.limit:g} s", failures(main))
-    report.add("## All problems")
-    mains = [section.main for section in parts if section.name == section.problem_set]
-    limits = " and ".join(f"{limit:g} s" for limit in sorted({main.limit for main in mains}))
-    caption = f"Success [%] by family within {limits}, 95 % intervals; in brackets: calls"
-    report.plot("families.svg", caption, families(mains, planners))
     if broken := crashes(bench):
         report.add("## Crashes and exceptions")
         report.items(map(plain, broken))
@@ -425,11 +342,10 @@ def crashes(bench: Bench) -> list[str]:
 
 MAX_REPLAYS = 12
 SOLVED_PROBLEMS = 2
-"""In replays, each with up to three planners; the other replays are of failures."""
+"""In replays, each with two planners; the other replays are of failures."""
 
 
-@dataclass(frozen=True, eq=False)
-class Replay:
+class Replay(NamedTuple):
     """A motion for the replays."""
 
     title: str
@@ -438,76 +354,49 @@ class Replay:
     positions: Float[ndarray, "n dof"]
 
 
-@dataclass(frozen=True, eq=False)
-class _Tries:
-    """The calls of all planners on a problem."""
-
-    case: Case
-    solved: list[Record]
-    """Shortest path first."""
-    failed: dict[str, str]
-    """Reasons of failures by planner."""
-
-    @property
-    def detour(self) -> float:
-        """Length of the shortest motion over that of the straight line between its ends."""
-        best = self.solved[0]
-        straight = float(np.linalg.norm(best.waypoints[-1] - best.waypoints[0]))
-        return (best.joint_length or 0.0) / max(straight, 1e-6)
-
-
 def motions_to_replay(bench: Bench, parts: Sequence[Section]) -> list[Replay]:
-    """Motions of the problems with the longest detours, then of problems on which the reference, or else
-    another planner, failed; at the main limit of their set, for cases that the folder keeps."""
-    tries: list[_Tries] = []
+    """The shortest and the longest motion of the problems with the longest detours, then motions of problems
+    on which the reference, or else another planner, failed; at the main limit of their set, for cases that
+    the folder keeps."""
+    tries: list[tuple[Case, list[Record], dict[str, str]]] = []
     for section in (section for section in parts if section.name == section.problem_set):
         main = section.main
-        cases = {case.name: case for case in read_cases(bench.folder, section.problem_set)}
-        calls = {row.planner: calls_on(bench.records[row.planner], section.problem_set) for row in main.rows}
-        for key in main.keys:
-            if key[1] == main.keys[0][1] and key[0] in cases:
-                records = {planner: deciding_record(of[key], main.limit) for planner, of in calls.items()}
-                outcomes = [outcome(record, main.limit) for record in records.values() if record is not None]
+        calls = [calls_on(bench.records[row.planner], section.problem_set) for row in main.rows]
+        for case in read_cases(bench.folder, section.problem_set):
+            key = case.name, main.keys[0][1]
+            if key in main.keys:
+                records = (deciding_record(of[key], main.limit) for of in calls)
+                outcomes = [outcome(record, main.limit) for record in records if record is not None]
                 solved = [o.record for o in outcomes if o.solved]
                 solved.sort(key=lambda record: record.joint_length or 0.0)
                 failed = {o.record.planner: o.failure for o in outcomes if not o.solved}
-                tries.append(_Tries(cases[key[0]], solved, failed))
-    hardest = sorted((t for t in tries if t.solved), key=lambda t: (len(t.solved) < 2, -t.detour))
-    hardest = hardest[:SOLVED_PROBLEMS]
-    failed = [
-        t
-        for t in tries
-        if t.failed and t not in hardest and (t.solved or isinstance(t.case.problem.goal, JointGoal))
-    ]
-    failed.sort(key=lambda t: (bench.reference not in t.failed, len(t.solved)))
-    replays = [replay for t in hardest for replay in _solved(t, bench.reference)]
-    return [*replays, *(_failed(t, bench.reference) for t in failed)][:MAX_REPLAYS]
-
-
-def _solved(tries: _Tries, reference: str) -> list[Replay]:
-    """The motion of the reference, the shortest and the longest."""
-    shortest = tries.solved[0]
-    longest = tries.solved[-1]
-    chosen = [*(r for r in tries.solved if r.planner == reference), shortest, longest]
+                tries.append((case, solved, failed))
+    tries.sort(key=lambda of: (len(of[1]) > 1, *map(_detour, of[1][:1])), reverse=True)
     replays = []
-    for record in {record.planner: record for record in chosen}.values():
-        which = "shortest, " if record is shortest else "longest, " if record is longest else ""
-        caption = f"{record.joint_length:.2f} rad, {which}in {seconds(record.time)} s"
-        replays.append(Replay(f"{record.planner} · {tries.case.name}", caption, tries.case, record.waypoints))
-    return replays
+    for case, solved, _ in tries[:SOLVED_PROBLEMS]:
+        for record in solved[:1] + solved[1:][-1:]:
+            which = "shortest" if record is solved[0] else "longest"
+            caption = f"{record.joint_length:.2f} rad, {which}, in {seconds(record.time)} s"
+            replays.append(Replay(f"{record.planner} · {case.name}", caption, case, record.waypoints))
+    rest = sorted(tries[SOLVED_PROBLEMS:], key=lambda of: (bench.reference not in of[2], len(of[1])))
+    replays += [replay for of in rest for replay in _failure(*of, bench.reference)]
+    return replays[:MAX_REPLAYS]
 
 
-def _failed(tries: _Tries, reference: str) -> Replay:
+def _detour(record: Record) -> float:
+    """Length of a motion over that of the straight line between its ends."""
+    straight = float(np.linalg.norm(record.waypoints[-1] - record.waypoints[0]))
+    return (record.joint_length or 0.0) / max(straight, 1e-6)
+
+
+def _failure(case: Case, solved: list[Record], failed: dict[str, str], reference: str) -> Iterator[Replay]:
     """A motion that solves a problem on which planners failed, or the straight line."""
-    name = tries.case.name
-    if tries.solved:
-        loser = reference if reference in tries.failed else next(iter(tries.failed))
-        number = len(tries.solved)
-        solvers = tries.solved[0].planner + (f", {number} solve it" if number > 1 else "")
-        caption = f"{tries.failed[loser]}; shown: {solvers}"
-        return Replay(f"{loser} fails · {name}", caption, tries.case, tries.solved[0].waypoints)
-    problem = tries.case.problem
-    assert isinstance(problem.goal, JointGoal)
-    caption = "solved by no planner; shown: the straight line, which is no solution"
-    line = np.stack([problem.start, problem.goal.positions[0]])
-    return Replay(f"not solved · {name}", caption, tries.case, line)
+    goal = case.problem.goal
+    if failed and solved:
+        loser = reference if reference in failed else next(iter(failed))
+        caption = f"{failed[loser]}; shown: {solved[0].planner}, {len(solved)} solve it"
+        yield Replay(f"{loser} fails · {case.name}", caption, case, solved[0].waypoints)
+    elif failed and isinstance(goal, JointGoal):
+        caption = "solved by no planner; shown: the straight line, which is no solution"
+        line = np.stack([case.problem.start, goal.positions[0]])
+        yield Replay(f"not solved · {case.name}", caption, case, line)

@@ -17,6 +17,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.tables import Figure
 from robotdiffuse.core.types import Status
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases
@@ -79,20 +80,6 @@ class Bench:
         """The planner that the others are compared with; its restarts if it has any."""
         plain = DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
         return plain + RESTARTED if plain + RESTARTED in self.records else plain
-
-    def sessions_of(self, record: Record) -> frozenset[str]:
-        """The numbers of the sessions, from 1, that may have made the record: one, if the record names it."""
-        return frozenset(
-            str(i)
-            for i, run in enumerate(self.sessions, start=1)
-            if (
-                run.get("run") == record.run
-                if record.run
-                else plain_name(record.planner) in run["planners"]
-                and record.problem_set in run["problems"]
-                and record.time_limit == run["time_limit"]
-            )
-        )
 
     @property
     def problem_sets(self) -> list[str]:
@@ -229,6 +216,12 @@ class Mean(NamedTuple):
         half = 1.96 * float(known.std(ddof=1)) / len(known) ** 0.5 if len(known) > 1 else np.nan
         return cls(float(known.mean()), half)
 
+    def cell(self, metric: Metric) -> Figure | None:
+        """The mean of a metric with its interval."""
+        value, half = (f"{metric.scale * x:{metric.format}}" for x in self)
+        known = value if np.isnan(self.half) else f"{value} ± {half}"
+        return None if np.isnan(self.value) else Figure(known.replace("-", "−"), self.value)
+
 
 @dataclass(frozen=True)
 class Row:
@@ -255,14 +248,14 @@ class Row:
     full: bool
     """Whether all solved calls used up the limit, with restarts or without."""
     timed: str
-    """The sessions that may have made the calls, and the calls at a time in these."""
+    """The sessions that made the calls, and the calls at a time in these."""
     measures: dict[str, Mean]
     """Of the returned motions, by the names of METRICS."""
     memory: float
     """Peak memory of the process [MB]."""
     failures: Counter[str]
-    families: dict[str, tuple[int, int]]
-    """Solved calls and all calls, by family."""
+    families: dict[str, tuple[float, tuple[float, float]]]
+    """Share of solved calls with its 95 % interval, by family."""
 
 
 @dataclass(frozen=True)
@@ -286,9 +279,6 @@ class Comparison:
         """Whether all rows were timed in the same sessions, with as many calls at a time."""
         return len({row.timed for row in self.rows}) < 2
 
-    def row(self, planner: str) -> Row | None:
-        return next((row for row in self.rows if row.planner == planner), None)
-
     @property
     def metrics(self) -> list[Metric]:
         """The metrics that some row has."""
@@ -305,8 +295,6 @@ class Curve:
     """Results later than this [s] are known for some problems only."""
     found: Float[ndarray, "solved"]
     """Times of first paths [s], sorted."""
-    anytime: bool
-    """Whether more than a tenth of the solved calls on non-trivial problems improved their path."""
     times: Float[ndarray, "t"]
     """Times from which half of these problems are solved [s]."""
     ratios: Float[ndarray, "t"]
@@ -419,43 +407,42 @@ def _comparison(
     names = {name for name, _ in keys}
     rows = []
     for planner, of in outcomes.items():
+        records = [o.record for o in of]
         solved = [o for o in of if o.solved]
-        success = len(solved) / len(of)
         figures = _indicators(of)
-        family_calls = Counter(o.record.family for o in of)
-        family_solved = Counter(o.record.family for o in solved)
+        by_family: dict[str, list[bool]] = {}
+        for o in of:
+            by_family.setdefault(o.record.family, []).append(o.solved)
+        timed = sorted({f"run {record.run or '?'}, {record.workers or '?'} at once" for record in records})
         row = Row(
             planner=planner,
-            success=success,
+            success=figures.success / 100,
             # the seeds of one problem are not independent, so trials are problems
-            success_interval=wilson_interval(round(success * len(names)), len(names)),
+            success_interval=wilson_interval(round(figures.success / 100 * len(names)), len(names)),
             collision=figures.collision / 100,
             link_length=figures.length,
             first=float(np.median([o.found for o in solved])) if solved else np.nan,
             returned=figures.time,
-            time=Mean.of(o.record.time for o in of).value,
+            time=Mean.of(record.time for record in records).value,
             comscore=scores.get(planner, np.nan),
             paired=None
             if planner == bench.reference or reference is None
             else compare(lengths[planner], reference),
             full=all(o.full(limit, least) for o, least in zip(of, shortest, strict=True) if o.solved),
-            timed=_timed(bench, of),
+            timed=" or ".join(timed),
             measures={name: Mean.of(o.record.measures.get(name) for o in solved) for name in METRICS},
-            memory=max((o.record.memory for o in of if o.record.memory is not None), default=np.nan),
+            memory=max((record.memory for record in records if record.memory is not None), default=np.nan),
             failures=Counter(o.failure for o in of if not o.solved),
-            families={family: (family_solved[family], n) for family, n in family_calls.items()},
+            families={
+                family: (sum(calls) / len(calls), wilson_interval(sum(calls), len(calls)))
+                for family, calls in by_family.items()
+            },
         )
         rows.append(row)
     loads = tuple(o.record.load for of in outcomes.values() for o in of if o.record.load is not None)
     missing = tuple(name for name in calls if name not in outcomes)
     seeds = len({seed for _, seed in keys})
     return Comparison(limit, len(names), problems, seeds, tuple(rows), missing, tuple(keys), loads)
-
-
-def _timed(bench: Bench, outcomes: Sequence[Outcome]) -> str:
-    runs = frozenset[str]().union(*(bench.sessions_of(o.record) for o in outcomes))
-    workers = {str(bench.sessions[int(number) - 1].get("workers", "?")) for number in runs}
-    return f"run {' or '.join(sorted(runs)) or '?'}, {' or '.join(sorted(workers)) or '?'} at once"
 
 
 def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
@@ -497,7 +484,6 @@ def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], lon
     solved = {key: r for key, r in records.items() if outcome(r, r.time_limit).found <= end}
     found = np.sort([min(r.progress[0][0], end) for r in solved.values()])
     hard = {key: r for key, r in solved.items() if not r.trivial}
-    improved = sum(len(r.progress) > 1 for r in hard.values())
     times = np.geomspace(1e-4, end, 240)
     ratios = np.full((max(len(hard), 1), len(times)), np.inf)
     for row, (key, record) in zip(ratios, hard.items(), strict=False):
@@ -506,4 +492,4 @@ def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], lon
     with np.errstate(invalid="ignore"):
         medians = np.median(ratios, axis=0)
     known = np.isfinite(medians)
-    return Curve(planner, len(records), end, found, improved > 0.1 * len(hard), times[known], medians[known])
+    return Curve(planner, len(records), end, found, times[known], medians[known])

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.tables import Cell, Column, Figure, Table, plain
+from robotdiffuse.core.tables import Column, Table, plain
 from robotdiffuse.core.types import Path
 from robotdiffuse.evaluation import plots
 from robotdiffuse.evaluation.bench import BenchSettings, Done, run_bench
@@ -26,7 +26,7 @@ from robotdiffuse.evaluation.comparison import Bench, Section, read_bench, secti
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, sampling_digest
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.problem_sets import hard_cases, read_cases, validator
-from robotdiffuse.evaluation.report import Report, interval
+from robotdiffuse.evaluation.report import Report, share_cell
 from robotdiffuse.evaluation.runs import Record, run_all
 from robotdiffuse.evaluation.statistics import Indicators, bootstrap_interval, comscores, wilson_interval
 from robotdiffuse.learning.diffusion import SAMPLERS
@@ -337,11 +337,6 @@ def scores(rows: Sequence[Row], of: dict[str, Indicators]) -> dict[str, float]:
     return dict(zip(others, among[ours], strict=False)) | {name: values[-1] for name, values in among.items()}
 
 
-def share_cells(part: int, whole: int) -> tuple[float, str]:
-    """A share in per cent, and its 95 % interval."""
-    return 100 * part / max(whole, 1), interval(*wilson_interval(part, whole), scale=100.0)
-
-
 def _table(section: Section, rows: dict[str, Row]) -> Table:
     """The table of a problem set or of its part; `rows` by planner."""
     comparison = section.main
@@ -358,22 +353,20 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
     table = []
     for of in comparison.rows:
         row = rows[of.planner]
-        shares = (round(share * comparison.problems) for share in (of.success, of.collision))
-        cells: list[Cell] = [row.name]
-        for share in shares:
-            cells += share_cells(share, comparison.problems)
-        for name in MEASURES:
-            mean, half = of.measures[name]
-            form = METRICS[name].format
-            cells.append(Figure(f"{mean:{form}} ± {half:{form}}", mean) if half == half else None)
-        cells += [of.time, comscore[row.name]]
+        collisions = wilson_interval(round(of.collision * comparison.problems), comparison.problems)
+        cells = (
+            row.name,
+            share_cell(of.success, of.success_interval),
+            share_cell(of.collision, collisions),
+            *(of.measures[name].cell(METRICS[name]) for name in MEASURES),
+            of.time,
+            comscore[row.name],
+        )
         table.append([*cells, *(printed.get(row.paper, (None,) * 5) if beside else ())])
     columns = (
         "row",
-        Column("success", "%", ".1f", "more"),
-        "95 %",
-        Column("collision", "%", ".1f", "less"),
-        "95 %",
+        Column("success", "%", better="more"),
+        Column("collision", "%", better="less"),
         Column("length of links 1 to 7", "m"),
         Column("joint length", "rad"),
         Column("duration", "s"),
@@ -483,19 +476,14 @@ def plot_success_by_steps(records: dict[str, dict[int, list[Record]]]) -> str:
     def fill(figure: "PlotFigure") -> None:
         axes = figure.subplots()
         for name, of_steps in records.items():
-            shares = [np.array([r.passed or 0.0 for r in of]) for of in of_steps.values()]
+            shares = [np.array([r.passed for r in of]) for of in of_steps.values()]
             mean = np.array([x.mean() for x in shares])
-            low, high = np.array([bootstrap_interval(x) for x in shares]).T
-            bars = 100 * np.stack([mean - low, high - mean]).clip(0)
-            axes.errorbar(list(of_steps), 100 * mean, bars, fmt="o-", markersize=4, label=name)
-        axes.set(xscale="log", xlabel="denoising steps T", ylim=(0, 102))
-        axes.set_xticks(STEPS, [str(steps) for steps in STEPS])
-        axes.minorticks_off()
-        axes.set_ylabel("single samples that pass the validator")
-        plots.percent_axis(axes)
-        axes.legend(loc="lower right")
+            bars = np.abs(np.array([bootstrap_interval(x) for x in shares]).T - mean)
+            axes.errorbar(list(of_steps), mean, bars, fmt="o-", markersize=4, label=name)
+        axes.set(xscale="log", xlabel="denoising steps T", ylabel="single samples that pass the validator")
+        axes.legend()
 
-    return plots.draw(fill, plots.HALF, 3.2)
+    return plots.draw(fill)
 
 
 def plot_success_over_time(bench: Bench) -> str:

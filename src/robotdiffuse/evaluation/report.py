@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path as FilePath
 
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.core.tables import Table, markdown, plain
+from robotdiffuse.core.tables import Figure, Table, markdown, plain
 
 STYLE = """
 body { max-width: 1320px; margin: 0 auto; padding: 24px; color: #222b38; background: white;
@@ -93,6 +93,11 @@ class Report:
 def interval(low: float, high: float, digits: int = 1, scale: float = 1.0) -> str:
     """The ends of an interval as a text."""
     return f"{scale * low:.{digits}f} to {scale * high:.{digits}f}"
+
+
+def share_cell(value: float, ends: tuple[float, float]) -> Figure:
+    """A share with its interval, in per cent."""
+    return Figure(f"{100 * value:.1f} ({interval(*ends, scale=100.0)})", value)
 
 
 def processor() -> str:
