@@ -37,7 +37,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.fitting.add import AddReport, add_robot
+from robotdiffuse.robots.fitting.preparation import AddReport, add_robot
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.parsing.urdf import UrdfTree

@@ -21,9 +21,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 
 TURN = [0.9, 0.1, -0.3, 0.3]
 

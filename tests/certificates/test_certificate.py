@@ -22,9 +22,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import VerifySettings, verify
 

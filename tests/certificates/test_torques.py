@@ -18,8 +18,8 @@ from robotdiffuse.certificates.requirements import inverse_dynamics, torque_boun
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.bodies import Payload
 from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.robots.inertias import Payload
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
 LOW = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2]

@@ -20,7 +20,7 @@ def test_robot_add_with_srdf_and_robot_list(
 ) -> None:
     """Pairs that an SRDF or the command allows, the comparison with sampling, progress without a terminal."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
-    monkeypatch.setattr("robotdiffuse.robots.fitting.add.PreparationSettings", lambda: QUICK)
+    monkeypatch.setattr("robotdiffuse.robots.fitting.preparation.PreparationSettings", lambda: QUICK)
     file = written(tmp_path, chain("base", row("j", 4), xyz="0 0 0.07", limits='lower="-3" upper="3"'))
     pairs = ("base", "j4_link", "User"), ("base", "j3_link", "Never"), ("base", "j1_link", "Adjacent")
     rows = (f'<disable_collisions link1="{a}" link2="{b}" reason="{why}"/>' for a, b, why in pairs)

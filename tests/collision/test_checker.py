@@ -36,9 +36,8 @@ from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 
 # -- distances -----------------------------------------------------------------------------------------------
 

@@ -12,9 +12,8 @@ from helpers.box_arm import HALF_WIDTH, box_arm
 from helpers.example_robots import example_robot
 from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collision, forward_frames
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 
 Q0 = np.zeros(3)
 

@@ -19,9 +19,8 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import compile_scene
 from robotdiffuse.collision.point_cloud_grid import THINNING, build_grid, cover_triangles, thin_points
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
 
 
 def test_a_point_cloud_is_many_spheres() -> None:

@@ -15,12 +15,11 @@ from robotdiffuse.collision.exact_meshes import ExactCollision, explain_collisio
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.bodies import Surface
-from robotdiffuse.robots.fitting.convex_hulls import convex_hull
+from robotdiffuse.robots.fitting.convex_parts import convex_hull
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
-from robotdiffuse.robots.surface_files import SURFACE_FILE
+from robotdiffuse.robots.robot_folder import SURFACE_FILE, read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify
 

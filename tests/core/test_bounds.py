@@ -13,9 +13,8 @@ from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Path
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.validation.validator import verify
 
 TRIANGLE = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]

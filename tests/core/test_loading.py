@@ -12,7 +12,8 @@ from helpers.clock import Clock, stop_clock
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.loading import compile_seconds, compiled, loading, loading_seconds
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.robots.kinematic_tree import once_per_robot
+from robotdiffuse.robots.robot import Robot
 
 FIRST_CALLS = """
 import sys, time

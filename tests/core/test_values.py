@@ -19,8 +19,8 @@ from robotdiffuse.core.types import Status
 from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.problems.constraints import FrameConstraint
 from robotdiffuse.robots.bodies import AttachedBody, ConvexMesh, Surface
-from robotdiffuse.robots.link_pair_tables import LinkPairTable
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import LinkPairTable, Robot
 from robotdiffuse.robots.visual_meshes import VisualMesh
 from robotdiffuse.validation.validator import verify
 

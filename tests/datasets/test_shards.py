@@ -33,7 +33,7 @@ from robotdiffuse.datasets.shards import (
     write_shard,
 )
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.robot import robot_fingerprint
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 ARM = box_arm()
@@ -301,7 +301,7 @@ def test_the_robot_must_be_that_of_the_data():
 
 
 def test_robot_fingerprint():
-    code = "from robotdiffuse.robots import load_robot\nfrom robotdiffuse.robots.fingerprint import *\n"
+    code = "from robotdiffuse.robots import load_robot\nfrom robotdiffuse.robots.robot import *\n"
     done = subprocess.run(
         [sys.executable, "-c", code + "print(robot_fingerprint(load_robot('panda')))"],
         capture_output=True,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from helpers.quick_preparation import QUICK, coarse_grids
-from robotdiffuse.robots.fitting.add import add_robot
+from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.visualization import picture
 
 ROOT = Path(__file__).parents[2]

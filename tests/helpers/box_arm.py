@@ -8,7 +8,8 @@ from numpy import ndarray
 from scipy.spatial import ConvexHull
 
 from helpers.example_robots import planar_arm
-from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import ConvexMesh, Robot
 
 HALF_WIDTH = 0.03
 

@@ -29,7 +29,7 @@ import yaml
 from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.cli import build_parser, main
 from robotdiffuse.problems.files import load_problem
-from robotdiffuse.robots.fitting.add import add_robot
+from robotdiffuse.robots.fitting.preparation import add_robot
 
 ROOT = Path(__file__).parents[2]
 PAGES = [

@@ -10,7 +10,8 @@ import pytest
 
 from helpers.urdfs import read_urdf
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot
 
 TIPS = {
     "panda": "panda_hand",

@@ -5,8 +5,9 @@ import numpy as np
 import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.robots.inertias import inertia_of
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.bodies import inertia_of
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot
 
 TURNED = transform(np.array([0.1, 0.0, 0.3]), rotation_about(np.array([0.6, 0.0, 0.8]), 0.7))
 

@@ -5,10 +5,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from robotdiffuse.robots.fitting import sphere_size_grid
-from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
+from robotdiffuse.robots.fitting import sphere_fitting
 from robotdiffuse.robots.fitting.convex_parts import PartSettings
 from robotdiffuse.robots.fitting.preparation import PreparationSettings
+from robotdiffuse.robots.fitting.self_collisions import SamplingSettings
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings
 
 QUICK = PreparationSettings(
@@ -24,5 +24,5 @@ QUICK = PreparationSettings(
 def coarse_grids() -> Iterator[None]:
     """Spheres are fitted on a tenth of the grid points."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sphere_size_grid, "GRID_POINTS", sphere_size_grid.GRID_POINTS // 10)
+        patch.setattr(sphere_fitting, "GRID_POINTS", sphere_fitting.GRID_POINTS // 10)
         yield

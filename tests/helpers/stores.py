@@ -8,8 +8,7 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.datasets.shards import Manifest, write_manifest, write_shard
-from robotdiffuse.robots.fingerprint import robot_fingerprint
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE
 
 WAYPOINTS = 254

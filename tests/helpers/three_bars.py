@@ -3,7 +3,8 @@
 import numpy as np
 
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import ConvexMesh, Robot
 
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)])
 FACES = "013 032 467 475 045 051 237 276 026 064 157 173"

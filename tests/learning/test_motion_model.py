@@ -18,7 +18,7 @@ from robotdiffuse.learning.encoders.networks import (
 from robotdiffuse.learning.motion_model import GuideFn, MotionModelSettings, SamplingSettings
 from robotdiffuse.learning.motion_network import MotionNetwork
 from robotdiffuse.learning.training.config import PlannerTraining
-from robotdiffuse.robots.normalizer import JointNormalizer
+from robotdiffuse.robots.kinematic_tree import JointNormalizer
 
 
 def cloud(n: int, seed: int = 0) -> torch.Tensor:

@@ -14,9 +14,9 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.start_goal import images
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import Robot
-from robotdiffuse.robots.joints import CONTINUOUS_LIMIT
+from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.parsing.joint_limits import with_limits
+from robotdiffuse.robots.parsing.urdf import with_limits
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box

@@ -13,12 +13,11 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fingerprint import robot_fingerprint
-from robotdiffuse.robots.fitting.convex_hulls import convex_hull, planes_of
+from robotdiffuse.robots.fitting.convex_parts import convex_hull, planes_of
 from robotdiffuse.robots.fitting.covering_spheres import MAX_SPHERES, cover
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.motion_bounds import motion_radii
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.scenes.shapes import Shape
 
 rng = np.random.default_rng(0)

@@ -11,8 +11,8 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
+from robotdiffuse.robots.fitting.sphere_fitting import stacked_planes
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps, within
-from robotdiffuse.robots.fitting.sphere_size_grid import stacked_planes
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot_folder import read_source
 from robotdiffuse.scenes.scene import Scene

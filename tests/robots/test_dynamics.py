@@ -15,9 +15,10 @@ from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.core.types import Status
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
+from robotdiffuse.robots.bodies import Payload, inertia_of
 from robotdiffuse.robots.dynamics import GRAVITY, Dynamics
-from robotdiffuse.robots.inertias import Payload, inertia_of
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.validation.validator import verify, verify_trajectory
 

@@ -13,7 +13,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import LOCKED_CACHE, once_per_robot
+from robotdiffuse.robots.kinematic_tree import once_per_robot
+from robotdiffuse.robots.robot import LOCKED_CACHE
 from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, write_robot_folder
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere

@@ -19,15 +19,13 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import reach_ball, reach_bound
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.bodies import Payload, inertia_of
 from robotdiffuse.robots.fitting.covering_spheres import cover
-from robotdiffuse.robots.inertias import Payload, inertia_of
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
-from robotdiffuse.robots.kinematics import link_pose, placed_spheres
+from robotdiffuse.robots.kinematics import link_pose, placed_spheres, reach
 from robotdiffuse.robots.parsing.srdf import read_srdf
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
-from robotdiffuse.robots.scaling import reach
 
 PARTS = chain("base", ["waist"]), chain("waist_link", row("left_", 4)), chain("waist_link", row("right_", 4))
 

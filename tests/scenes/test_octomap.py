@@ -9,7 +9,7 @@ import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import problem_from_record, problem_record
-from robotdiffuse.scenes.octomap import TREE_DEPTH, occupied_voxels, read_octomap
+from robotdiffuse.scenes.point_cloud import TREE_DEPTH, occupied_voxels, read_octomap
 
 HALF = 2 ** (TREE_DEPTH - 1)
 Key = tuple[int, int, int]

@@ -18,9 +18,8 @@ from robotdiffuse.problems.files import load_problem, problem_from_record, probl
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene, contact_notes
-from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.validation.validator import verify
 
 BALL = Sphere([1.15, 0.0, 0.0], 0.1, "ball")

@@ -17,11 +17,9 @@ from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
-from robotdiffuse.scenes.height_map import HeightMap
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.point_cloud import crop, distinct, read_points, voxel_thin
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, HeightMap, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.scenes.surface_points import DRAWS, VisibleRegion, sample_surface
 
 TURN = (0.8, 0.2, -0.5, 0.3)

@@ -16,9 +16,8 @@ from robotdiffuse.core.types import Path
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 from robotdiffuse.simulation import PyBulletOracle
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.validator import verify

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import speed_limits
 from robotdiffuse.trajectories.corner_rounding import BLEND_DEVIATION, BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import MIN_JERK, TimingSettings, symmetric_bounds, timing_grid

@@ -8,8 +8,8 @@ from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.bodies import Payload
 from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.validation.torques import Pieces, first_excess, static_pieces, trajectory_pieces
 from robotdiffuse.validation.validator import verify, verify_trajectory
 

@@ -21,9 +21,8 @@ from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.trajectories.cubics import Cubics
 from robotdiffuse.trajectories.speed_limits import TimingSettings
 from robotdiffuse.trajectories.timing import time_parameterize

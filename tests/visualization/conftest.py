@@ -6,9 +6,8 @@ import pytest
 from helpers.three_bars import CORNERS, CUBE, three_bars
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 
 
 @pytest.fixture(scope="session")

@@ -12,9 +12,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status
 from robotdiffuse.drawables import decimated
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud
+from robotdiffuse.scenes.shapes import Mesh, PointCloud
 from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
 from robotdiffuse.visualization.arm import DrawnArm
 

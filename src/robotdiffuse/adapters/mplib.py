@@ -23,12 +23,10 @@ from robotdiffuse.planning.workspace import Workspace
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.bodies import RigidShape
-from robotdiffuse.robots.fitting.add import add_robot
+from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.robot_folder import ROBOT_FILE
-from robotdiffuse.robots.user_data_dir import user_robots
-from robotdiffuse.scenes.mesh import Mesh
-from robotdiffuse.scenes.shapes import Box, PointCloud, Sphere
+from robotdiffuse.robots.robot_folder import ROBOT_FILE, user_robots
+from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
 
 SUCCESS = "Success"
 CLOUD = "point_cloud"

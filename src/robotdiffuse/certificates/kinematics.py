@@ -22,7 +22,8 @@ from robotdiffuse.core.types import (
     Values,
     Vector,
 )
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot
 
 
 class Postures(NamedTuple):

@@ -11,9 +11,8 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.core.types import Points, Rotation, Values, Vector
-from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 CLEARANCE_CAP = 1.0
 """Larger clearances are reported as this [m]."""

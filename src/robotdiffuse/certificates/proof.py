@@ -16,9 +16,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory, Values
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud, Shape
+from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
 
 BOUND_TOLERANCE = 1e-6
 """A recomputed bound may differ from the written one by this [m] or [rad], because files round."""

@@ -46,8 +46,9 @@ from robotdiffuse.core.types import (
 from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.inertias import Inertia
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.bodies import Inertia
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot
 
 # Halvings of a step at most, and stretches at a time, to show that a frame keeps its speed.
 MAX_HALVINGS = 24

@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from robotdiffuse.robots.fitting.add import AddReport
-    from robotdiffuse.robots.robot import Joint, Robot
+    from robotdiffuse.robots.fitting.preparation import AddReport
+    from robotdiffuse.robots.kinematic_tree import Joint
+    from robotdiffuse.robots.robot import Robot
 
 MAX_PAIRS = 8
 """Most pairs of links in the report of `robot add`."""
@@ -132,7 +133,7 @@ def run_add(arguments: argparse.Namespace) -> int:
     console = Console(stderr=True)
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
     with exit_on_interrupt(bar.stop), bar:
-        from robotdiffuse.robots.fitting.add import add_robot
+        from robotdiffuse.robots.fitting.preparation import add_robot
 
         task = bar.add_task("reading the URDF")
 

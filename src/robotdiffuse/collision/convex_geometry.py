@@ -13,10 +13,10 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.robots.robot import Robot, once_per_robot
-from robotdiffuse.scenes.mesh import Triangulated
+from robotdiffuse.robots.kinematic_tree import once_per_robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 SURFACES_BELOW = 0.002
 """Distance of the convex parts of two grazing links below which their surfaces decide [m]."""

@@ -34,10 +34,10 @@ from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_surface
-from robotdiffuse.robots.robot import Robot, once_per_robot
-from robotdiffuse.scenes.mesh import Triangulated
+from robotdiffuse.robots.kinematic_tree import once_per_robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated
 
 CHUNK_SIZE = 8192
 """Configurations that `collides` processes at once; bounds its memory."""

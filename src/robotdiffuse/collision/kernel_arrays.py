@@ -24,12 +24,11 @@ from robotdiffuse.collision.point_cloud_grid import (
 from robotdiffuse.collision.sphere_pair_tables import build_pair_tables, no_tables
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.robots.link_pair_tables import LinkPairTable
+from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import motion_radii
-from robotdiffuse.robots.robot import Robot, once_per_robot
-from robotdiffuse.scenes.mesh import Triangulated
+from robotdiffuse.robots.robot import LinkPairTable, Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud
+from robotdiffuse.scenes.shapes import PointCloud, Triangulated
 
 FLOAT32_ROUNDING = 4e-7
 """Obstacles grow by this share of their coordinates, which is more than float32 rounding."""

@@ -43,8 +43,9 @@ from robotdiffuse.collision.kernels.motion_pieces import Motion, Pieces
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
+from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import motion_radii
-from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 if TYPE_CHECKING:

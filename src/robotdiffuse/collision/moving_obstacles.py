@@ -25,8 +25,9 @@ from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
+from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.motion_bounds import motion_radii
-from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle, track_speeds
 from robotdiffuse.scenes.scene import Scene
 

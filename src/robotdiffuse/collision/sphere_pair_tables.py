@@ -3,7 +3,7 @@
 The relative pose of two links depends only on the joints between them. For pairs with one or two such joints,
 such as forearm and hand, bounding spheres overlap almost always. A table over the two joints says where the
 links may touch at all: one look-up replaces hundreds of distances. Tables are computed from spheres, or from
-convex parts if the robot has such a table (`robots/fitting/convex_pair_tables.py`).
+convex parts if the robot has such a table (`robots/fitting/sampled_links.py`).
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.lane_clearance import pair_clearances
 from robotdiffuse.collision.kernels.lane_collision import TABLE_HEADER, TABLE_SIDE
-from robotdiffuse.robots.link_pair_tables import LinkPairTable
+from robotdiffuse.robots.robot import LinkPairTable
 
 CELLS_PER_JOINT = TABLE_SIDE - 2
 """Cells along each joint's range; a ring of cells around them stands for values beyond the range."""

@@ -17,7 +17,8 @@ from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import Check, checks_of, surfaces_decide
 from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
-from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.robots.kinematic_tree import once_per_robot
+from robotdiffuse.robots.robot import Robot
 
 MAX_OVERLAP = 0.005
 """Overlap of convex parts beyond which links collide, whatever their surfaces [m]."""

@@ -23,7 +23,7 @@ from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.datasets.rows import read_rows
 from robotdiffuse.datasets.shards import SPLITS, read_manifest
 from robotdiffuse.datasets.surface_clouds import surface_clouds
-from robotdiffuse.robots.normalizer import JointNormalizer
+from robotdiffuse.robots.kinematic_tree import JointNormalizer
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.surface_points import VisibleRegion

@@ -30,8 +30,7 @@ from robotdiffuse.core.errors import InputError, located, missing_package, readi
 from robotdiffuse.core.input_files import file_name, input_file, read_json
 from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.settings import Count, Natural, Settings
-from robotdiffuse.robots.fingerprint import robot_fingerprint
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, robot_fingerprint
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box
 

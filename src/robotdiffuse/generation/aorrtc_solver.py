@@ -17,7 +17,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
 from robotdiffuse.planning.search.rrt import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, falling_clearances
-from robotdiffuse.robots.link_pair_tables import TURN
+from robotdiffuse.robots.kinematic_tree import TURN
 
 ITERATIONS_PER_STEP = 500
 """Between two checks whether to stop."""

@@ -33,8 +33,9 @@ from robotdiffuse.perception.seen_points import near_scene
 from robotdiffuse.perception.voxel_grid import FINE, LOW, SHAPE, VOXEL
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import Range, base_spheres
+from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.kinematics import link_poses
-from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 Packed = UInt8[ndarray, "56 56 32"]

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from robotdiffuse.learning import need_packages
 from robotdiffuse.learning.weight_files import RobotIdentity
-from robotdiffuse.robots.normalizer import JointNormalizer
+from robotdiffuse.robots.kinematic_tree import JointNormalizer
 
 if TYPE_CHECKING:
     from onnx import GraphProto

@@ -23,9 +23,9 @@ from robotdiffuse.core.errors import InputError, joined, shortened
 from robotdiffuse.core.input_files import is_file, read_bytes, read_json
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.robots.normalizer import JointNormalizer
-from robotdiffuse.robots.robot import Robot, once_per_robot
-from robotdiffuse.robots.user_data_dir import user_robots
+from robotdiffuse.robots.kinematic_tree import JointNormalizer, once_per_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot_folder import user_robots
 
 Given = TypeVar("Given", bound="NetworkSettings")
 

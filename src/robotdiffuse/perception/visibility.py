@@ -12,7 +12,8 @@ from robotdiffuse.core.kernels import kernel
 from robotdiffuse.core.types import Configuration, Points
 from robotdiffuse.perception.observed_volume import MAX_DEPTH, usable_depth
 from robotdiffuse.perception.ray_caster import in_camera
-from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.robots.kinematic_tree import once_per_robot
+from robotdiffuse.robots.robot import Robot
 
 OCCLUSION_START = np.float32(2.0)
 """Voxels nearer to a voxel than this do not hide it, in edges: its neighbours are as unknown as it is."""

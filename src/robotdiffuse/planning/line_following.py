@@ -18,8 +18,7 @@ from robotdiffuse.problems.compiled_constraints import line_end, rotation_vector
 from robotdiffuse.problems.constraints import CartesianLine
 from robotdiffuse.problems.goals import JointGoal, PoseGoal
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.follow_kernel import follow
-from robotdiffuse.robots.ik_kernel import IKParameters
+from robotdiffuse.robots.ik_kernel import IKParameters, follow
 from robotdiffuse.robots.inverse_kinematics import (
     InverseKinematicsSettings,
     ik_chain,

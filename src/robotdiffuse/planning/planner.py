@@ -18,9 +18,8 @@ from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.validation.tolerances import goal_index
 
 PlannerSettings = TypeVar("PlannerSettings", bound=Settings)

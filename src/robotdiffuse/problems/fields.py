@@ -41,10 +41,8 @@ from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
 from robotdiffuse.problems.problem import UNKNOWN_POLICIES, check_clearance
 from robotdiffuse.robots import ROBOTS
-from robotdiffuse.robots.bodies import TOOL
-from robotdiffuse.robots.inertias import Payload
-from robotdiffuse.robots.named_poses import named_pose
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.bodies import TOOL, Payload
+from robotdiffuse.robots.robot import Robot, named_pose
 from robotdiffuse.scenes.files import (
     FILE_CONTENT,
     SHAPES,

@@ -29,10 +29,9 @@ from robotdiffuse.core.types import Pose, Vector
 from robotdiffuse.robots.bodies import AttachedBody
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
-from robotdiffuse.scenes.mesh import Mesh
-from robotdiffuse.scenes.octomap import cover_radius, occupied_voxels
+from robotdiffuse.scenes.point_cloud import cover_radius, occupied_voxels
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
 
 SCENE = "a planning scene"
 REQUEST = "a motion plan request"

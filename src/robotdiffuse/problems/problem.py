@@ -23,10 +23,10 @@ from robotdiffuse.problems.goals import Goal, OneGoal
 from robotdiffuse.problems.goals import JointGoal as JointGoal
 from robotdiffuse.problems.goals import PoseGoal as PoseGoal
 from robotdiffuse.problems.goals import PosesGoal as PosesGoal
+from robotdiffuse.robots.bodies import Payload
 from robotdiffuse.robots.dynamics import check_dynamics
-from robotdiffuse.robots.inertias import Payload
-from robotdiffuse.robots.named_poses import named_pose
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot, named_pose
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import ALL_LINKS, Scene
 
@@ -451,7 +451,7 @@ class Problem(Value):
             InputError: For q of the wrong shape.
         """
         from robotdiffuse.collision import CollisionChecker  # compiled code
-        from robotdiffuse.robots.kinematic_methods import configurations
+        from robotdiffuse.robots.robot import configurations
 
         rows = configurations(self.robot, q)
         checker = CollisionChecker(self.robot, self.scene)

@@ -10,9 +10,8 @@ from robotdiffuse.perception.depth_view import AssumedPoints, DepthView, SeenPoi
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud, Shape
+from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 
 MAX_EXTENT = 10.0
 """Meshes, clouds and views that are larger get a note; so do other shapes of which every edge is longer: a

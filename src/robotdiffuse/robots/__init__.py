@@ -9,19 +9,19 @@ from pathlib import Path
 from robotdiffuse.core.errors import InputError, check_type, unknown_name
 from robotdiffuse.core.input_files import is_file
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fingerprint import robot_fingerprint
-from robotdiffuse.robots.joints import Joint
-from robotdiffuse.robots.kinematic_methods import fk, ik, jacobian
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, read_robot_folder, read_source
-from robotdiffuse.robots.surface_files import SURFACE_FILE
-from robotdiffuse.robots.user_data_dir import user_robots
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot, robot_fingerprint
+from robotdiffuse.robots.robot_folder import (
+    MESH_FILE,
+    ROBOT_FILE,
+    SURFACE_FILE,
+    read_robot_folder,
+    read_source,
+    user_robots,
+)
 
 __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
 
-Robot.fk = fk  # type: ignore[method-assign]
-Robot.jacobian = jacobian  # type: ignore[method-assign]
-Robot.ik = ik  # type: ignore[method-assign]
 DATA = Path(__file__).parent / "data"
 ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}")))
 """Names of the bundled robots."""
@@ -108,7 +108,7 @@ def _added() -> dict[str, Path]:
 
 def _from_urdf(urdf: Path) -> Robot:
     """The added robot with the content of a URDF; prepared and added if there is none."""
-    from robotdiffuse.robots.fitting.add import add_robot
+    from robotdiffuse.robots.fitting.preparation import add_robot
     from robotdiffuse.robots.parsing.urdf import UrdfTree
 
     tree = UrdfTree(urdf, {})

@@ -1,12 +1,15 @@
-"""Convex meshes, and bodies that are attached to links of a robot."""
+"""Bodies of links: convex meshes, surfaces, inertias, and what is attached to links."""
 
 from dataclasses import dataclass, fields
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, no_type_check, runtime_checkable
 
+import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import Value
+from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, within
+from robotdiffuse.core.errors import InputError, shown
 
 TOOL = "tool"
 """Default name of a tool."""
@@ -77,3 +80,90 @@ def _content(value: Any) -> object:
     if hasattr(value, "__dataclass_fields__"):
         return type(value), *(_content(getattr(value, f.name)) for f in fields(value))
     return tuple(map(_content, value)) if isinstance(value, tuple) else value
+
+
+SLACK = 1e-6
+"""How negative the smallest principal moment of a link may be, relative to the largest entry, for rounding in
+files."""
+
+
+class Inertia(NamedTuple):
+    """Mass and inertia of a link, in its frame."""
+
+    mass: float
+    """[kg]"""
+    com: Float[ndarray, "3"]
+    """Centre of mass [m]."""
+    moments: Float[ndarray, "3 3"]
+    """Inertia matrix about the centre of mass, along the frame's axes [kg m²]."""
+
+    @property
+    def values(self) -> list[float]:
+        """The ten numbers that `inertia_of` takes."""
+        upper = self.moments[np.triu_indices(3)]
+        return [self.mass, *self.com.tolist(), *upper.tolist()]
+
+
+def inertia_of(values: ArrayLike) -> Inertia:
+    """An inertia from mass, x, y, z, ixx, ixy, ixz, iyy, iyz, izz; raises ValueError if physically
+    impossible."""
+    row = np.array(values, np.float64)
+    if row.shape != (10,) or not within(row):
+        raise ValueError("ten finite numbers expected")
+    xx, xy, xz, yy, yz, zz = row[4:]
+    moments = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    least = float(np.linalg.eigvalsh(moments)[0])
+    if not row[0] > 0 or least < -SLACK * np.abs(moments).max():
+        raise ValueError("a mass above 0 and moments of inertia of at least 0 expected")
+    return read_only(Inertia(float(row[0]), row[1:4], moments))
+
+
+@no_type_check
+@dataclass(frozen=True, eq=False)
+class Payload(Value):
+    """A mass that a link carries; joint torques must support it in addition to the arm.
+
+    Raises InputError for numbers that are not finite, and for negative mass or moments of inertia.
+    """
+
+    mass: float
+    """[kg]"""
+    com: Float[ndarray, "3"] = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
+    """Centre of mass, in the frame of the link [m]."""
+    link: str | None = None
+    """Link that carries the mass; None: the robot's tip."""
+    moments: Float[ndarray, "3"] = (0.0, 0.0, 0.0)  # pyright: ignore[reportAssignmentType]
+    """Moments of inertia about the centre of mass, along the frame's axes [kg m²]; 0 for a point mass."""
+
+    def __post_init__(self) -> None:
+        mass = numbers(self.mass)
+        if mass is None or mass.ndim != 0 or not 0 <= mass <= MAX_COORDINATE:
+            raise InputError(
+                f"payload.mass is {shown(self.mass)}; it must be a number from 0 to {MAX_COORDINATE:g} kg"
+            )
+        object.__setattr__(self, "mass", float(mass))
+        for name, least in (("com", -MAX_COORDINATE), ("moments", 0.0)):
+            value = numbers(getattr(self, name))
+            if (
+                value is None
+                or value.shape != (3,)
+                or not ((value >= least) & (value <= MAX_COORDINATE)).all()
+            ):
+                raise InputError(
+                    f"payload.{name} is {shown(getattr(self, name))}; it must be 3 numbers from {least:g} to "
+                    f"{MAX_COORDINATE:g}"
+                )
+            object.__setattr__(self, name, value)
+        if self.link is not None and not isinstance(self.link, str):
+            raise InputError(f"payload.link is {shown(self.link)}; it must be the name of a link")
+        super().__post_init__()
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            mass: float,
+            com: ArrayLike = (0.0, 0.0, 0.0),
+            link: str | None = None,
+            moments: ArrayLike = (0.0, 0.0, 0.0),
+        ) -> None: ...

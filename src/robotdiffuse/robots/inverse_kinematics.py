@@ -10,7 +10,7 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import for_kernels, rigid_transform
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, IKChain, IKParameters, solve_seeds
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.kinematic_tree import KinematicTree
 
 KINDS = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "continuous": CONTINUOUS}
 
@@ -57,7 +57,7 @@ class InverseKinematicsSettings:
 
 
 def inverse_kinematics(
-    robot: Robot,
+    robot: KinematicTree,
     frame: str,
     T_base_frame: Float[ndarray, "4 4"],
     count: int = 10,
@@ -144,7 +144,7 @@ def inverse_kinematics(
     return accepted[np.argsort(np.linalg.norm(accepted - near, axis=1), kind="stable")]
 
 
-def ik_chain(robot: Robot, frame: str, limit_margin: float) -> tuple[Int[ndarray, "k"], IKChain]:
+def ik_chain(robot: KinematicTree, frame: str, limit_margin: float) -> tuple[Int[ndarray, "k"], IKChain]:
     """The joints that move a link, or come after it, and their arrays, within the limits less a margin."""
     arm = np.flatnonzero(~beside(robot, frame))
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])[arm]
@@ -155,7 +155,7 @@ def ik_chain(robot: Robot, frame: str, limit_margin: float) -> tuple[Int[ndarray
 
 
 def random_seeds(
-    robot: Robot,
+    robot: KinematicTree,
     lower: Float[ndarray, "dof"],
     upper: Float[ndarray, "dof"],
     count: int,
@@ -174,7 +174,7 @@ def random_seeds(
     return near + rng.uniform(0.0, 1.0, (count, 1)) * (anywhere - near)
 
 
-def beside(robot: Robot, link: str) -> Bool[ndarray, "dof"]:
+def beside(robot: KinematicTree, link: str) -> Bool[ndarray, "dof"]:
     """Which planned joints are neither before nor after a link: those of another arm."""
     frame = robot.link_frame(link)
     before = robot.moved_by[frame]
@@ -182,7 +182,7 @@ def beside(robot: Robot, link: str) -> Bool[ndarray, "dof"]:
     return ~(before | behind)
 
 
-def _longest_reach(robot: Robot, chain: list[int], tool: Float[ndarray, "4 4"]) -> float:
+def _longest_reach(robot: KinematicTree, chain: list[int], tool: Float[ndarray, "4 4"]) -> float:
     """Upper bound on the distance of the tool from the first joint's origin over all configurations [m]."""
     lengths = np.linalg.norm(robot.frame_offsets[chain[1:], :3, 3], axis=1).sum()
     lengths += np.linalg.norm(tool[:3, 3])

@@ -1,20 +1,92 @@
-"""KinematicTree: joints and links of a robot, and what follows from them: limits, frames, chains."""
+"""Joints and links of a robot, and what follows from them: limits, frames, chains."""
 
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, wraps
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.bounds import Value, read_only
-from robotdiffuse.core.errors import unknown_name
-from robotdiffuse.core.transforms import inverse, rotation_z_to, transform
-from robotdiffuse.robots.joints import MOVING_KINDS, Joint
-from robotdiffuse.robots.link_pair_tables import TURN
+from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.loading import loading
+from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
+
+MOVING_KINDS = ("revolute", "continuous", "prismatic")
+LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
+CONTINUOUS_LIMIT = 3 * np.pi
+"""Position limits of continuous joints in planning, plus and minus [rad]: a start lies within half a turn,
+and a goal at most one turn from the start. The joints themselves have no limits."""
+MIMIC_SLACK = 1e-6
+"""Largest difference between a value given for a mimic joint and the value that its leader implies."""
+
+
+class Mimic(NamedTuple):
+    """A mimic joint's rule: its value is multiplier * (value of `joint`) + offset."""
+
+    joint: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Joint(Value):
+    """A joint of the URDF tree. Fixed joints have no meaningful limits."""
+
+    name: str
+    kind: str
+    """revolute, continuous, prismatic or fixed."""
+    parent: str
+    child: str
+    T_parent_joint: Float[ndarray, "4 4"]
+    axis: Float[ndarray, "3"]
+    """Unit axis in the joint frame."""
+    lower: float = 0.0
+    """[rad] or [m]; -`CONTINUOUS_LIMIT` for a continuous joint."""
+    upper: float = 0.0
+    velocity: float = 0.0
+    """[rad/s] or [m/s]"""
+    acceleration: float = 0.0
+    jerk: float = 0.0
+    mimic: Mimic | None = None
+    """The joint that this one follows, if any; it is locked together with that one."""
+    effort: float = 0.0
+    """Largest torque [N m] or force [N]; 0 if the URDF gives none."""
+
+    def motion(self, q: float) -> Float[ndarray, "4 4"]:
+        """T_joint_child at the joint value q [rad] or [m]."""
+        if self.kind == "prismatic":
+            return transform(self.axis * q)
+        if self.kind == "fixed":
+            return np.eye(4)
+        return transform(np.zeros(3), rotation_about(self.axis, q))
+
+
+def with_mimics(joints: tuple[Joint, ...], locked: dict[str, float]) -> dict[str, float]:
+    """The values of locked joints, including the joints that mimic them, by name [rad] or [m]."""
+    by_name = {joint.name: joint for joint in joints}
+
+    def value(name: str) -> float | None:
+        mimic = by_name[name].mimic if name in by_name else None
+        leader = None if mimic is None else value(mimic.joint)
+        return (
+            locked.get(name) if mimic is None or leader is None else mimic.multiplier * leader + mimic.offset
+        )
+
+    values = {name: value(name) for name in (*locked, *(joint.name for joint in joints if joint.mimic))}
+    return {name: number for name, number in values.items() if number is not None}
+
 
 MAX_WRAPPED_STEP = 0.5
 """Largest distance of a step of a continuous joint from a whole turn at which its values count as wrapped
 [rad]."""
+
+
+T = TypeVar("T")
+R = TypeVar("R", bound="KinematicTree")
+TURN = 2 * np.pi
 
 
 class KinematicTree(Value):
@@ -27,6 +99,7 @@ class KinematicTree(Value):
     root: str
     above: dict[str, Float[ndarray, "4 4"]]
     other_tips: tuple[str, ...]
+    spheres: dict[str, Float[ndarray, "n 4"]]
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
@@ -258,3 +331,41 @@ class KinematicTree(Value):
         if link not in self._frames[0]:
             raise unknown_name("link", link, self.link_names)
         return self._frames[0][link]
+
+
+def once_per_robot(build: Callable[[R], T]) -> Callable[[R], T]:
+    """Decorator: cache a function of a robot on the robot itself, for the robot's lifetime. The first call
+    counts as loading."""
+    name = f"{build.__module__}.{build.__qualname__}"
+
+    @wraps(build)
+    def known(robot: R) -> T:
+        if name not in robot.__dict__:
+            with loading():
+                robot.__dict__[name] = build(robot)
+        return robot.__dict__[name]
+
+    return known
+
+
+class JointNormalizer:
+    """Maps lower limits to -1 and upper limits to 1, joint by joint; computed in float64."""
+
+    def __init__(self, lower: Float[ndarray, "dof"], upper: Float[ndarray, "dof"]) -> None:
+        """`lower` and `upper` are joint limits [rad], [m] for prismatic joints. Raises InputError for an
+        empty or infinite range."""
+        for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
+            if not (np.isfinite(low) and np.isfinite(high) and low < high):
+                raise InputError(
+                    f"limits of joint {i} are {low} and {high}; they must be finite, lower below upper"
+                )
+        self.middle = (upper + lower) / 2
+        self.half_range = (upper - lower) / 2
+
+    def to_unit(self, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch dof"]:
+        """Joint values [rad] or [m] mapped to [-1, 1], of the same dtype."""
+        return ((q - self.middle) / self.half_range).astype(q.dtype)
+
+    def from_unit(self, x: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch dof"]:
+        """Joint values [rad] or [m] from values in [-1, 1], of the same dtype."""
+        return (x * self.half_range + self.middle).astype(x.dtype)

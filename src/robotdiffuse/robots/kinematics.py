@@ -4,15 +4,20 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.robots.kinematic_tree import KinematicTree, once_per_robot
+
+REACH_SAMPLES = 4096
+"""Random configurations for measuring the reach."""
+REACH_QUANTILE = 0.99
+"""Quantile of the distances of the tip, since the largest ones are rare and random."""
 
 
-def link_pose(robot: Robot, q: Float[ndarray, "dof"], link: str) -> Float[ndarray, "4 4"]:
+def link_pose(robot: KinematicTree, q: Float[ndarray, "dof"], link: str) -> Float[ndarray, "4 4"]:
     """T_base_link at one configuration; raises InputError for an unknown link."""
     return link_poses(robot, np.asarray(q)[None], link)[0]
 
 
-def _motions(robot: Robot, j: int, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 4 4"]:
+def _motions(robot: KinematicTree, j: int, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 4 4"]:
     """The motion of planned joint j about or along its z axis, at each configuration."""
     motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
     if robot.prismatic[j]:
@@ -24,7 +29,7 @@ def _motions(robot: Robot, j: int, q: Float[ndarray, "n dof"]) -> Float[ndarray,
     return motion
 
 
-def link_poses(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 4 4"]:
+def link_poses(robot: KinematicTree, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 4 4"]:
     """T_base_link at a batch of configurations; raises InputError for an unknown link."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for j in robot.chain(link):
@@ -32,7 +37,7 @@ def link_poses(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[nda
     return T @ robot.T_frame_link(link)
 
 
-def link_jacobians(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 6 dof"]:
+def link_jacobians(robot: KinematicTree, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 6 dof"]:
     """Geometric Jacobians of a link at a batch of configurations; raises InputError for an unknown link.
 
     Rows are linear, then angular, in the axes of the base frame; the linear ones are of the link's origin.
@@ -51,13 +56,13 @@ def link_jacobians(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float
     return J
 
 
-def link_origins(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 3"]:
+def link_origins(robot: KinematicTree, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 3"]:
     """Positions of a link's origin in the base frame [m]; raises InputError for an unknown link."""
     return link_poses(robot, q, link)[:, :3, 3]
 
 
 @once_per_robot
-def _spheres_by_frame(robot: Robot) -> list[Float[ndarray, "n 4"]]:
+def _spheres_by_frame(robot: KinematicTree) -> list[Float[ndarray, "n 4"]]:
     """Collision spheres [x y z radius, m] by frame, in the coordinates of that frame."""
     parts: list[list[ndarray]] = [[np.zeros((0, 4))] for _ in range(robot.dof + 1)]
     for link, spheres in robot.spheres.items():
@@ -67,7 +72,7 @@ def _spheres_by_frame(robot: Robot) -> list[Float[ndarray, "n 4"]]:
     return [np.concatenate(part) for part in parts]
 
 
-def placed_spheres(robot: Robot, q: Float[ndarray, "dof"]) -> Float[ndarray, "n 4"]:
+def placed_spheres(robot: KinematicTree, q: Float[ndarray, "dof"]) -> Float[ndarray, "n 4"]:
     """All collision spheres at one configuration, x y z radius in the base frame [m]."""
     parts = []
     frames = [np.eye(4)]
@@ -76,3 +81,22 @@ def placed_spheres(robot: Robot, q: Float[ndarray, "dof"]) -> Float[ndarray, "n 
     for T, spheres in zip(frames, _spheres_by_frame(robot), strict=True):
         parts.append(np.column_stack([spheres[:, :3] @ T[:3, :3].T + T[:3, 3], spheres[:, 3]]))
     return np.concatenate(parts)
+
+
+@once_per_robot
+def reach(robot: KinematicTree) -> float:
+    """Distance between tip and shoulder that 99 % of the configurations do not exceed [m].
+
+    The shoulder is the point on the first joint's axis at the height of the second joint. With several arms,
+    the reach of the longest one.
+    """
+    q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (REACH_SAMPLES, robot.dof))
+    reached = []
+    for tip in robot.tips:
+        first = list(robot.chain(tip)[:2])
+        if not first:  # all joints of this arm are locked
+            continue
+        offsets = robot.frame_offsets[first]
+        shoulder = np.array([*offsets[0, :2, 3], (offsets[0] @ offsets[-1])[2, 3]])
+        reached.append(np.linalg.norm(link_origins(robot, q, tip) - shoulder, axis=1))
+    return float(np.quantile(reached, REACH_QUANTILE, axis=1).max())

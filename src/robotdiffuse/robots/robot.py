@@ -1,31 +1,111 @@
 """Robot: one or several arms as plain data, used by kinematics and collision checking alike."""
 
-from collections.abc import Callable, Sequence
+import hashlib
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache, reduce, wraps
+from functools import lru_cache, reduce
 from numbers import Real
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, cast
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import MAX_COORDINATE
+from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, within
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.loading import loading
-from robotdiffuse.robots.bodies import TOOL, AttachedBody, BodyContent, ConvexMesh, RigidShape, Surface
-from robotdiffuse.robots.inertias import Inertia
-from robotdiffuse.robots.joints import MIMIC_SLACK, MOVING_KINDS, Joint, with_mimics
-from robotdiffuse.robots.kinematic_tree import KinematicTree
-from robotdiffuse.robots.link_pair_tables import LinkPairTable
+from robotdiffuse.robots.bodies import (
+    TOOL,
+    AttachedBody,
+    BodyContent,
+    ConvexMesh,
+    Inertia,
+    RigidShape,
+    Surface,
+)
+from robotdiffuse.robots.kinematic_tree import (
+    LIMITS,
+    MIMIC_SLACK,
+    MOVING_KINDS,
+    TURN,
+    Joint,
+    KinematicTree,
+    with_mimics,
+)
+from robotdiffuse.robots.kinematics import link_jacobians, link_poses
+
+ROUNDING = 1e-5
+"""Upper bound on the rounding error of a joint value [rad] or [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkPairTable(Value):
+    """Where the convex parts of two links are apart, as a function of the one or two joints between them."""
+
+    links: tuple[str, str]
+    joints: tuple[str, ...]
+    """Joints between the links, from the base on."""
+    lower: tuple[float, ...]
+    """Joint values at which the table begins [rad] or [m]."""
+    upper: tuple[float, ...]
+    """Joint values at which it ends. A range of one whole turn repeats itself."""
+    apart: Bool[ndarray, "*cells"]
+    """Whether the links are apart throughout a cell."""
+
+    def at(self, *values: Float[ndarray, "n"]) -> Bool[ndarray, "n"]:
+        """Whether the links are known to be apart at joint values, one array per joint."""
+        known = np.ones(len(values[0]), dtype=bool)
+        index = []
+        for axis, value in enumerate(values):
+            cell = np.floor((value - self.lower[axis]) / self._edge(axis)).astype(int)
+            count = self.apart.shape[axis]
+            if not self._whole(axis):
+                known &= (cell >= 0) & (cell < count)
+            index.append(cell % count)
+        return known & self.apart[tuple(index)]
+
+    def throughout(
+        self, *intervals: tuple[Float[ndarray, "n"], Float[ndarray, "n"]]
+    ) -> Bool[ndarray, "*intervals"]:
+        """Whether the links are known to be apart throughout intervals [low, high] of the joints between
+        them.
+
+        With two joints, the result holds every combination of an interval of the first and one of the second.
+        """
+        touch = ~self.apart
+        for axis, (low, high) in enumerate(intervals):
+            touch = np.moveaxis(np.tensordot(self._reached(axis, low, high), touch, (1, axis)), 0, axis)
+            if not self._whole(axis):
+                beyond = (low < self.lower[axis] - ROUNDING) | (high > self.upper[axis] + ROUNDING)
+                touch |= np.expand_dims(beyond, tuple(i for i in range(len(intervals)) if i != axis))
+        return ~touch.astype(bool)
+
+    def _edge(self, axis: int) -> float:
+        return (self.upper[axis] - self.lower[axis]) / self.apart.shape[axis]
+
+    def _whole(self, axis: int) -> bool:
+        return abs(self.upper[axis] - self.lower[axis] - TURN) < ROUNDING
+
+    def _reached(
+        self, axis: int, low: Float[ndarray, "n"], high: Float[ndarray, "n"]
+    ) -> Bool[ndarray, "n cells"]:
+        """Which cells along a joint each interval overlaps."""
+        count = self.apart.shape[axis]
+        first = np.floor((low - ROUNDING - self.lower[axis]) / self._edge(axis)).astype(int)
+        last = np.floor((high + ROUNDING - self.lower[axis]) / self._edge(axis)).astype(int)
+        steps = np.arange((last - first).max(initial=0) + 1)
+        cell = np.minimum(first[:, None] + steps, last[:, None])
+        cell = cell % count if self._whole(axis) else np.clip(cell, 0, count - 1)
+        found = np.zeros((len(low), count), dtype=bool)
+        np.put_along_axis(found, cell, True, axis=1)
+        return found
+
 
 LOCKED_CACHE = 256
 """Number of robots with locked joints in the cache, least recently used out first: about 0.1 MB each."""
 ATTACHED_CACHE = 64
 """Number of robots with attached bodies in the cache."""
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,21 +161,84 @@ class Robot(KinematicTree):
     """Pairs of links whose `meshes` can overlap where their `surfaces` are apart; see
     `collision.surface_pairs`."""
 
-    if TYPE_CHECKING:  # assigned by the package: kinematics imports robots, not the reverse
+    def fk(self, q: ArrayLike, link: str | None = None) -> ndarray:
+        """Forward kinematics: the pose of a link in the frame of the base.
 
-        def fk(self, q: ArrayLike, link: str | None = None) -> ndarray: ...
+        Args:
+            q: A configuration [dof], or several [n, dof], of the planned joints [rad] or [m].
+            link: Name of the link; None: the tip of the robot.
 
-        def jacobian(self, q: ArrayLike, link: str | None = None) -> ndarray: ...
+        Returns:
+            T_base_link [4, 4], or [n, 4, 4].
 
-        def ik(
-            self,
-            pose: ArrayLike,
-            link: str | None = None,
-            *,
-            count: int = 10,
-            near: ArrayLike | None = None,
-            seed: int = 0,
-        ) -> ndarray: ...
+        Raises:
+            InputError: For an unknown link, or q of the wrong shape.
+
+        Examples:
+            >>> rd.load_robot("panda").fk([0, -0.785, 0, -2.356, 0, 1.571, 0.785])[:3, 3].round(2).tolist()
+            [0.31, 0.0, 0.59]
+        """
+        rows = configurations(self, q)
+        T = link_poses(self, np.atleast_2d(rows), self.tip if link is None else link)
+        return T[0] if rows.ndim == 1 else T
+
+    def jacobian(self, q: ArrayLike, link: str | None = None) -> ndarray:
+        """Geometric Jacobian of a link.
+
+        Its linear, then its angular velocity, for each unit of a joint's velocity. Both are in the axes of
+        the base; the linear velocity is that of the link's origin.
+
+        Args:
+            q: A configuration [dof], or several [n, dof], of the planned joints [rad] or [m].
+            link: Name of the link; None: the tip of the robot.
+
+        Returns:
+            A matrix [6, dof], or [n, 6, dof].
+
+        Raises:
+            InputError: For an unknown link, or q of the wrong shape.
+        """
+        rows = configurations(self, q)
+        J = link_jacobians(self, np.atleast_2d(rows), self.tip if link is None else link)
+        return J[0] if rows.ndim == 1 else J
+
+    def ik(
+        self,
+        pose: ArrayLike,
+        link: str | None = None,
+        *,
+        count: int = 10,
+        near: ArrayLike | None = None,
+        seed: int = 0,
+    ) -> ndarray:
+        """Inverse kinematics: configurations within the joint limits that bring a link to a pose.
+
+        They may collide: see `Problem.is_free`.
+
+        Args:
+            pose: T_base_link [4, 4].
+            link: Name of the link; None: the tip of the robot.
+            count: Largest number of configurations.
+            near: A configuration [dof]; results are sorted by their distance from it.
+            seed: Seed of the random starts.
+
+        Returns:
+            Distinct configurations [k, dof]; no rows if the pose was not reached.
+
+        Raises:
+            InputError: For an unknown link, and for a pose that is not rigid.
+
+        Examples:
+            >>> robot = rd.load_robot("panda")
+            >>> robot.ik(rd.pose([0.5, 0.1, 0.4], rpy=[3.1416, 0, 0]), count=3).shape
+            (3, 7)
+        """
+        from robotdiffuse.robots.inverse_kinematics import inverse_kinematics  # compiled code
+
+        rng = np.random.default_rng(seed)
+        frame = self.tip if link is None else link
+        seeded = None if near is None else configurations(self, near)
+        return inverse_kinematics(self, frame, cast(ndarray, pose), count, rng=rng, near=seeded)
 
     def checked_pairs(self) -> tuple[tuple[str, str], ...]:
         """Pairs of links that are checked against each other: with geometry, on different frames, not
@@ -317,7 +460,9 @@ def _variant(robot: Robot, locked: tuple[tuple[str, float], ...]) -> Robot:
 
 @lru_cache(maxsize=ATTACHED_CACHE)
 def _with_body(robot: Robot, content: BodyContent) -> Robot:
-    from robotdiffuse.robots.attached_bodies import body_geometry  # compiled code; few robots need it
+    from robotdiffuse.robots.fitting.covering_spheres import (
+        body_geometry,  # compiled code; few robots need it
+    )
 
     body = content.body
     axis = np.array([0.0, 0.0, 1.0])
@@ -340,16 +485,96 @@ def _with_body(robot: Robot, content: BodyContent) -> Robot:
     )
 
 
-def once_per_robot(build: Callable[[Robot], T]) -> Callable[[Robot], T]:
-    """Decorator: cache a function of a robot on the robot itself, for the robot's lifetime. The first call
-    counts as loading."""
-    name = f"{build.__module__}.{build.__qualname__}"
+def scaled(robot: Robot, scale: float) -> Robot:
+    """The arm without attached bodies, scaled by a factor with its spheres and meshes; angular limits
+    stay."""
+    arm = robot.arm
+    prismatic = {joint.name for joint in arm.joints if joint.kind == "prismatic"}
 
-    @wraps(build)
-    def known(robot: Robot) -> T:
-        if name not in robot.__dict__:
-            with loading():
-                robot.__dict__[name] = build(robot)
-        return robot.__dict__[name]
+    def sized(joint: Joint) -> Joint:
+        by = scale if joint.name in prismatic else 1.0
+        limits = {name: by * getattr(joint, name) for name in ("lower", "upper")}
+        return replace(joint, T_parent_joint=_moved(joint.T_parent_joint, scale), **limits)
 
-    return known
+    return replace(
+        arm,
+        joints=tuple(map(sized, arm.joints)),
+        spheres={link: scale * rows for link, rows in arm.spheres.items()},
+        meshes={
+            link: tuple(replace(mesh, vertices=scale * mesh.vertices) for mesh in meshes)
+            for link, meshes in arm.meshes.items()
+        },
+        locked={name: (scale if name in prismatic else 1.0) * value for name, value in arm.locked.items()},
+        above={link: _moved(T, scale) for link, T in arm.above.items()},
+    )
+
+
+def _moved(T: Float[ndarray, "4 4"], scale: float) -> Float[ndarray, "4 4"]:
+    found = T.copy()
+    found[:3, 3] *= scale
+    return found
+
+
+def configurations(robot: Robot, q: ArrayLike) -> ndarray:
+    """A configuration [dof], or several [n, dof]. Raises InputError for anything else."""
+    rows = numbers(q)
+    if rows is None or rows.ndim not in (1, 2) or rows.shape[-1] != robot.dof or not within(rows):
+        names = ", ".join(robot.joint_names)
+        raise InputError(f"q is {shown(q)}; it must be {robot.dof} numbers, or rows of them: {names}")
+    return rows
+
+
+def named_pose(robot: Robot, field: str, name: str) -> list[float]:
+    """The planned joints' values in a named pose of the robot [rad] or [m].
+
+    Raises InputError, naming the field, for an unknown name (the message lists those that hold all planned
+    joints) and for a pose that lacks some.
+    """
+    whole = [pose for pose, values in robot.poses.items() if {*robot.joint_names} <= values.keys()]
+    if not whole:
+        values = f"a list of {robot.dof} numbers: {', '.join(robot.joint_names)}"
+        raise InputError(f"{field} is {shown(name)}; it must be {values} ({robot.name} has no named poses)")
+    if name not in robot.poses:
+        raise unknown_name(f"pose in {field}:", name, whole)
+    values = robot.poses[name]
+    missing = [joint for joint in robot.joint_names if joint not in values]
+    if missing:
+        raise InputError(
+            f"{field}: the pose {name!r} has no {', '.join(missing)}; whole poses: {', '.join(whole)}"
+        )
+    return [values[joint] for joint in robot.joint_names]
+
+
+DIGITS = 9
+"""Numbers are rounded to this many decimals, since rotations from quaternions differ by machine in the last
+bits."""
+
+
+def robot_fingerprint(robot: Robot) -> str:
+    """The first 16 hexadecimal digits of a SHA-256, the same in every process.
+
+    It covers joints, limits, spheres, meshes, locked joints and allowed collisions, but not the robot's name.
+    """
+    digest = hashlib.sha256()
+
+    def add(names: object, *numbers: object) -> None:
+        digest.update(json.dumps(names).encode())
+        for values in numbers:
+            rounded = np.round(np.asarray(values, np.float64), DIGITS) + 0.0  # no negative zeros
+            digest.update(str(rounded.shape).encode() + rounded.tobytes())
+
+    add([robot.base, *robot.tips])
+    for joint in robot.joints:
+        limits = [getattr(joint, name) for name in LIMITS]
+        add([joint.name, joint.kind, joint.parent, joint.child], joint.T_parent_joint, joint.axis, limits)
+        if joint.mimic is not None:
+            add(joint.mimic.joint, joint.mimic[1:])
+    for link in sorted(robot.spheres):
+        add(link, robot.spheres[link])
+    for link in sorted(robot.meshes):
+        for mesh in robot.meshes[link]:
+            add(link, mesh.vertices, mesh.faces)
+    for name in sorted(robot.locked):
+        add(name, robot.locked[name])
+    add(sorted(sorted(pair) for pair in robot.allowed_collisions))
+    return digest.hexdigest()[:16]

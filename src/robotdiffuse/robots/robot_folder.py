@@ -1,8 +1,15 @@
-"""Reads and writes robot folders: robot.json (human-readable), meshes.npz (convex collision meshes) and, if
-links graze each other, surfaces.npz."""
+"""Reads and writes robot folders: robot.json (human-readable), meshes.npz (convex collision meshes) and,
+if links graze each other, surfaces.npz.
 
+surfaces.npz holds the surfaces of grazing links (`Robot.grazing`). It is optional and no part of a robot's
+identity: data, weights and proofs that were made without it stay valid, because surfaces only free
+configurations in which convex parts overlap.
+"""
+
+import hashlib
 import io
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +23,81 @@ from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import is_file, read_arrays, read_json
 from robotdiffuse.core.output_files import write_atomically, write_error
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
-from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.inertias import inertia_of
-from robotdiffuse.robots.joints import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic
-from robotdiffuse.robots.link_pair_tables import LinkPairTable
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.surface_files import SURFACE_FILE, pack_surfaces, read_surfaces
+from robotdiffuse.robots.bodies import ConvexMesh, Surface, inertia_of
+from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, LIMITS, MOVING_KINDS, Joint, Mimic
+from robotdiffuse.robots.robot import LinkPairTable, Robot
+
+
+def user_robots() -> Path:
+    """The folder of added robots: $ROBOTDIFFUSE_ROBOTS, or robotdiffuse/robots in the user's data
+    directory."""
+    chosen = os.environ.get("ROBOTDIFFUSE_ROBOTS")
+    if chosen:
+        return Path(chosen)
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(data) / "robotdiffuse" / "robots"
+
+
+SURFACE_FILE = "surfaces.npz"
+Surfaces = dict[str, Surface]
+Grazing = frozenset[frozenset[str]]
+Meshes = dict[str, tuple[ConvexMesh, ...]]
+
+
+def pack_surfaces(surfaces: Surfaces, grazing: Grazing, meshes: Meshes) -> bytes:
+    """The content of surfaces.npz. Coordinates are rounded to float32, by 6e-8 of their size at most."""
+    content = io.BytesIO()
+    arrays = {
+        "links": np.array(list(surfaces), np.str_),
+        "sizes": np.array([(len(s.vertices), len(s.faces)) for s in surfaces.values()], np.int64),
+        "vertices": np.concatenate([s.vertices for s in surfaces.values()]).astype(np.float32),
+        "faces": np.concatenate([s.faces for s in surfaces.values()]).astype(np.int32),
+        "grazing": np.array(sorted(sorted(pair) for pair in grazing), np.str_),
+        "of": np.array(_digest(meshes)),
+    }
+    np.savez_compressed(content, allow_pickle=False, **arrays)
+    return content.getvalue()
+
+
+def read_surfaces(file: Path, meshes: Meshes) -> tuple[Surfaces, Grazing]:
+    """The surfaces and grazing pairs of a file; InputError if it is damaged or made for other `meshes`."""
+    arrays = read_arrays(file)
+    try:
+        links, sizes, vertices, faces, grazing, of = (
+            arrays[key] for key in ("links", "sizes", "vertices", "faces", "grazing", "of")
+        )
+        ends = np.cumsum(sizes, axis=0)
+        if (ends[-1] != (len(vertices), len(faces))).any() or vertices.shape[1:] != (3,):
+            raise ValueError("sizes do not add up")
+        if str(of) != _digest(meshes):
+            raise ValueError("it belongs to other convex meshes; create the robot again")
+        surfaces = {
+            str(link): _surface(vertices[end[0] - size[0] : end[0]], faces[end[1] - size[1] : end[1]])
+            for link, size, end in zip(links, sizes, ends, strict=True)
+        }
+        pairs = frozenset(frozenset(map(str, pair)) for pair in grazing)
+        if {link for pair in pairs for link in pair} != {*surfaces} or not {*surfaces} <= {*meshes}:
+            raise ValueError("grazing pairs and surfaces must name the same links of the robot")
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        raise InputError(f"{file} is damaged: {type(error).__name__}: {shortened(str(error))}") from None
+    return surfaces, pairs
+
+
+def _surface(vertices: ndarray, faces: ndarray) -> Surface:
+    vertices = vertices.astype(np.float64)
+    faces = faces.astype(np.int64)
+    if faces.shape[1:] != (3,) or not ((faces >= 0) & (faces < len(vertices))).all() or not within(vertices):
+        raise ValueError("triangles of finite vertices expected")
+    return Surface(vertices, faces)
+
+
+def _digest(meshes: Meshes) -> str:
+    digest = hashlib.sha256()
+    for link in sorted(meshes):
+        for mesh in meshes[link]:
+            digest.update(link.encode() + np.ascontiguousarray(mesh.vertices, np.float64).tobytes())
+    return digest.hexdigest()
+
 
 FORMAT = 2
 """Version of the format."""
@@ -29,7 +105,6 @@ AXIS_LENGTH_TOLERANCE = 1e-3
 """Largest difference between the length of a joint axis and 1."""
 ROBOT_FILE = "robot.json"
 MESH_FILE = "meshes.npz"
-LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
 def write_robot_folder(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:

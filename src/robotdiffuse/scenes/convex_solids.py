@@ -7,8 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fitting.convex_hulls import convex_hull
-from robotdiffuse.robots.fitting.convex_parts import Surface, convex_parts
+from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull, convex_parts
 
 PRISM_SIDES = 32
 """Sides of the prism around a cylinder, which is 0.5 % wider than the cylinder."""

@@ -12,11 +12,19 @@ from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import read_arrays
 from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
-from robotdiffuse.scenes.height_map import HeightMap
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.point_cloud import default_radius, read_points
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import (
+    IDENTITY,
+    Box,
+    Capsule,
+    Cylinder,
+    HeightMap,
+    Mesh,
+    PointCloud,
+    Shape,
+    Sphere,
+)
 
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Box, Cylinder, Capsule, Mesh, PointCloud, HeightMap)

@@ -9,8 +9,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, transform
 from robotdiffuse.robots.parsing.mjcf import ellipsoid, imported_mujoco, kind_of, mesh_of, robot_bodies
-from robotdiffuse.scenes.mesh import Mesh
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
 PLANE_SIZE = 10.0
 """Edge of the box that stands for an infinite plane [m]."""

@@ -12,13 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, no_type_check
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import (
+    MAX_COORDINATE,
     MIN_SIZE,
     Value,
+    form,
+    numbers,
     points,
     positive,
     read_only,
@@ -26,6 +29,7 @@ from robotdiffuse.core.bounds import (
     vector,
 )
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.mesh_files import read_triangles
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.point_cloud import POINT_RADIUS, default_radius, distinct, read_points, voxel_thin
@@ -404,3 +408,213 @@ class PointCloud(Shape):
             T: The rigid motion, a homogeneous transform [4, 4].
         """
         return replace(self, points=self.points @ T[:3, :3].T + T[:3, 3], file=None)
+
+
+class Triangulated(Shape):
+    """A shape whose triangles are used for planning, validation, sampling and drawing."""
+
+    @property
+    @abstractmethod
+    def mesh(self) -> "Mesh":
+        """Triangles around the shape, in the base frame."""
+
+    @property
+    def area(self) -> float:
+        return self.mesh.area
+
+    @property
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        return self.mesh.bounds
+
+
+class PosedTriangles(Triangulated):
+    """Triangles in a frame of their own, which `xyz` and `wxyz` place in the base frame."""
+
+    xyz: Float[ndarray, "3"]
+    wxyz: Float[ndarray, "4"]
+
+    @property
+    def T_base_shape(self) -> Float[ndarray, "4 4"]:
+        return transform(self.xyz, rotation_from_quaternion(self.wxyz))
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+        T = T @ self.T_base_shape
+        return replace(self, xyz=T[:3, 3], wxyz=quaternion_from_rotation(T[:3, :3]))  # type: ignore[type-var]
+
+
+@no_type_check
+@dataclass(frozen=True, eq=False)
+class Mesh(PosedTriangles):
+    """A triangle mesh. Only its surface counts for collision. `Mesh.from_file` reads one.
+
+    vertices: n x 3, in the mesh's own frame [m].
+    faces: n x 3 indices of vertices, from 0.
+    xyz, wxyz: pose of the mesh's frame in the frame of the robot's base.
+    name: as of Box.
+    """
+
+    vertices: Float[ndarray, "v 3"]
+    """In the mesh's own frame [m]."""
+    faces: Int[ndarray, "f 3"]
+    xyz: Float[ndarray, "3"] = field(default=(0.0, 0.0, 0.0))  # type: ignore[assignment]
+    wxyz: Float[ndarray, "4"] = field(default=IDENTITY)  # type: ignore[assignment]
+    file: str | None = None
+    """The file that it was read from, for writing it back."""
+    name: str = "mesh"
+    kind: ClassVar[str] = "mesh"
+
+    def __post_init__(self) -> None:
+        vertices = points("mesh", "vertices", self.vertices)
+        faces = numbers(self.faces)
+        if faces is None or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+            raise InputError(f"mesh.faces is {form(faces)}; it must be n x 3 indices, at least one row")
+        if not (faces == np.floor(faces)).all() or faces.min() < 0 or faces.max() >= len(vertices):
+            raise InputError(
+                f"mesh.faces holds values from {faces.min():g} to {faces.max():g}; "
+                f"they must be indices of the {len(vertices)} vertices"
+            )
+        set_fields(
+            self,
+            vertices=vertices,
+            faces=faces.astype(np.int64),
+            xyz=vector("mesh", "xyz", self.xyz, 3),
+            wxyz=unit_quaternion("mesh", self.wxyz),
+        )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            vertices: ArrayLike,
+            faces: ArrayLike,
+            xyz: ArrayLike = (0.0, 0.0, 0.0),
+            wxyz: ArrayLike = IDENTITY,
+            file: str | None = None,
+            name: str = "mesh",
+        ) -> None: ...
+
+    @classmethod
+    def from_file(
+        cls,
+        file: str | Path,
+        xyz: ArrayLike = (0.0, 0.0, 0.0),
+        wxyz: ArrayLike = IDENTITY,
+        scale: float = 1.0,
+        name: str = "mesh",
+    ) -> "Mesh":
+        """The mesh of a file that trimesh reads (.stl, .obj, .ply, .dae, .glb, ...).
+
+        Args:
+            file: The file.
+            xyz: Position of the file's frame in the frame of the base [m].
+            wxyz: Its orientation, a quaternion.
+            scale: Meters for each unit of the file: 0.001 for millimeters.
+            name: Name of the obstacle, for messages and allowed contacts.
+
+        Raises:
+            InputError: For a file that cannot be read, or a scale that is not positive.
+        """
+        vertices, faces = read_triangles(file)
+        scale = positive("mesh", "scale", scale)
+        if scale == 1:
+            return cls(vertices, faces, xyz, wxyz, str(Path(file).absolute()), name)
+        return cls(scale * vertices, faces, xyz, wxyz, name=name)  # files of problems have no scale
+
+    @property
+    def mesh(self) -> "Mesh":
+        return self
+
+    @cached_property
+    def world_vertices(self) -> Float[ndarray, "v 3"]:
+        return read_only(self.vertices @ rotation_from_quaternion(self.wxyz).T + self.xyz)
+
+    @cached_property
+    def face_areas(self) -> Float[ndarray, "f"]:
+        a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
+        return read_only(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+
+    @property
+    def area(self) -> float:
+        return float(self.face_areas.sum())
+
+    @property
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        return np.stack([self.world_vertices.min(axis=0), self.world_vertices.max(axis=0)])
+
+    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
+        from robotdiffuse.scenes.convex_solids import mesh_parts
+
+        return mesh_parts(self.vertices.tobytes(), self.faces.tobytes())
+
+
+@no_type_check
+@dataclass(frozen=True, eq=False)
+class HeightMap(PosedTriangles):
+    """Terrain: heights at the points of a grid, joined by triangles. Only this surface counts for collision.
+
+    heights: rows along y, columns along x, above `xyz` along z [m]; cells with a height that is not a number
+        are holes.
+    cell: distance between neighbouring points [m].
+    xyz, wxyz: pose of the first height's point at height 0 in the frame of the robot's base.
+    name: as of Box.
+    """
+
+    heights: Float[ndarray, "rows columns"]
+    cell: float
+    xyz: Float[ndarray, "3"] = field(default=(0.0, 0.0, 0.0))  # type: ignore[assignment]
+    wxyz: Float[ndarray, "4"] = field(default=IDENTITY)  # type: ignore[assignment]
+    file: str | None = None
+    """The file that it was read from, for writing it back."""
+    name: str = "height_map"
+    kind: ClassVar[str] = "height_map"
+
+    def __post_init__(self) -> None:
+        heights = numbers(self.heights)
+        if heights is None or heights.ndim != 2 or min(heights.shape) < 2:
+            raise InputError(
+                f"height_map.heights is {form(heights)}; it must be rows x columns, at least 2 x 2"
+            )
+        known = np.abs(heights[~np.isnan(heights)])
+        if not (known <= MAX_COORDINATE).all():
+            raise InputError(f"height_map.heights has numbers that are not within ±{MAX_COORDINATE:g} m")
+        set_fields(
+            self,
+            heights=heights,
+            cell=positive("height_map", "cell", self.cell),
+            xyz=vector("height_map", "xyz", self.xyz, 3),
+            wxyz=unit_quaternion("height_map", self.wxyz),
+        )
+        if not len(self._faces):
+            raise InputError("height_map.heights has no cell of four heights")
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            heights: ArrayLike,
+            cell: float,
+            xyz: ArrayLike = (0.0, 0.0, 0.0),
+            wxyz: ArrayLike = IDENTITY,
+            file: str | None = None,
+            name: str = "height_map",
+        ) -> None: ...
+
+    @property
+    def _faces(self) -> ndarray:
+        rows, columns = self.heights.shape
+        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+        whole = ~np.isnan(self.heights)
+        whole = (whole[:-1, :-1] & whole[1:, :-1] & whole[:-1, 1:] & whole[1:, 1:]).ravel()
+        a = corner[whole]
+        b = a + 1
+        c = a + columns
+        d = a + columns + 1
+        return np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        rows, columns = self.heights.shape
+        y, x = np.meshgrid(np.arange(rows) * self.cell, np.arange(columns) * self.cell, indexing="ij")
+        vertices = np.stack([x, y, np.nan_to_num(self.heights)], axis=-1).reshape(-1, 3)
+        used, faces = np.unique(self._faces, return_inverse=True)
+        return Mesh(vertices[used], faces.reshape(-1, 3), self.xyz, self.wxyz, name=self.name)

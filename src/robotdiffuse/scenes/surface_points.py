@@ -13,9 +13,8 @@ from numpy.random import Generator
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Positive, Settings
-from robotdiffuse.scenes.mesh import Mesh, Triangulated
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, Triangulated
 
 MAX_SAMPLING_ROUNDS = 6
 """Rounds of sampling in `sample_surface` before it repeats points."""

@@ -18,12 +18,12 @@ from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, rpy_from_rotation
 from robotdiffuse.drawables import Drawable, Surface, drawables, link_surfaces
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
-from robotdiffuse.scenes.mesh import Mesh, Triangulated
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.point_cloud import voxel_thin
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere, Triangulated
 
 COLLISION_MARGIN = 0.001
 """Margin that Bullet adds around each convex mesh [m]; Bullet's call to change it has no effect."""

@@ -13,8 +13,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.types import Configurations, JointRows, Trajectory, Values
-from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.robots.torque_bounds import Stretches
+from robotdiffuse.robots.dynamics import Dynamics, Stretches
 from robotdiffuse.trajectories.cubics import Cubics
 
 RESOLUTION = 1e-3

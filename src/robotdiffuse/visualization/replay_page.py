@@ -19,10 +19,9 @@ from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, drawables, thinned
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.mesh import Triangulated
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import PointCloud
+from robotdiffuse.scenes.shapes import PointCloud, Triangulated
 from robotdiffuse.visualization.arm import DrawnArm, facts, interpolated, timed
 from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
 

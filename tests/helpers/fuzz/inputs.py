@@ -167,9 +167,8 @@ def _mesh(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     import trimesh
 
-    from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
     from robotdiffuse.robots.parsing.srdf import read_srdf
-    from robotdiffuse.robots.parsing.urdf import UrdfTree
+    from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
 
     part = bytes(trimesh.creation.box((0.1, 0.05, 0.3)).export(file_type="stl"))  # type: ignore[arg-type]
     (folder / "part.stl").write_bytes(damaged(rng, part) if rng.random() < 0.2 else part)

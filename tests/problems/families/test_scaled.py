@@ -9,8 +9,8 @@ from robotdiffuse.problems.families.family import POSE
 from robotdiffuse.problems.families.scaled import ScaledFamily, family_for, scale_for
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.scaling import reach, scaled
+from robotdiffuse.robots.kinematics import link_pose, reach
+from robotdiffuse.robots.robot import scaled
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 

@@ -23,10 +23,10 @@ from robotdiffuse.problems.files import (
 )
 from robotdiffuse.problems.problem import AnyGoal, JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.scenes.mesh import Mesh
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 
 Z = np.array([0.0, 0.0, 1.0])
 READY = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]

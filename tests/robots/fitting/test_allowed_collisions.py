@@ -10,16 +10,17 @@ from helpers.box_arm import box_arm, box_mesh
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.fitting.add import AddReport
-from robotdiffuse.robots.fitting.allowed_collisions import (
+from robotdiffuse.robots.fitting.preparation import AddReport
+from robotdiffuse.robots.fitting.sampled_links import Links
+from robotdiffuse.robots.fitting.self_collisions import (
+    FalseCollisions,
     PairReport,
     SamplingSettings,
     allowed_pairs,
     find_allowed_collisions,
 )
-from robotdiffuse.robots.fitting.false_collisions import FalseCollisions
-from robotdiffuse.robots.fitting.sampled_links import Links
-from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import ConvexMesh, Robot
 
 QUICK = SamplingSettings(samples=1500)
 

@@ -12,14 +12,13 @@ from helpers.quick_preparation import coarse_grids
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.transforms import transform
-from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.fitting.convex_pair_tables import joint_table
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface
 from robotdiffuse.robots.fitting.preparation import PreparationSettings, Prepared, prepare
-from robotdiffuse.robots.fitting.sampled_links import Links
+from robotdiffuse.robots.fitting.sampled_links import Links, joint_table
+from robotdiffuse.robots.fitting.self_collisions import SamplingSettings
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings
-from robotdiffuse.robots.link_pair_tables import LinkPairTable
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import LinkPairTable, Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, write_robot_folder
 from robotdiffuse.scenes.scene import Scene
 

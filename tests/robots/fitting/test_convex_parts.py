@@ -8,9 +8,16 @@ import trimesh
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fitting.convex_hulls import convex_hull, planes_of
-from robotdiffuse.robots.fitting.convex_parts import Part, PartSettings, Surface, convex_parts, simplified
-from robotdiffuse.robots.fitting.distance_grid import DistanceGrid
+from robotdiffuse.robots.fitting.convex_parts import (
+    DistanceGrid,
+    Part,
+    PartSettings,
+    Surface,
+    convex_hull,
+    convex_parts,
+    planes_of,
+    simplified,
+)
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:

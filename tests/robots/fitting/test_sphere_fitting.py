@@ -7,11 +7,19 @@ import trimesh
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.fitting.convex_hulls import convex_hull
-from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours, neighbours
-from robotdiffuse.robots.fitting.sphere_fitting import Cells, SphereSettings, covered, fit_spheres, stick_out
-from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Solid
-from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
+from robotdiffuse.robots.fitting.convex_parts import convex_hull
+from robotdiffuse.robots.fitting.preparation import hidden_by_neighbours, neighbours
+from robotdiffuse.robots.fitting.sphere_fitting import (
+    Bounds,
+    Cells,
+    Solid,
+    SphereSettings,
+    covered,
+    fit_spheres,
+    stick_out,
+)
+from robotdiffuse.robots.kinematic_tree import Joint
+from robotdiffuse.robots.robot import ConvexMesh, Robot
 
 QUICK = SphereSettings(candidates=200, rounds=6, tries=1, starts=1)
 TOLERANCE = 0.015

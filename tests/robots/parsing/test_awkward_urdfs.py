@@ -15,9 +15,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.fitting import preparation
-from robotdiffuse.robots.fitting.add import add_robot
-from robotdiffuse.robots.fitting.preparation import LARGE_REACH, PreparationSettings
-from robotdiffuse.robots.scaling import reach
+from robotdiffuse.robots.fitting.preparation import LARGE_REACH, PreparationSettings, add_robot
+from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify
 

@@ -9,7 +9,7 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.fitting.add import add_robot
+from robotdiffuse.robots.fitting.preparation import add_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.robots.robot import Robot

@@ -17,14 +17,12 @@ from helpers.urdfs import read_urdf
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_rpy
 from robotdiffuse.robots import ROBOTS, load_robot
-from robotdiffuse.robots.fitting.add import add_robot
-from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.fitting.convex_hulls import MIN_THICKNESS, convex_hull
-from robotdiffuse.robots.fitting.preparation import PreparationSettings
+from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, convex_hull
+from robotdiffuse.robots.fitting.preparation import PreparationSettings, add_robot
+from robotdiffuse.robots.fitting.self_collisions import SamplingSettings
 from robotdiffuse.robots.fitting.sphere_fitting import covered
-from robotdiffuse.robots.joints import CONTINUOUS_LIMIT
-from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
-from robotdiffuse.robots.parsing.urdf import UrdfTree
+from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT
+from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.robot_folder import read_robot_folder, read_source, write_robot_folder
 

@@ -10,7 +10,7 @@ import trimesh
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.fitting.convex_parts import Surface
 from robotdiffuse.robots.parsing.packages import Packages
-from robotdiffuse.robots.parsing.urdf_geometry import link_surfaces
+from robotdiffuse.robots.parsing.urdf import link_surfaces
 
 
 def surfaces(file: Path, shape: str, origin: str = "") -> tuple[Surface, ...]:

@@ -21,9 +21,8 @@ from robotdiffuse.problems.goals import AnyGoal, JointGoal, PoseGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
 from robotdiffuse.validation.validator import verify_trajectory
 from robotdiffuse.visualization.live.session import (
     INVALID,

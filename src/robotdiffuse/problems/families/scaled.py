@@ -13,13 +13,14 @@ from numpy.random import Generator
 
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import CONFIGURATION, Family, SampledProblem, Spheres
-from robotdiffuse.robots.robot import Robot, once_per_robot
-from robotdiffuse.robots.scaling import reach, scaled
+from robotdiffuse.robots.kinematic_tree import once_per_robot
+from robotdiffuse.robots.kinematics import reach
+from robotdiffuse.robots.robot import Robot, scaled
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
 PANDA_REACH = 0.855
-"""A Panda's reach, as computed by `robots.scaling.reach` [m]."""
+"""A Panda's reach, as computed by `robots.kinematics.reach` [m]."""
 UNSCALED_RANGE = (0.8, 1.25)
 """Families are not scaled for arms whose reach, relative to a Panda's, is in this range."""
 

@@ -5,37 +5,145 @@ Configurations in which the true meshes are free, but parts or spheres collide, 
 Preparation measures these false collisions. If a pair of links has too many, its parts and spheres are made
 again, finer at the places where they touch. If no spheres are fine enough, a table over the joints between
 the links tells where they are apart.
+
+`add_robot` reads a URDF, prepares the robot and writes its folder.
 """
 
-from collections.abc import Callable, Mapping
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.fitting.allowed_collisions import (
+from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.transforms import inverse
+from robotdiffuse.robots.bodies import Surface
+from robotdiffuse.robots.fitting.convex_parts import PartSettings, convex_parts
+from robotdiffuse.robots.fitting.sampled_links import Links, joint_table
+from robotdiffuse.robots.fitting.self_collisions import (
+    BY_SRDF,
     CHECKED,
+    LIMITS,
+    NAMED,
+    POSE,
+    FalseCollisions,
+    PairFalseCollisions,
     PairReport,
     SamplingSettings,
     allowed_pairs,
     find_allowed_collisions,
-)
-from robotdiffuse.robots.fitting.convex_pair_tables import joint_table
-from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_parts
-from robotdiffuse.robots.fitting.false_collisions import (
-    FalseCollisions,
-    PairFalseCollisions,
     measure_false_collisions,
 )
-from robotdiffuse.robots.fitting.grazing_links import with_grazing_links
-from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours
-from robotdiffuse.robots.fitting.sampled_links import Links
-from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
-from robotdiffuse.robots.fitting.sphere_size_grid import FLOOR_TOLERANCE, Bounds, Solid
+from robotdiffuse.robots.fitting.sphere_fitting import (
+    FLOOR_TOLERANCE,
+    Bounds,
+    Planes,
+    Solid,
+    SphereSettings,
+    covered,
+    fit_spheres,
+    stacked_planes,
+    stick_out,
+)
+from robotdiffuse.robots.fitting.sphere_fitting_kernel import within
+from robotdiffuse.robots.kinematic_tree import MOVING_KINDS
+from robotdiffuse.robots.kinematics import reach
+from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
+from robotdiffuse.robots.parsing.urdf import UrdfTree, read_limits, with_limits
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.scaling import reach
+from robotdiffuse.robots.robot_folder import read_robot_folder, user_robots, write_robot_folder
+
+JOINT_SAMPLES = 9
+"""Values of the joint between two links at which points are tested."""
+GAP = 0.004
+"""Points this close to a neighbour count as inside [m]: gaps between links are about this thin."""
+BOX_PADDING = 10 * GAP
+"""Points further than this from a neighbour's bounding box are skipped, even near sharp edges [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """A link that a joint connects to another one."""
+
+    link: str
+    T_link_neighbour: Float[ndarray, "n 4 4"]
+    """At joint values over the range of the joint between them; one pose if it is fixed."""
+
+
+def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
+    """Links with geometry that a joint connects to this one; skips fixed links without geometry in
+    between."""
+    found = []
+    for joint in robot.joints:
+        above = joint.parent
+        T_above_parent = np.eye(4)
+        while above not in robot.meshes and above != robot.base:
+            through = next(j for j in robot.joints if j.child == above)
+            if through.kind in MOVING_KINDS:
+                break
+            above = through.parent
+            T_above_parent = through.T_parent_joint @ T_above_parent
+        if link not in (above, joint.child) or not {above, joint.child} <= set(robot.meshes):
+            continue
+        endless = joint.kind == "continuous"
+        ends = (-np.pi, np.pi) if endless else (joint.lower, joint.upper)
+        values = np.linspace(*ends, JOINT_SAMPLES) if joint.kind in MOVING_KINDS else [0.0]
+        T = np.stack([T_above_parent @ joint.T_parent_joint @ joint.motion(float(q)) for q in values])
+        other = joint.child if link == above else above
+        found.append(Neighbour(other, T if link == above else np.stack([inverse(t) for t in T])))
+    return tuple(found)
+
+
+def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Float[ndarray, "n 3"]], Bool[ndarray, "n"]]:
+    """A function that tells which points, in the link's frame [m], are inside one neighbour at all joint
+    values."""
+    neighbour_planes: list[tuple[Neighbour, tuple[ndarray, ndarray], Planes]] = []
+    for other in neighbours(robot, link):
+        corners = np.concatenate([mesh.vertices for mesh in robot.meshes[other.link]])
+        box = corners.min(0) - BOX_PADDING, corners.max(0) + BOX_PADDING
+        neighbour_planes.append((other, box, stacked_planes(robot.meshes[other.link])))
+
+    def hidden(points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+        found = np.zeros(len(points), dtype=bool)
+        for other, (low, high), planes in neighbour_planes:
+            left = np.flatnonzero(~found)
+            for T in other.T_link_neighbour:
+                local = (points[left] - T[:3, 3]) @ T[:3, :3]
+                near = ((local >= low) & (local <= high)).all(axis=1)
+                left = left[near]
+                local = local[near]
+                left = left[within(local, *planes, -GAP)]
+            found[left] = True
+        return found
+
+    return hidden
+
+
+def with_grazing_links(
+    robot: Robot, surfaces: Mapping[str, tuple[Surface, ...]], measured: Iterable[FalseCollisions]
+) -> Robot:
+    """The robot with the surfaces of all pairs of links whose parts collided falsely in any measurement."""
+    grazing = frozenset(
+        frozenset(pair.links) for found in measured for pair in found.pairs if pair.by_parts > 0
+    )
+    links = sorted({link for pair in grazing for link in pair})
+    return replace(robot, surfaces={link: _joined(surfaces[link]) for link in links}, grazing=grazing)
+
+
+def _joined(surfaces: Iterable[Surface]) -> Surface:
+    """One surface with equal vertices merged, so that its connected components are known; coordinates as
+    stored, in float32."""
+    corners = np.concatenate([surface.vertices[surface.faces].reshape(-1, 3) for surface in surfaces])
+    vertices, index = np.unique(corners.astype(np.float32), axis=0, return_inverse=True)
+    faces = index.reshape(-1, 3)
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return Surface(vertices.astype(np.float64), faces[distinct])
+
 
 LARGE_REACH = 1.4
 """Reach beyond which the lengths in the settings grow with the reach [m]: a larger arm works in more space,
@@ -348,3 +456,194 @@ def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
     height = T_base_link[0, 2, 3]
     lowest = min(float((mesh.vertices @ up).min()) for mesh in robot.meshes[link])
     return up, min(-height, lowest - FLOOR_TOLERANCE)
+
+
+# A warning is given below this fraction of free configurations, and above this fraction of false
+# collisions.
+MIN_FREE = 0.2
+MAX_FALSE_COLLISIONS = 0.08
+MAX_PROPOSED = 3
+"""Pairs proposed by the error for a robot that always collides with itself, if no single pair always
+collides."""
+ASSUMED_SAFE = {
+    LIMITS: "up to a limit of one joint, and the URDF's limits allow that",
+    POSE: "also in a pose that the SRDF names",
+}
+"""Reasons for allowing a pair that a person should check, with the evidence."""
+BYTES_PER_UNIT = 1 if sys.platform == "darwin" else 1024
+"""Bytes per unit of `ru_maxrss`."""
+
+
+@dataclass(frozen=True)
+class PairDifference:
+    """Two links that sampling and an SRDF classify differently."""
+
+    links: tuple[str, str]
+    sampled: str
+    """The reason found by sampling, or `checked`."""
+    colliding: float
+    """Fraction of the configurations in which the meshes collide."""
+    srdf: str
+    """The SRDF's reason, or `checked`."""
+
+
+@dataclass(frozen=True)
+class AddReport:
+    """Result of `add_robot`."""
+
+    robot: Robot
+    folder: Path
+    links: tuple[LinkReport, ...]
+    pairs: tuple[PairReport, ...]
+    false_collisions: FalseCollisions
+    seconds: float
+    """Processor time [s]."""
+    memory: int
+    """Peak memory of this process so far [bytes]."""
+    srdf: Path | None = None
+    """The SRDF given, or found beside the URDF."""
+    differences: tuple[PairDifference, ...] = ()
+    """Pairs of links that sampling and the SRDF classify differently."""
+
+    @property
+    def sphere_count(self) -> int:
+        return sum(link.spheres for link in self.links)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Problems that will limit planning, and allowed pairs of links whose meshes collide."""
+        found = []
+        of = self.false_collisions
+        worst = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in of.pairs[:3])
+        if of.free < MIN_FREE:
+            often = sorted(of.pairs, key=lambda pair: -pair.colliding)[:3]
+            names = "; ".join(f"{' against '.join(pair.links)} {pair.colliding:.1%}" for pair in often)
+            found.append(
+                f"only {of.free:.1%} of the configurations are free of self-collision by the URDF's meshes "
+                f"({names}); allow pairs that may touch with --allow"
+            )
+        if of.by_spheres > MAX_FALSE_COLLISIONS:
+            found.append(
+                f"covering spheres collide falsely in {of.by_spheres:.1%} of the free configurations, more "
+                f"than {MAX_FALSE_COLLISIONS:.0%} ({worst}); planning cannot use these"
+            )
+        found += [
+            f"{' against '.join(pair.links)} is not checked, though the URDF's meshes collide in "
+            f"{pair.colliding:.1%} of the configurations, {ASSUMED_SAFE[pair.reason]}; make "
+            f"sure that the arm cannot hit itself there"
+            for pair in self.pairs
+            if pair.reason in ASSUMED_SAFE and pair.colliding
+        ]
+        return (*found, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
+
+
+def never_free(false_collisions: FalseCollisions) -> bool:
+    """Whether all sampled configurations are in self-collision, so that nothing can be planned."""
+    return false_collisions.free == 0 or false_collisions.by_parts == 1
+
+
+def never_free_error(urdf: str | Path, false_collisions: FalseCollisions) -> InputError:
+    """The error for a robot that always collides with itself.
+
+    It proposes to allow the pairs of links that always collide, or else those that collide most often.
+    """
+
+    def colliding(pair: PairFalseCollisions) -> float:
+        return max(pair.colliding, pair.by_parts)
+
+    often = sorted(false_collisions.pairs, key=lambda pair: -colliding(pair))
+    worst = [pair for pair in often if colliding(pair) == 1] or often[:MAX_PROPOSED]
+    names = "; ".join(f"{' and '.join(pair.links)} collide in {colliding(pair):.1%}" for pair in worst)
+    options = " ".join(f"--allow {' '.join(pair.links)}" for pair in worst)
+    return InputError(
+        f"{urdf}: every configuration collides with itself: {names}; if these links may touch, add "
+        f"{options}, or give an SRDF that allows such pairs with --srdf FILE"
+    )
+
+
+def add_robot(
+    urdf: str | Path,
+    name: str | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    locked: dict[str, float] | None = None,
+    limits: str | Path | None = None,
+    out: str | Path | None = None,
+    license: str = "see the URDF",
+    settings: PreparationSettings | None = None,
+    seed: int = 0,
+    progress: Progress = lambda what, step, steps: None,
+    group: str | None = None,
+    srdf: str | Path | None = None,
+    allow: Sequence[tuple[str, str]] = (),
+    packages: dict[str, str | Path] | None = None,
+) -> AddReport:
+    """Read a URDF, prepare the robot (see `prepare`) and write the robot folder.
+
+    Args:
+        urdf: URDF or xacro file, or MuJoCo model. Compiling xacro runs the code in its expressions.
+        name: Name of the robot; by default the URDF's.
+        base: See `UrdfTree.robot`, also for `tip`, `locked` and `group`.
+        limits: Joint limits, a file in the form of MoveIt's joint_limits.yaml.
+        out: Folder to write; by default `user_robots() / name`.
+        license: License of the geometry, kept in the folder.
+        settings: Settings of the preparation.
+        seed: The same input and seed give the same robot.
+        progress: Called at each step.
+        srdf: Source of groups, poses and passive joints; by default the SRDF found beside the URDF. Pairs of
+            links that it allows are not checked, but only if it is given here. All pairs found by sampling
+            are compared with the SRDF's.
+        allow: Further pairs of links that are not checked.
+        packages: Folders of ROS packages by name.
+
+    Raises:
+        InputError: For bad input, and for a robot that always collides with itself.
+    """
+    begin = time.process_time()
+    tree = UrdfTree(Path(urdf), packages or {}, compile_xacro=True)
+    found = Path(srdf) if srdf is not None else None if tree.semantics else srdf_beside(urdf, tree.name)
+    semantics = tree.semantics if found is None else read_srdf(found)
+    robot = tree.robot(base, tip, locked, group, semantics)
+    for link in {link for pair in allow for link in pair} - {*robot.link_names}:
+        raise unknown_name("link in allow", link, robot.link_names)
+    name = name or robot.name
+    if not name or Path(name).name != name or name.startswith("."):
+        raise InputError(f"robot name is {name!r}; it must be a valid folder name: give --name NAME")
+    robot = replace(robot, name=name)
+    if limits is not None:
+        changed, notes = read_limits(limits)
+        robot = replace(with_limits(robot, changed), notes=(*robot.notes, *notes))
+    if not robot.meshes:
+        raise InputError(
+            f"{urdf}: no link has collision or visual geometry, so collisions cannot be checked; add "
+            f"<collision> elements to its links"
+        )
+    known = {} if semantics is None else semantics.allowed
+    allowed = {pair: BY_SRDF for pair in known} if srdf is not None or found is None else {}
+    allowed |= {frozenset(pair): NAMED for pair in allow}
+    surfaces = {link: tree.surfaces(link) for link in robot.meshes}
+    settings = settings or PreparationSettings()
+    if semantics is not None and semantics is tree.semantics:
+        settings = replace(settings, sampling=replace(settings.sampling, assumptions=False))
+    made = prepare(robot, surfaces, settings, seed, progress, allowed)
+    if never_free(made.false_collisions):
+        raise never_free_error(urdf, made.false_collisions)
+    differences = tuple(
+        PairDifference(pair.links, pair.reason, pair.colliding, known.get(frozenset(pair.links), CHECKED))
+        for pair in made.sampled
+        if semantics is not None and (pair.reason == CHECKED) == (frozenset(pair.links) in known)
+    )
+    folder = user_robots() / name if out is None else Path(out)
+    source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": license}
+    measured = made.false_collisions
+    shares = {"free": round(measured.free, 4), "refused": round(measured.by_spheres, 4)}
+    note = (
+        f"{measured.free:.1%} of the configurations are free of self-collision; convex parts "
+        f"collide falsely in {measured.by_parts:.1%} of these, spheres in "
+        f"{measured.by_spheres:.1%}"
+    )
+    write_robot_folder(replace(made.robot, notes=(*robot.notes, note)), folder, source | shares)
+    seconds = time.process_time() - begin
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
+    shown = (made.links, made.pairs, made.false_collisions, seconds, memory, found, differences)
+    return AddReport(read_robot_folder(folder), folder, *shown)

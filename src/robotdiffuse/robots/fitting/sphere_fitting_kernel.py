@@ -33,7 +33,7 @@ def plane_depths(points, normals, offsets, starts):
     """Distance [n] from each point to the nearest face plane of the part in which it is deepest; negative
     outside.
 
-    Planes are as in `sphere_size_grid.stacked_planes`.
+    Planes are as in `sphere_fitting.stacked_planes`.
     """
     depths = np.empty(len(points))
     for i in range(len(points)):

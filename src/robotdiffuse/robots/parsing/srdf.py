@@ -4,14 +4,17 @@ Format: https://docs.ros.org/en/noetic/api/srdfdom/html/ and MoveIt's "URDF and 
 """
 
 import math
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 
 from robotdiffuse.core.bounds import MAX_COORDINATE
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, repeated, shown, unknown_name
 from robotdiffuse.core.input_files import is_file, parse_xml, read_bytes
-from robotdiffuse.robots.joints import MOVING_KINDS, Joint
+from robotdiffuse.robots.kinematic_tree import MOVING_KINDS, Joint
+from robotdiffuse.robots.robot import Robot
 
 SRDF_FOLDERS = (".", "../srdf", "../config", "srdf", "config")
 """Folders that are searched for the SRDF of a URDF, relative to the URDF's folder."""
@@ -154,4 +157,233 @@ def read_srdf(file: str | Path) -> Srdf:
         },
         poses=poses,
         passive=frozenset(text(joint, "name") for joint in root.findall("passive_joint")),
+    )
+
+
+GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
+"""Matches names of gripper joints, if few joints come after them."""
+# Names of the group of all arms: of two, and of any number.
+BOTH = "both"
+ALL = "all"
+SUFFIX_CHARACTERS = "_-/0123456789 "
+"""Characters stripped from the end of the common prefix of an arm's joint names."""
+# Largest number of movable joints per branch of a gripper: with two branches, such as two fingers, and with
+# other numbers of branches.
+MAX_FINGER_JOINTS = 2
+MAX_HAND_FINGER_JOINTS = 3
+MIN_ARM_JOINTS = 4
+"""Smallest number of movable joints of an arm if there are several chains. After this many joints, three or
+more branches form a hand, however long its fingers are."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A chain of movable joints and the link at its end."""
+
+    joints: tuple[str, ...]
+    tip: str
+    own: int
+    """Number of joints after the last branching."""
+
+    @property
+    def name(self) -> str:
+        """The common prefix of the names of the joints after the last branching, or else the tip."""
+        columns = zip(*self.joints[-self.own :], strict=False)
+        same = takewhile(lambda letters: len({*letters}) == 1, columns)
+        common = "".join(letters[0] for letters in same).rstrip(SUFFIX_CHARACTERS)
+        return common.removesuffix("joint").rstrip("_-/ ") or self.tip
+
+
+class JointTree:
+    """The movable joints below a link."""
+
+    def __init__(self, base: str, joints: list[Joint]) -> None:
+        """Takes `joints` as in `Robot.joints`: all below the base, parents before children."""
+        self.base = base
+        self.below: dict[str, list[Joint]] = {}
+        self.moving: dict[str, int] = {}
+        """Largest number of independent movable joints in a chain below each link."""
+        self.moved: set[str] = set()
+        """Links with a movable joint below them, mimic joints included."""
+        depth: dict[str, int] = {}
+        for joint in joints:
+            self.below.setdefault(joint.parent, []).append(joint)
+        for joint in reversed(joints):
+            self.moving[joint.parent] = max(self.moving.get(joint.parent, 0), self._chain_length(joint))
+            depth[joint.parent] = max(depth.get(joint.parent, 0), depth.get(joint.child, 0) + 1)
+            if joint.kind in MOVING_KINDS or joint.child in self.moved:
+                self.moved.add(joint.parent)
+        self._depth = depth
+
+    def _chain_length(self, joint: Joint) -> int:
+        """Largest number of independent movable joints in a chain that begins with a joint."""
+        drives = joint.kind in MOVING_KINDS and joint.mimic is None
+        return self.moving.get(joint.child, 0) + drives
+
+    def arms(self) -> list[Arm]:
+        """The arms below the base, or else the longest chains of movable joints."""
+        found = self._arms_from(self.base, (), 0)
+        own = [arm for arm in found if arm.own >= MIN_ARM_JOINTS]
+        longest = max((len(arm.joints) for arm in found), default=0)
+        return own or [arm for arm in found if len(arm.joints) == longest]
+
+    def _arms_from(self, link: str, chain: tuple[str, ...], own: int) -> list[Arm]:
+        """Arms that continue a chain of joints at a link; `own` of its joints come after the last
+        branching."""
+        while True:
+            ways = [j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.moved]
+            if chain and self._begins_gripper(ways, own):
+                return [Arm(chain, link, own)]
+            if len(ways) > 1:
+                branches = [self._arms_from(j.child, *self._extended(j, chain, 0)) for j in ways]
+                return [arm for branch in branches for arm in branch]
+            if not ways:
+                return [Arm(chain, self._deepest(link), own)] if own else []
+            chain, own = self._extended(ways[0], chain, own)
+            link = ways[0].child
+
+    def _extended(self, joint: Joint, chain: tuple[str, ...], own: int) -> tuple[tuple[str, ...], int]:
+        """A chain and its number of own joints, extended by a joint if that is movable."""
+        return ((*chain, joint.name), own + 1) if joint.kind in MOVING_KINDS else (chain, own)
+
+    def _begins_gripper(self, ways: list[Joint], own: int) -> bool:
+        """Whether a gripper or a hand begins where these joints branch off, `own` joints after the last
+        branching."""
+        rows = [self._chain_length(joint) for joint in ways]
+        if len(ways) == 1:
+            jaw = ways[0].kind in MOVING_KINDS and GRIPPER.search(ways[0].name)
+            return bool(jaw) and rows[0] <= MAX_HAND_FINGER_JOINTS
+        if len(ways) == 2:
+            return max(rows) <= MAX_FINGER_JOINTS
+        return len(ways) > 2 and (max(rows) <= MAX_HAND_FINGER_JOINTS or own >= MIN_ARM_JOINTS)
+
+    def _deepest(self, link: str) -> str:
+        """The deepest link below a link."""
+        while self.below.get(link):
+            link = max(self.below[link], key=lambda joint: self._depth.get(joint.child, 0)).child
+        return link
+
+
+def planned_joints(
+    file: Path, base: str, joints: list[Joint], tip: str | None, group: str | None, srdf: Srdf | None
+) -> tuple[set[str], list[str]]:
+    """Names of the joints that are planned unless they are locked, and the tips.
+
+    There are several tips if the group has several chains, such as two arms. `joints` are all joints below
+    the base, parents before children. Raises InputError for an unknown tip or group, a group with joints that
+    do not lead to the given tip, and a robot with several arms of which none is chosen.
+    """
+    above = {joint.child: joint for joint in joints}
+    if tip is not None and tip not in (base, *above):
+        raise unknown_name(f"tip link below {base} in {file.name}", tip, [base, *above])
+    chosen: list[str] | None = None
+    if group is not None and srdf is not None and group in srdf.groups:
+        chosen = [joint.name for joint in srdf.joints(group, tuple(joints))]
+        if not chosen:
+            raise InputError(f"{srdf.path}: group {group} has no movable joint below {base}")
+        tips = _ends(chosen, above, srdf.tips(group)) if tip is None else [tip]
+    elif group is not None or tip is None:
+        arms = JointTree(base, joints).arms()
+        groups = [] if srdf is None else list(srdf.groups)
+        found = _one_arm(file, arms, groups) if group is None else _named_arms(file, arms, group, groups)
+        tips = [tip] if tip else [arm.tip for arm in found] or [base]
+    else:
+        tips = [tip]
+    leading = [joint for end in tips for joint in chain(above, end) if joint.kind in MOVING_KINDS]
+    off = [name for name in chosen or () if name not in {joint.name for joint in leading}]
+    if off:
+        raise InputError(
+            f"{file}: {', '.join(off)} of group {group} do not lead to {tip}; leave out --tip, or choose a "
+            f"group of one arm"
+        )
+    passive = frozenset() if srdf is None else srdf.passive
+    names = {joint.name for joint in leading if joint.mimic is None and joint.name not in passive}
+    return names if chosen is None else names & {*chosen}, tips
+
+
+def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> list[str]:
+    """Tips of a group: those of the chains that define it, or else the last links of its joints."""
+    last = {joint.child: joint.child for joint in above.values() if joint.name in chosen}
+    for link in [*last]:
+        for joint in chain(above, link)[:-1]:
+            last.pop(joint.child, None)
+    for tip in written:
+        on_way = [joint.child for joint in chain(above, tip) if joint.child in last]
+        if on_way:
+            last[on_way[-1]] = tip
+    return list(last.values())
+
+
+def passive_notes(srdf: Srdf | None, joints: list[Joint]) -> list[str]:
+    """Notes on the passive joints, which are held."""
+    passive = frozenset() if srdf is None else srdf.passive
+    return [f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in passive]
+
+
+def chain(above: dict[str, Joint], tip: str) -> list[Joint]:
+    """The joints from the base to a link; `above` maps links to their parent joints."""
+    joints: list[Joint] = []
+    while tip in above:
+        joints.append(above[tip])
+        tip = above[tip].parent
+    return joints[::-1]
+
+
+def refuse_linkages(file: Path, robot: Robot) -> None:
+    """Raise InputError if joints that mimic a planned joint move geometry, since planning would hold them."""
+    by_name = {joint.name: joint for joint in robot.joints}
+    above = {joint.child: joint for joint in robot.joints}
+    for joint in robot.joints:
+        leader = joint
+        while leader.mimic is not None:
+            leader = by_name[leader.mimic.joint]
+        if joint.mimic is None or leader.name in robot.locked:
+            continue
+        if any(joint in chain(above, link) for link in (*robot.meshes, *robot.tips)):
+            raise InputError(
+                f"{file}: joint {joint.name} mimics {leader.name}, which is planned; that is not supported: "
+                f"hold it with --lock {leader.name}=VALUE, or end the arm above it with --tip"
+            )
+
+
+def _one_arm(file: Path, arms: list[Arm], groups: list[str]) -> list[Arm]:
+    """The only arm of a robot, or none; raises InputError that lists the arms if there are several.
+
+    `groups` are the names of groups in the SRDF, for the message.
+    """
+    if len(arms) < 2:
+        return arms
+    raise InputError(
+        f"{file} has {len(arms)} arms: {_listed(arms)}; choose one, or {_together(arms)} as one robot: "
+        f"robotdiffuse robot add {file.name} --group {_names_of(arms)[0]}"
+        + (f" (groups of its SRDF: {', '.join(groups)})" if groups else "")
+    )
+
+
+def _named_arms(file: Path, arms: list[Arm], name: str, groups: list[str]) -> list[Arm]:
+    """The arm with a name of `_names_of` or with a tip, or all arms; raises InputError for other names."""
+    names = _names_of(arms)
+    chosen = [arm for arm, its in zip(arms, names, strict=True) if name in (its, arm.tip)]
+    if chosen:
+        return chosen[:1]
+    together = {ALL, _together(arms)} if len(arms) > 1 else set[str]()
+    if name in together:
+        return arms
+    raise unknown_name(f"group of {file}", name, [*names, *sorted(together), *groups])
+
+
+def _together(arms: list[Arm]) -> str:
+    return BOTH if len(arms) == 2 else ALL
+
+
+def _names_of(arms: list[Arm]) -> list[str]:
+    """The names of arms, or their tips if two have the same name."""
+    twice = repeated(arm.name for arm in arms)
+    return [arm.tip if arm.name in twice else arm.name for arm in arms]
+
+
+def _listed(arms: list[Arm]) -> str:
+    return ", ".join(
+        f"{name} ({len(arm.joints)} joints to {arm.tip})"
+        for name, arm in zip(_names_of(arms), arms, strict=True)
     )

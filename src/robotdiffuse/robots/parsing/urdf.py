@@ -1,31 +1,174 @@
-"""Reads robots from URDF, xacro and MuJoCo files."""
+"""Reads robots from URDF, xacro and MuJoCo files, and limits of joints from MoveIt's joint_limits.yaml."""
 
 import hashlib
+import math
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, MIN_RATE
+from robotdiffuse.core.bounds import (
+    MAX_COORDINATE,
+    MAX_RATE,
+    MIN_RATE,
+    MIN_SIZE,
+    points,
+    unit_quaternion,
+    within,
+)
 from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
-from robotdiffuse.core.input_files import parse_xml, read_bytes
-from robotdiffuse.core.transforms import inverse
-from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.robots.fitting.convex_hulls import MIN_THICKNESS, convex_hull, thickened
-from robotdiffuse.robots.fitting.convex_parts import Surface
-from robotdiffuse.robots.inertias import Inertia, inertia_of
-from robotdiffuse.robots.joints import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
-from robotdiffuse.robots.parsing.joint_groups import passive_notes, planned_joints, refuse_linkages
-from robotdiffuse.robots.parsing.mobile_bases import moves_in_a_plane
+from robotdiffuse.core.input_files import parse_xml, read_bytes, read_yaml
+from robotdiffuse.core.mesh_files import read_triangles
+from robotdiffuse.core.transforms import inverse, rotation_from_quaternion, rotation_from_rpy, transform
+from robotdiffuse.robots.bodies import ConvexMesh, Inertia, inertia_of
+from robotdiffuse.robots.fitting.convex_parts import MIN_THICKNESS, Surface, convex_hull, thickened
+from robotdiffuse.robots.kinematic_tree import CONTINUOUS_LIMIT, MOVING_KINDS, Joint, Mimic, with_mimics
+from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.robots.parsing.packages import Packages, compiled_xacro, is_xacro, with_prefixes
-from robotdiffuse.robots.parsing.srdf import Srdf
-from robotdiffuse.robots.parsing.urdf_geometry import link_surfaces
-from robotdiffuse.robots.parsing.urdf_values import numbers_of, origin_of
+from robotdiffuse.robots.parsing.srdf import Srdf, passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.scaling import reach
+
+
+def numbers_of(
+    path: Path, text: str, count: int, what: str, most: float = MAX_COORDINATE
+) -> Float[ndarray, "n"]:
+    """The numbers of an attribute, whose absolute values are at most `most`."""
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(f"{path}: {what} is {shown(text)}; it must be {count} finite number(s)")
+    if not within(values, most):
+        raise InputError(f"{path}: {what} is {shown(text)}; it must be within ±{most:g}")
+    return values
+
+
+def origin_of(path: Path, element: ET.Element, what: str) -> Float[ndarray, "4 4"]:
+    """The transform of the element's <origin>."""
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(4)
+    xyz = numbers_of(path, origin.get("xyz", "0 0 0"), 3, f"{what}: origin xyz")
+    turned = origin.get("quat_xyzw")
+    if turned is None:
+        rpy = numbers_of(path, origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
+        return transform(xyz, rotation_from_rpy(*map(float, rpy)))
+    if "rpy" in origin.attrib:
+        raise InputError(f"{path}: {what}: origin has rpy and quat_xyzw; it must have one of them")
+    where = f"{what}: origin quat_xyzw"
+    x, y, z, w = unit_quaternion(f"{path}: {what}", numbers_of(path, turned, 4, where), "origin quat_xyzw")
+    return transform(xyz, rotation_from_quaternion(np.array([w, x, y, z])))
+
+
+ROTATING_KINDS = ("revolute", "continuous")
+RIGHT_ANGLE_TOLERANCE = 1e-3
+"""Largest absolute cosine of an angle that counts as a right angle."""
+
+
+def moves_in_a_plane(joints: Sequence[Joint]) -> bool:
+    """Whether a chain of joints moves in a plane, as a base on wheels: two perpendicular prismatic joints,
+    and a rotation about the axis perpendicular to both."""
+    moving = [joint for joint in joints if joint.kind != "fixed"]
+    if sorted(joint.kind in ROTATING_KINDS for joint in moving) != [False, False, True]:
+        return False
+    R = np.eye(3)
+    axes = []
+    for joint in joints:
+        R = R @ joint.T_parent_joint[:3, :3]
+        if joint.kind != "fixed":
+            axes.append(R @ joint.axis)
+    return bool(np.abs(np.array(axes) @ np.transpose(axes) - np.eye(3)).max() < RIGHT_ANGLE_TOLERANCE)
+
+
+PRIMITIVES = ("box", "capsule", "cylinder", "sphere")
+
+
+def link_surfaces(
+    path: Path, link: ET.Element, kind: str, packages: Packages, notes: list[str]
+) -> tuple[Surface, ...]:
+    """The elements `kind` (collision or visual) of a link as triangle meshes, in the link's frame.
+
+    `notes` receives a note on each mesh file that is turned or scaled. Raises InputError for elements without
+    geometry, unknown shapes and damaged meshes.
+    """
+    parts = []
+    name = link.get("name", "")
+    for element in link.findall(kind):
+        geometry = element.find("geometry")
+        shape = next(iter(geometry), None) if geometry is not None else None
+        if shape is None:
+            raise InputError(f"{path}: link {name}: a <{kind}> has no geometry")
+        if shape.tag == "mesh":
+            surface = _mesh(path, shape, name, packages, notes)
+        elif shape.tag in PRIMITIVES:
+            hull = convex_hull(_primitive(path, shape, name))
+            surface = Surface(hull.vertices, hull.faces)
+        else:
+            raise InputError(
+                f"{path}: link {name}: {kind} shape <{shape.tag}> is not supported; "
+                f"known: {', '.join(sorted((*PRIMITIVES, 'mesh')))}"
+            )
+        T = origin_of(path, element, f"link {name}: {kind}")
+        parts.append(Surface(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces))
+    return tuple(parts)
+
+
+def _primitive(path: Path, shape: ET.Element, link: str) -> Float[ndarray, "n 3"]:
+    """Corners of a polyhedron around a primitive."""
+
+    def positive(name: str, count: int) -> Float[ndarray, "n"]:
+        what = f"link {link}: {shape.tag} {name}"
+        values = numbers_of(path, shape.get(name, ""), count, what)
+        if (values < MIN_SIZE).any():
+            raise InputError(f"{path}: {what} is {shown(shape.get(name))}; it must be positive")
+        return values
+
+    if shape.tag == "box":
+        return np.array(trimesh.creation.box(positive("size", 3)).vertices)
+    radius = positive("radius", 1)
+    if shape.tag == "sphere":
+        return _ball() * radius
+    if shape.tag == "capsule":
+        end = _ball() * radius
+    else:
+        angle = np.arange(32) * np.pi / 16
+        ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(32)], axis=1)
+        end = ring * radius / np.cos(np.pi / 32)
+    half = float(positive("length", 1)[0]) / 2
+    return np.concatenate([end + np.array([0, 0, z]) for z in (-half, half)])
+
+
+def _mesh(path: Path, shape: ET.Element, link: str, packages: Packages, notes: list[str]) -> Surface:
+    file = packages.file(shape.get("filename", ""))
+    where = f"link {link}: mesh"
+    scale = numbers_of(path, shape.get("scale", "1 1 1"), 3, f"{where} scale")
+    if (np.abs(scale) < MIN_SIZE).any():
+        raise InputError(f"{path}: {where} scale is {shown(shape.get('scale'))}; its numbers must not be 0")
+    try:
+        vertices, faces = read_triangles(file, merge=True, notes=notes)
+        vertices = points(where, "vertices", vertices * scale)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    if len(vertices) < 4:
+        raise InputError(
+            f"{path}: link {link}: {file} has no triangle mesh with at least four vertices; "
+            f"repair it or remove its element"
+        )
+    return Surface(vertices, faces)
+
+
+def _ball() -> Float[ndarray, "n 3"]:
+    """Vertices of a polyhedron around the unit ball."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+    inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
+    return np.array(ball.vertices) / inner
+
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 KINDS = (*MOVING_KINDS, "fixed")
@@ -132,7 +275,7 @@ class UrdfTree:
         or at zero clipped into their limits. Locked mimic joints follow their leaders.
 
         Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity limit and 10 / s times
-        the acceleration limit (`parsing.joint_limits` changes them). Collision elements become convex hulls
+        the acceleration limit (`with_limits` changes them). Collision elements become convex hulls
         in the link's frame; cylinders, capsules and spheres become polyhedra around them. If no link has
         collision elements, visual elements are used, with a note.
 
@@ -141,7 +284,7 @@ class UrdfTree:
             the
                 root's frame is kept, for scenes given in that frame.
             tip: Last link. By default the link where a gripper or a hand begins (see
-                `robots.parsing.joint_groups`), such as panda_hand for a Panda with fingers, or else the
+                `robots.parsing.srdf`), such as panda_hand for a Panda with fingers, or else the
                 deepest link.
             locked: Values of locked joints by name [rad] or [m].
             group: A group of the SRDF, the common prefix of an arm's joint names, or "both" or "all". A group
@@ -462,3 +605,97 @@ class UrdfTree:
             element = self.links[link]
             self._surfaces[link] = link_surfaces(self.path, element, self.kind, self.packages, self.notes)
         return self._surfaces[link]
+
+
+FIELDS = {
+    "min_position": "lower",
+    "max_position": "upper",
+    "max_velocity": "velocity",
+    "max_acceleration": "acceleration",
+    "max_jerk": "jerk",
+}
+FACTORS = ("default_velocity_scaling_factor", "default_acceleration_scaling_factor")
+FLAGS = (
+    "has_position_limits",
+    "has_velocity_limits",
+    "has_acceleration_limits",
+    "has_jerk_limits",
+)
+
+
+def read_limits(file: str | Path) -> tuple[dict[str, dict[str, float]], tuple[str, ...]]:
+    """Read limits from a YAML or JSON file: values by joint and by field of `Joint`, and notes.
+
+    The file has the form joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position,
+    max_position, max_velocity, max_acceleration and max_jerk. A field is ignored if MoveIt's flag
+    has_..._limits for it is false. Other fields of the file, such as MoveIt's default scaling factors, are
+    ignored, with a note. Raises InputError that names the joint and the field.
+    """
+    data = read_yaml(file, "joint limits")
+    joints = data.get("joint_limits") if isinstance(data, dict) else None
+    if not isinstance(joints, dict):
+        raise InputError(
+            f"{file} has no joint_limits; it must contain joint_limits: {{JOINT: {{max_velocity: ...}}}}"
+        )
+    notes = tuple(
+        f"{Path(file).name}: {name} {shown(value)} is ignored"
+        + (
+            f"; plan with {name.removeprefix('default_').removesuffix('_factor')}={value}"
+            if name in FACTORS
+            else ""
+        )
+        for name, value in data.items()
+        if name != "joint_limits"
+    )
+    return {str(name): _fields(str(file), str(name), entry) for name, entry in joints.items()}, notes
+
+
+def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
+    """The robot with limits changed, by joint and field; InputError for an unknown joint.
+
+    A new velocity limit also scales acceleration and jerk limits, unless these are given. A continuous joint
+    with a position limit becomes revolute; a missing second limit is half a turn.
+    """
+    movable = {joint.name: joint for joint in robot.joints if joint.kind in MOVING_KINDS}
+    for name in limits:
+        if name not in movable:
+            raise unknown_name("joint in joint_limits", name, movable)
+    changed = [
+        _changed(joint, limits[joint.name]) if joint.name in limits else joint for joint in robot.joints
+    ]
+    return replace(robot, joints=tuple(changed))
+
+
+def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
+    if not isinstance(entry, dict):
+        raise InputError(f"{file}: joint_limits of {joint} is {shown(entry)}; it must be a mapping")
+    fields: dict[str, float] = {}
+    for key, value in entry.items():
+        if key in FLAGS:
+            continue
+        if key not in FIELDS:
+            raise unknown_name(f"field of {joint} in {file}", key, FIELDS)
+        kind = "position" if key.endswith("position") else key.removeprefix("max_")
+        if entry.get(f"has_{kind}_limits") is False:
+            continue
+        most = MAX_COORDINATE if kind == "position" else MAX_RATE
+        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or abs(value) > most or (kind != "position" and value < MIN_RATE):
+            rule = f"within ±{most:g}" if kind == "position" else f"from {MIN_RATE:g} to {most:g}"
+            raise InputError(f"{file}: {key} of {joint} is {shown(value)}; it must be a number {rule}")
+        fields[FIELDS[key]] = float(value)
+    return fields
+
+
+def _changed(joint: Joint, fields: dict[str, float]) -> Joint:
+    if "velocity" in fields and "acceleration" not in fields:
+        fields = fields | {"acceleration": ACCELERATION_PER_VELOCITY * fields["velocity"]}
+    if "acceleration" in fields and "jerk" not in fields:
+        fields = fields | {"jerk": JERK_PER_ACCELERATION * fields["acceleration"]}
+    if joint.kind == "continuous" and {"lower", "upper"} & fields.keys():
+        joint = replace(joint, kind="revolute", lower=-math.pi, upper=math.pi)
+    lower = fields.get("lower", joint.lower)
+    upper = fields.get("upper", joint.upper)
+    if lower > upper:
+        raise InputError(f"joint_limits of {joint.name}: min_position {lower} is above max_position {upper}")
+    return replace(joint, **fields)

@@ -14,9 +14,8 @@ from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory, Tree
 from robotdiffuse.drawables import GOAL, START, Color, Drawable, Surface, thinned
 from robotdiffuse.planning.hybrid import Candidates
-from robotdiffuse.robots.scaling import reach
-from robotdiffuse.scenes.mesh import Mesh
-from robotdiffuse.scenes.shapes import PointCloud, Shape
+from robotdiffuse.robots.kinematics import reach
+from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 from robotdiffuse.visualization.arm import DrawnArm, interpolated
 from robotdiffuse.visualization.live.session import dimensions
 

@@ -30,7 +30,7 @@ from robotdiffuse.planning.exploration.simulated import (
 from robotdiffuse.planning.exploration.steps import CHANCE, DONE, LOOK, POLICIES, STRICT, ExplorerSettings
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.scaling import reach
+from robotdiffuse.robots.kinematics import reach
 from robotdiffuse.visualization.arm import DrawnArm
 from robotdiffuse.visualization.exploration import (
     LOOK_COLOR,

@@ -19,9 +19,8 @@ from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.drawables import GOAL, START, drawables, own_frame
 from robotdiffuse.planning import PLANNERS
-from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.scaling import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization.arm import DrawnArm, interpolated
 from robotdiffuse.visualization.live.drawing import (

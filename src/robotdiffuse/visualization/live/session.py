@@ -35,12 +35,10 @@ from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, Pose
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import known_robots, load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
-from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.kinematics import link_pose, reach
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.scaling import reach
-from robotdiffuse.scenes.mesh import Mesh
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from robotdiffuse.validation.report import Report
 from robotdiffuse.validation.validator import verify, verify_trajectory
 from robotdiffuse.visualization.live.threads import LatestTask

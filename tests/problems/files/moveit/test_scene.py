@@ -17,8 +17,7 @@ from robotdiffuse.problems.files import (
 from robotdiffuse.problems.moveit import moveit_frames, moveit_scene, read_moveit_scene
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.mesh import Mesh
-from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Sphere
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Sphere
 
 
 def test_scene_as_motion_bench_maker_writes_it() -> None:
