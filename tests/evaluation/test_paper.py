@@ -80,13 +80,22 @@ def test_the_row_of_weights_says_what_they_are(
 ) -> None:
     about = {"format": FORMAT, "settings": settings.to_json(), "training": {"samples": 800_000.0}}
     (tmp_path / "model.json").write_text(json.dumps(about))
-    row = Table1Settings(tmp_path, paper_weights=str(tmp_path)).rows[5]
-    assert row == Row(name, f"diffusion@{tmp_path}:samples=1:guidance_steps=0:repeat=false")
+    guided, unguided = Table1Settings(tmp_path, paper_weights=str(tmp_path)).rows[5:7]
+    assert guided == Row(name, f"diffusion@{tmp_path}:samples=1:repeat=false")
+    unguided_planner = f"diffusion@{tmp_path}:samples=1:guidance_steps=0:repeat=false"
+    assert unguided == Row(f"{name}, no guidance", unguided_planner)
 
 
 def test_weights_of_the_package_are_named_without_their_folder(tmp_path: Path) -> None:
     row = Table1Settings(tmp_path, paper_weights="panda_points").rows[5]
     assert row.name.startswith(f"{paper.WITHOUT_CLEARANCES}: points, cross_attention")
+
+
+def test_a_limit_that_no_sample_keeps_is_refused_before_the_first_call(tmp_path: Path) -> None:
+    settings = Table1Settings(tmp_path, time_limit=1e-4, paper_weights="panda_points")
+    with pytest.raises(InputError, match=r"single sample takes about .* denoising steps"):
+        paper.run_table1(settings, lambda _: None, lambda *_: None)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

@@ -290,8 +290,8 @@ def _add_planning(parser: argparse.ArgumentParser) -> None:
         ("--time-limit S", "of a call [s] (default: 10)", positive, 10.0),
         (
             "--paper-weights FOLDER",
-            "weights of `train planner --config paper`, or points, for a row of the diffusion model without "
-            "clearances, guidance and further samples (default: a note says how to train them)",
+            "weights of `train planner --config paper`, or points, for rows of single samples without "
+            "clearances, with and without guidance (default: a note says how to train them)",
         ),
         ("--workers N", "planners that run at once (default: half of the cores)", count),
     )

@@ -6,6 +6,7 @@ configuration and a first goal configuration, whose pose is the goal. Planners f
 and success is within 1 cm and 15 degrees.
 """
 
+import timeit
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path as FilePath
@@ -144,13 +145,15 @@ def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
 
 # Table 1
 AS_IN_PAPER = "diffusion, as the paper says"
-WITHOUT_CLEARANCES = "diffusion, no clearances, one unguided sample"
+WITHOUT_CLEARANCES = "diffusion, no clearances, one sample"
 PAPER_PARTS = "compression_autoencoder", "transformer", 254
 """Encoder, denoiser and waypoints of the paper's method."""
 PAPER_SAMPLES = 1_600_000
 """Samples of the paper's training: 25,000 batches of 64."""
+GUIDED_SAMPLE = ("samples=1", "repeat=false")
+"""One sample, no further batches where the validator refuses it."""
 ONE_SAMPLE = ("samples=1", "guidance_steps=0", "repeat=false")
-"""One sample, no guidance by distances, no further batches where the validator refuses it."""
+"""The same without guidance by distances: the paper's JPC of Table 2."""
 NO_WEIGHTS = (
     f"{AS_IN_PAPER}: no weights of its size and with its encoder. Train them with `robotdiffuse train "
     "planner --config paper --data FOLDER --encoder FOLDER --out FOLDER` and name them by --paper-weights."
@@ -239,8 +242,8 @@ class Table1Settings:
     time_limit: float = 10.0
     """Of a call [s]; RRT* uses all of it."""
     paper_weights: str | None = None
-    """Folder with weights of config `paper`, `points` or another one without clearances as inputs, for a row
-    of single samples without guidance."""
+    """Folder with weights of config `paper`, `points` or another one without clearances as inputs, for two
+    rows of single samples: under guidance, as the paper's own row, and without it."""
     workers: int = 1
     cluster: str | None = None
     """As for `BenchSettings`."""
@@ -250,8 +253,11 @@ class Table1Settings:
         """Of the table; without clearances as inputs only with weights for it."""
         if self.paper_weights is None:
             return ROWS
-        planner = ":".join([f"diffusion@{self.paper_weights}", *ONE_SAMPLE])
-        return (*ROWS[:5], Row(_title(self.paper_weights), planner), *ROWS[5:])
+        title = _title(self.paper_weights)
+        diffusion = f"diffusion@{self.paper_weights}"
+        guided = Row(title, ":".join([diffusion, *GUIDED_SAMPLE]))
+        unguided = Row(f"{title}, no guidance", ":".join([diffusion, *ONE_SAMPLE]))
+        return (*ROWS[:5], guided, unguided, *ROWS[5:])
 
     @property
     def bench(self) -> BenchSettings:
@@ -269,10 +275,11 @@ class Table1Settings:
 def run_table1(settings: Table1Settings, report: Say, done: Done) -> Bench:
     """Make the calls that are missing in the folder; the bench with all of them.
 
-    Raises InputError for paper weights with clearances as inputs, and as `run_bench` does.
+    Raises InputError for paper weights with clearances as inputs or with more steps than fit into the time
+    limit, and as `run_bench` does.
     """
     if settings.paper_weights is not None:
-        _check_paper_weights(settings.paper_weights)
+        _check_paper_weights(settings.paper_weights, settings.time_limit)
     write_problems(settings.out, settings.problems, report)
     run_bench(settings.bench, report, done)
     return read_bench(settings.out, list(settings.bench.specs))
@@ -287,15 +294,26 @@ def _title(folder: str) -> str:
     return f"{title}: {of.encoder}, {of.denoiser}, {100 * seen:.0f} % of {PAPER_SAMPLES / 1e6:g} M samples"
 
 
-def _check_paper_weights(folder: str) -> None:
-    """Raises InputError for weights that get the clearances of the scene as inputs."""
+def _check_paper_weights(folder: str, time_limit: float) -> None:
+    """Raises InputError for weights that get the clearances of the scene as inputs, and for those of which a
+    single sample takes longer here than the time limit [s]."""
     from robotdiffuse.learning.exported_model import exported_model
-    from robotdiffuse.robots import load_robot
 
-    if exported_model("model", folder, load_robot("panda")).settings.clearance_features:
+    model = exported_model("model", folder, load_robot("panda"))
+    if model.settings.clearance_features:
         raise InputError(
             f"paper_weights is {folder}, whose inputs include clearances; the paper's method sees the scene "
             "by its code alone: train with --config paper or points"
+        )
+    steps = model.settings.sampling_steps or model.schedule.steps
+    inputs = (1, model.waypoints, model.feature_count), 1, (1, model.condition_count)
+    zeros = [np.zeros(shape, np.float32) for shape in inputs]
+    seconds = steps * min(timeit.repeat(lambda: model.denoised(*zeros), number=1, repeat=3))
+    if seconds > time_limit:
+        raise InputError(
+            f"time_limit is {time_limit:g} s and paper_weights is {folder}, of which a single sample takes "
+            f"about {seconds:.0f} s here ({steps} denoising steps): no call would end in time. Give a time "
+            f"limit of at least {2 * seconds:.0f}"
         )
 
 
@@ -376,7 +394,9 @@ def _table(section: Section, rows: dict[str, Row]) -> Table:
         Column("ComScore", "", ".3f", "more"),
         *(("paper: suc", "col", "len", "time", "ComScore") if beside else ()),
     )
-    return Table.of(title, columns, table)
+    five = sorted((row.name for row in rows.values() if row.paper), key=lambda name: -comscore[name])
+    order = "Order of the paper's five rows by ComScore: " + ", ".join(f"{x} {comscore[x]:.3f}" for x in five)
+    return Table.of(title, columns, table, (f"{order}.",))
 
 
 def notes(settings: Table1Settings) -> list[str]:

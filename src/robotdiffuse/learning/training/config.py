@@ -254,6 +254,7 @@ CONFIGS: dict[str, Config] = {
             "sampler": "ddpm",
             "sampling_steps": None,
             "validation_problems": 100,
+            "checkpoint_seconds": 1_800.0,
             "denoiser_settings": TransformerSettings.paper_size(),
             **_TABLE2_ROW,
         },
