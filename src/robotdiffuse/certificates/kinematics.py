@@ -16,7 +16,6 @@ from robotdiffuse.core.types import (
     JointValues,
     Path,
     Points,
-    Pose,
     Rotation,
     Trajectory,
     Values,
@@ -59,32 +58,33 @@ class Linkage:
     def place(self, q: Configurations, link: str | None = None) -> Postures:
         """Poses at configurations. With `link`, only the links between the base and that link; the rest is
         0."""
-        n = len(q)
-        dof = len(self._planned)
+        n, dof = q.shape
         T = np.zeros((n, len(self.links), 4, 4))
+        T[:, :, 3, 3] = 1.0
         origins = np.zeros((n, dof, 3))
         axes = np.zeros((n, dof, 3))
-        T[:, :, 3, 3], sines, rests = 1.0, np.sin(q).T[:, :, None, None], 1 - np.cos(q).T[:, :, None, None]
         at = {self.robot.base: (np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)))}
         for joint in self.robot.joints if link is None else self._up_to(link):
             R, p = at[joint.parent]
             turn = joint.T_parent_joint[:3, :3]
-            along = joint.axis
             p = p + R @ joint.T_parent_joint[:3, 3]
             j = self._planned.get(joint.name)
-            if j is None and joint.kind != "fixed":
-                held = _motion(joint.kind, along, self.robot.locked.get(joint.name, 0.0))
-                p = p + R @ (turn @ held[:3, 3])
-                turn = turn @ held[:3, :3]
+            axis = R @ (turn @ joint.axis)
+            value = np.full((n, 1), self.robot.locked.get(joint.name, 0.0)) if j is None else q[:, j, None]
             if j is not None:
                 origins[:, j] = p
-                axes[:, j] = R @ (turn @ along)
-            if j is not None and not self.slides[j]:
-                K = cross_matrix(along)  # for Rodrigues' formula
-                R = _times(R, turn) + sines[j] * _times(R, turn @ K) + rests[j] * _times(R, turn @ K @ K)
-            else:
+                axes[:, j] = axis
+            if joint.kind in ("fixed", "prismatic"):
                 R = _times(R, turn)
-                p = p if j is None else p + q[:, j, None] * axes[:, j]
+                p = p + value * axis * (joint.kind == "prismatic")
+            else:
+                K = cross_matrix(joint.axis)  # for Rodrigues' formula
+                angle = value[:, None]
+                R = (
+                    _times(R, turn)
+                    + np.sin(angle) * _times(R, turn @ K)
+                    + (1 - np.cos(angle)) * _times(R, turn @ K @ K)
+                )
             at[joint.child] = R, p
         for k, name in enumerate(self.links):
             if name in at:
@@ -199,18 +199,8 @@ def cross_matrix(axis: Vector) -> Rotation:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def _motion(kind: str, axis: Vector, q: float) -> Pose:
-    T = np.eye(4)
-    K = cross_matrix(axis)
-    if kind == "prismatic":
-        T[:3, 3] = q * axis
-    else:
-        T[:3, :3] += np.sin(q) * K + (1 - np.cos(q)) * (K @ K)
-    return T
-
-
 class Cubics(NamedTuple):
-    """The cubics from each row to the next; their accelerations are linear in time."""
+    """The cubics from each row to the next; their accelerations are linear in time, and 0 for a path."""
 
     times: Values
     """When each begins [s]."""
@@ -244,6 +234,11 @@ class Cubics(NamedTuple):
     def pulls(self) -> JointRows:
         """The greatest absolute acceleration of each."""
         return np.maximum(np.abs(self.start), np.abs(self.end))
+
+    @property
+    def jerks(self) -> JointRows:
+        """The absolute jerk of each."""
+        return np.abs(self.end - self.start) / self.steps
 
     @property
     def speeds(self) -> JointRows:
@@ -297,14 +292,15 @@ def places_of(motion: Path | Trajectory, between: Values) -> Values:
     return np.sort(np.concatenate([clock(motion), between]), kind="stable")
 
 
-def cubics_of(motion: Path | Trajectory) -> Cubics | None:
-    """The cubics of a trajectory whose times increase; None for a path or a single row."""
-    if not isinstance(motion, Trajectory) or len(motion.times) < 2:
-        return None
-    steps = np.diff(motion.times)[:, None]
+def cubics_of(motion: Path | Trajectory) -> Cubics:
+    """The cubics of a trajectory whose times increase; the straight lines of a path, whose `clock` counts."""
+    times = clock(motion)
+    steps = np.diff(times)[:, None]
     q = motion.positions
-    v = motion.velocities
-    mean = (q[1:] - q[:-1]) / steps
-    start = (6 * mean - 4 * v[:-1] - 2 * v[1:]) / steps
-    end = (2 * v[:-1] + 4 * v[1:] - 6 * mean) / steps
-    return Cubics(motion.times[:-1], steps, q[:-1], v[:-1], start, end)
+    mean = np.diff(q, axis=0) / steps
+    v, last = (
+        (motion.velocities[:-1], motion.velocities[1:]) if isinstance(motion, Trajectory) else (mean, mean)
+    )
+    start = (6 * (mean - v) - 2 * (last - v)) / steps
+    end = (6 * (last - mean) - 2 * (last - v)) / steps
+    return Cubics(times[:-1], steps, q[:-1], v, start, end)

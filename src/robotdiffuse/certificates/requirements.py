@@ -33,15 +33,18 @@ from robotdiffuse.certificates.kinematics import (
 )
 from robotdiffuse.certificates.proof import BOUND_TOLERANCE, MotionProof, Tolerances
 from robotdiffuse.core.errors import InputError, joined
+from robotdiffuse.core.transforms import rotation_z_to
 from robotdiffuse.core.types import (
     Configurations,
     JointRows,
     JointValues,
     Path,
     Points,
+    Pose,
     Rotation,
     Trajectory,
     Values,
+    Vector,
 )
 from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal, poses_of
@@ -69,24 +72,11 @@ class ConstraintBound(NamedTuple):
     """From each configuration to the next."""
 
 
-class _Body(NamedTuple):
-    """A box whose half sizes may be 0 or infinite along some of its axes."""
-
-    center: ndarray
-    R: ndarray
-    half: ndarray
-
-    def distances(self, points: ndarray) -> ndarray:
-        """Signed distances of points [m], negative inside."""
-        beyond = np.abs((points - self.center) @ self.R) - self.half
-        return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
-
-
 class _FrameMotion(NamedTuple):
     """Motion of a frame from each of n + 1 configurations to the next."""
 
-    p: Float[ndarray, "n1 3"]
-    R: Float[ndarray, "n1 3 3"]
+    p: Points
+    R: ndarray
     turn: Values
     """Upper bound of its rotation [rad]."""
     went: Values
@@ -104,30 +94,25 @@ def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list
     in each joint [rad] or [m]. Raises InputError for a Cartesian line if the goal is not a single pose."""
     linkage = Linkage(problem.robot)
     q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
-    frames = {constraint.frame for constraint in problem.constraints}
-    placed = linkage.place(q, *frames) if len(frames) == 1 else linkage.place(q)
+    placed = {frame: linkage.place(q, frame) for frame in {one.frame for one in problem.constraints}}
     found = []
-    for constraint in problem.constraints:
-        along = _frame_motion(linkage, placed, q, constraint.frame)
-        name = f"{constraint.kind} of {constraint.frame}"
-        if isinstance(constraint, AxisCone):
-            cosines = along.R @ constraint.axis @ constraint.direction
+    for one in problem.constraints:
+        along = _frame_motion(linkage, placed[one.frame], q, one.frame)
+        name = f"{one.kind} of {one.frame}"
+        if isinstance(one, AxisCone):
+            cosines = along.R @ one.axis @ one.direction
             least = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
             bounds = np.arccos(np.clip(least, -1.0, 1.0)) + chord * along.joints
-            found.append(ConstraintBound(name, constraint.angle, bounds))
+            found.append(ConstraintBound(name, one.angle, bounds))
             continue
-        if isinstance(constraint, CartesianLine):
-            T_start, T_goal = _line_poses(problem, linkage, constraint)
-            body = _segment(T_start[:3, 3], T_goal[:3, 3])
-        else:
-            body = _body(constraint)
-        limit = 0.0 if isinstance(constraint, PositionBox) else constraint.tolerance
-        apart = body.distances(along.p)
+        ends = _line_poses(problem, linkage, one) if isinstance(one, CartesianLine) else ()
+        apart = _distances(along.p, *_box(one, *ends))
         bounds = np.maximum(apart[1:], apart[:-1]) + along.sag + chord * along.slack
+        limit = 0.0 if isinstance(one, PositionBox) else one.tolerance
         found.append(ConstraintBound(name, limit, bounds))
-        if isinstance(constraint, CartesianLine) and constraint.angle is not None:
-            bounds = _angle_bounds(along, T_start, T_goal, chord)
-            found.append(ConstraintBound(f"{name}, its angle", constraint.angle, bounds))
+        if isinstance(one, CartesianLine) and one.angle is not None:
+            bounds = _angle_bounds(along, chord, *ends)
+            found.append(ConstraintBound(f"{name}, its angle", one.angle, bounds))
     return found
 
 
@@ -141,19 +126,15 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
     linkage = Linkage(problem.robot)
     lines = []
     cubics = cubics_of(motion)
-    if cubics is None:
-        return lines
     far = np.concatenate([motion.positions, cubics.turns])
-    jerks = np.abs(cubics.end - cubics.start) / cubics.steps
     for one in problem.constraints:
         if not isinstance(one, CartesianLine) or one.speed is None:
             continue
         joints = np.flatnonzero(linkage.moved[linkage.links.index(one.frame)])
-        levers = linkage.levers
         speed = np.cumsum(cubics.speeds[:, joints], axis=1)
         pull = np.cumsum(cubics.pulls[:, joints], axis=1)
         products = np.diff(3 * pull * speed + speed**3, axis=1, prepend=0.0)
-        bends = (jerks[:, joints] + products) @ levers(one.frame, far)
+        bends = (cubics.jerks[:, joints] + products) @ linkage.levers(one.frame, far)
         row = np.arange(len(bends))
         start = np.zeros(len(bends))
         stop = cubics.steps[:, 0]
@@ -201,34 +182,33 @@ def _frame_motion(linkage: Linkage, postures: Postures, q: ndarray, frame: str) 
     return _FrameMotion(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), len(joints))
 
 
-def _body(constraint: Constraint) -> _Body:
+def _box(constraint: Constraint, *ends: Pose) -> tuple[Vector, Rotation, Vector]:
+    """Centre, rotation and half sizes, which may be 0 or infinite, of where a frame's origin may be; between
+    the ends of a Cartesian line."""
     if isinstance(constraint, PositionBox):
         T = constraint.T_base_box
         assert T is not None  # the constructor sees to it
         middle = (constraint.low + constraint.high) / 2
         half = (constraint.high - constraint.low) / 2
-        return _Body(T[:3, :3] @ middle + T[:3, 3], T[:3, :3], half)
-    assert not isinstance(constraint, AxisCone | CartesianLine)
-    flat = isinstance(constraint, OnPlane)
-    along = constraint.normal if isinstance(constraint, OnPlane) else constraint.direction
-    half = np.array([np.inf, np.inf, 0.0] if flat else [0.0, 0.0, np.inf])
-    return _Body(constraint.point, _with_z(along), half)
+        return T[:3, :3] @ middle + T[:3, 3], T[:3, :3], half
+    if isinstance(constraint, CartesianLine):
+        start, goal = (T[:3, 3] for T in ends)
+        length = float(np.linalg.norm(goal - start))
+        along = (goal - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])
+        return (start + goal) / 2, rotation_z_to(along), np.array([0.0, 0.0, length / 2])
+    assert not isinstance(constraint, AxisCone)
+    if isinstance(constraint, OnPlane):
+        return constraint.point, rotation_z_to(constraint.normal), np.array([np.inf, np.inf, 0.0])
+    return constraint.point, rotation_z_to(constraint.direction), np.array([0.0, 0.0, np.inf])
 
 
-def _segment(start: ndarray, goal: ndarray) -> _Body:
-    length = float(np.linalg.norm(goal - start))
-    along = (goal - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])
-    return _Body((start + goal) / 2, _with_z(along), np.array([0.0, 0.0, length / 2]))
+def _distances(points: Points, center: Vector, R: Rotation, half: Vector) -> Values:
+    """Signed distances of points to a box [m], negative inside."""
+    beyond = np.abs((points - center) @ R) - half
+    return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
 
 
-def _with_z(z: ndarray) -> Rotation:
-    """A rotation matrix with a given unit vector as its third column."""
-    x = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
-
-
-def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndarray, ndarray]:
+def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[Pose, Pose]:
     """T_base_frame at start and goal."""
     k = linkage.links.index(line.frame)
     start = linkage.place(problem.start[None]).T[0]
@@ -245,15 +225,16 @@ def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tupl
     raise InputError(f"cartesian_line of {line.frame}: the goal does not determine one pose of it")
 
 
-def _angle_bounds(along: _FrameMotion, T_start: ndarray, T_goal: ndarray, chord: float) -> ndarray:
+def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
     """Bounds of the angle between the frame's orientation and the one interpolated at its place on the
     line."""
+    T_start, T_goal = ends
     way = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(way))
-    turn = _rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
-    whole = float(np.linalg.norm(turn))
-    axis = turn / whole if whole > 0 else np.array([0.0, 0.0, 1.0])
-    K = cross_matrix(axis)
+    turn = T_goal[:3, :3] @ T_start[:3, :3].T
+    whole = float(_angles(turn[None], np.eye(3))[0])
+    K = cross_matrix(np.linalg.eigh(turn + turn.T)[1][:, -1])
+    K = K if (turn * K).sum() >= 0 else -K  # the axis, not its opposite
     if length < MIN_LINE_LENGTH:  # the frame turns in place: the nearest orientation on its way
         turned = along.R @ T_start[:3, :3].T
         sines = (turned * K).sum(axis=(1, 2))
@@ -265,21 +246,15 @@ def _angle_bounds(along: _FrameMotion, T_start: ndarray, T_goal: ndarray, chord:
         angles = (share * whole)[:, None, None]
         reach = whole / length
     wanted = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
-    # from the norm of the difference of rotations, which is accurate near 0 too
-    chords = np.linalg.norm(along.R - wanted, axis=(1, 2))
-    off = 2 * np.arcsin(np.clip(chords / np.sqrt(8), 0.0, 1.0))
+    off = _angles(along.R, wanted)
     return (off[1:] + off[:-1] + along.turn + reach * along.went) / 2 + chord * (
         along.joints + reach * along.slack
     )
 
 
-def _rotation_vector(R: ndarray) -> ndarray:
-    angle = 2 * np.arcsin(np.clip(np.linalg.norm(R - np.eye(3)) / np.sqrt(8), 0.0, 1.0))
-    if angle < 1e-12:
-        return np.zeros(3)
-    axis = np.linalg.eigh(R + R.T)[1][:, -1]
-    skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return angle * axis * (-1.0 if skew @ axis < 0 else 1.0)
+def _angles(first: ndarray, second: ndarray) -> Values:
+    """Angles between rotations, from the norm of their difference, which is accurate near 0 too."""
+    return 2 * np.arcsin(np.clip(np.linalg.norm(first - second, axis=(1, 2)) / np.sqrt(8), 0.0, 1.0))
 
 
 GRAVITY = 9.81
@@ -288,39 +263,15 @@ MIN_MASS = 1e-9
 """Smaller masses are ignored [kg]."""
 
 
-class Bound(NamedTuple):
-    """Upper bounds of the norm of vectors, or the size of numbers, and of their first two derivatives."""
-
-    size: ndarray
-    first: ndarray
-    second: ndarray
-
-    def __add__(self, other: "Bound") -> "Bound":  # type: ignore[override]
-        return Bound(*(a + b for a, b in zip(self, other, strict=True)))
-
-    def __mul__(self, other: "Bound") -> "Bound":  # type: ignore[override]
-        second = self.second * other.size + 2 * self.first * other.first + self.size * other.second
-        return Bound(self.size * other.size, self.first * other.size + self.size * other.first, second)
-
-    def scaled(self, by: float) -> "Bound":
-        return Bound(*(by * part for part in self))
+Bound = Float[ndarray, "3 m"]
+"""Upper bounds of the norm of vectors, or the size of numbers, and of their first two derivatives."""
 
 
-class States(NamedTuple):
-    """The m stretches of a motion from each sample to the next: states at their starts and ends, and bounds
-    [m, dof] with derivatives by time (of paths, by the share of the way)."""
-
-    q: Float[ndarray, "2 m dof"]
-    v: Float[ndarray, "2 m dof"]
-    a: Float[ndarray, "2 m dof"]
-    durations: Values
-    """Of the stretches [s]; 1 for a path."""
-    places: Bound
-    """Of positions."""
-    speeds: Bound
-    """Of velocities; 0 for a path, whose configurations are at rest."""
-    pulls: Bound
-    """Of accelerations."""
+def _product(one: ndarray, other: ndarray) -> ndarray:
+    """The `Bound` of products."""
+    size, first, second = other
+    twice = one[2] * size + 2 * one[1] * first + one[0] * second
+    return np.stack([one[0] * size, one[1] * size + one[0] * first, twice])
 
 
 def torque_bounds(problem: Problem, motion: Path | Trajectory, samples: Values) -> JointRows:
@@ -329,53 +280,30 @@ def torque_bounds(problem: Problem, motion: Path | Trajectory, samples: Values) 
     Samples are the rows and, between them, `samples`: times, or for a path rows plus shares of the way to the
     next.
     """
-    states = _states(motion, samples)
-    torques = [np.abs(inverse_dynamics(problem, *end)) for end in zip(*states[:3], strict=True)]
-    second_derivatives = _second_derivative_bounds(problem, states)
-    return np.maximum(*torques) + second_derivatives * states.durations[:, None] ** 2 / 8
+    ends, durations, bounds = _states(motion, samples)
+    torques = np.abs([inverse_dynamics(problem, *end) for end in ends]).max(axis=0)
+    return torques + _second_derivative_bounds(problem, bounds) * durations[:, None] ** 2 / 8
 
 
-def _states(motion: Path | Trajectory, samples: Values) -> States:
+def _states(motion: Path | Trajectory, samples: Values) -> tuple[ndarray, Values, ndarray]:
+    """Of the m stretches of a motion from each sample to the next: positions, velocities and accelerations
+    at their starts and ends [2, 3, m, dof]; their durations [s], 1 for a path; and the `Bound` of each of the
+    three [3, 3, m, dof], with derivatives by time (of paths, which are at rest, by the share of the way)."""
     cubics = cubics_of(motion)
-    if cubics is None:
-        return _static_states(configurations(motion, samples))
+    if isinstance(motion, Path) or not len(cubics.times):
+        q = configurations(motion, samples)
+        q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
+        ends = np.zeros((2, 3, *q[1:].shape))
+        ends[:, 0] = q[:-1], q[1:]
+        bounds = np.zeros((3, *ends[0].shape))
+        bounds[0, :2] = np.abs(ends[:, 0]).max(axis=0), np.abs(np.diff(q, axis=0))
+        return ends, np.ones(len(q) - 1), bounds
     at = places_of(motion, samples)
     row = cubics.rows(at[:-1])
-    ends = [cubics.at(row, time - cubics.times[row]) for time in (at[:-1], at[1:])]
-    q, v, a = (np.stack(both) for both in zip(*ends, strict=True))
-    speed = cubics.speeds
-    pull = cubics.pulls
-    jerk = np.abs(cubics.end - cubics.start) / cubics.steps
-    far = np.abs(cubics.positions) + speed * cubics.steps
-    places = (far, speed, pull)
-    speeds = (speed, pull, jerk)
-    pulls = (pull, jerk, 0 * jerk)
-    bounds = (Bound(*(part[row] for part in of)) for of in (places, speeds, pulls))
-    return States(q, v, a, np.diff(at), *bounds)
-
-
-def _static_states(q: Configurations) -> States:
-    q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
-    step = np.abs(np.diff(q, axis=0))
-    places = Bound(np.maximum(np.abs(q[1:]), np.abs(q[:-1])), step, 0 * step)
-    none = Bound(0 * step, 0 * step, 0 * step)
-    ends = np.stack([q[:-1], q[1:]])
-    return States(ends, 0 * ends, 0 * ends, np.ones(len(step)), places, none, none)
-
-
-class Vectors(NamedTuple):
-    """Vectors whose product is the cross product, as `Bound` is for their bounds."""
-
-    xyz: Points
-
-    def __add__(self, other: "Vectors") -> "Vectors":  # type: ignore[override]
-        return Vectors(self.xyz + other.xyz)
-
-    def __mul__(self, other: "Vectors") -> "Vectors":  # type: ignore[override]
-        return Vectors(np.cross(self.xyz, other.xyz))
-
-    def scaled(self, by: float) -> "Vectors":
-        return Vectors(by * self.xyz)
+    ends = np.array([cubics.at(row, time - cubics.times[row]) for time in (at[:-1], at[1:])])
+    far = np.abs(cubics.positions) + cubics.speeds * cubics.steps
+    rates = [far, cubics.speeds, cubics.pulls, cubics.jerks, 0 * far]
+    return ends, np.diff(at), np.array([rates[k : k + 3] for k in range(3)])[:, :, row]
 
 
 def inverse_dynamics(problem: Problem, q: Configurations, v: JointRows, a: JointRows) -> JointRows:
@@ -387,29 +315,30 @@ def inverse_dynamics(problem: Problem, q: Configurations, v: JointRows, a: Joint
     still = np.zeros((len(q), 3))
 
     def of_joint(joint: Joint, j: int | None, seen: None) -> tuple[Any, ...]:
-        arm = Vectors(T[joint.child][:, :3, 3] - T[joint.parent][:, :3, 3])
+        arm = T[joint.child][:, :3, 3] - T[joint.parent][:, :3, 3]
         if j is None:
             return arm, None, None, None, seen
         axis = postures.axes[:, j]
-        return arm, Vectors(axis), Vectors(v[:, j, None] * axis), Vectors(a[:, j, None] * axis), seen
+        return arm, axis, v[:, j, None] * axis, a[:, j, None] * axis, seen
 
-    def of_body(body: Inertia, link: str, _: None) -> tuple[Vectors, Callable[[Vectors], Vectors]]:
+    def of_body(body: Inertia, link: str, _: None) -> tuple[ndarray, Callable[[ndarray], ndarray]]:
         R = T[link][:, :3, :3]
         inertia = R @ body.moments @ R.transpose(0, 2, 1)
-        return Vectors(R @ body.com), lambda w: Vectors(np.einsum("nij,nj->ni", inertia, w.xyz))
+        return R @ body.com, lambda w: np.einsum("nij,nj->ni", inertia, w)
 
-    at_base = None, Vectors(still), Vectors(still), Vectors(still + GRAVITY * up)
-    loads = _newton_euler(problem, at_base, of_joint, of_body)
-    return np.stack([(axis.xyz * load.xyz).sum(axis=1) for axis, load in loads], axis=1)
+    at_base = None, still, still, still + GRAVITY * up
+    loads = _newton_euler(problem, at_base, of_joint, of_body, np.cross)
+    return np.stack([(axis * load).sum(axis=1) for axis, load in loads], axis=1)
 
 
 def _newton_euler(
     problem: Problem,
-    at_base: tuple[Any, Any, Any, Any],
+    at_base: tuple[Any, ...],
     of_joint: Callable[[Joint, int | None, Any], tuple[Any, ...]],
-    of_body: Callable[[Inertia, str, Any], tuple[Any, Callable[[Any], Any]]],
-) -> list[tuple[Any, Any]]:
-    """The axis of each planned joint, and the force or moment along it: of `Vectors`, or bounds of them.
+    of_body: Callable[[Inertia, str, Any], tuple[ndarray, Callable[[ndarray], ndarray]]],
+    cross: Callable[[ndarray, ndarray], ndarray],
+) -> list[tuple[ndarray, ndarray]]:
+    """The axis of each planned joint, and the force or moment along it: vectors, or the `Bound` of each.
 
     at_base: what `of_joint` and `of_body` need of a link, angular velocity and acceleration, and acceleration
         of the origin against gravity, of the base; its angular velocity is 0.
@@ -417,49 +346,49 @@ def _newton_euler(
         the child's; None, or the axis, and the joint's velocity and acceleration along it; and what is needed
         of the child.
     of_body: the arm to a body's centre of mass, and the product with its inertia.
+    cross: the cross product.
     """
     robot = problem.robot
-    number = {joint.name: j for j, joint in enumerate(problem.robot.planned_joints)}
+    number = {joint.name: j for j, joint in enumerate(robot.planned_joints)}
     slides = Linkage(robot).slides
     turning = {robot.base: at_base}
-    arms = dict[str, Any]()
-    axes = dict[str, Any]()
+    arms = dict[str, ndarray]()
+    axes = dict[str, ndarray]()
     for joint in robot.joints:
         j = number.get(joint.name)
         link = joint.child
         needed, w, dw, pull = turning[joint.parent]
         arms[link], axes[link], along, bent, needed = of_joint(joint, j, needed)
-        pull = pull + dw * arms[link] + w * (w * arms[link])
+        pull = pull + cross(dw, arms[link]) + cross(w, cross(w, arms[link]))
         if j is not None and slides[j]:
-            pull = pull + bent + (w * along).scaled(2.0)
+            pull = pull + bent + 2.0 * cross(w, along)
         elif j is not None:
-            w, dw = w + along, dw + bent + w * along
+            w, dw = w + along, dw + bent + cross(w, along)
         turning[link] = needed, w, dw, pull
     carried = _masses(problem)
     force, moment = ({link: at_base[1] for link in turning} for _ in range(2))
-    loads = dict[int, tuple[Any, Any]]()
+    loads = {}
     for joint in reversed(robot.joints):
         j = number.get(joint.name)
         link = joint.child
         needed, w, dw, pull = turning[link]
         for body in carried.get(link, ()):
             arm, inertia = of_body(body, link, needed)
-            own = (pull + dw * arm + w * (w * arm)).scaled(body.mass)
+            own = body.mass * (pull + cross(dw, arm) + cross(w, cross(w, arm)))
             force[link] = force[link] + own
-            moment[link] = moment[link] + inertia(dw) + w * inertia(w) + arm * own
+            moment[link] = moment[link] + inertia(dw) + cross(w, inertia(w)) + cross(arm, own)
         if j is not None:
             loads[j] = axes[link], force[link] if slides[j] else moment[link]
         force[joint.parent] = force[joint.parent] + force[link]
-        moment[joint.parent] = moment[joint.parent] + moment[link] + arms[link] * force[link]
+        moment[joint.parent] = moment[joint.parent] + moment[link] + cross(arms[link], force[link])
     return [loads[j] for j in range(len(number))]
 
 
-def _second_derivative_bounds(problem: Problem, states: States) -> JointRows:
+def _second_derivative_bounds(problem: Problem, bounds: ndarray) -> JointRows:
     """Upper bounds on the second derivatives of torques from each sample to the next: the same equations on
     bounds. Of a link, bounds of its rotation are needed."""
     robot = problem.robot
-    none = np.zeros(len(states.durations))
-    still = Bound(none, none, none)
+    still = np.zeros((3, bounds.shape[2]))
     slides = Linkage(robot).slides
 
     def of_joint(joint: Joint, j: int | None, seen: Bound) -> tuple[Any, ...]:
@@ -468,26 +397,26 @@ def _second_derivative_bounds(problem: Problem, states: States) -> JointRows:
         if j is None:
             return arm, None, None, None, seen
         axis = _rotating(1.0, seen)
-        place, speed, bent = (Bound(*(part[:, j] for part in of)) for of in states[4:])
+        place, speed, bent = bounds[..., j]
         if slides[j]:
-            arm = arm + place * axis
+            arm = arm + _product(place, axis)
         else:
-            seen = seen + Bound(place.first, place.second, none) * axis
-        return arm, axis, speed * axis, bent * axis, seen
+            seen = seen + _product(np.stack([*place[1:], still[0]]), axis)
+        return arm, axis, _product(speed, axis), _product(bent, axis), seen
 
     def of_body(body: Inertia, _: str, seen: Bound) -> tuple[Bound, Callable[[Bound], Bound]]:
         most = float(np.linalg.eigvalsh(body.moments)[-1])
-        inertia = Bound(none + most, 2 * most * seen.size, most * (2 * seen.first + 4 * seen.size**2))
-        return _rotating(float(np.linalg.norm(body.com)), seen), lambda w: inertia * w
+        inertia = most * np.stack([still[0] + 1, 2 * seen[0], 2 * seen[1] + 4 * seen[0] ** 2])
+        return _rotating(float(np.linalg.norm(body.com)), seen), lambda w: _product(inertia, w)
 
-    at_base = still, still, still, Bound(none + GRAVITY, none, none)
-    loads = _newton_euler(problem, at_base, of_joint, of_body)
-    return np.stack([(axis * load).second for axis, load in loads], axis=1)
+    at_base = still, still, still, np.stack([still[0] + GRAVITY, *still[1:]])
+    loads = _newton_euler(problem, at_base, of_joint, of_body, _product)
+    return np.stack([_product(*load)[2] for load in loads], axis=1)
 
 
 def _rotating(length: float, seen: Bound) -> Bound:
     """Bounds of a vector of constant length that rotates with a link whose rotation is bounded by `seen`."""
-    return Bound(length + 0 * seen.size, length * seen.size, length * (seen.first + seen.size**2))
+    return length * np.stack([1 + 0 * seen[0], seen[0], seen[1] + seen[0] ** 2])
 
 
 def _masses(problem: Problem) -> dict[str, list[Inertia]]:
@@ -526,39 +455,32 @@ def configurations(motion: Path | Trajectory, between: Values) -> Configurations
     `between`: times [s], for which the configurations are on the cubics through the rows' positions and
     velocities; for a path, rows plus shares of the way to the next, on its straight lines.
     """
-    if not len(between):
-        return motion.positions
     cubics = cubics_of(motion)
-    if cubics is None:
-        places = places_of(motion, between)
-        rows = clock(motion)
-        return np.column_stack([np.interp(places, rows, joint) for joint in motion.positions.T])
-    times = np.concatenate([clock(motion), between])
     rows = cubics.rows(between)
     q = np.concatenate([motion.positions, cubics.at(rows, between - cubics.times[rows])[0]])
-    return q[np.argsort(times, kind="stable")]
+    return q[np.argsort(np.concatenate([clock(motion), between]), kind="stable")]
 
 
-def deviations(motion: Path | Trajectory, between: Values) -> JointRows | None:
-    """How far a motion leaves the straight line from each of its `configurations` to the next; None for a
-    path, which does not."""
-    cubics = cubics_of(motion)
-    return None if cubics is None else cubics.deviations(places_of(motion, between))
+def deviations(motion: Path | Trajectory, between: Values) -> JointRows:
+    """How far a motion leaves the straight line from each of its `configurations` to the next."""
+    return cubics_of(motion).deviations(places_of(motion, between))
 
 
-def not_covered(problem: Problem, motion: Path | Trajectory) -> list[str]:
-    """Requirements of the problem that no certificate of such a motion can prove."""
-    untimed = not isinstance(motion, Trajectory)
-    return ["moving, without times"] if untimed and problem.moving else []
+def not_covered(problem: Problem, motion: Path | Trajectory) -> str:
+    """What the problem requires and no certificate of such a motion can prove; "" for nothing."""
+    return "moving, without times" if problem.moving and isinstance(motion, Path) else ""
 
 
 def not_checked(problem: Problem, motion: Path | Trajectory) -> list[str]:
     """What the checker leaves to the validator, or cannot see, in words."""
-    unchecked = ["sharp reversals"]
-    if not isinstance(motion, Trajectory):
-        unchecked.append("velocities, accelerations and times, which a path has not")
-        unchecked += ["start_velocity"] if problem.start_velocity is not None else []
-    return unchecked + (["what no view has seen"] if problem.views else [])
+    path = isinstance(motion, Path)
+    parts = {
+        "sharp reversals": True,
+        "velocities, accelerations and times, which a path has not": path,
+        "start_velocity": path and problem.start_velocity is not None,
+        "what no view has seen": problem.views,
+    }
+    return [what for what, unchecked in parts.items() if unchecked]
 
 
 def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
@@ -566,11 +488,10 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
     robot = problem.robot
     motion = certificate.motion
     tolerances = certificate.tolerances
-    for name in not_covered(problem, motion):
+    name = not_covered(problem, motion)
+    if name:
         yield f"problem: certificates do not prove anything about {name}"
-    q = configurations(motion, certificate.between)
-    cubics = cubics_of(motion)
-    every = motion.positions if cubics is None else np.concatenate([motion.positions, cubics.turns])
+    every = np.concatenate([motion.positions, cubics_of(motion).turns])
     beyond = np.maximum(robot.lower - every, every - robot.upper)
     beyond[:, robot.continuous] = 0.0
     for j in np.flatnonzero(~(beyond <= tolerances.limit_slack).all(axis=0)):
@@ -586,7 +507,7 @@ def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
         yield from _rate_errors(robot, motion, certificate, begins)
         yield from frame_speed_errors(problem, motion, tolerances.rate_slack)
         yield from _jerk_errors(robot, motion, certificate)
-    yield from _constraint_errors(problem, certificate, q)
+    yield from _constraint_errors(problem, certificate)
     yield from _torque_errors(problem, certificate)
 
 
@@ -613,15 +534,15 @@ def place_errors(problem: Problem, certificate: MotionProof) -> list[str]:
 def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
     """The largest jerk of each joint along the cubics; None for a path, and where accelerations jump or are
     written otherwise."""
-    cubics = cubics_of(motion)
-    if cubics is None:
+    if isinstance(motion, Path) or len(motion.times) < 2:
         return None
+    cubics = cubics_of(motion)
     most = np.where(robot.acceleration > 0, robot.acceleration, cubics.pulls.max(axis=0))
-    written = motion.accelerations  # type: ignore[union-attr]
+    written = motion.accelerations
     off = np.maximum(np.abs(written[:-1] - cubics.start), np.abs(written[1:] - cubics.end))
     if not (cubics.jumps() <= JUMP * most).all() or not (off <= JUMP * most).all():
         return None
-    return (np.abs(cubics.end - cubics.start) / cubics.steps).max(axis=0)
+    return cubics.jerks.max(axis=0)
 
 
 def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> Iterator[str]:
@@ -686,10 +607,11 @@ def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     yield from _stated_errors("torques", stated, most, allowed)
 
 
-def _constraint_errors(problem: Problem, certificate: MotionProof, q: Configurations) -> Iterator[str]:
+def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     """Path constraints that are not shown to be kept, and bounds that differ from the proof."""
     if not problem.constraints and not certificate.constraints:
         return
+    q = configurations(certificate.motion, certificate.between)
     shown = constraint_bounds(problem, q, certificate.tolerances.chord)
     if [one.name for one in shown] != [name for name, _ in certificate.constraints]:
         yield "constraints: they are not those of the problem"
@@ -713,88 +635,41 @@ def _stated_errors(
 def _rate_errors(
     robot: Robot, motion: Trajectory, certificate: MotionProof, begins: JointValues
 ) -> Iterator[str]:
+    """Joints that exceed their limits of velocity or acceleration, by any measure of them, cubics that leave
+    what was certified, and motions that do not begin as they must or end at rest."""
     tolerances = certificate.tolerances
-    step = np.diff(motion.times)[:, None]
+    times = motion.times
+    step = np.diff(times)[:, None]
     cubics = cubics_of(motion)
     off = deviations(motion, certificate.between)
-    if off is not None and not off.max() <= tolerances.chord * (1 + 1e-6) + 1e-12:
+    if not off.max(initial=0.0) <= tolerances.chord * (1 + 1e-6) + 1e-12:
         yield "motion: its cubics leave the straight lines that were certified"
+    q = motion.positions
     v = motion.velocities
     a = motion.accelerations
     share = 1 + tolerances.rate_slack
-    mean = np.diff(motion.positions, axis=0) / step
-    change = np.diff(v, axis=0) / step
-    rates = (
-        ("velocity", v, robot.velocity),
-        ("mean velocity between rows", mean, robot.velocity),
-        ("acceleration", a, robot.acceleration),
-        ("mean acceleration between rows", change, robot.acceleration),
-    )
     unsure = 2 * tolerances.limit_slack
-    blur = {"mean velocity between rows": unsure / np.maximum(step, MIN_TIME)}
-    if cubics is not None:
-        # velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step
-        along = "velocity along its cubics"
-        bent = "acceleration along its cubics"
-        rates += (along, cubics.speeds, robot.velocity), (bent, cubics.pulls, robot.acceleration)
-        blur |= {along: 1.5 * unsure / step, bent: 6 * unsure / step**2}
-        yield from _agreement_errors(robot, motion, cubics, begins, unsure)
-    for what, values, limit in rates:
-        over = ~(np.abs(values) <= share * limit + blur.get(what, 0.0)) & (limit > 0)
-        for j in np.flatnonzero(over.any(axis=0)):
-            most = np.abs(values[:, j]).max()
-            yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {most:.4g} > {limit[j]:.4g}"
-    yield from _position_errors(robot, motion, share, unsure)
-    yield from _acceleration_errors(robot, motion, begins, share, unsure, tolerances.rate_slack)
-    known = np.where(robot.velocity > 0, robot.velocity, np.abs(v).max(axis=0, initial=0.0))
-    off = np.abs(np.stack([v[0] - begins, v[-1]]))
-    if (off > tolerances.rate_slack * known + tolerances.rest).any():
-        how = "at the problem's start_velocity, or end" if begins.any() else "and end"
-        yield f"motion: it does not begin {how} at rest"
-
-
-def _position_errors(robot: Robot, motion: Trajectory, share: float, unsure: float) -> Iterator[str]:
-    """Joints that move further, from any row to any later one, than their velocity limits allow in that time.
-
-    Positions have a tolerance of `unsure`: once for the two rows and, for rows far apart, once for each step
-    between them.
-    """
-    step = np.diff(motion.times)[:, None]
-    q = motion.positions
-    allowed = np.zeros_like(q)
-    most = share * robot.velocity * step + unsure * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
-    np.cumsum(most, axis=0, out=allowed[1:])
-    furthest = np.zeros(q.shape[1])
-    for way in (q, -q):
-        # largest excess over all earlier rows, by a running minimum
-        least = np.minimum.accumulate(way - allowed, axis=0)
-        furthest = np.maximum(furthest, (way - allowed - least).max(axis=0))
-    for j in np.flatnonzero((furthest > unsure) & (robot.velocity > 0)):
-        name = robot.joint_names[j]
-        limit = robot.velocity[j]
-        how = f"it gets {furthest[j]:.3g} further than {limit:.4g} allows"
-        yield f"motion: {name} exceeds its limit of mean velocity from one row to another: {how}"
-
-
-def _acceleration_errors(
-    robot: Robot,
-    motion: Trajectory,
-    begins: JointValues,
-    share: float,
-    unsure: float,
-    rest_slack: float,
-) -> Iterator[str]:
-    """Joints whose mean accelerations over windows, computed from positions, exceed their limits.
-
-    Before the first row the arm is taken to move at its start velocity, and after the last row to stand
-    still. The mean acceleration, from the mean velocity before a row to that after it, is a value that the
-    joint must have reached.
-    """
-    times = motion.times
-    q = motion.positions
-    limit = robot.acceleration
-    fine = np.diff(times).min(initial=np.inf) < AVERAGING_WINDOWS[0]
+    speed = robot.velocity
+    pull = robot.acceleration
+    change = np.diff(v, axis=0) / step
+    # velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step
+    blur = 6 * unsure / step**2
+    yield from _agreement_errors(robot, motion, cubics, begins, blur)
+    for what, values, limit, room in (
+        ("velocity", v, speed, 0.0),
+        ("mean velocity between rows", np.diff(q, axis=0) / step, speed, unsure / np.maximum(step, MIN_TIME)),
+        ("acceleration", a, pull, 0.0),
+        ("mean acceleration between rows", change, pull, 0.0),
+        ("velocity along its cubics", cubics.speeds, speed, 1.5 * unsure / step),
+        ("acceleration along its cubics", cubics.pulls, pull, blur),
+    ):
+        yield from _exceeded(robot, what, np.abs(values), limit, share * limit + room)
+    beyond = _furthest(motion, share, unsure, speed)
+    how = "it gets {:.3g} further than {:.4g} allows"
+    yield from _exceeded(robot, "mean velocity from one row to another", beyond, speed, unsure, how)
+    fine = step.min(initial=np.inf) < AVERAGING_WINDOWS[0]
     for window in AVERAGING_WINDOWS if fine else AVERAGING_WINDOWS[:1]:
+        # before the first row the arm moves at its start velocity, and after the last it stands still
         at = np.concatenate([[times[0] - window], times, [times[-1] + window]])
         rows = np.concatenate([q[:1] - window * begins, q, q[-1:]])
         first = np.searchsorted(at, times - window, side="right") - 1
@@ -802,32 +677,66 @@ def _acceleration_errors(
         before = (times - at[first])[:, None]
         after = (at[last] - times)[:, None]
         apart = (before + after) / 2
+        # from the mean velocity before a row to that after it: a value that the joint must have reached
         bent = np.abs((rows[last] - q) / after - (q - rows[first]) / before) / apart
         outside = ((first == 0) * 1.0 + (last == len(at) - 1))[:, None]
-        room = unsure / before + unsure / after + outside * rest_slack * robot.velocity
-        over = ~(bent <= share * limit + room / apart) & (limit > 0)
-        for j in np.flatnonzero(over.any(axis=0)):
-            name = robot.joint_names[j]
-            most = bent[over[:, j], j].max()
-            what = "mean acceleration by its positions"
-            yield f"motion: {name} exceeds its limit of {what}: {most:.4g} > {limit[j]:.4g}"
-        if over.any():
-            return
+        room = unsure / before + unsure / after + outside * tolerances.rate_slack * speed
+        what = "mean acceleration by its positions"
+        lines = [*_exceeded(robot, what, bent, pull, share * pull + room / apart)]
+        yield from lines
+        if lines:
+            break
+    known = np.where(speed > 0, speed, np.abs(v).max(axis=0, initial=0.0))
+    off = np.abs(np.stack([v[0] - begins, v[-1]]))
+    if (off > tolerances.rate_slack * known + tolerances.rest).any():
+        how = "at the problem's start_velocity, or end" if begins.any() else "and end"
+        yield f"motion: it does not begin {how} at rest"
+
+
+def _exceeded(
+    robot: Robot,
+    what: str,
+    values: JointRows,
+    limit: JointValues,
+    allowed: ndarray | float,
+    how: str = "{:.4g} > {:.4g}",
+) -> Iterator[str]:
+    """A line for each joint with a limit some of whose values are not within what is allowed."""
+    over = ~(values <= allowed) & (limit > 0)
+    for j in np.flatnonzero(over.any(axis=0)):
+        most = how.format(values[over[:, j], j].max(), limit[j])
+        yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {most}"
+
+
+def _furthest(motion: Trajectory, share: float, unsure: float, speed: JointValues) -> JointRows:
+    """How much further each joint moves at most, from any row to any later one, than its velocity limit
+    allows in that time [1, dof].
+
+    Positions have a tolerance of `unsure`: once for the two rows and, for rows far apart, once for each step
+    between them.
+    """
+    step = np.diff(motion.times)[:, None]
+    q = motion.positions
+    allowed = np.zeros_like(q)
+    most = share * speed * step + unsure * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
+    np.cumsum(most, axis=0, out=allowed[1:])
+    # largest excess over all earlier rows, by a running minimum
+    ahead = np.stack([q, -q]) - allowed
+    return (ahead - np.minimum.accumulate(ahead, axis=1)).max(axis=(0, 1))[None]
 
 
 def _agreement_errors(
-    robot: Robot, motion: Trajectory, cubics: Cubics, begins: JointValues, unsure: float
+    robot: Robot, motion: Trajectory, cubics: Cubics, begins: JointValues, blur: ndarray
 ) -> Iterator[str]:
     """Joints whose written accelerations are not near those of the cubics beside their rows."""
     before = np.concatenate([cubics.start[:1], cubics.end])
     after = np.concatenate([cubics.start, cubics.end[-1:]])
-    off = np.maximum(np.minimum(before, after) - motion.accelerations, 0.0)
-    off = np.maximum(off, motion.accelerations - np.maximum(before, after))
+    a = motion.accelerations
+    off = np.maximum(np.minimum(before, after) - a, a - np.maximum(before, after)).clip(0.0)
     if begins.any():
-        off[0] = 0.0  # the motion before may have ended in any acceleration
-    peak = np.maximum(cubics.pulls.max(axis=0), np.abs(motion.accelerations).max(axis=0))
+        off[:1] = 0.0  # the motion before may have ended in any acceleration
+    peak = np.abs(np.concatenate([cubics.pulls, a])).max(axis=0)
     peak = np.maximum(peak, REST_SHARE * robot.acceleration)
-    blur = 6 * unsure / cubics.steps**2
     room = np.maximum(np.concatenate([blur[:1], blur]), np.concatenate([blur, blur[-1:]]))
     for j in np.flatnonzero(~(off <= AGREEMENT * peak + room).all(axis=0)):
         name = robot.joint_names[j]

@@ -217,7 +217,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     check_type("settings", settings, VerifySettings, "VerifySettings")
     unsupported = not_covered(problem, motion)
     if unsupported:
-        raise InputError(f"certificates prove nothing about {', '.join(unsupported)}, which the problem has")
+        raise InputError(f"certificates prove nothing about {unsupported}, which the problem has")
     report = verify(problem, motion, settings)
     if report.violation is not None:
         raise NotValidError(f"the motion is not valid: {report.violation.line}")
@@ -317,8 +317,6 @@ def _between(motion: Path | Trajectory, chord: float) -> Values:
     """Times between the rows such that the cubics leave the straight lines between them by at most
     `chord`."""
     cubics = cubics_of(motion)
-    if cubics is None:
-        return np.zeros(0)
     off = (cubics.pulls * cubics.steps**2 / 8).max(axis=1)
     parts = np.maximum(np.ceil(np.sqrt(off / chord)), 1).astype(int)
     if parts.sum() > MAX_STRETCHES:
