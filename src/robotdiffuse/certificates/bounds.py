@@ -233,7 +233,6 @@ class Prover:
     ) -> tuple[ndarray, ndarray]:
         further = np.array([self._of[c.link] for c in self.claims])[claim]
         moved = self._moved[further]
-        others = np.zeros(len(claim))
         if not pairs:
 
             def to_scene(row: ndarray, at: ndarray, centers: ndarray) -> ndarray:
@@ -245,6 +244,7 @@ class Prover:
             return self._ball_bounds(further, moved, posture, postures, spans, to_scene)
         nearer = np.array([self._of.get(c.against, 0) for c in self.claims])[claim]
         alone = self._moved[nearer] & ~moved
+        others = np.zeros(len(claim))
         some = np.flatnonzero(alone.any(axis=1))
         if len(some):
             others[some] = self._ball_bounds(nearer[some], alone[some], posture[some], postures, spans)[1]
@@ -438,7 +438,7 @@ class MovingProver(Prover):
     ) -> None:
         super().__init__(robot, Scene(), q, off)
         self.times, self.moving = times, tuple(moving)
-        self._shapes = [Obstacles(Scene([one.shape])) for one in moving]
+        self.obstacles = Obstacles(Scene([one.shape for one in moving]))
 
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
@@ -456,26 +456,19 @@ class MovingProver(Prover):
         further = np.array([self._of[claim.link] for claim in self.claims])[stretches.claim]
         number = {one.name: i for i, one in enumerate(self.moving)}
         which = np.array([number[claim.against] for claim in self.claims])[stretches.claim]
-        obstacle = np.empty(len(which))
+        speed, known, stands = (
+            np.array(values)[which]
+            for values in zip(
+                *((one.top_speed, one.known, one.track[1][0]) for one in self.moving), strict=True
+            )
+        )
+        obstacle = speed * np.where(known, np.maximum(at - begin, end - at), np.maximum(end, 0.0))
+        T = np.array([self.moving[i].pose(time) for i, time in zip(which, at, strict=True)])
 
-        def distances(row: ndarray, at_row: ndarray, centers: ndarray) -> ndarray:
-            found = np.empty(len(row))
-            for i, one in enumerate(self.moving):
-                of_it = np.flatnonzero(which == i)
-                if one.max_speed is None:
-                    T = np.array([one.pose(time) for time in at[of_it]]).reshape(-1, 4, 4)
-                    obstacle[of_it] = one.top_speed * np.maximum(at - begin, end - at)[of_it]
-                else:
-                    T = np.broadcast_to(one.pose(0.0), (len(of_it), 4, 4))
-                    obstacle[of_it] = one.max_speed * np.maximum(end[of_it], 0.0)
-                place = np.empty(len(which), int)
-                place[of_it] = np.arange(len(of_it))
-                balls = np.flatnonzero(which[row] == i)
-                there = T[place[row[balls]]]
-                local = np.einsum("nji,nj->ni", there[:, :3, :3], centers[balls] - there[:, :3, 3])
-                stands = one.pose(float(one.track[0][0]))
-                found[balls] = self._shapes[i].distances(local @ stands[:3, :3].T + stands[:3, 3])[:, 0]
-            return found
+        def distances(row: ndarray, _: ndarray, centers: ndarray) -> Values:
+            local = np.einsum("nji,nj->ni", T[row, :3, :3], centers - T[row, :3, 3])
+            apart = self.obstacles.distances(_placed_points(stands[row], local))
+            return apart[np.arange(len(row)), which[row]]
 
         posture = np.arange(len(which))
         moved = self._moved[further]

@@ -10,6 +10,7 @@ finds, prove it.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import coal
@@ -237,7 +238,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     torques = ()
     if problem.constraints:
 
-        def of_constraints(places: Values) -> tuple[Sequence[str], ndarray, Sequence[float]]:
+        def of_constraints(places: Values) -> tuple[Any, ...]:
             shown = constraint_bounds(problem, configurations(motion, places), tolerances.chord)
             names, limits, each = zip(*shown, strict=True)
             return names, np.column_stack(each), limits
@@ -327,14 +328,6 @@ def _between(motion: Path | Trajectory, chord: float) -> Values:
     return np.concatenate([np.zeros(0), *within])
 
 
-class _Found(NamedTuple):
-    stretches: Stretches
-    by_planes: ndarray
-    clearance: ndarray
-    displacement: ndarray
-    planes: list[Plane]
-
-
 def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[str, float]]:
     """A proof of all claims, and the clearance that it shows by kind (SCENE or ""); `least` is asked for
     [m]."""
@@ -345,7 +338,7 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
     targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + ROUNDING_RESERVE
     in_time = isinstance(prover, MovingProver)
     tools = None if in_time else PlaneFinder(prover)
-    done: list[_Found] = []
+    done = list[StretchProof]()
     total = 0
     while len(todo.claim) or not done:  # robots without bodies have nothing to prove
         n = len(todo.claim)
@@ -374,7 +367,14 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
             displacement[rows[chosen]] = less[chosen]
             _check_parts_are_apart(prover, todo.some(rows[better <= 0]))
         proved = clearance - displacement >= target
-        done.append(_proved_part(todo, proved, by_planes, clearance, displacement, planes))
+        number = np.cumsum(proved) - 1
+        kept = tuple(
+            plane._replace(stretch=int(number[plane.stretch]))
+            for plane in planes
+            if proved[plane.stretch] and by_planes[plane.stretch]
+        )
+        columns = by_planes[proved], clearance[proved], displacement[proved]
+        done.append(StretchProof(prover.claims, todo.some(proved), *columns, kept))
         total += n
         if total > MAX_STRETCHES:
             raise InputError(f"no proof of less than {MAX_STRETCHES:,} stretches was found for the motion")
@@ -393,23 +393,6 @@ def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
             )
 
 
-def _proved_part(
-    todo: Stretches,
-    proved: ndarray,
-    by_planes: ndarray,
-    clearance: ndarray,
-    displacement: ndarray,
-    planes: list[Plane],
-) -> _Found:
-    number = np.cumsum(proved) - 1
-    kept = [
-        plane._replace(stretch=int(number[plane.stretch]))
-        for plane in planes
-        if proved[plane.stretch] and by_planes[plane.stretch]
-    ]
-    return _Found(todo.some(proved), by_planes[proved], clearance[proved], displacement[proved], kept)
-
-
 def _cut(
     todo: Stretches, clearance: ndarray, displacement: ndarray, target: ndarray, which: ndarray
 ) -> Stretches:
@@ -418,9 +401,7 @@ def _cut(
     # where spheres are too coarse, parts are made short enough for planes
     asked = np.where(clearance < PLANES_BELOW, displacement / PLANES_DISPLACEMENT, 1.2 * displacement / spare)
     parts = np.clip(np.ceil(asked), 2, MAX_SPLIT).astype(int)
-    claims = []
-    starts = []
-    stops = []
+    rows = []
     for i in np.flatnonzero(which).tolist():
         low = float(todo.start[i])
         high = float(todo.stop[i])
@@ -430,15 +411,12 @@ def _cut(
         edges[-1] = high
         if not (np.diff(edges) > 0).all():
             raise InputError("no proof was found for the motion: it is too near to contact")
-        claims.append(np.full(n, todo.claim[i]))
-        starts.append(edges[:-1])
-        stops.append(edges[1:])
-    if not claims:
-        return Stretches(np.zeros(0, int), np.zeros(0), np.zeros(0))
-    return Stretches(np.concatenate(claims), np.concatenate(starts), np.concatenate(stops))
+        rows += [(todo.claim[i], *ends) for ends in pairwise(edges.tolist())]
+    claim, start, stop = np.array(rows).reshape(-1, 3).T
+    return Stretches(claim.astype(int), start, stop)
 
 
-def _join(prover: Prover, done: list[_Found]) -> tuple[StretchProof, dict[str, float]]:
+def _join(prover: Prover, done: list[StretchProof]) -> tuple[StretchProof, dict[str, float]]:
     claim, start, stop = (np.concatenate(parts) for parts in zip(*(f.stretches for f in done), strict=True))
     order = np.lexsort((start, claim))
     place = np.empty(len(order), int)
