@@ -200,8 +200,8 @@ def place_along(space, starts, ends, counts):
         for j in range(starts.shape[1]):
             block[j, :] = np.float32(0.5) * (starts[i, j] + ends[i, j])
         for _ in range(counts[i] // W):
-            place_frames(space.robot, block, work.frames, work.centres)
-    return work.centres[0, 0]
+            place_frames(space.robot, block, work.frames, work.centers)
+    return work.centers[0, 0]
 
 
 def free_edges(path: ndarray, space: Space) -> tuple[ndarray, ndarray]:

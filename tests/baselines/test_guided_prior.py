@@ -69,7 +69,7 @@ WAYPOINTS = 48
 
 
 def bumps(waypoints: int) -> Float[ndarray, "inner inner"]:
-    """Covariance of smooth bumps over the inner waypoints, in normalised joint values."""
+    """Covariance of smooth bumps over the inner waypoints, in normalized joint values."""
     t = np.linspace(0, 1, waypoints)[1:-1, None]
     waves = np.concatenate([0.25 / k * np.sin(np.pi * k * t) for k in (1, 2, 3)], 1)
     return waves @ waves.T + 1e-6 * np.eye(waypoints - 2)

@@ -156,7 +156,7 @@ def test_the_order_of_the_points_does_not_matter_and_no_points_are_zeros() -> No
     torch.testing.assert_close(net.encode(cloud), net.encode(shuffled))
     near = sorted_along_curve(cloud, net.region)
     steps = (near[:, 1:] - near[:, :-1]).norm(dim=-1).mean()
-    assert steps < 0.7 * (cloud[:, 1:] - cloud[:, :-1]).norm(dim=-1).mean(), "neighbours are near each other"
+    assert steps < 0.7 * (cloud[:, 1:] - cloud[:, :-1]).norm(dim=-1).mean(), "neighbors are near each other"
     assert not sorted_along_curve(torch.zeros(1, 40, 3), net.region).any()
     empty = scene_clouds(CollisionChecker(PANDA, Scene([])), net.region, net.settings.points, 1, rng)[0]
     torch.testing.assert_close(net.code_of(empty), net.encode(torch.zeros(1, 40, 3))[0])

@@ -247,7 +247,7 @@ def test_the_clearance_is_printed_beside_the_requested_one(
     far = write_problem(tmp_path, scene=[{"sphere": {"center": [0, 5, 0], "radius": 0.1}}])
     assert run("plan", far, "--planner", "aorrtc", "--clearance", 0.02) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "certified > 1 m to the scene (asked: 20 mm), at least" in printed and "millimetres" in printed
+    assert "certified > 1 m to the scene (asked: 20 mm), at least" in printed and "millimeters" in printed
     assert run("plan", far, "--clearance", 5) == 2
     assert "clearance is 5.0; it must be between 0 and 0.5" in capsys.readouterr().err
 

@@ -187,7 +187,7 @@ def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
     q = rng.uniform(robot.lower, robot.upper, (600, robot.dof))
     free = CollisionChecker(robot, scene).free(q)
     assert not ExactCollision(robot, scene).collides(q[free]).any()
-    # a cover that sticks out by a centimetre or two cannot refuse much more than this
+    # a cover that sticks out by a centimeter or two cannot refuse much more than this
     assert (~free & ~ExactCollision(robot, scene).collides(q)).mean() < 0.1
 
 

@@ -48,7 +48,7 @@ def test_collada_is_read_in_metres(tmp_path: Path) -> None:
     """100 mm were read as 100 m."""
     notes: list[str] = []
     np.testing.assert_allclose(corners(collada(tmp_path, "0.001"), notes), 1e-3 * np.diag([1, 2, 3]))
-    assert notes == ["part.dae is in units of 0.001 m; it is read in metres"]
+    assert notes == ["part.dae is in units of 0.001 m; it is read in meters"]
     with pytest.raises(InputError, match="its unit is '0' m"):
         read_triangles(collada(tmp_path, "0"))
 

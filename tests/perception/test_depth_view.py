@@ -69,12 +69,12 @@ def test_depth_files(tmp_path: Path) -> None:
     for name in ("a.png", "a.npy", "a.npz"):
         assert np.allclose(read_depth(tmp_path / name), image / 1000)
     assert np.allclose(read_depth(tmp_path / "a.png", 0.0001), image / 10000)
-    Image.fromarray(image.astype(np.uint8)).save(tmp_path / "grey.png")
-    np.save(tmp_path / "colour.npy", np.zeros((4, 4, 3)))
+    Image.fromarray(image.astype(np.uint8)).save(tmp_path / "gray.png")
+    np.save(tmp_path / "color.npy", np.zeros((4, 4, 3)))
     (tmp_path / "bad.png").write_bytes(b"no image")
     for name, message in {
-        "grey.png": "greyscale with 16 bits",
-        "colour.npy": "holds float64 of 4 x 4 x 3",
+        "gray.png": "grayscale with 16 bits",
+        "color.npy": "holds float64 of 4 x 4 x 3",
         "bad.png": "cannot be read",
         "none.png": "does not exist",
         "a.jpg": "unknown depth image format",

@@ -35,7 +35,7 @@ def planned(T_end: np.ndarray, scene: rd.Scene | None = None, **options) -> rd.P
 LINES = {
     "down": moved([0, 0, -0.2]),
     "aside and turned": moved([-0.1, 0.2, -0.05], [0.0, 0.6, 0.8], 0.7),
-    "half a millimetre": moved([0, 0, -0.0005]),
+    "half a millimeter": moved([0, 0, -0.0005]),
     "turn in place": moved([0, 0, 0], [0.0, 0.0, 1.0], 0.9),
     "tilt in place": moved([0, 0, 0], [1.0, 0.0, 0.0], -0.5),
 }

@@ -378,7 +378,7 @@ def test_the_goal_index_names_the_goal_that_is_reached() -> None:
         (start, 0),
     ):
         assert rd.plan(rd.Problem(robot, FREE, start, goal)).goal_index == index
-    # poses 2 mm apart: both are within the validator's centimetre
+    # poses 2 mm apart: both are within the validator's centimeter
     T = link_pose(robot, near, robot.tip)
     T_beside = transform(T[:3, 3] + [0.002, 0, 0], T[:3, :3])
     goals = rd.AnyGoal((rd.PoseGoal(robot.tip, T_beside), rd.PoseGoal(robot.tip, T)))

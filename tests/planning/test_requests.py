@@ -1,4 +1,4 @@
-"""Every planner fulfils each kind of request, or refuses it with one line that names the planner and what it
+"""Every planner fulfills each kind of request, or refuses it with one line that names the planner and what it
 does not support."""
 
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""Notes on numbers that look like millimetres."""
+"""Notes on numbers that look like millimeters."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def _notes(*shapes: rd.Box | rd.Mesh | rd.PointCloud | rd.Sphere, **options: obj
 )
 def test_obstacles_in_millimetres_are_noted(shape: rd.Box, text: str) -> None:
     [note] = _notes(shape)
-    assert note.startswith("check the units") and text in note and "millimetres" in note
+    assert note.startswith("check the units") and text in note and "millimeters" in note
 
 
 def test_scenes_in_metres_have_no_notes_on_units() -> None:
@@ -49,7 +49,7 @@ def test_a_depth_image_in_millimetres_is_noted() -> None:
     assert _notes(views=[view]) == ()
     wrong = [rd.DepthView(1000 * view.depth, view.intrinsics, T_base_camera)]
     [note] = _notes(views=wrong)
-    assert "depths of views[0] begin at" in note and "millimetres" in note
+    assert "depths of views[0] begin at" in note and "millimeters" in note
     problem = rd.Problem(PANDA, rd.Scene(), START, GOAL, views=wrong, unknown="padded")
     assert load_planner("aorrtc").plan(problem).notes.count(note) == 1
 
@@ -69,5 +69,5 @@ def test_a_cloud_that_the_arm_stands_in_is_noted() -> None:
     scene = rd.Scene([rd.PointCloud(points, name="scan")])
     result = load_planner("aorrtc").plan(rd.Problem(PANDA, scene, START, GOAL), time_limit=60.0)
     assert result.status is Status.INVALID_START
-    assert "points of scan are within the arm" in result.notes[0] and "millimetres" in result.notes[0]
+    assert "points of scan are within the arm" in result.notes[0] and "millimeters" in result.notes[0]
     assert arm_in_cloud_note(PANDA, rd.Scene([rd.PointCloud(CUBE + 2)]), np.array(START)) == ""

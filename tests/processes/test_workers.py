@@ -102,7 +102,7 @@ def test_errors_of_calls_keep_the_process() -> None:
         with pytest.raises(TypeError):
             worker.call(odd)
         with pytest.raises(SystemExit):
-            worker.call(sys.exit, "no licence")
+            worker.call(sys.exit, "no license")
         assert worker.call(os.getpid) == first
         assert worker.call(renewed) == first
         assert worker.call(os.getpid) != first

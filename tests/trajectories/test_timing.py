@@ -550,7 +550,7 @@ def test_joints_without_a_jerk_limit_have_the_stated_default() -> None:
 
 
 def test_a_corner_that_its_neighbour_leaves_more_room_is_checked_again() -> None:
-    """The second corner, accepted beside a wide neighbour, grew when that shrank, and left the clearance."""
+    """The second corner, accepted beside a wide neighbor, grew when that shrank, and left the clearance."""
     robot = arm()
     q = np.zeros((4, 7))
     q[1:, 0] = 1.0

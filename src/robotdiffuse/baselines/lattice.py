@@ -7,7 +7,7 @@ In each planned joint, nodes lie whole steps of `spacing` from the start. Edges 
 up to `joints_per_move` joints); their cost is joint-space length [rad]. The corners of the cell around a goal
 are connected to it by exact last edges. The result is the path along the lattice, without shortcuts.
 
-Limits, with seven joints: a node has 14 neighbours, or 2,186 if all joints may move at once, and a spacing of
+Limits, with seven joints: a node has 14 neighbors, or 2,186 if all joints may move at once, and a spacing of
 0.3 rad makes 10^9 nodes. The heuristic ignores obstacles: before a search leaves a pocket, it fills it, and
 that takes a time that grows with the seventh power of the pocket's width. Inflation trades length for speed.
 Passages narrower than a step are not found: no path on the lattice does not mean no path. A path of
@@ -97,9 +97,9 @@ def make_table(goals: int, max_nodes: int, edges: int) -> Table:
     heap = np.empty(n, np.int32)
     place = np.zeros(n, np.int32)
     state = np.zeros(n, np.uint8)
-    known = np.zeros((n, edges), np.uint8)
+    checked_edges = np.zeros((n, edges), np.uint8)
     values = np.zeros(5, np.int64)
-    table = Table(slots, keys, g, rhs, parent, state, known, heap, place, first, second, values)
+    table = Table(slots, keys, g, rhs, parent, state, checked_edges, heap, place, first, second, values)
     table.values[NODES] = goals
     table.g[:goals] = table.rhs[:goals] = INFINITE
     table.parent[:goals] = -1
@@ -387,12 +387,12 @@ def heuristic(lattice, at, targets, cell):
 @allocation_free()
 def _queue_key(s, node):
     """CalculateKey of D* Lite, whose k_m is OFFSET."""
-    least = min(s.table.g[node], s.table.rhs[node])
+    cost = min(s.table.g[node], s.table.rhs[node])
     bound = np.int64(0)
     if node >= len(s.lattice.goals):
         _coordinates(s.lattice, s.table.keys[node], s.at)
         bound = np.int64(s.inflation * heuristic(s.lattice, s.at, s.targets, s.cell))
-    return least + bound + s.table.values[OFFSET], s.ties * least
+    return cost + bound + s.table.values[OFFSET], s.ties * cost
 
 
 @allocation_free()
@@ -432,14 +432,17 @@ def search(s, expansions):
     g = table.g
     rhs = table.rhs
     for _ in range(expansions):
+        # u and k_old: the top of U and its key
         u = np.int64(table.heap[0]) if table.values[QUEUED] > 0 else table.values[TARGET]
         if u < goals:
             table.values[TARGET] = u
         target = table.values[TARGET]
         key = table.first[u], table.second[u]
-        done = key >= _queue_key(s, target) and rhs[target] <= g[target]
-        if done or table.values[QUEUED] == 0 or table.state[target] == BLOCKED:
+        # until U.TopKey >= CalculateKey(s_start) and rhs(s_start) <= g(s_start)
+        converged = key >= _queue_key(s, target) and rhs[target] <= g[target]
+        if converged or table.values[QUEUED] == 0 or table.state[target] == BLOCKED:
             return Outcome.FOUND if rhs[target] < INFINITE else Outcome.EXHAUSTED
+        # k_old < CalculateKey(u): k_m has grown since u was queued
         if _queue_key(s, u) > key:
             _queue_if_inconsistent(s, u)
             continue
@@ -447,6 +450,7 @@ def search(s, expansions):
             return Outcome.FULL
         _check_nodes(s, s.near)
         table.values[EXPANSIONS] += 1
+        # an overconsistent node gets its rhs; an underconsistent one is queued again, without a cost
         g[u] = rhs[u] if g[u] > rhs[u] else INFINITE
         _queue_if_inconsistent(s, u)
         for e in range(len(s.near)):
@@ -454,6 +458,7 @@ def search(s, expansions):
             if v < 0:
                 continue
             if g[u] < INFINITE:
+                # rhs(s) = min(rhs(s), c(s, u) + g(u))
                 cost = g[u] + s.steps[e]
                 closed = s.inflation > 1 and g[v] < INFINITE
                 if cost >= rhs[v] or closed or not _edge_free(s, u, v, e):
@@ -461,6 +466,7 @@ def search(s, expansions):
                 rhs[v] = cost
                 table.parent[v] = u
             elif table.parent[v] == u:
+                # u gave rhs(s): the minimum over all edges instead
                 _choose_parent(s, v)
             else:
                 continue
@@ -488,12 +494,12 @@ def update(s, distances, reaches):
         for column in range(table.edges.shape[1]):
             if table.edges[node, column] == UNKNOWN:
                 continue
-            other = s.near[column] if column < half else np.int64(-1)
-            if other < 0 or min(distances[node], distances[other]) <= reaches[column]:
+            neighbor = s.near[column] if column < half else np.int64(-1)
+            if neighbor < 0 or min(distances[node], distances[neighbor]) <= reaches[column]:
                 table.edges[node, column] = UNKNOWN
                 changed[node] = True
-                if other >= 0:
-                    changed[other] = True
+                if neighbor >= 0:
+                    changed[neighbor] = True
     _check_nodes(s, np.arange(goals, table.values[NODES]))
     for node in range(goals, table.values[NODES]):
         if changed[node]:
@@ -557,7 +563,7 @@ def make_lattice(
     spacing = settings.spacing
     name = settings.settings_name
     start = start.astype(float)
-    most = min(settings.joints_per_move, robot.dof)
+    moving_joints = min(settings.joints_per_move, robot.dof)
     below, above = (
         np.maximum(np.floor(distance / spacing - LIMIT_MARGIN), 0).astype(np.int64)
         for distance in (start - robot.lower, robot.upper - start)
@@ -570,19 +576,21 @@ def make_lattice(
             f"{spacing * (total / MAX_NODE_KEYS) ** (1 / robot.dof) * 1.1:.2g} does it"
         )
     edges = np.cumsum([comb(robot.dof, k) * 2**k for k in range(1, robot.dof + 1)])
-    if (count := edges[most - 1]) > MAX_MOVES:
+    if (count := edges[moving_joints - 1]) > MAX_MOVES:
         raise InputError(
             f"{name}.joints_per_move is {settings.joints_per_move}; on {robot.name} that makes {count} edges "
             f"of a node; it must be at most {np.searchsorted(edges, MAX_MOVES, side='right')}"
         )
     strides = np.concatenate([[1], np.cumprod(counts[:-1])]).astype(np.int64)
     origin = start - spacing * below
-    half = lattice_moves(robot.dof, most)
+    half = lattice_moves(robot.dof, moving_joints)
     moves = np.concatenate([half, -half])
     costs = np.ceil(UNITS * np.sqrt(np.abs(moves).sum(axis=1))).astype(np.int64)
     goals_at = (goals.astype(float) - origin) / spacing
     goals = np.ascontiguousarray(goals, np.float32)
-    lattice = Lattice(origin, float(spacing), counts, strides, moves, costs, 1 / sqrt(most), goals, goals_at)
+    lattice = Lattice(
+        origin, float(spacing), counts, strides, moves, costs, 1 / sqrt(moving_joints), goals, goals_at
+    )
     return lattice, int(below @ strides)
 
 
@@ -744,34 +752,36 @@ class DStarLiteSearch(AStarSearch[DStarLiteSettings]):
         distances = np.full(len(self._table.keys), np.inf, np.float32)
         before = self.checker.scene.shapes
         after = checker.scene.shapes
-        kept = {id(shape) for shape in before} & {id(shape) for shape in after}
-        kept = kept if self.checker.scene.allowed_contacts == checker.scene.allowed_contacts else set()
-        moved = [shape for shape in (*before, *after) if id(shape) not in kept]
-        known = slice(len(self.goals), self._table.values[NODES])
+        unchanged = {id(shape) for shape in before} & {id(shape) for shape in after}
+        unchanged = (
+            unchanged if self.checker.scene.allowed_contacts == checker.scene.allowed_contacts else set()
+        )
+        moved = [shape for shape in (*before, *after) if id(shape) not in unchanged]
+        table_rows = slice(len(self.goals), self._table.values[NODES])
         if checker.padding != self.checker.padding:
-            distances[known] = -np.inf
+            distances[table_rows] = -np.inf
         elif moved:
             margin = float(self._search.space.padding) + DISTANCE_ROUNDING
-            q = self._configurations(self._coordinates(self._table.keys[known]))
+            q = self._configurations(self._coordinates(self._table.keys[table_rows]))
             limit = float(self._reaches.max()) + 2 * margin
             clearances = CollisionChecker(checker.robot, Scene(moved)).link_clearances(q, limit=limit)
-            distances[known] = clearances.min(axis=1, initial=np.inf) - margin
+            distances[table_rows] = clearances.min(axis=1, initial=np.inf) - margin
         return distances
 
     def _move_start(self, start: Configuration) -> None:
         lattice = self._lattice
         at = (np.asarray(start, np.float64) - lattice.origin) / lattice.spacing
-        whole = np.round(at).astype(np.int64)
-        if np.abs(at - whole).max() > 1e-3 or (whole < 0).any() or (whole >= lattice.counts).any():
+        rounded = np.round(at).astype(np.int64)
+        if np.abs(at - rounded).max() > 1e-3 or (rounded < 0).any() or (rounded >= lattice.counts).any():
             raise InputError(f"start is {np.round(start, 4)}; it must be a node of the lattice")
-        [node] = add_nodes(self._table, np.array([whole @ lattice.strides]))
+        [node] = add_nodes(self._table, np.array([rounded @ lattice.strides]))
         if node < 0:
             raise InputError(
                 f"start is {np.round(start, 4)}; the search has not reached it, and memory is full"
             )
         if node != self._table.values[TARGET]:
             # rounded up: queued keys must stay lower bounds
-            self._table.values[OFFSET] += heuristic(lattice, whole, self._search.targets, 0) + 2
+            self._table.values[OFFSET] += heuristic(lattice, rounded, self._search.targets, 0) + 2
         self._table.values[TARGET] = node
 
 
@@ -798,8 +808,8 @@ class _LatticePlanner(Planner[LatticePlannerSettings]):
                 }
                 status = Status.TIMEOUT if outcome is Outcome.GOING else Status.NO_PATH
                 return context.fail(status, reasons[outcome])
-            done = f"solved by {self.name}: {search.expansions} expansions"
-            result = context.finish(start_goal.complete(path), self.name, reason=done)
+            reason = f"solved by {self.name}: {search.expansions} expansions"
+            result = context.finish(start_goal.complete(path), self.name, reason=reason)
             if result is not None:
                 return result
             if settings.resolution <= FINEST_RESOLUTION:

@@ -8,7 +8,7 @@ parts, by the paper's names:
 - *Bidirectional neural planning* (`NeuralPlanning.between`): both ends step towards each other, unchecked
   (the states are "beacons"), until the straight line between them is free.
 - *Lazy states contraction*: states that a free straight line can skip are removed.
-- *Replanning*: states in collision are removed, and neural planning runs between neighbouring states without
+- *Replanning*: states in collision are removed, and neural planning runs between neighboring states without
   a free straight line, up to `replanning` times. The network's dropout makes each time different.
 - *Hybrid replanning*, if `hybrid` is on: a classical planner repairs what still collides, RRT-Connect here
   (paper: RRT*). It is off by default, as in the paper's MPNetPath:NR, so that benchmarks measure the network.
@@ -27,8 +27,8 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive

@@ -106,7 +106,7 @@ def _arrays(scenes: PackedScenes) -> tuple[SceneArrays, ndarray, ndarray, ndarra
     kinds, params = (np.ascontiguousarray(array) for array in (scenes.kinds, scenes.params))
     floors = np.zeros((len(scenes), 6)) if scenes.floors is None else scenes.floors
     different, floor = np.unique(floors, axis=0, return_inverse=True)
-    there = different.any(axis=1)
-    boxes = compile_scene(Scene([Box(row[:3], row[3:]) for row in different[there]])).solids
-    place = np.where(there, np.cumsum(there) - 1, -1)
+    has_floor = different.any(axis=1)
+    boxes = compile_scene(Scene([Box(row[:3], row[3:]) for row in different[has_floor]])).solids
+    place = np.where(has_floor, np.cumsum(has_floor) - 1, -1)
     return compile_scene(Scene([])), boxes, place[floor.reshape(-1)], kinds, params

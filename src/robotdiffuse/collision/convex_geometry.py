@@ -42,7 +42,7 @@ class Part(NamedTuple):
     """Empty for a ball, which has one vertex."""
     rounding: float
     center: Float[ndarray, "3"]
-    """Centre of a ball around the part."""
+    """Center of a ball around the part."""
     radius: float
 
 

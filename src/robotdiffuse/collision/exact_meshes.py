@@ -100,7 +100,7 @@ def _pieces(robot: Robot) -> dict[str, tuple[_Piece, ...]]:
 
 @once_per_robot
 def _balls(robot: Robot) -> dict[str, tuple[int, ndarray, ndarray]]:
-    """For each link its frame, and the centres [k, 3] and radii [k] of balls around its parts."""
+    """For each link its frame, and the centers [k, 3] and radii [k] of balls around its parts."""
     return {
         link: (parts[0].frame, np.stack([p.center for p in parts]), np.array([p.radius for p in parts]))
         for link, parts in parts_of(robot).items()
@@ -195,7 +195,7 @@ class ExactCollision:
         self._collide = coal.CollisionRequest()
 
     def _boxes(self, solids: Sequence[Solid]) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """The boxes of obstacles: R_box_base [o,3,3], centres [o,3], half sizes [o,3] and roundings [o]."""
+        """The boxes of obstacles: R_box_base [o,3,3], centers [o,3], half sizes [o,3] and roundings [o]."""
         T = np.stack([solid.T_base_box for solid in solids])
         return (
             np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),

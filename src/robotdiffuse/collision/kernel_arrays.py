@@ -76,24 +76,24 @@ class SceneArrays(NamedTuple):
     """Obstacles: solids, and points in a grid."""
 
     solids: ndarray
-    """[n, 17] Minkowski sums of a box, a disc about its z axis and a ball: centre, world-to-shape rotation
+    """[n, 17] Minkowski sums of a box, a disc about its z axis and a ball: center, world-to-shape rotation
     (row-major), half edges, radius of the ball, and 1 for a cylinder, else 0. The first two half edges of a
     cylinder are its radius. Surfaces that links may touch are balls among the solids."""
     solid_boxes: ndarray
     """[rows, 6 * 16] axis-aligned boxes around the solids in rows of sixteen: low x of all, then low y, low
     z, high x, high y and high z."""
     points: ndarray
-    """[n, 4] centre, radius; sorted by cell."""
+    """[n, 4] center, radius; sorted by cell."""
     point_rows: ndarray
     """[rows, 4 * 16] the points in rows of sixteen: x of all, then y, z and radius. The last one is
     repeated."""
     cell_first: ndarray
     """[cells + 1] first point of each cell."""
     grid: ndarray
-    """[nx * ny * nz] distance from each voxel's centre to the nearest point's centre; beyond the band a lower
+    """[nx * ny * nz] distance from each voxel's center to the nearest point's center; beyond the band a lower
     bound."""
     nearest: ndarray
-    """[nx * ny * nz] index of the point that is nearest to each voxel's centre, -1 far beyond the band."""
+    """[nx * ny * nz] index of the point that is nearest to each voxel's center, -1 far beyond the band."""
     grid_frame: ndarray
     """[14] origin x y z; edges of voxel and cell; largest and smallest radius of a point; band; numbers of
     voxels nx, ny, nz; numbers of cells."""
@@ -177,8 +177,8 @@ def _placed_groups(robot: Robot) -> dict[str, _Group]:
     for link in links:
         T = robot.T_frame_link(link)
         local = np.asarray(robot.spheres[link], np.float64)
-        centres = local[:, :3] @ T[:3, :3].T + T[:3, 3]
-        link_spheres.append(np.column_stack([centres, local[:, 3]]))
+        centers = local[:, :3] @ T[:3, :3].T + T[:3, 3]
+        link_spheres.append(np.column_stack([centers, local[:, 3]]))
         parts.append(_clusters(link_spheres[-1]))
     bounds = _bounding_spheres([*link_spheres, *(part for of_link in parts for part in of_link)])
     of_parts = iter(bounds[len(link_spheres) :])
@@ -200,7 +200,7 @@ def reach_bound(robot: Robot) -> float:
 
 @once_per_robot
 def reach_ball(robot: Robot) -> tuple[ndarray, float]:
-    """Centre [3] and radius of a ball around all spheres of moving links [m]. It is about the first joint if
+    """Center [3] and radius of a ball around all spheres of moving links [m]. It is about the first joint if
     that moves them all, and then smaller than the one about the base's origin."""
     first = robot.frame_offsets[0, :3, 3]
     reach = reach_bound(robot)
@@ -213,14 +213,14 @@ def _clusters(spheres: ndarray) -> list[ndarray]:
     """Spheres in parts of at most sixteen, by halving along the direction of largest extent."""
     if len(spheres) <= W:
         return [spheres]
-    centred = spheres[:, :3] - spheres[:, :3].mean(axis=0)
-    order = np.argsort(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], kind="stable")
+    centered = spheres[:, :3] - spheres[:, :3].mean(axis=0)
+    order = np.argsort(centered @ np.linalg.svd(centered, full_matrices=False)[2][0], kind="stable")
     half = len(spheres) // 2
     return _clusters(spheres[order[:half]]) + _clusters(spheres[order[half:]])
 
 
 def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
-    """A nearly minimal sphere around each set of spheres (Badoiu and Clarkson: the centre repeatedly moves
+    """A nearly minimal sphere around each set of spheres (Badoiu and Clarkson: the center repeatedly moves
     towards the farthest one)."""
     if not sets:
         return []
@@ -230,12 +230,12 @@ def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
     for padded, real in zip(spheres, sets, strict=True):
         padded[: len(real)] = real
         padded[len(real) :, :3] = 0.0
-    centres = np.array([real[:, :3].mean(axis=0) for real in sets])
+    centers = np.array([real[:, :3].mean(axis=0) for real in sets])
     for i in range(1, 200):
-        reach = np.linalg.norm(spheres[..., :3] - centres[:, None], axis=-1) + spheres[..., 3]
-        centres = centres + (spheres[each, reach.argmax(axis=1), :3] - centres) / (i + 1)
-    reach = np.linalg.norm(spheres[..., :3] - centres[:, None], axis=-1) + spheres[..., 3]
-    return list(np.column_stack([centres, reach.max(axis=1) + 1e-6]))
+        reach = np.linalg.norm(spheres[..., :3] - centers[:, None], axis=-1) + spheres[..., 3]
+        centers = centers + (spheres[each, reach.argmax(axis=1), :3] - centers) / (i + 1)
+    reach = np.linalg.norm(spheres[..., :3] - centers[:, None], axis=-1) + spheres[..., 3]
+    return list(np.column_stack([centers, reach.max(axis=1) + 1e-6]))
 
 
 GRID_SECONDS_PER_POINT = 7e-7
@@ -304,12 +304,12 @@ def _rows(solids: Sequence[Solid], reach: float) -> ndarray:
     high = np.minimum(half, base + far)
     nonempty = low < high
     half[nonempty] = ((high - low) / 2)[nonempty]
-    centre = T[:, :3, 3] + np.einsum("nij,nj->ni", R, np.where(nonempty, (low + high) / 2, 0.0))
-    grown = FLOAT32_ROUNDING * (np.abs(centre).max(axis=1) + sizes.max(axis=1))
+    center = T[:, :3, 3] + np.einsum("nij,nj->ni", R, np.where(nonempty, (low + high) / 2, 0.0))
+    grown = FLOAT32_ROUNDING * (np.abs(center).max(axis=1) + sizes.max(axis=1))
     sizes += grown[:, None] * (sizes > 0)
     half[:, :2] += sizes[:, 3:4]
     turned = R.transpose(0, 2, 1).reshape(-1, 9)
-    return np.concatenate([centre, turned, half, sizes[:, 4:], sizes[:, 3:4] > 0], axis=1).astype(np.float32)
+    return np.concatenate([center, turned, half, sizes[:, 4:], sizes[:, 3:4] > 0], axis=1).astype(np.float32)
 
 
 def _boxes_around(rows: ndarray) -> ndarray:

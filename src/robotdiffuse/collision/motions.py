@@ -166,18 +166,18 @@ class ContinuousCollision:
         return Sweep(None, *certified.tolist())
 
     def _ask(
-        self, motion: Motion, found: Round, rows: ndarray, columns: ndarray, best: ndarray
+        self, motion: Motion, bounds: Round, rows: ndarray, columns: ndarray, best: ndarray
     ) -> tuple[tuple[float, int], Round] | None:
         """Let Coal compute the distances that the round leaves to it.
 
         If there is a contact, returns its place and check, and the part of the round before it: an earlier
         contact may still be found there, and what follows no longer matters. Else returns None.
         """
-        todo = found.pieces
-        clearance = found.clearance
-        lower = found.lower
+        todo = bounds.pieces
+        clearance = bounds.clearance
+        lower = bounds.lower
         kinds = self.checks.kind[columns]
-        travel = found.travel[rows, columns]
+        travel = bounds.travel[rows, columns]
         middle = (todo.start + todo.stop) / 2
         at = motion_pieces.configurations(motion, middle[rows])
         cutoffs = np.clip(travel + best[kinds], 2 * self.contact, CLEARANCE_CAP)
@@ -196,7 +196,7 @@ class ContinuousCollision:
         todo.stop[row] = middle[row]
         clearance[row:] = lower[row:] = -np.inf
         parts = (todo.start, todo.stop, todo.undecided)
-        rest = Round(Pieces(*(part[:keep] for part in parts)), *(part[:keep] for part in found[1:]))
+        rest = Round(Pieces(*(part[:keep] for part in parts)), *(part[:keep] for part in bounds[1:]))
         return (float(middle[row]), int(columns[computed])), rest
 
     @cached_property

@@ -53,7 +53,7 @@ def thin_points(points: Float[ndarray, "n 3"], radius: float, reach: float) -> F
 
 
 def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]:
-    """One sphere per voxel around all spheres with centres in it."""
+    """One sphere per voxel around all spheres with centers in it."""
     if not len(spheres):
         return NO_SPHERES
     offsets = spheres[:, :3] - spheres[:, :3].min(axis=0)
@@ -69,10 +69,10 @@ def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]
         return spheres
     spheres = spheres[packed & ((1 << bits) - 1)]
     counts = np.diff(starts, append=len(spheres))
-    centres = np.add.reduceat(spheres[:, :3], starts) / counts[:, None]
-    away = spheres[:, :3] - np.repeat(centres, counts, axis=0)
+    centers = np.add.reduceat(spheres[:, :3], starts) / counts[:, None]
+    away = spheres[:, :3] - np.repeat(centers, counts, axis=0)
     radii = np.maximum.reduceat(np.sqrt(np.einsum("ij,ij->i", away, away)) + spheres[:, 3], starts)
-    return np.column_stack([centres, radii])
+    return np.column_stack([centers, radii])
 
 
 def join_to_few(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "m 4"]:
@@ -90,9 +90,9 @@ def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[n
     # bisection ends with pieces of about a quarter of the squared spacing
     spacing = max(MESH_SPACING, float(np.sqrt(4 * _area(near) / MAX_POINTS)))
     triangle_parts = _divide(near, spacing, reach)
-    centres = triangle_parts.mean(axis=1)
-    radii = np.linalg.norm(triangle_parts - centres[:, None], axis=2).max(axis=1, initial=0.0)
-    spheres = np.column_stack([centres, radii + 1e-4])
+    centers = triangle_parts.mean(axis=1)
+    radii = np.linalg.norm(triangle_parts - centers[:, None], axis=2).max(axis=1, initial=0.0)
+    spheres = np.column_stack([centers, radii + 1e-4])
     return _join(spheres, spacing) if len(spheres) > MAX_POINTS else spheres
 
 

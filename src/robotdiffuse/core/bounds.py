@@ -10,8 +10,8 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shown
 
 MAX_COORDINATE = 1e4
-"""Largest absolute coordinate, size or joint value [m] or [rad]: ten kilometres. At this distance float32
-resolves about a millimetre, and compiled code adds a margin for it."""
+"""Largest absolute coordinate, size or joint value [m] or [rad]: ten kilometers. At this distance float32
+resolves about a millimeter, and compiled code adds a margin for it."""
 MIN_SIZE = 1e-9
 """Smallest size [m]; float32 cannot resolve smaller ones beside coordinates."""
 # Smallest limit of a joint's velocity or acceleration, and largest rate, in their own units.

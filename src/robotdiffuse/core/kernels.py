@@ -56,19 +56,19 @@ def cache_folder() -> Path:
     folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(user, PACKAGE.name))
     if is_writable(folder):
         return folder
-    own = Path(tempfile.gettempdir()) / f"{PACKAGE.name}-{os.getuid()}"
+    fallback = Path(tempfile.gettempdir()) / f"{PACKAGE.name}-{os.getuid()}"
     try:
-        own.mkdir(mode=0o700, exist_ok=True)
-        if own.is_symlink() or own.stat().st_uid != os.getuid():
-            raise PermissionError(f"{own} belongs to another user")
+        fallback.mkdir(mode=0o700, exist_ok=True)
+        if fallback.is_symlink() or fallback.stat().st_uid != os.getuid():
+            raise PermissionError(f"{fallback} belongs to another user")
     except OSError:
-        own = Path(tempfile.mkdtemp(prefix=f"{PACKAGE.name}-"))
+        fallback = Path(tempfile.mkdtemp(prefix=f"{PACKAGE.name}-"))
     warnings.warn(
-        f"{folder} is not writable: compiled code is kept in {own}; set NUMBA_CACHE_DIR to choose another "
-        "folder",
+        f"{folder} is not writable: compiled code is kept in {fallback}; set NUMBA_CACHE_DIR to choose "
+        "another folder",
         stacklevel=2,
     )
-    return own
+    return fallback
 
 
 def is_writable(folder: Path) -> bool:
@@ -112,16 +112,16 @@ def _folder_name(module: str) -> str:
 def _compiled_from(module: str) -> set[str]:
     """The modules whose code or constants are compiled into a module: itself, what it imports of the package
     and, where that is compiled too, what those import."""
-    found: set[str] = set()
+    modules: set[str] = set()
     waiting = [module]
     while waiting:
         name = waiting.pop()
-        if name in found:
+        if name in modules:
             continue
-        found.add(name)
+        modules.add(name)
         if b".core.kernels import" in _source(name):
             waiting.extend(_imported(name))
-    return found
+    return modules
 
 
 @cache

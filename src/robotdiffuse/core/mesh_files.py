@@ -1,4 +1,4 @@
-"""Reads triangle meshes from files, with z up and, where the format has a unit, in metres."""
+"""Reads triangle meshes from files, with z up and, where the format has a unit, in meters."""
 
 import io
 import logging
@@ -53,7 +53,7 @@ def read_triangles(
 ) -> tuple[ndarray, ndarray]:
     """Vertices [v, 3] and faces [f, 3] of a mesh file, with z up.
 
-    Collada is read in metres by its <unit>, other formats in the units of the file. Collada with another
+    Collada is read in meters by its <unit>, other formats in the units of the file. Collada with another
     <up_axis>, and glTF, which has y up, are turned.
 
     Args:
@@ -77,10 +77,10 @@ def read_triangles(
         raise InputError(f"mesh file {file} is a pointer of Git LFS; get the file itself: git lfs pull")
     options: dict[str, Any] = {}
     up = "Z_UP"
-    metres = 1.0
+    meters = 1.0
     try:
         if ending == ".dae":
-            content, up, metres = _collada(content)
+            content, up, meters = _collada(content)
             options = {"ignore_broken": False}
         elif ending in (".glb", ".gltf"):
             up = "Y_UP"
@@ -100,9 +100,9 @@ def read_triangles(
         raise InputError(f"mesh file {file} cannot be read: its vertices do not have three coordinates")
     if notes is not None and up != "Z_UP":
         notes.append(f"{path.name} has {up[0].lower()} up; it is turned to z up")
-    if notes is not None and metres != 1:
-        notes.append(f"{path.name} is in units of {metres:g} m; it is read in metres")
-    vertices = metres * np.asarray(mesh.vertices, np.float64)
+    if notes is not None and meters != 1:
+        notes.append(f"{path.name} is in units of {meters:g} m; it is read in meters")
+    vertices = meters * np.asarray(mesh.vertices, np.float64)
     return vertices @ R_UP[up].T, np.asarray(mesh.faces, np.int64)
 
 
@@ -121,12 +121,12 @@ def _collada(content: bytes) -> tuple[bytes, str, float]:
     unit = root.find("asset/unit")
     unit_text = "1" if unit is None else unit.get("meter", "1")
     try:
-        metres = float(unit_text)
+        meters = float(unit_text)
     except ValueError:
-        metres = 0.0
+        meters = 0.0
     if up not in R_UP:
         raise InputError(f"its up_axis is {shown(up)}; it must be one of {', '.join(R_UP)}")
-    if not 1e-9 < metres < 1e9:
+    if not 1e-9 < meters < 1e9:
         raise InputError(f"its unit is {shown(unit_text)} m; it must be a positive number")
     if any(sum(map(int, (count.text or "").split())) > len(content) for count in root.iter("vcount")):
         raise InputError("a polygon has more corners than the file has bytes")
@@ -138,7 +138,7 @@ def _collada(content: bytes) -> tuple[bytes, str, float]:
     if sum(_weight(scene, nodes, weights, {}, 0) for scene in root.iter("visual_scene")) > MAX_FILE_SIZE:
         raise InputError("its scene uses geometries too often to fit into memory")
     root.set("xmlns", "http://www.collada.org/2005/11/COLLADASchema")
-    return ET.tostring(root), up, metres
+    return ET.tostring(root), up, meters
 
 
 def _weight(

@@ -16,7 +16,7 @@ IDENTITY = np.eye(4)
 
 
 def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b 3 3"]:
-    """Rotation matrix of a quaternion, normalised first."""
+    """Rotation matrix of a quaternion, normalized first."""
     if wxyz.ndim == 1:  # plain floats: NumPy takes several times as long for four numbers
         w, x, y, z = wxyz.tolist()
         norm = math.sqrt(w * w + x * x + y * y + z * z)

@@ -1,7 +1,7 @@
 """Data sets of motions that were made elsewhere: `rd.write_dataset`, and the layout of the paper's authors.
 
 In the authors' robot.npz `x_train` [n, 254, 7] are joint values [rad], and `y_train` [n, 23]: start 7, goal
-that was reached 7, centres of two spheres 6, position of the target 3 [m]. The authors' viewer sends the
+that was reached 7, centers of two spheres 6, position of the target 3 [m]. The authors' viewer sends the
 first 20; that the last three are the target's position is our interpretation of the 23. float32.
 """
 
@@ -291,7 +291,7 @@ def import_npz(
 
 
 def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[ndarray, "n 2 3"]]:
-    """The motions, and the centres of the two spheres of each."""
+    """The motions, and the centers of the two spheres of each."""
     row_shapes = {"x_train": (WAYPOINTS, DOF), "y_train": (CONDITION_NUMBERS,)}
     input_file(file, largest=sys.maxsize)
     try:

@@ -36,7 +36,7 @@ MAX_THREADS = 8
 CAMERA_CENTER = (0.0, 0.0, 0.4)
 """Point that the cameras of partial views look at, in the base frame [m]."""
 CAMERA_DISTANCE = (1.5, 2.5)
-"""From the centre [m]; a camera inside an obstacle does not see it."""
+"""From the center [m]; a camera inside an obstacle does not see it."""
 CAMERA_ELEVATION = (0.1, 1.2)
 """Above the horizontal [rad]."""
 ABOVE_FLOOR = VisibleRegion(floor=0.0, reach=10.0)

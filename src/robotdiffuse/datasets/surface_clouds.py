@@ -132,14 +132,14 @@ def fill_clouds(kinds, params, seeds, region, eyes, out):
         x = seeds[i] | np.uint64(1)
         for _ in range(8):  # mixes seeds that differ in few bits
             x = _next(x)
-        found = 0
+        filled = 0
         draws = count
         if bounded or seen:
             draws *= _OVERSAMPLING
         if total <= _ZERO:
             draws = 0
         for _ in range(draws):
-            if found == count:
+            if filled == count:
                 break
             x = _next(x)
             pick = np.float32(x >> np.uint64(40)) * _UNIT * total
@@ -159,9 +159,9 @@ def fill_clouds(kinds, params, seeds, region, eyes, out):
                 # G. Marsaglia 1972: a direction from a point of the disc
                 ring = _FOUR * np.sqrt(_ONE - _FOUR * s)
                 radius = params[i, j, 3]
-                out[i, found, 0] = params[i, j, 0] + radius * ring * u
-                out[i, found, 1] = params[i, j, 1] + radius * ring * v
-                out[i, found, 2] = params[i, j, 2] + radius * (_ONE - _TWO * _FOUR * s)
+                out[i, filled, 0] = params[i, j, 0] + radius * ring * u
+                out[i, filled, 1] = params[i, j, 1] + radius * ring * v
+                out[i, filled, 2] = params[i, j, 2] + radius * (_ONE - _TWO * _FOUR * s)
             else:
                 offset = pick - (ends[j - 1] if j > 0 else _ZERO)
                 side = _HALF if x & np.uint64(1) else -_HALF
@@ -178,19 +178,19 @@ def fill_clouds(kinds, params, seeds, region, eyes, out):
                     b = v
                     c = side
                 for r in range(3):
-                    out[i, found, r] = (
+                    out[i, filled, r] = (
                         params[i, j, r] + axes[j, r, 0] * a + axes[j, r, 1] * b + axes[j, r, 2] * c
                     )
-            if bounded and not _inside(region, out[i, found]):
+            if bounded and not _inside(region, out[i, filled]):
                 continue
             if seen:
-                _localize(kinds[i], params[i], into, out[i, found], at)
+                _localize(kinds[i], params[i], into, out[i, filled], at)
                 if _hidden(kinds[i], j, at, eye):
                     continue
-            found += 1
-        for p in range(found, count):
+            filled += 1
+        for p in range(filled, count):
             for r in range(3):
-                out[i, p, r] = out[i, p - found, r] if found > 0 else _ZERO
+                out[i, p, r] = out[i, p - filled, r] if filled > 0 else _ZERO
 
 
 @kernel(error_model="numpy")
@@ -284,15 +284,15 @@ def _hidden(kinds, own, at, eye):
             continue
         if kinds[j] == SPHERE:
             along = _ZERO
-            long = _ZERO
+            length_squared = _ZERO
             start = _ZERO
             for c in range(3):
                 way = eye[j, c] - at[j, c]
                 along += at[j, c] * way
-                long += way * way
+                length_squared += way * way
                 start += at[j, c] * at[j, c]
-            t = min(max(-along / long, _ZERO), _ONE)
-            if start + t * (_TWO * along + t * long) < _ONE - _MARGIN:
+            t = min(max(-along / length_squared, _ZERO), _ONE)
+            if start + t * (_TWO * along + t * length_squared) < _ONE - _MARGIN:
                 return True
             continue
         enter = _ZERO

@@ -18,8 +18,8 @@ from numpy import ndarray
 
 from robotdiffuse import __version__
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.interrupts import delay_interrupts

@@ -33,7 +33,7 @@ IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001)}
-"""Types of the pixels of depth images, and metres per unit (REP 118)."""
+"""Types of the pixels of depth images, and meters per unit (REP 118)."""
 Stamped = TypeVar("Stamped", bound=tuple[float, Any])
 MAX_SIZE = 64 * 10**9
 """Of recordings [bytes]."""
@@ -232,7 +232,7 @@ def insert_by_time(history: list[Stamped], stamped: Stamped) -> None:
     insort(history, stamped, key=itemgetter(0))
 
 
-def neighbours(history: list[Stamped], stamp: float, gap: float) -> list[Stamped]:
+def neighbors(history: list[Stamped], stamp: float, gap: float) -> list[Stamped]:
     """The entries on both sides of a time, without those more than `gap` from it [s]; one at the very time
     counts alone."""
     i = bisect_left(history, stamp, key=itemgetter(0))
@@ -290,7 +290,7 @@ class TransformHistory:
         poses = self._poses[frame]
         if frame in self._static:
             return poses[-1][1]
-        near = neighbours(poses, stamp, gap)
+        near = neighbors(poses, stamp, gap)
         if not near:
             raise InputError(f"there is no transform of {frame} within {gap:g} s of {where}")
         if len(near) == 1:
@@ -316,7 +316,7 @@ class _States:
 
     def at(self, stamp: float, where: str) -> Configuration:
         """The configuration at a time. Raises InputError, naming `where`, if none is near."""
-        near = neighbours(self._states, stamp, MAX_GAP)
+        near = neighbors(self._states, stamp, MAX_GAP)
         if not near:
             names = ", ".join(self._robot.joint_names)
             raise InputError(f"there is no joint state of {names} within {MAX_GAP:g} s of {where}")

@@ -25,13 +25,13 @@ DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
 MAX_PIXELS = 2**24
 """Most pixels of a depth image, in all its channels: a small file can unpack to a huge image."""
 INTEGER_SCALE = 0.001
-"""Metres per unit of integer depth images, unless a scale is given."""
+"""Meters per unit of integer depth images, unless a scale is given."""
 
 
 def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "h w"]:
     """A depth image [m]: a 16 bit .png, an array in .npy or .npz (named depth, or the only one), or .exr.
 
-    scale: metres per unit; None: 0.001 for integers, 1 for floating-point numbers. Raises InputError for a
+    scale: meters per unit; None: 0.001 for integers, 1 for floating-point numbers. Raises InputError for a
     file that is missing or is not a depth image.
     """
     file = Path(file)
@@ -61,7 +61,7 @@ def _read_png(file: Path) -> ndarray:
     with warnings.catch_warnings(action="ignore"), Image.open(file) as image:  # warns of large images
         if image.mode not in ("I;16", "I;16B", "I"):
             raise InputError(
-                f"depth image {file} has the mode {image.mode}; it must be greyscale with 16 bits"
+                f"depth image {file} has the mode {image.mode}; it must be grayscale with 16 bits"
             )
         _check_size(file, image.width * image.height)
         return np.asarray(image).astype(np.int64)
@@ -157,7 +157,7 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
         source = {"depth": file} | ({} if scale is None else {"scale": scale})
     elif scale is not None:
         raise InputError(
-            "view.scale cannot be combined with an image in the problem file, which is in metres"
+            "view.scale cannot be combined with an image in the problem file, which is in meters"
         )
     return DepthView(image, values["intrinsics"], T_base_camera, configuration, source=source)
 

@@ -115,7 +115,7 @@ def _intersect(kind, ox, oy, oz, dx, dy, dz, a, b, c):
 def render_depth(kinds, rows, intrinsics, T, depth):
     """Lowers each pixel of `depth` [h w] to the depth of the nearest shape.
 
-    Shapes that contain the camera are not rendered. rows [n, 16]: centre, rotation from the base's frame to
+    Shapes that contain the camera are not rendered. rows [n, 16]: center, rotation from the base's frame to
     the shape's, half sizes or radius and half height, radius of a bounding sphere; T: T_base_camera. All
     arrays are float32, except kinds.
     """
@@ -179,7 +179,7 @@ def _squared_distance(kind, x, y, z, a, b, c):
 
 @kernel()
 def fill_voxels(kinds, rows, low, voxel, margin, out):
-    """Sets the voxels of out [nx ny nz] whose centre is in a shape, or at most `margin` [m] from it.
+    """Sets the voxels of out [nx ny nz] whose center is in a shape, or at most `margin` [m] from it.
 
     rows: as in `render_depth`; low: lower corner of the grid. All arrays are float32, except kinds
     and `out`, bool.
@@ -255,7 +255,7 @@ def voxels_within(
     grid: VoxelGrid,
     margin: float = 0.005,
 ) -> Voxels:
-    """Which voxels of a grid are occupied: their centre is in a shape, or at most `margin` [m] from it.
+    """Which voxels of a grid are occupied: their center is in a shape, or at most `margin` [m] from it.
 
     With the default margin, walls of 1 cm have no holes in a grid with voxels of 2 cm. Raises
     InputError for shapes other than spheres, boxes, cylinders and capsules.

@@ -52,7 +52,7 @@ class VoxelGrid:
         return np.array(self.low, np.float32), np.float32(self.edge)
 
     def centers(self, at: Int[ndarray, "n 3"]) -> Points:
-        """The centres of the voxels of these indices [m]."""
+        """The centers of the voxels of these indices [m]."""
         return (at + 0.5) * self.edge + self.low
 
     def indices(self, points: Points) -> Int[ndarray, "n 3"]:
@@ -64,18 +64,18 @@ class VoxelGrid:
         return np.asarray(((at >= 0) & (at < self.shape)).all(axis=1))
 
     def filled(self, robot: Robot, configurations: Iterable[Configuration], margin: float = 0.0) -> Voxels:
-        """Voxels with their centres in the arm's covering spheres, inflated by `margin` [m], at any of these
+        """Voxels with their centers in the arm's covering spheres, inflated by `margin` [m], at any of these
         configurations."""
         return self.within(np.concatenate([placed_spheres(robot, q) for q in configurations]), margin)
 
     def within(self, spheres: Float[ndarray, "n 4"], margin: float = 0.0) -> Voxels:
-        """Voxels with their centres in spheres, inflated by `margin` [m]."""
+        """Voxels with their centers in spheres, inflated by `margin` [m]."""
         out = np.zeros(self.shape, np.bool_)
         mark(spheres.astype(np.float32) + np.array([0, 0, 0, margin], np.float32), *self.frame, out)
         return out
 
     def swept(self, robot: Robot, path: Path, margin: float = 0.0) -> Voxels:
-        """Voxels with their centres in the arm's covering spheres, inflated by `margin` [m], anywhere on a
+        """Voxels with their centers in the arm's covering spheres, inflated by `margin` [m], anywhere on a
         path."""
         out = np.zeros(self.shape, np.bool_)
         sweep(compile_robot(robot), path.positions.astype(np.float32), np.float32(margin), *self.frame, out)
@@ -104,7 +104,7 @@ def refined(voxels: Bool[ndarray, "mx my mz"]) -> Voxels:
 
 @kernel(nogil=True)
 def sweep(robot, path, margin, low, voxel, swept):
-    """Mark the voxels with centres that the moving covering spheres, inflated by `margin` [m], pass over;
+    """Mark the voxels with centers that the moving covering spheres, inflated by `margin` [m], pass over;
     `swept` is bool[nx, ny, nz].
 
     robot: RobotArrays; path float32[n, dof]; low [3] corner of the voxels and `voxel`, their edge [m].
@@ -139,7 +139,7 @@ def sweep(robot, path, margin, low, voxel, swept):
 
 @kernel(nogil=True)
 def mark(spheres, low, voxel, marked):
-    """Mark the voxels with centres in one of the spheres [n, 4]."""
+    """Mark the voxels with centers in one of the spheres [n, 4]."""
     for s in range(len(spheres)):
         _mark(spheres[s, 0], spheres[s, 1], spheres[s, 2], spheres[s, 3], low, voxel, marked)
 
@@ -205,25 +205,25 @@ def heaviest_part(marked, weights):
     """Bounding box int64[2, 3] of the connected part of the marked voxels with the largest sum of weights:
     first voxel and one beyond the last. Voxels that share a face are connected."""
     todo = np.empty((marked.sum(), 3), np.int64)
-    left = marked.copy()
+    unvisited = marked.copy()
     best = np.zeros((2, 3), np.int64)
-    most = -1.0
+    max_weight = -1.0
     for i, j, k in np.argwhere(marked):
-        count = _push(i, j, k, left, todo, 0)
-        done = 0
+        count = _push(i, j, k, unvisited, todo, 0)
+        visited = 0
         weight = 0.0
-        while done < count:
-            x = todo[done, 0]
-            y = todo[done, 1]
-            z = todo[done, 2]
-            done += 1
+        while visited < count:
+            x = todo[visited, 0]
+            y = todo[visited, 1]
+            z = todo[visited, 2]
+            visited += 1
             weight += weights[x, y, z]
             for way in (-1, 1):
-                count = _push(x + way, y, z, left, todo, count)
-                count = _push(x, y + way, z, left, todo, count)
-                count = _push(x, y, z + way, left, todo, count)
-        if weight > most and count:
-            most = weight
+                count = _push(x + way, y, z, unvisited, todo, count)
+                count = _push(x, y + way, z, unvisited, todo, count)
+                count = _push(x, y, z + way, unvisited, todo, count)
+        if weight > max_weight and count:
+            max_weight = weight
             for axis in range(3):
                 best[0, axis], best[1, axis] = todo[:count, axis].min(), todo[:count, axis].max() + 1
     return best

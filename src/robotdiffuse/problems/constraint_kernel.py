@@ -103,7 +103,7 @@ class Work(NamedTuple):
 @kernel()
 def make_work(rows):
     m, dof = rows.lever_bounds.shape
-    most = 3 * m
+    row_count = 3 * m
     return Work(
         np.empty((3, 4)),
         np.empty(dof),
@@ -114,10 +114,10 @@ def make_work(rows):
         np.empty(m),
         np.empty((3, 4)),
         np.empty(6),
-        np.zeros((most, dof)),
-        np.zeros(most),
-        np.zeros((most, most)),
-        np.zeros(most),
+        np.zeros((row_count, dof)),
+        np.zeros(row_count),
+        np.zeros((row_count, row_count)),
+        np.zeros(row_count),
         np.zeros(dof),
         np.zeros(dof, np.bool_),
         np.empty(dof),
@@ -214,10 +214,16 @@ def _roll_pitch_yaw(rows, m, T, angles):
     pitch = np.arctan2(-r20, np.sqrt(r21 * r21 + r22 * r22))
     half = rows.half_size[m]
     value = max(abs(roll) - half[0], abs(pitch) - half[1], abs(yaw) - half[2])
-    other = roll - np.copysign(np.pi, roll), np.copysign(np.pi, pitch) - pitch, yaw - np.copysign(np.pi, yaw)
-    other_value = max(abs(other[0]) - half[0], abs(other[1]) - half[1], abs(other[2]) - half[2])
+    alternative = (
+        roll - np.copysign(np.pi, roll),
+        np.copysign(np.pi, pitch) - pitch,
+        yaw - np.copysign(np.pi, yaw),
+    )
+    other_value = max(
+        abs(alternative[0]) - half[0], abs(alternative[1]) - half[1], abs(alternative[2]) - half[2]
+    )
     if other_value < value:
-        angles[0], angles[1], angles[2] = other
+        angles[0], angles[1], angles[2] = alternative
         return other_value
     angles[0] = roll
     angles[1] = pitch
@@ -356,22 +362,22 @@ def _unproved(rows, limits, a, b, fraction, first, second, work):
 def proved(rows, limits, a, b, min_fraction, work):
     """The fraction of the straight motion from a to b up to which the limits are proved, and the row that is
     not proved there; 1.0 and -1 if all are proved. Pieces are split down to the fraction `min_fraction`."""
-    done = 0.0
+    proved_fraction = 0.0
     fraction = 1.0
     end = 0
     evaluate(rows, a, 0, work)
-    while done < 1.0:
-        fraction = min(fraction, 1.0 - done)
+    while proved_fraction < 1.0:
+        fraction = min(fraction, 1.0 - proved_fraction)
         for k in range(len(a)):
-            work.trial[k] = a[k] + (done + fraction) * (b[k] - a[k])
+            work.trial[k] = a[k] + (proved_fraction + fraction) * (b[k] - a[k])
         evaluate(rows, work.trial, 1 - end, work)
         row = _unproved(rows, limits, a, b, fraction, end, 1 - end, work)
         if row < 0:
-            done = done + fraction
+            proved_fraction = proved_fraction + fraction
             end = 1 - end
             fraction = 2 * fraction
         elif fraction <= min_fraction:
-            return done, row
+            return proved_fraction, row
         else:
             fraction *= 0.5
     return 1.0, -1

@@ -25,7 +25,7 @@ SCALAR_BOUNDS = {
 }
 """Scalar fields: minimum, maximum, unit."""
 DIRECTION_FIELDS = ("axis", "direction", "normal")
-"""Vector fields that are normalised."""
+"""Vector fields that are normalized."""
 BASE_FRAME = read_only(np.eye(4))
 
 
@@ -151,7 +151,7 @@ class CartesianLine(FrameConstraint):
 
     The goal must therefore determine the pose of the link: one configuration, or a pose without tolerances of
     a link that is rigidly connected to it. The orientation follows the shortest rotation from start to goal,
-    in proportion to the fraction of the segment travelled.
+    in proportion to the fraction of the segment traveled.
     """
 
     kind: ClassVar[str] = "cartesian_line"

@@ -458,7 +458,7 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     """Start, attached objects and goals of a parsed request; `frames` and `folder` are those of its scene.
 
     Several joint goal constraints are alternative goals. A position and an orientation constraint of one link
-    are a pose goal at the centre of the region, whose size and tolerances are ignored. Raises InputError for
+    are a pose goal at the center of the region, whose size and tolerances are ignored. Raises InputError for
     anything else, and for path constraints, because ignoring them would change the problem.
     """
     data = mapping_of(REQUEST, data)

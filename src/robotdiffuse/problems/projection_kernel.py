@@ -20,7 +20,7 @@ from robotdiffuse.problems.constraint_kernel import (
 from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step
 
 ANGLE_WEIGHT = 0.3
-"""Metres that correspond to one radian in projection."""
+"""Meters that correspond to one radian in projection."""
 MIN_COSINE = 0.05
 """Smallest cosine of a pitch with which rates of roll and yaw are computed."""
 # For projection: damping (squared singular values well above it are inverted), longest step [rad], and
@@ -75,10 +75,10 @@ def _residuals(rows, limits, q, work):
                 work.e[count] = ANGLE_WEIGHT * (value - rows.inner_limit[m])
             elif rows.row_kind[m] == ROLL_PITCH_YAW:
                 angle = work.error[r]
-                inner = rows.inner_half_size[m, r]
+                half_size = rows.inner_half_size[m, r]
                 if abs(angle) <= rows.half_size[m, r]:
                     continue
-                work.e[count] = ANGLE_WEIGHT * (min(max(angle, -inner), inner) - angle)
+                work.e[count] = ANGLE_WEIGHT * (min(max(angle, -half_size), half_size) - angle)
             else:
                 work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * keep
             for j in range(dof):
@@ -120,13 +120,13 @@ def step(rows, limits, q, most, work):
         return 0
     work.held[:] = False
     damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
-    again = False
+    clamped_joint = False
     for k in range(dof):
         low = q[k] <= rows.lower[k]
         high = q[k] >= rows.upper[k]
         if not rows.continuous[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
-            work.held[k] = again = True
-    if again:
+            work.held[k] = clamped_joint = True
+    if clamped_joint:
         damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
     length = np.sqrt((work.step * work.step).sum())
     scale = min(1.0, most / max(length, 1e-12))
@@ -146,9 +146,9 @@ def project(rows, limits, q, work):
     Returns whether q satisfies the limits.
     """
     for _ in range(MAX_ITERATIONS):
-        left = step(rows, limits, q, MAX_STEP, work)
-        if left <= 0:
-            return left == 0
+        residuals = step(rows, limits, q, MAX_STEP, work)
+        if residuals <= 0:
+            return residuals == 0
     return _residuals(rows, limits, q, work) == 0
 
 

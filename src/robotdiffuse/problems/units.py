@@ -1,4 +1,4 @@
-"""Notes on problems whose numbers look like millimetres."""
+"""Notes on problems whose numbers look like millimeters."""
 
 import numpy as np
 from jaxtyping import Float
@@ -20,11 +20,11 @@ VIEW_STRIDE = 4
 """One pixel of so many, along rows and columns, is looked at."""
 MIN_POINTS_IN_ARM = 10
 """Fewer points than this within the arm are noise."""
-ADVICE = "lengths are in metres: divide millimetres by 1000"
+ADVICE = "lengths are in meters: divide millimeters by 1000"
 
 
 def unit_notes(problem: Problem) -> tuple[str, ...]:
-    """Notes on obstacles that are all out of reach or too large: they may be given in millimetres."""
+    """Notes on obstacles that are all out of reach or too large: they may be given in millimeters."""
     reach = reach_bound(problem.robot)
     shapes = [shape for shape in problem.scene.shapes if not isinstance(shape, (SeenPoints, AssumedPoints))]
     seen = len(shapes) < len(problem.scene.shapes)

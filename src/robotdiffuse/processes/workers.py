@@ -166,7 +166,7 @@ class Worker:
             raise EndedError("closed")
         process, connection = self._running
         due = time.monotonic() + timeout
-        cancelled = False
+        stop_sent = False
         self._number += 1
         try:
             connection.send((self._number, given))
@@ -175,8 +175,8 @@ class Worker:
                 if remaining <= 0:
                     self.end(0.0)
                     raise OverrunError("because its call took too long")
-                if not cancelled and stop():
-                    cancelled = True
+                if not stop_sent and stop():
+                    stop_sent = True
                     due = min(due, time.monotonic() + CANCEL_TIMEOUT)
                     connection.send((self._number, None))
                 if connection.poll(min(remaining, CHECK_INTERVAL)):

@@ -130,8 +130,8 @@ class MovingObstacle(Value):
     def radius(self) -> float:
         """Bound of the distance of its points from the origin of its frame [m]."""
         low, high = self.shape.bounds
-        centre = self.shape.T_base_shape[:3, 3]
-        return float(np.linalg.norm(np.maximum(np.abs(low - centre), np.abs(high - centre))))
+        center = self.shape.T_base_shape[:3, 3]
+        return float(np.linalg.norm(np.maximum(np.abs(low - center), np.abs(high - center))))
 
     @cached_property
     def track(self) -> tuple[Float[ndarray, "k"], Float[ndarray, "k 4 4"]]:

@@ -70,7 +70,7 @@ class World:
         visuals: bool = False,
         moving: Sequence[MovingObstacle] = (),
     ) -> None:
-        """visuals: add coloured surfaces for cameras, which takes longer to load. moving: further
+        """visuals: add colored surfaces for cameras, which takes longer to load. moving: further
         obstacles, where they are at time 0 until `move`."""
         self.robot = robot
         self.visuals = visuals
@@ -281,7 +281,7 @@ def write_obj(file: Path, mesh: Surface | ConvexMesh | Mesh) -> None:
 def mass_properties(
     meshes: tuple[ConvexMesh, ...], density: float
 ) -> tuple[float, Float[ndarray, "3"], Float[ndarray, "3 3"]]:
-    """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of solids in the link frame.
+    """Mass [kg], center of mass [m] and inertia about it [kg m^2] of solids in the link frame.
 
     Overlapping solids count twice where they overlap.
     """
@@ -320,7 +320,7 @@ def _add_mesh(element: Xml.Element, use: str, file: Path) -> Xml.Element:
 
 
 def _add_visual(element: Xml.Element, surface: Surface, stem: Path) -> None:
-    """Add one visual for each colour, because PyBullet's renderer has no face colours."""
+    """Add one visual for each color, because PyBullet's renderer has no face colors."""
     for i, (rgb, part) in enumerate(surface.by_color):
         file = stem.with_name(f"{stem.name}_visual_{i}.obj")
         write_obj(file, part)
@@ -360,7 +360,7 @@ class DepthCamera(Settings, name="camera"):
     position: tuple[float, ...]
     """x y z [m]"""
     target: tuple[float, ...]
-    """The point at the centre of the image [m]."""
+    """The point at the center of the image [m]."""
     up: tuple[float, ...] = (0.0, 0.0, 1.0)
     """Upward direction in the image; not along the line of sight."""
     width: Annotated[int, Bound(least=1.0, most=4096.0)] = 320

@@ -48,26 +48,26 @@ def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
     if i >= n - 1:
         return np.array([s, s]), np.zeros(2)
     x = speed * speed
-    left = time
+    time_left = time
     count = 0
     out[0, 0] = s
     out[1, 0] = speed
-    while i < n - 1 and (x >= STILL_SPEED_SQUARED or left > 0):
+    while i < n - 1 and (x >= STILL_SPEED_SQUARED or time_left > 0):
         low, high = _acceleration_bounds(one, two, grid, i, s, x, most[i + 1], acceleration)
-        pull = high if left > 0 else low
+        pull = high if time_left > 0 else low
         width = grid[i + 1] - s
         beyond = max(x + 2 * pull * width, 0.0)
         both = np.sqrt(x) + np.sqrt(beyond)
         lasts = 2 * width / both if both > 0 else np.inf
-        if 0 < left < lasts:
-            s = min(s + (np.sqrt(x) + 0.5 * pull * left) * left, grid[i + 1] - MIN_INTERVAL)
-            x = max((np.sqrt(x) + pull * left) ** 2, 0.0)
-            left = 0.0
-        elif left <= 0 and x + 2 * pull * width < 0:
+        if 0 < time_left < lasts:
+            s = min(s + (np.sqrt(x) + 0.5 * pull * time_left) * time_left, grid[i + 1] - MIN_INTERVAL)
+            x = max((np.sqrt(x) + pull * time_left) ** 2, 0.0)
+            time_left = 0.0
+        elif time_left <= 0 and x + 2 * pull * width < 0:
             s = s - x / (2 * pull)
             x = 0.0
         else:
-            left -= lasts
+            time_left -= lasts
             i, s, x = i + 1, grid[i + 1], beyond
         count += 1
         out[0, count], out[1, count] = s, np.sqrt(x)
@@ -78,15 +78,15 @@ def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
 @kernel()
 def state_after(ahead, speeds, time):
     """s and speed some time [s] after the beginning; at rest at the end once the motion is over."""
-    left = time
+    time_left = time
     for i in range(len(ahead) - 1):
         width = ahead[i + 1] - ahead[i]
         both = speeds[i] + speeds[i + 1]
         if both <= 0:
             return ahead[i], 0.0
         lasts = 2 * width / both
-        if left < lasts:
+        if time_left < lasts:
             pull = (speeds[i + 1] - speeds[i]) / lasts
-            return ahead[i] + (speeds[i] + 0.5 * pull * left) * left, speeds[i] + pull * left
-        left -= lasts
+            return ahead[i] + (speeds[i] + 0.5 * pull * time_left) * time_left, speeds[i] + pull * time_left
+        time_left -= lasts
     return ahead[-1], 0.0

@@ -18,7 +18,7 @@ class BlendedPolyline:
     """
 
     def __init__(self, waypoints: Configurations, half_widths: Values) -> None:
-        """`waypoints`: at least two, no two neighbours equal. `half_widths`: one for each inner waypoint; no
+        """`waypoints`: at least two, no two neighbors equal. `half_widths`: one for each inner waypoint; no
         two rounded corners overlap, and none reaches beyond an end."""
         self.waypoints = waypoints
         steps = waypoints[1:] - waypoints[:-1]

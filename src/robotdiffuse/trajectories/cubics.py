@@ -133,13 +133,13 @@ def _extremes(times, q, v):
             m = (q[i + 1, j] - q[i, j]) * per
             a = (6 * m - 4 * speed - 2 * v[i + 1, j]) * per
             b = (2 * speed + 4 * v[i + 1, j] - 6 * m) * per
-            most = max(abs(speed), abs(v[i + 1, j]))
+            peak_speed = max(abs(speed), abs(v[i + 1, j]))
             if a * b < 0:
-                most = max(most, abs(speed + h * a * a / (2 * (a - b))))
+                peak_speed = max(peak_speed, abs(speed + h * a * a / (2 * (a - b))))
             mean[i, j] = m
             start[i, j] = a
             end[i, j] = b
-            velocity[i, j], acceleration[i, j] = most, max(abs(a), abs(b))
+            velocity[i, j], acceleration[i, j] = peak_speed, max(abs(a), abs(b))
             jerk[j] = max(jerk[j], abs(b - a) * per)
             off = acceleration[i, j] * h * h / 8
             chord[i], chords[j] = max(chord[i], off), max(chords[j], off)

@@ -48,7 +48,7 @@ def time_curve(
     extra: ExtraLimits = NO_EXTRA_LIMITS,
 ) -> Trajectory:
     """The fastest motion from rest to rest along the smooth curve through at least four configurations, no
-    two neighbours equal.
+    two neighbors equal.
 
     Velocity, acceleration and jerk limits hold at every time. Raises OutOfTimeError if the deadline leaves no
     time.

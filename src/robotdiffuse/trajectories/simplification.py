@@ -7,9 +7,9 @@ Microseconds via Vectorized Sampling-Based Planning", ICRA 2024, and in OMPL's p
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
+from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
@@ -21,7 +21,7 @@ MIN_GAIN = np.float32(1e-3)
 """Simplification ends after a round that shortens the path by a smaller share of its length."""
 REMOVE_SHARE, PULL_SHARE = np.float32(0.1), np.float32(0.35)
 """Tightening removes a waypoint in REMOVE_SHARE of its attempts, and between REMOVE_SHARE and PULL_SHARE
-pulls one straight towards its neighbours' chord. All others pull and also move it at random."""
+pulls one straight towards its neighbors' chord. All others pull and also move it at random."""
 MAX_RANDOM_MOVE, RANDOM_MOVE_LOG_RANGE = np.float32(0.3), np.float32(5.0)
 """Longest random move of a waypoint, in each joint [rad], and the natural logarithm of the ratio of the
 longest to the shortest."""
@@ -56,7 +56,7 @@ def shortcut(space, path, tries, state):
     """A path [n, dof] with the same start and goal that is free and no longer.
 
     Waypoints that a straight line can skip are removed. `tries` attempts follow, which alternate between a
-    random shortcut between two segments and a move of a waypoint towards the chord of its neighbours.
+    random shortcut between two segments and a move of a waypoint towards the chord of its neighbors.
     """
     work, block, a, b = _make_scratch(space, path)
     points = _skipped(space, path, block, work)
@@ -217,7 +217,7 @@ def _place_at(points, n, length, out):
 
 @inner_kernel()
 def _pull_in(space, points, n, trial, block, work, state):
-    """Moves a random inner waypoint towards the chord of its neighbours, by less after each failed check."""
+    """Moves a random inner waypoint towards the chord of its neighbors, by less after each failed check."""
     i = 1 + int(random(state) * np.float32(n - 2))
     i = min(i, n - 2)
     before = points[i - 1]
@@ -238,7 +238,7 @@ def _pull_in(space, points, n, trial, block, work, state):
 
 @inner_kernel(inline="always")
 def _move(space, points, i, anywhere, trial, block, work, state):
-    """Moves waypoint i towards the chord of its neighbours, and at random with `anywhere`, if that is free
+    """Moves waypoint i towards the chord of its neighbors, and at random with `anywhere`, if that is free
     and shorter."""
     before = points[i - 1]
     at = points[i]

@@ -172,7 +172,7 @@ def _shrunk(
     `least`."""
     deviations, accepted = deviations.copy(), np.zeros(len(deviations))
     while True:
-        # a corner becomes wider where its neighbour leaves it more of their segment
+        # a corner becomes wider where its neighbor leaves it more of their segment
         line = rounded_line(waypoints, deviations)
         widths = line[3]
         doubtful = np.flatnonzero((deviations > 0) & (widths > accepted * (1 + 1e-9)))

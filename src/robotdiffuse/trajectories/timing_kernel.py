@@ -104,21 +104,21 @@ def rounded_line(waypoints, deviations):
         lengths[i] = np.sqrt((directions[i] ** 2).sum())
         directions[i] /= lengths[i]
         knots[i + 1] = knots[i] + lengths[i]
-    wanted = np.empty(n - 2)
+    blend_widths = np.empty(n - 2)
     widths = np.empty(n - 2)
     for i in range(n - 2):
         turn = np.sqrt(((directions[i + 1] - directions[i]) ** 2).sum())
-        wanted[i] = deviations[i] / max(BLEND_DEVIATION * turn, 1e-12)
+        blend_widths[i] = deviations[i] / max(BLEND_DEVIATION * turn, 1e-12)
     # A segment between two corners is shared: each gets half, or what the other does not want. A segment at
     # an end belongs to its only corner.
     for i in range(n - 2):
         before = lengths[i]
         after = lengths[i + 1]
         if i > 0:
-            before = max(0.5 * before, before - wanted[i - 1])
+            before = max(0.5 * before, before - blend_widths[i - 1])
         if i < n - 3:
-            after = max(0.5 * after, after - wanted[i + 1])
-        widths[i] = min(min(before, after), wanted[i])
+            after = max(0.5 * after, after - blend_widths[i + 1])
+        widths[i] = min(min(before, after), blend_widths[i])
     return waypoints, knots, directions, widths
 
 
@@ -137,9 +137,9 @@ def timing_grid(knots, half_widths, corner_intervals, line_intervals):
     for i in range(corners + 1):
         low = knots[i + 1] - half_widths[i] if i < corners else length
         high = knots[i + 1] + half_widths[i] if i < corners else length
-        for end, least, negligible in ((low, 2, 1e-12), (high, corner_intervals, 0.0)):
+        for end, min_intervals, negligible in ((low, 2, 1e-12), (high, corner_intervals, 0.0)):
             if end - s > negligible:
-                intervals = max(least, int(np.round(line_intervals * (end - s) / length)))
+                intervals = max(min_intervals, int(np.round(line_intervals * (end - s) / length)))
                 step = (end - s) / intervals
                 for k in range(1, intervals):
                     grid[count + k] = s + k * step
@@ -180,43 +180,45 @@ def estimated_time(line, velocity, acceleration):
     n, dof = first.shape
     x = np.empty(n)
     for i in range(n):
-        most = np.inf
+        limit = np.inf
         for j in range(dof):
             if first[i, j] != 0:
-                most = min(most, (velocity[j] / first[i, j]) ** 2)
+                limit = min(limit, (velocity[j] / first[i, j]) ** 2)
             if second[i, j] != 0:
-                most = min(most, acceleration[j] / abs(second[i, j]))
-        x[i] = most
+                limit = min(limit, acceleration[j] / abs(second[i, j]))
+        x[i] = limit
     x[0] = x[n - 1] = 0.0
     for i in range(n - 1, 0, -1):
-        most = x[i] + 2 * (grid[i] - grid[i - 1]) * _greatest_pull(first, second, i, x[i], -1.0, acceleration)
-        x[i - 1] = min(x[i - 1], most)
+        limit = x[i] + 2 * (grid[i] - grid[i - 1]) * _greatest_pull(
+            first, second, i, x[i], -1.0, acceleration
+        )
+        x[i - 1] = min(x[i - 1], limit)
     for i in range(n - 1):
-        most = x[i] + 2 * (grid[i + 1] - grid[i]) * _greatest_pull(first, second, i, x[i], 1.0, acceleration)
-        x[i + 1] = min(x[i + 1], most)
+        limit = x[i] + 2 * (grid[i + 1] - grid[i]) * _greatest_pull(first, second, i, x[i], 1.0, acceleration)
+        x[i + 1] = min(x[i + 1], limit)
     duration = 0.0
     for i in range(n - 1):
         width = grid[i + 1] - grid[i]
         pull = (x[i + 1] - x[i]) / (2 * width)
-        worst = 1.0
+        worst_excess = 1.0
         for j in range(dof):
             for k in range(2):
                 rate = abs(first[i + k, j] * pull + second[i + k, j] * x[i + k])
-                worst = max(worst, rate / acceleration[j])
-        duration += 2 * width / (np.sqrt(x[i]) + np.sqrt(x[i + 1])) * np.sqrt(worst)
+                worst_excess = max(worst_excess, rate / acceleration[j])
+        duration += 2 * width / (np.sqrt(x[i]) + np.sqrt(x[i + 1])) * np.sqrt(worst_excess)
     return duration
 
 
 @inner_kernel()
 def _greatest_pull(first, second, i, x, sign, acceleration):
     """The greatest |s̈| of a sign with which accelerations are within their limits at grid point i."""
-    most = np.inf
+    max_pull = np.inf
     for j in range(first.shape[1]):
         if first[i, j] != 0:
             pull = sign * first[i, j]
             curve = second[i, j] * x
-            most = min(most, (acceleration[j] - (curve if pull > 0 else -curve)) / abs(pull))
-    return most
+            max_pull = min(max_pull, (acceleration[j] - (curve if pull > 0 else -curve)) / abs(pull))
+    return max_pull
 
 
 @inner_kernel()
@@ -266,11 +268,11 @@ def controllable(first, second, grid, velocity, weakest, strongest):
     n, dof = first.shape
     x = np.empty(n)
     for i in range(n):  # velocity limits
-        most = np.inf
+        limit = np.inf
         for j in range(dof):
             if first[i, j] != 0:
-                most = min(most, (velocity[j] / abs(first[i, j])) ** 2)
-        x[i] = most
+                limit = min(limit, (velocity[j] / abs(first[i, j])) ** 2)
+        x[i] = limit
     x[n - 1] = 0.0
     for i in range(n - 2, -1, -1):
         width = grid[i + 1] - grid[i]
@@ -303,8 +305,8 @@ def fastest_speeds(first, second, grid, velocity, weakest, strongest, start_spee
         width = grid[i + 1] - grid[i]
         high, slope = _bounds_of_next(first, second, i, width, now, x[i + 1], weakest, strongest)[2:4]
         # at least this much is possible from x[i], and proportionally less from a smaller x
-        least = MIN_SPEED_RATIO * now * min(1.0, x[i + 1] / x[i])
-        now = min(max(high + slope * now, least), x[i + 1])
+        floor_speed = MIN_SPEED_RATIO * now * min(1.0, x[i + 1] / x[i])
+        now = min(max(high + slope * now, floor_speed), x[i + 1])
     return speeds
 
 
@@ -314,7 +316,7 @@ def slowdown(line, grid, speeds, velocity, acceleration):
     too."""
     waypoints, knots, directions, half_widths = line
     dof = waypoints.shape[1]
-    worst = 1.0
+    factor = 1.0
     first = np.empty(dof)
     second = np.empty(dof)
     for i in range(len(grid) - 1):
@@ -331,10 +333,10 @@ def slowdown(line, grid, speeds, velocity, acceleration):
             squared = max(speeds[i] ** 2 + 2 * pull * at, 0.0)
             speed = np.sqrt(squared)
             for j in range(dof):
-                worst = max(worst, spare * abs(first[j]) * speed / velocity[j])
+                factor = max(factor, spare * abs(first[j]) * speed / velocity[j])
                 rate = abs(first[j] * pull + second[j] * squared)
-                worst = max(worst, spare * np.sqrt(rate / acceleration[j]))
-    return worst
+                factor = max(factor, spare * np.sqrt(rate / acceleration[j]))
+    return factor
 
 
 @kernel()

@@ -92,8 +92,8 @@ def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: Verify
 
 def check_motion(what: str, motion: object, kinds: tuple[type, ...]) -> None:
     """Raise InputError unless `motion` is a motion of one of these kinds, with arrays of numbers."""
-    known = {Path: "a Path, e.g. result.path", Trajectory: "a Trajectory, e.g. result.trajectory"}
-    check_type(what, motion, kinds, ", or ".join(known[kind] for kind in kinds))
+    descriptions = {Path: "a Path, e.g. result.path", Trajectory: "a Trajectory, e.g. result.trajectory"}
+    check_type(what, motion, kinds, ", or ".join(descriptions[kind] for kind in kinds))
     check_type(f"{what}.joint_names", motion.joint_names, (tuple, list), "a tuple of names")  # type: ignore
     for name in ("positions", *(("times", *ROWS[1:]) if isinstance(motion, Trajectory) else ())):
         values = getattr(motion, name)
@@ -113,11 +113,11 @@ class Verifier:
         """See `verify`."""
         check_motion("path", path, (Path,))
         self._check_shape("path", path)
-        found = []
+        known_violations = []
         if self.dynamics is not None and within(path.positions):
             clock = np.arange(len(path.positions), dtype=float)
-            found = self._torques(clock, static_pieces(path.positions), " to hold the payload")
-        return self._report(path.positions, None, found)
+            known_violations = self._torques(clock, static_pieces(path.positions), " to hold the payload")
+        return self._report(path.positions, None, known_violations)
 
     def trajectory(self, trajectory: Trajectory) -> Report:
         """See `verify_trajectory`."""
@@ -136,27 +136,29 @@ class Verifier:
             at = float(trajectory.times[0])
             return Report(False, Violation("time", at, f"times begin at {at:.6g} s, not at 0"), None, None)
         if trajectory.duration > MAX_DURATION:
-            time, most = distinct(trajectory.duration, MAX_DURATION)
-            message = f"the motion takes {time} s; at most {most} s can be validated"
+            time, max_time = distinct(trajectory.duration, MAX_DURATION)
+            message = f"the motion takes {time} s; at most {max_time} s can be validated"
             return Report(False, Violation("time", 0.0, message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
         cubics = Cubics(trajectory)
         begins = self.problem.start_velocity
-        found = rate_violations(self.robot, trajectory, self.settings, begins, cubics)
+        known_violations = rate_violations(self.robot, trajectory, self.settings, begins, cubics)
         at_rest = None
         if self.problem.waypoints:
             at_rest = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
-        if found:
-            return self._report(trajectory.positions, trajectory.times, found, at_rest)
-        found += self._limits_between(cubics)
+        if known_violations:
+            return self._report(trajectory.positions, trajectory.times, known_violations, at_rest)
+        known_violations += self._limits_between(cubics)
         if self.dynamics is not None:
-            found += self._torques(trajectory.times, trajectory_pieces(trajectory), ", with the payload")
+            known_violations += self._torques(
+                trajectory.times, trajectory_pieces(trajectory), ", with the payload"
+            )
         along = None
         if self.constraints is not None:
-            found += self._too_fast(cubics)
-            along = cubics.sampled(self.settings.constraint_chord)[:2] if not found else None
-        report = self._report_on_chords(cubics, found, at_rest, along)
+            known_violations += self._too_fast(cubics)
+            along = cubics.sampled(self.settings.constraint_chord)[:2] if not known_violations else None
+        report = self._report_on_chords(cubics, known_violations, at_rest, along)
         if not report.valid:
             return report
         jerks = np.maximum(trajectory.peak_jerks, cubics.extremes.jerk)
@@ -202,18 +204,18 @@ class Verifier:
     def _check_shape(self, what: str, motion: Path | Trajectory) -> None:
         shape = motion.positions.shape
         if tuple(motion.joint_names) != self.robot.joint_names:
-            given = joined(motion.joint_names)
+            names = joined(motion.joint_names)
             right = joined(self.robot.joint_names)
-            raise InputError(f"{what}.joint_names is {given}; the robot's planned joints are {right}")
+            raise InputError(f"{what}.joint_names is {names}; the robot's planned joints are {right}")
         if len(shape) != 2 or shape[1] != self.robot.dof or shape[0] == 0:
             raise InputError(
                 f"{what}.positions has shape {shape}; it must be n x {self.robot.dof} with n >= 1"
             )
         if isinstance(motion, Trajectory):
-            for name, wanted in (("times", shape[:1]), ("velocities", shape), ("accelerations", shape)):
+            for name, expected in (("times", shape[:1]), ("velocities", shape), ("accelerations", shape)):
                 values = getattr(motion, name)
-                if values.shape != wanted:
-                    rule = f"it must be {wanted}, as {what}.positions has shape {shape}"
+                if values.shape != expected:
+                    rule = f"it must be {expected}, as {what}.positions has shape {shape}"
                     raise InputError(f"{what}.{name} has shape {values.shape}; {rule}")
 
     def _report(
@@ -354,8 +356,8 @@ class Verifier:
             return []
         at = float(np.interp(beyond.place, np.arange(len(trajectory.times)), trajectory.times))
         one = self.constraints.speed_limited[beyond.joint]
-        most = limits[beyond.joint]
-        speed, limit = distinct(beyond.torque, most, digits=4)
+        speed_limit = limits[beyond.joint]
+        speed, limit = distinct(beyond.torque, speed_limit, digits=4)
         message = f"{one.frame} moves at {speed} m/s; {one.kind} allows {limit} m/s"
         return [Violation("speed", at, message, one.frame, one.kind, beyond.excess)]
 
@@ -377,14 +379,14 @@ class Verifier:
         settings = self.settings
         if not len(q) > settings.reversals + 2:
             return None
-        kept = _spaced_rows(for_kernels(q), settings.reversal_step)
-        steps = np.diff(q[kept], axis=0)
+        row_indices = _spaced_rows(for_kernels(q), settings.reversal_step)
+        steps = np.diff(q[row_indices], axis=0)
         steps /= np.linalg.norm(steps, axis=1, keepdims=True)
         cosines = (steps[1:] * steps[:-1]).sum(axis=1)
         sharp = np.flatnonzero(cosines < np.cos(settings.reversal_angle))
         if len(sharp) <= settings.reversals:
             return None
-        at = float(clock[kept[sharp[settings.reversals] + 1]])
+        at = float(clock[row_indices[sharp[settings.reversals] + 1]])
         message = (
             f"the motion twitches: {len(sharp)} sharp reversals; at most {settings.reversals} are allowed"
         )
@@ -407,11 +409,11 @@ class Verifier:
             else:
                 stops = np.arange(len(q)) if at_rest is None else np.flatnonzero(at_rest)
                 late = stops[stops >= after]
-                there = (i for i in late if goal_error(self.robot, goal, q[i], self.settings) is None)
-                place = next(there, None)
+                reaching = (i for i in late if goal_error(self.robot, goal, q[i], self.settings) is None)
+                place = next(reaching, None)
             if place is None:
-                what = f"pass within {blend:g} of" if blend else "stop at"
-                message = f"the motion does not {what} waypoints[{k}] after those before it"
+                requirement = f"pass within {blend:g} of" if blend else "stop at"
+                message = f"the motion does not {requirement} waypoints[{k}] after those before it"
                 return Violation("waypoint", float(clock[-1]), message, f"waypoints[{k}]", None, None)
             after = float(place)
         return None
@@ -448,16 +450,16 @@ class Verifier:
 def _spaced_rows(q, step):
     """Indices of rows of q[n, dof] such that each is at least `step` from the one before, beginning with row
     0."""
-    kept = np.zeros(len(q), np.int64)
+    row_indices = np.zeros(len(q), np.int64)
     count = 1
     for i in range(1, len(q)):
         total = 0.0
         for j in range(q.shape[1]):
-            total += (q[i, j] - q[kept[count - 1], j]) ** 2
+            total += (q[i, j] - q[row_indices[count - 1], j]) ** 2
         if total >= step * step:
-            kept[count] = i
+            row_indices[count] = i
             count += 1
-    return kept[:count]
+    return row_indices[:count]
 
 
 @lru_cache(maxsize=8)
@@ -469,18 +471,18 @@ def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
 
 def _moving_contact_violation(contact: "TimedContact") -> Violation:
     link = contact.link
-    other = contact.obstacle
+    obstacle = contact.obstacle
     time = contact.time
-    message = f"{describe_contact(link, other, contact.depth, False)} at {time:.3f} s"
-    return Violation("scene_collision", time, message, link, other, contact.depth)
+    message = f"{describe_contact(link, obstacle, contact.depth, False)} at {time:.3f} s"
+    return Violation("scene_collision", time, message, link, obstacle, contact.depth)
 
 
 def collision_violation(contact: Contact, time: float) -> Violation:
     """The violation for a contact at a time."""
-    (link, pair), other = contact.check, contact.other
+    (link, pair), partner = contact.check, contact.other
     kind = "scene_collision" if pair is None else "self_collision"
-    message = describe_contact(link, other, contact.depth, pair is not None)
-    return Violation(kind, time, message, link, other, contact.depth)
+    message = describe_contact(link, partner, contact.depth, pair is not None)
+    return Violation(kind, time, message, link, partner, contact.depth)
 
 
 def violations(
@@ -498,38 +500,40 @@ def violations(
     if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
         return () if report.violation is None else (report.violation,)
     still = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
-    found = [
+    all_violations = [
         w for w in report.found if w.kind != "limits" and not (w.kind in CONTACT_KINDS and w.other in still)
     ]
     q = motion.positions
     clock = np.arange(len(motion.positions), dtype=float)
     if timed:
-        rates = any(wrong.kind in RATE_KINDS for wrong in found)
+        rates = any(wrong.kind in RATE_KINDS for wrong in all_violations)
         clock, q = (motion.times, q) if rates else Cubics(motion).sampled(settings.chord)[:2]
     for contact in contacts(problem.robot, problem.scene, q, settings.contact):
-        found.append(collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock))))
+        all_violations.append(
+            collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock)))
+        )
     if timed:
         times, turns = Cubics(motion).turns()
         clock = np.concatenate([clock, times])
         q = np.concatenate([q, turns])
-    found += _limit_violations(problem, q, clock, settings)
-    return tuple(sorted(found, key=lambda wrong: wrong.time))
+    all_violations += _limit_violations(problem, q, clock, settings)
+    return tuple(sorted(all_violations, key=lambda wrong: wrong.time))
 
 
 def _limit_violations(
     problem: Problem, q: ndarray, clock: ndarray, settings: VerifySettings
 ) -> list[Violation]:
     robot = problem.robot
-    found = []
+    limit_violations = []
     beyond = np.maximum(robot.lower - q, q - robot.upper)
     beyond[:, robot.continuous] = 0.0
     for j in np.flatnonzero((beyond > settings.limit_slack).any(axis=0)).tolist():
         over = np.flatnonzero(beyond[:, j] > settings.limit_slack)
         i = int(over[clock[over].argmin()])
-        most = float(beyond[:, j].max())
+        excess = float(beyond[:, j].max())
         name = robot.joint_names[j]
         low = robot.lower[j]
         high = robot.upper[j]
-        message = f"{name} leaves its limits, {low:.6g} to {high:.6g}, by up to {most:.3g}"
-        found.append(Violation("limits", float(clock[i]), message, name, None, most))
-    return found
+        message = f"{name} leaves its limits, {low:.6g} to {high:.6g}, by up to {excess:.3g}"
+        limit_violations.append(Violation("limits", float(clock[i]), message, name, None, excess))
+    return limit_violations

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status, Trajectory

@@ -1,4 +1,4 @@
-"""Planning under path constraints: motions keep them at every millimetre, by kinematics that share no code
+"""Planning under path constraints: motions keep them at every millimeter, by kinematics that share no code
 with search and validator; starts and goals that cannot are reported."""
 
 from dataclasses import replace

@@ -7,8 +7,8 @@ import pytest
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import explain_collision
-from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status

@@ -29,7 +29,7 @@ def test_a_scaled_arm_reaches_so_many_times_as_far_and_touches_itself_at_the_sam
     assert reach(large) == pytest.approx(1.5 * reach(robot), rel=1e-9)
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (200, robot.dof))
     one, other = (CollisionChecker(arm, scene) for arm, scene in ((robot, EMPTY), (large, EMPTY)))
-    expected = np.minimum(1.5 * one.pair_clearances(q), 1.0)  # distances are capped at a metre
+    expected = np.minimum(1.5 * one.pair_clearances(q), 1.0)  # distances are capped at a meter
     np.testing.assert_allclose(other.pair_clearances(q), expected, atol=1e-5)
 
 

@@ -223,7 +223,7 @@ WRONG: dict[str, tuple[object, str]] = {
         shape(sphere={"center": [0, 0, 1], "radius": None}),
         r"scene\[1\].sphere.radius is None; it must be a positive number",
     ),
-    "short centre": (shape(sphere={"center": [0, 1], "radius": 1}), r"scene\[1\].sphere.center is \[0, 1\]"),
+    "short center": (shape(sphere={"center": [0, 1], "radius": 1}), r"scene\[1\].sphere.center is \[0, 1\]"),
     "NaN in a shape": (
         shape(sphere={"center": [0, 1, float("nan")], "radius": 1}),
         r"scene\[1\].sphere.center .* 3 finite numbers",

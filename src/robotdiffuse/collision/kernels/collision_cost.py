@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import parent_of
+from robotdiffuse.collision.kernels.frames import parent_of
 from robotdiffuse.collision.kernels.lane_clearance import (
     clearances_into,
     make_clearance_workspace,
@@ -124,7 +124,7 @@ def solid_distance(solid, x, y, z):
 def scene_distance(scene, x, y, z, limit):
     """Signed distance of a point to the nearest obstacle, at most `limit`, and its gradient.
 
-    Distances to point clouds may be too large by a few millimetres.
+    Distances to point clouds may be too large by a few millimeters.
     """
     best = limit
     bx = _ZERO
@@ -288,7 +288,7 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
     frames_of(robot, q, work.frames)
     frames = work.frames
     wrench = work.wrench[0]
-    other = work.wrench[1]
+    opposite_wrench = work.wrench[1]
     cost = _ZERO
     for g in range(len(robot.frame)):
         index = robot.frame[g]
@@ -313,7 +313,7 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
         bb = robot.bounds[b]
         cx, cy, cz = placed(fb, bb[0], bb[1], bb[2])
         wrench[:] = _ZERO
-        other[:] = _ZERO
+        opposite_wrench[:] = _ZERO
         for s in range(robot.first[a], robot.first[a + 1]):
             x, y, z = placed(fa, robot.spheres[s, 0], robot.spheres[s, 1], robot.spheres[s, 2])
             reach = robot.spheres[s, 3] + bb[3] + self_margin
@@ -332,9 +332,9 @@ def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
                     fy = h * dy / d
                     fz = h * dz / d
                     _push(wrench, x, y, z, fx, fy, fz)
-                    _push(other, u, v, w, -fx, -fy, -fz)
+                    _push(opposite_wrench, u, v, w, -fx, -fy, -fz)
         _pull(robot, frames, ia, wrench, grad)
-        _pull(robot, frames, ib, other, grad)
+        _pull(robot, frames, ib, opposite_wrench, grad)
     return cost
 
 

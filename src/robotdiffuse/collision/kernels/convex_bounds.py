@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import parent_of
-from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
+from robotdiffuse.collision.kernels.frames import parent_of, placed, point_to_box, step
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
 MAX_GJK_STEPS = 32
@@ -33,7 +32,7 @@ class Hulls(NamedTuple):
     frame: np.ndarray
     """[parts] index of the frame that each part is fixed to."""
     balls: np.ndarray
-    """[parts, 4] centre and radius of a ball around all of the part."""
+    """[parts, 4] center and radius of a ball around all of the part."""
     rounding: np.ndarray
     """[parts] radius by which the hull is inflated."""
 
@@ -116,17 +115,17 @@ def part_speed(hulls, p, base, posture):
     frame = hulls.frame[p]
     ball = hulls.balls[p]
     twist = posture.twists[frame]
-    other = posture.twists[base]
+    base_twist = posture.twists[base]
     T = posture.frames[frame]
-    a = twist[0] - other[0]
-    b = twist[1] - other[1]
-    c = twist[2] - other[2]
+    a = twist[0] - base_twist[0]
+    b = twist[1] - base_twist[1]
+    c = twist[2] - base_twist[2]
     x = placed(T, ball, 0)
     y = placed(T, ball, 1)
     z = placed(T, ball, 2)
-    u = b * z - c * y + twist[3] - other[3]
-    v = c * x - a * z + twist[4] - other[4]
-    w = a * y - b * x + twist[5] - other[5]
+    u = b * z - c * y + twist[3] - base_twist[3]
+    v = c * x - a * z + twist[4] - base_twist[4]
+    w = a * y - b * x + twist[5] - base_twist[5]
     return np.sqrt(u * u + v * v + w * w) + ball[3] * np.sqrt(a * a + b * b + c * c)
 
 
@@ -158,12 +157,12 @@ def ball_to_ball(hulls, p, q, posture):
 @inner_kernel(fastmath=True)
 def _least(vertices, first, last, x, y, z, offset, u, v, w, speed):
     """Minimum of a - |b| over vertices, where a and b are linear functions of the vertex; plus `offset`."""
-    least = np.inf
+    minimum = np.inf
     for i in range(first, last):
         a = vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z
         b = vertices[0, i] * u + vertices[1, i] * v + vertices[2, i] * w + speed
-        least = min(least, a - abs(b))
-    return least + offset
+        minimum = min(minimum, a - abs(b))
+    return minimum + offset
 
 
 @inner_kernel()
@@ -332,8 +331,8 @@ def _nearest(simplex, count, edges, nearest):
     or 0 if the origin is inside.
     """
     new = simplex[count - 1]
-    least = _dot(new, new)
-    kept = 0
+    best_square = _dot(new, new)
+    face = 0
     for r in range(3):
         nearest[r] = new[r]
         for k in range(count - 1):
@@ -363,14 +362,14 @@ def _nearest(simplex, count, edges, nearest):
                 total = 0.0
                 for r in range(3):
                     total += (new[r] + x * e[r] + y * f[r]) ** 2
-                if total < least:
-                    least = total
-                    kept = 1 << i | 1 << j
+                if total < best_square:
+                    best_square = total
+                    face = 1 << i | 1 << j
                     for r in range(3):
                         nearest[r] = new[r] + x * e[r] + y * f[r]
     at = 0
     for k in range(count):
-        if k == count - 1 or kept >> k & 1:
+        if k == count - 1 or face >> k & 1:
             for r in range(3):
                 simplex[at, r] = simplex[k, r]
             at += 1
@@ -431,11 +430,11 @@ def best_plane(hulls, p, solids, other, base, enough, plane, posture):
     along the motion; then it replaces `plane`.
     """
     n = posture.points[0]
-    known = False
+    cached = False
     for r in range(3):
         n[r] = plane[r]
-        known |= plane[r] != 0.0
-    if known:
+        cached |= plane[r] != 0.0
+    if cached:
         middle, along = separation(hulls, p, solids, other, base, posture)
         if along >= enough:
             return middle, along, False

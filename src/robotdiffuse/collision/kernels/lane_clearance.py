@@ -1,7 +1,7 @@
 """Compiled clearances of covering spheres to the scene and to each other, of 16 configurations or short
 motions at once; see `lane_collision.py`.
 
-A motion is given by its middle and the joint motion dq from there to either end. A sphere's centre moves by t
+A motion is given by its middle and the joint motion dq from there to either end. A sphere's center moves by t
 v + r from the middle to the place t in [-1, 1]: v is the Jacobian times dq, and |r| is at most a remainder
 that `motion_certificate.py` computes for the whole link. Distance to a convex obstacle is a convex function
 along t v and thus nowhere below its tangent: with the distance d and the direction n to the obstacle's
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import parent_of
+from robotdiffuse.collision.kernels.frames import parent_of
 from robotdiffuse.collision.kernels.lane_collision import (
     W,
     lanes_that_may_touch,
@@ -46,8 +46,8 @@ class ClearanceWorkspace(NamedTuple):
     twists: np.ndarray
     """[dof + 1, 6 * W] angular velocity of each frame, and velocity of its point at the base's origin, per
     unit of t."""
-    centres: np.ndarray
-    """[groups, 3 * W] centres of the bounding spheres."""
+    centers: np.ndarray
+    """[groups, 3 * W] centers of the bounding spheres."""
     positions: np.ndarray
     """[spheres, 3 * W]"""
     placed: np.ndarray
@@ -55,7 +55,7 @@ class ClearanceWorkspace(NamedTuple):
     near: np.ndarray
     """[obstacles]"""
     bounds: np.ndarray
-    """[obstacles, W] distances of a bounding sphere's centre."""
+    """[obstacles, W] distances of a bounding sphere's center."""
     need: np.ndarray
     """[1, W] clearances are computed up to this [m]; a lane with a negative value is skipped."""
     clearance: np.ndarray
@@ -96,7 +96,7 @@ def to_solid(x, y, z, vx, vy, vz, solid):
     u = dx * solid[3] + dy * solid[4] + dz * solid[5]
     v = dx * solid[6] + dy * solid[7] + dz * solid[8]
     w = dx * solid[9] + dy * solid[10] + dz * solid[11]
-    # speeds away from the solid's centre
+    # speeds away from the solid's center
     p = vx * solid[3] + vy * solid[4] + vz * solid[5]
     q = vx * solid[6] + vy * solid[7] + vz * solid[8]
     r = (vx * solid[9] + vy * solid[10] + vz * solid[11]) * copysign(_ONE, w)
@@ -153,7 +153,7 @@ def _length(x, y, z):
 def place_motions(robot, q, dq, work):
     """Writes the frames in the middles q[dof, 16] and their twists along dq[dof, 16]; a joint's axis is the z
     axis of its frame."""
-    place_frames(robot, q, work.frames, work.centres)
+    place_frames(robot, q, work.frames, work.centers)
     work.placed[:] = False
     for j in range(len(robot.offsets)):
         parent = parent_of(robot.parents, j)
@@ -195,12 +195,12 @@ def _lower_to(distance, towards, work):
 def _mark_near(robot, scene, g, speed, work):
     """Marks the obstacles that can be nearest to a group in any lane; returns whether there are any.
 
-    An obstacle at distance d from the centre of the bounding sphere is at least d - radius and at most d +
+    An obstacle at distance d from the center of the bounding sphere is at least d - radius and at most d +
     radius away from the group. For the points, which come after the solids, there is only a lower bound.
     """
-    x, y, z = _at(work.centres, g)
+    x, y, z = _at(work.centers, g)
     radius = robot.bounds[g, 3]
-    least = load(work.need, 0, 0)
+    upper_bound = load(work.need, 0, 0)
     zero = x * _ZERO
     solids = len(scene.solids)
     for k in range(solids):
@@ -208,7 +208,7 @@ def _mark_near(robot, scene, g, speed, work):
         if len(scene.may_touch) and scene.may_touch[g, k]:
             distance = zero + _FAR
         store(work.bounds, k, 0, distance)
-        least = minimum(least, distance + radius)
+        upper_bound = minimum(upper_bound, distance + radius)
     obstacles = solids
     if len(scene.points):
         obstacles += 1
@@ -217,7 +217,7 @@ def _mark_near(robot, scene, g, speed, work):
             work.bounds[solids, i] = min(distance, POINT_RANGE + radius)
     some = False
     for k in range(obstacles):
-        work.near[k] = (load(work.bounds, k, 0) - radius - speed < least) != 0
+        work.near[k] = (load(work.bounds, k, 0) - radius - speed < upper_bound) != 0
         some |= work.near[k]
     return some
 
@@ -228,7 +228,7 @@ def group_along(robot, scene, g, moving, work):
     `work`. Without `moving` the twists are taken for zero."""
     frame = robot.frame[g]
     solids = len(scene.solids)
-    x, y, z = _at(work.centres, g)
+    x, y, z = _at(work.centers, g)
     zero = x * _ZERO
     speed = _speed(work.twists, frame, 0, x, y, z, robot.bounds[g, 3]) if moving else zero
     _reset(work)
@@ -263,8 +263,8 @@ def pair_along(robot, p, moving, work):
     twists = work.twists
     f = robot.frame[a]
     g = robot.frame[b]
-    x, y, z = _at(work.centres, a)
-    u, v, w = _at(work.centres, b)
+    x, y, z = _at(work.centers, a)
+    u, v, w = _at(work.centers, b)
     zero = x * _ZERO
     speed = _speed(twists, f, g, x, y, z, bounds[a, 3]) if moving else zero
     _reset(work)
@@ -282,7 +282,7 @@ def pair_along(robot, p, moving, work):
         p, q, r = _velocity(twists, f, x, y, z) if moving else (zero, zero, zero)
         for t in range(robot.first[b], robot.first[b + 1]):
             dx, dy, dz = _at(work.positions, t)
-            # only the difference of the velocities along the line between the centres counts, whatever frame
+            # only the difference of the velocities along the line between the centers counts, whatever frame
             # it is seen from
             i, j, k = _velocity(twists, g, dx, dy, dz) if moving else (zero, zero, zero)
             dx = x - dx
@@ -299,7 +299,7 @@ def block_clearances(robot, scene, q, limit, work, out):
 
     q: [dof, 16].
     """
-    place_frames(robot, q, work.frames, work.centres)
+    place_frames(robot, q, work.frames, work.centers)
     work.placed[:] = False
     work.need[:] = limit
     for g in range(len(out)):
@@ -315,41 +315,41 @@ def block_pair_clearances(robot, q, limit, work, out):
     Where spheres touch although the pair's table excludes contact, the distance is unknown and `limit` is
     written.
     """
-    place_frames(robot, q, work.frames, work.centres)
+    place_frames(robot, q, work.frames, work.centers)
     work.placed[:] = False
     work.need[:] = limit
     for p in range(len(out)):
         pair_along(robot, p, False, work)
         table = robot.pairs[p, 2]
         bit = robot.pairs[p, 3]
-        known = 0
+        separated_lanes = 0
         if table >= 0 and reduce_min(load(work.clearance, 0, 0)) <= _ZERO:
-            known = ~lanes_that_may_touch(robot, table, bit, q)
+            separated_lanes = ~lanes_that_may_touch(robot, table, bit, q)
         for i in range(W):
-            apart = work.clearance[0, i] <= _ZERO and known >> i & 1
-            out[p, i] = limit if apart else work.clearance[0, i]
+            separated = work.clearance[0, i] <= _ZERO and separated_lanes >> i & 1
+            out[p, i] = limit if separated else work.clearance[0, i]
 
 
 @inner_kernel()
 def pair_clearances_into(robot, q, limit, work, out):
     """Writes clearances of the checked pairs for the rows of q[n, dof] to out[n, pairs]."""
     block = np.empty((q.shape[1], W), np.float32)
-    found = np.empty((out.shape[1], W), np.float32)
+    lane_clearances = np.empty((out.shape[1], W), np.float32)
     for start in range(0, len(q), W):
         take_block(q, start, block)
-        block_pair_clearances(robot, block, limit, work, found)
-        _put_block(found, start, out)
+        block_pair_clearances(robot, block, limit, work, lane_clearances)
+        _put_block(lane_clearances, start, out)
 
 
 @inner_kernel()
 def clearances_into(robot, scene, q, limit, work, out):
     """Writes clearances of the moving groups for the rows of q[n, dof] to out[n, groups]."""
     block = np.empty((q.shape[1], W), np.float32)
-    found = np.empty((out.shape[1], W), np.float32)
+    lane_clearances = np.empty((out.shape[1], W), np.float32)
     for start in range(0, len(q), W):
         take_block(q, start, block)
-        block_clearances(robot, scene, block, limit, work, found)
-        _put_block(found, start, out)
+        block_clearances(robot, scene, block, limit, work, lane_clearances)
+        _put_block(lane_clearances, start, out)
 
 
 @inner_kernel()

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import parent_of
+from robotdiffuse.collision.kernels.frames import parent_of
 from robotdiffuse.collision.kernels.point_grid import far_from_points, near_points, touch_points
 from robotdiffuse.collision.kernels.simd import (
     W,
@@ -97,8 +97,8 @@ def _slide(frames, parent, j, offset, q):
 
 
 @allocation_free(forceinline=True)
-def _centres_of(frames, f, spheres, s):
-    """Positions of a sphere's centre in 16 lanes."""
+def _centers_of(frames, f, spheres, s):
+    """Positions of a sphere's center in 16 lanes."""
     x = spheres[s, 0]
     y = spheres[s, 1]
     z = spheres[s, 2]
@@ -111,16 +111,16 @@ def _centres_of(frames, f, spheres, s):
 
 @allocation_free(forceinline=True)
 def place(frames, f, spheres, s, positions, p):
-    """Writes the positions of a sphere's centre in 16 lanes to row p of `positions`."""
-    x, y, z = _centres_of(frames, f, spheres, s)
+    """Writes the positions of a sphere's center in 16 lanes to row p of `positions`."""
+    x, y, z = _centers_of(frames, f, spheres, s)
     store(positions, p, 0, x)
     store(positions, p, 1, y)
     store(positions, p, 2, z)
 
 
 @allocation_free(forceinline=True)
-def place_frames(robot, q, frames, centres):
-    """Writes the frames of 16 configurations q[dof, 16], and the centres of the bounding spheres of all
+def place_frames(robot, q, frames, centers):
+    """Writes the frames of 16 configurations q[dof, 16], and the centers of the bounding spheres of all
     groups."""
     for j in range(len(robot.offsets)):
         if robot.offsets[j, 12] > _ZERO:
@@ -128,7 +128,7 @@ def place_frames(robot, q, frames, centres):
         else:
             _turn(frames, parent_of(robot.parents, j), j, robot.offsets[j], q)
     for g in range(len(robot.frame)):
-        place(frames, robot.frame[g], robot.bounds, g, centres, g)
+        place(frames, robot.frame[g], robot.bounds, g, centers, g)
 
 
 class Workspace(NamedTuple):
@@ -136,8 +136,8 @@ class Workspace(NamedTuple):
 
     frames: np.ndarray
     """[dof + 1, 12 * W]"""
-    centres: np.ndarray
-    """[groups, 3 * W] centres of the bounding spheres."""
+    centers: np.ndarray
+    """[groups, 3 * W] centers of the bounding spheres."""
     row: np.ndarray
     """[1, 3 * W] positions of a row of spheres."""
 
@@ -204,7 +204,7 @@ def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
     for row in range(first, last):
         lanes_that_may_touch = near & ~hits
         if last - first > 1:
-            x, y, z = _centres_of(frames, f, robot.row_bounds, row)
+            x, y, z = _centers_of(frames, f, robot.row_bounds, row)
             lanes_that_may_touch &= _touching(x, y, z, robot.row_bounds[row, 3] + padding, solids, k)
         while lanes_that_may_touch:
             i = first_lane(lanes_that_may_touch)
@@ -227,7 +227,7 @@ def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
     for row in range(first, last):
         lanes_that_may_touch = near & ~hits
         if last - first > 1:
-            x, y, z = _centres_of(frames, f, robot.row_bounds, row)
+            x, y, z = _centers_of(frames, f, robot.row_bounds, row)
             lanes_that_may_touch &= near_points(x, y, z, robot.row_bounds[row, 3] + padding, scene)
         while lanes_that_may_touch:
             i = first_lane(lanes_that_may_touch)
@@ -257,21 +257,21 @@ def _touching_each_other(robot, a, b, near, stop_at_first, work):
     frames = work.frames
     bounds = robot.row_bounds
     for row in range(robot.first_row[a], robot.first_row[a + 1]):
-        x, y, z = _centres_of(frames, robot.frame[a], bounds, row)
-        u = load(work.centres, b, 0)
-        v = load(work.centres, b, 1)
-        w = load(work.centres, b, 2)
+        x, y, z = _centers_of(frames, robot.frame[a], bounds, row)
+        u = load(work.centers, b, 0)
+        v = load(work.centers, b, 1)
+        w = load(work.centers, b, 2)
         near_row = near & ~hits & _touching_balls(x, y, z, bounds[row, 3], u, v, w, robot.bounds[b, 3])
         if near_row == 0:
             continue
-        for other in range(robot.first_row[b], robot.first_row[b + 1]):
-            u, v, w = _centres_of(frames, robot.frame[b], bounds, other)
+        for other_row in range(robot.first_row[b], robot.first_row[b + 1]):
+            u, v, w = _centers_of(frames, robot.frame[b], bounds, other_row)
             lanes_that_may_touch = near_row & ~hits
-            lanes_that_may_touch &= _touching_balls(x, y, z, bounds[row, 3], u, v, w, bounds[other, 3])
+            lanes_that_may_touch &= _touching_balls(x, y, z, bounds[row, 3], u, v, w, bounds[other_row, 3])
             while lanes_that_may_touch:
                 i = first_lane(lanes_that_may_touch)
                 lanes_that_may_touch &= lanes_that_may_touch - 1
-                if _rows_touch(robot, row, robot.frame[a], other, robot.frame[b], i, work):
+                if _rows_touch(robot, row, robot.frame[a], other_row, robot.frame[b], i, work):
                     hits |= 1 << i
                     if stop_at_first:
                         return hits
@@ -305,9 +305,9 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
     for g in range(len(robot.frame)):
         if robot.frame[g] == 0:
             continue
-        x = load(work.centres, g, 0)
-        y = load(work.centres, g, 1)
-        z = load(work.centres, g, 2)
+        x = load(work.centers, g, 0)
+        y = load(work.centers, g, 1)
+        z = load(work.centers, g, 2)
         x0 = reduce_min(x)
         x1 = reduce_max(x)
         y0 = reduce_min(y)
@@ -356,19 +356,19 @@ def lanes_that_may_touch(robot, table, bit, q):
 @allocation_free(forceinline=True)
 def _hits_itself(robot, q, hits, stop_at_first, work):
     """`hits`, with the lanes added in which a checked pair of links touches."""
-    centres = work.centres
+    centers = work.centers
     bounds = robot.bounds
     for p in range(len(robot.pairs)):
         a = robot.pairs[p, 0]
         b = robot.pairs[p, 1]
         table = robot.pairs[p, 2]
         bit = robot.pairs[p, 3]
-        x = load(centres, a, 0)
-        y = load(centres, a, 1)
-        z = load(centres, a, 2)
-        u = load(centres, b, 0)
-        v = load(centres, b, 1)
-        w = load(centres, b, 2)
+        x = load(centers, a, 0)
+        y = load(centers, a, 1)
+        z = load(centers, a, 2)
+        u = load(centers, b, 0)
+        v = load(centers, b, 1)
+        w = load(centers, b, 2)
         near = _touching_balls(x, y, z, bounds[a, 3], u, v, w, bounds[b, 3]) & ~hits
         if table >= 0:
             near &= lanes_that_may_touch(robot, table, bit, q)
@@ -386,7 +386,7 @@ def block_hits(robot, scene, q, padding, stop_at_first, work):
     `padding` [m] is added to the radii for checks against the scene. With `stop_at_first` the check ends at
     the first configuration that collides.
     """
-    place_frames(robot, q, work.frames, work.centres)
+    place_frames(robot, q, work.frames, work.centers)
     hits = _hits_scene(robot, scene, padding, stop_at_first, work)
     if hits == ALL_LANES or (stop_at_first and hits):
         return hits

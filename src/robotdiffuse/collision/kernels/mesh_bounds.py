@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import parent_of
-from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
+from robotdiffuse.collision.kernels.frames import parent_of, placed, point_to_box, step
 from robotdiffuse.core.kernels import kernel
 
 
@@ -26,7 +25,7 @@ def forward(offsets, parents, slides, q):
 def scene_bounds(frames, frame, centers, radii, boxes):
     """Lower bounds [n, pieces * obstacles] of the distances of a link's pieces to obstacles [m].
 
-    Pieces are given by balls in frame `frame`, obstacles by `boxes`: R_box_base [o, 3, 3], centres [o, 3],
+    Pieces are given by balls in frame `frame`, obstacles by `boxes`: R_box_base [o, 3, 3], centers [o, 3],
     half sizes [o, 3] and roundings [o].
     """
     rotation, middle, half, rounding = boxes
@@ -48,8 +47,8 @@ def scene_bounds(frames, frame, centers, radii, boxes):
 def pair_bounds(frames, frame, centers, radii, other_frame, other_centers, other_radii):
     """Lower bounds [n, pieces * others] of the distances between the pieces of two links, given by balls
     [m]."""
-    others = len(other_radii)
-    out = np.empty((len(frames), len(radii) * others))
+    other_count = len(other_radii)
+    out = np.empty((len(frames), len(radii) * other_count))
     for i in range(len(frames)):
         S = frames[i, frame]
         T = frames[i, other_frame]
@@ -57,11 +56,11 @@ def pair_bounds(frames, frame, centers, radii, other_frame, other_centers, other
             x = placed(S, centers[p], 0)
             y = placed(S, centers[p], 1)
             z = placed(S, centers[p], 2)
-            for o in range(others):
+            for o in range(other_count):
                 c = other_centers[o]
                 u = x - placed(T, c, 0)
                 v = y - placed(T, c, 1)
                 w = z - placed(T, c, 2)
                 gap = np.sqrt(u * u + v * v + w * w)
-                out[i, p * others + o] = gap - radii[p] - other_radii[o]
+                out[i, p * other_count + o] = gap - radii[p] - other_radii[o]
     return out

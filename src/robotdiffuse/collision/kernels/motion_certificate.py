@@ -156,17 +156,17 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
     q = np.empty(dof)
     dq = np.empty(dof)
     e = np.empty(dof)
-    most = np.empty(dof)
+    max_speeds = np.empty(dof)
     scratch = np.empty(dof)
     for first in range(0, n, W):
         last = min(first + W, n)
         for i in range(W):
             row = first + i
             if row < n:
-                _spread(motion, pieces.start[row], pieces.stop[row], q, dq, e, most, scratch)
+                _spread(motion, pieces.start[row], pieces.stop[row], q, dq, e, max_speeds, scratch)
                 for c in range(count):
                     if pieces.undecided[row, c]:
-                        rest[row, c] = _remainder(checks.motion_radii[c], checks.second[c], e, most)
+                        rest[row, c] = _remainder(checks.motion_radii[c], checks.second[c], e, max_speeds)
             for j in range(dof):
                 block[j, i] = q[j]
                 moves[j, i] = dq[j]
@@ -201,55 +201,57 @@ def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
 
 
 @inner_kernel()
-def _is_open(found, checks, best, tightness, row, c):
+def _is_open(bounds, checks, best, tightness, row, c):
     """Whether a check of a piece is not settled by its lower bound."""
-    least = tightness * best[checks.kind[c]]
-    return found.pieces.undecided[row, c] and found.lower[row, c] < least
+    required = tightness * best[checks.kind[c]]
+    return bounds.pieces.undecided[row, c] and bounds.lower[row, c] < required
 
 
 @kernel()
-def bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, contact, posture):
+def bound_by_convex_parts(arm, solids, motion, checks, bounds, best, tightness, contact, posture):
     """Better bounds from the convex meshes where those of the spheres are too coarse; lowers best[2].
 
     Returns the number of checks that are left to Coal.
     """
-    n, count = found.clearance.shape
+    n, count = bounds.clearance.shape
     dof = motion.q.shape[1]
     q = np.empty(dof)
     dq = np.empty(dof)
     e = np.empty(dof)
-    most = np.empty(dof)
+    max_speeds = np.empty(dof)
     scratch = np.empty(dof)
-    asked = 0
+    open_count = 0
     for row in range(n):
         posed = False
         for c in range(count):
-            if found.clearance[row, c] > CONVEX_PARTS_BELOW or not _is_open(
-                found, checks, best, tightness, row, c
+            if bounds.clearance[row, c] > CONVEX_PARTS_BELOW or not _is_open(
+                bounds, checks, best, tightness, row, c
             ):
                 continue
             if not posed:
-                _spread(motion, found.pieces.start[row], found.pieces.stop[row], q, dq, e, most, scratch)
+                _spread(
+                    motion, bounds.pieces.start[row], bounds.pieces.stop[row], q, dq, e, max_speeds, scratch
+                )
                 meshes.pose(arm.offsets, arm.parents, arm.slides, q, dq, posture)
                 posed = True
-            rest = found.rest[row, c]
+            rest = bounds.rest[row, c]
             kind = checks.kind[c]
-            coarser = found.clearance[row, c]
-            clearance, lower, best[kind], coarse, touching = _parted(
+            coarser = bounds.clearance[row, c]
+            clearance, lower, best[kind], unresolved, touching = _parted(
                 arm.hulls, solids, checks, c, rest, best[kind], tightness, contact, posture
             )
-            if not coarse:
-                found.clearance[row, c] = max(clearance, coarser)
-                found.lower[row, c] = max(lower, found.lower[row, c])
-            if coarse and not touching and coarser > COAL_BELOW:
+            if not unresolved:
+                bounds.clearance[row, c] = max(clearance, coarser)
+                bounds.lower[row, c] = max(lower, bounds.lower[row, c])
+            if unresolved and not touching and coarser > COAL_BELOW:
                 best[kind] = min(best[kind], coarser)
-            elif touching or coarse:
+            elif touching or unresolved:
                 speed = 0.0
                 for p in range(checks.parts[c, 0], checks.parts[c, 1]):
                     speed = max(speed, meshes.part_speed(arm.hulls, p, checks.base[c], posture))
-                found.travel[row, c] = speed + rest
-                asked += 1
-    return asked
+                bounds.travel[row, c] = speed + rest
+                open_count += 1
+    return open_count
 
 
 @inner_kernel(inline="always")
@@ -266,12 +268,12 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     parts = len(hulls.frame)
     clearance = CLEARANCE_CAP
     lower = CLEARANCE_CAP
-    coarse = False
+    unresolved = False
     touching = False
-    others = range(len(solids.disc)) if against_scene else range(checks.parts[c, 2], checks.parts[c, 3])
+    partners = range(len(solids.disc)) if against_scene else range(checks.parts[c, 2], checks.parts[c, 3])
     for p in range(checks.parts[c, 0], checks.parts[c, 1]):
         speed = meshes.part_speed(hulls, p, base, posture)
-        for o in others:
+        for o in partners:
             if against_scene and len(solids.may_touch) and solids.may_touch[c, o]:
                 continue
             if against_scene:
@@ -281,12 +283,12 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
             along = middle - speed
             if against_scene and solids.bounds[o]:
                 if along - rest < tightness * best:
-                    coarse = True
+                    unresolved = True
                     continue
             elif along - rest < best:
-                other, slot = (o, parts + o) if against_scene else (-1 - o, o)
+                solid, slot = (o, parts + o) if against_scene else (-1 - o, o)
                 middle, along, measured = meshes.best_plane(
-                    hulls, p, solids, other, common, tightness * best + rest, posture.planes[p, slot], posture
+                    hulls, p, solids, solid, common, tightness * best + rest, posture.planes[p, slot], posture
                 )
                 if measured and middle <= max(contact, checks.undecided[c]):
                     touching = True
@@ -294,14 +296,14 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
                     best = min(best, middle)
             clearance = min(clearance, middle)
             lower = min(lower, along - rest)
-    return clearance, lower, best, coarse, touching
+    return clearance, lower, best, unresolved, touching
 
 
 @kernel()
-def settle(checks, found, best, certified, tightness):
+def settle(checks, bounds, best, certified, tightness):
     """Settles the checks whose bounds suffice and splits the other pieces; lowers certified[2]."""
-    pieces = found.pieces
-    n, count = found.clearance.shape
+    pieces = bounds.pieces
+    n, count = bounds.clearance.shape
     parts = np.zeros(n, np.int64)
     total = np.int64(0)
     for row in range(n):
@@ -309,16 +311,16 @@ def settle(checks, found, best, certified, tightness):
             if not pieces.undecided[row, c]:
                 continue
             kind = checks.kind[c]
-            least = tightness * best[kind]
-            lower = found.lower[row, c]
-            if lower >= least:
+            required = tightness * best[kind]
+            lower = bounds.lower[row, c]
+            if lower >= required:
                 pieces.undecided[row, c] = False
                 certified[kind] = min(certified[kind], lower)
                 continue
             # the loss of clearance along a piece falls linearly with its length, the remainder quadratically
-            rest = found.rest[row, c]
-            spare = found.clearance[row, c] - least
-            lost = found.clearance[row, c] - lower - rest
+            rest = bounds.rest[row, c]
+            spare = bounds.clearance[row, c] - required
+            lost = bounds.clearance[row, c] - lower - rest
             k = 2
             while k < MAX_SPLIT and not lost / k + rest / (k * k) <= spare:
                 k += 1
@@ -337,18 +339,20 @@ def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightnes
     work = make_clearance_workspace(arm.spheres, len(scene.solids))
     posture = meshes.make_posture(arm.hulls, solids, motion.q.shape[1])
     while True:
-        found = bound_by_spheres(arm, scene, motion, checks, pieces, best, work)
-        asked = bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, contact, posture)
-        n, count = found.clearance.shape
-        if n == 0 or asked:
-            rows = np.empty(asked, np.int64)
-            columns = np.empty(asked, np.int64)
+        bounds = bound_by_spheres(arm, scene, motion, checks, pieces, best, work)
+        open_count = bound_by_convex_parts(
+            arm, solids, motion, checks, bounds, best, tightness, contact, posture
+        )
+        n, count = bounds.clearance.shape
+        if n == 0 or open_count:
+            rows = np.empty(open_count, np.int64)
+            columns = np.empty(open_count, np.int64)
             k = 0
             for row in range(n):
                 for c in range(count):
-                    if found.travel[row, c] >= 0:
+                    if bounds.travel[row, c] >= 0:
                         rows[k] = row
                         columns[k] = c
                         k += 1
-            return found, rows, columns
-        pieces = settle(checks, found, best, certified, tightness)
+            return bounds, rows, columns
+        pieces = settle(checks, bounds, best, certified, tightness)

@@ -35,13 +35,13 @@ def travel_along(q, motion_radii):
     """`Motion.travel` [n] of the waypoints q[n, dof]: each step counts the link that moves most."""
     travel = np.zeros(len(q))
     for i in range(1, len(q)):
-        most = 0.0
+        link_travel = 0.0
         for c in range(len(motion_radii)):
             total = 0.0
             for j in range(q.shape[1]):
                 total += motion_radii[c, j] * abs(q[i, j] - q[i - 1, j])
-            most = max(most, total)
-        travel[i] = travel[i - 1] + most
+            link_travel = max(link_travel, total)
+        travel[i] = travel[i - 1] + link_travel
     return travel
 
 

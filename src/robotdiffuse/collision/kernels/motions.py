@@ -65,17 +65,17 @@ def motion_free(space, a, b, block, work):
     if len(space.near_ends) == 0:
         return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, block, work)
     length = distance(a, b)
-    pieces = max(int(np.ceil(length / RELAXATION_STEP)), 1)
-    half = np.float32(0.5) * length / np.float32(pieces)
+    steps = max(int(np.ceil(length / RELAXATION_STEP)), 1)
+    half = np.float32(0.5) * length / np.float32(steps)
     first = 0
-    first_padding = padding_near(space, a, b, np.float32(0.5) / np.float32(pieces), half)
-    for k in range(1, pieces + 1):
+    first_padding = padding_near(space, a, b, np.float32(0.5) / np.float32(steps), half)
+    for k in range(1, steps + 1):
         padding = np.float32(-1.0)
-        if k < pieces:
-            padding = padding_near(space, a, b, (np.float32(k) + np.float32(0.5)) / np.float32(pieces), half)
+        if k < steps:
+            padding = padding_near(space, a, b, (np.float32(k) + np.float32(0.5)) / np.float32(steps), half)
         if padding != first_padding:
-            s = np.float32(first) / np.float32(pieces)
-            t = np.float32(k) / np.float32(pieces)
+            s = np.float32(first) / np.float32(steps)
+            t = np.float32(k) / np.float32(steps)
             if not _stretch_free(space, a, b, s, t, first_padding, block, work):
                 return False
             first = k

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import parent_of
-from robotdiffuse.collision.kernels.frames import placed, step, write_rotation
+from robotdiffuse.collision.kernels.frames import parent_of, placed, step, write_rotation
 from robotdiffuse.core.kernels import inner_kernel, kernel
 
 CLEARANCE_CAP = 1.0
@@ -57,8 +56,8 @@ class Tracks(NamedTuple):
     """[k] bound on the speed of the obstacle's points until the next pose [m/s]; 0 for its last."""
     growth: np.ndarray
     """[obstacles] inflation per second since time 0 [m/s]."""
-    centre: np.ndarray
-    """[obstacles, 3] centre of the box in the obstacle's frame."""
+    center: np.ndarray
+    """[obstacles, 3] center of the box in the obstacle's frame."""
     half: np.ndarray
     """[obstacles, 3] half edges of the box."""
     disc: np.ndarray
@@ -111,11 +110,11 @@ def pose_at(tracks, o, time, rotation, xyz):
 @kernel()
 def speed_between(tracks, o, start, stop):
     """Upper bound on the speed of any point of obstacle o between two times [m/s], without its growth."""
-    most = 0.0
+    max_speed = 0.0
     for k in range(tracks.first[o], tracks.first[o + 1] - 1):
         if tracks.times[k] < stop and tracks.times[k + 1] > start:
-            most = max(most, tracks.speeds[k])
-    return most
+            max_speed = max(max_speed, tracks.speeds[k])
+    return max_speed
 
 
 @inner_kernel()
@@ -124,9 +123,9 @@ def _obstacle_distance(tracks, o, rotation, xyz, x, y, z):
     x = x - xyz[0]
     y = y - xyz[1]
     z = z - xyz[2]
-    u = abs(rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z - tracks.centre[o, 0])
-    v = abs(rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z - tracks.centre[o, 1])
-    w = abs(rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z - tracks.centre[o, 2])
+    u = abs(rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z - tracks.center[o, 0])
+    v = abs(rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z - tracks.center[o, 1])
+    w = abs(rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z - tracks.center[o, 2])
     w -= tracks.half[o, 2]
     if tracks.disc[o] > 0:
         a = np.sqrt(u * u + v * v) - tracks.disc[o]
@@ -155,15 +154,15 @@ def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
     )
     if around > enough:
         return around
-    least = np.inf
+    clearance = np.inf
     for s in range(links.first[link], links.first[link + 1]):
         p = links.spheres[s]
         gap = (
             _obstacle_distance(tracks, o, rotation, xyz, placed(T, p, 0), placed(T, p, 1), placed(T, p, 2))
             - p[3]
         )
-        least = min(least, gap)
-    return least
+        clearance = min(clearance, gap)
+    return clearance
 
 
 @inner_kernel()
@@ -227,7 +226,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     stops = np.empty(MAX_HALVINGS + 2)
     depths = np.empty(MAX_HALVINGS + 2, np.int64)
     pairs = np.empty((MAX_HALVINGS + 2, count, obstacles), np.bool_)
-    left = [(0.0, 0.0, 0, 0) for _ in range(0)]
+    remaining = [(0.0, 0.0, 0, 0) for _ in range(0)]
     certified = CLEARANCE_CAP
     for task in range(len(tasks.start)):
         starts[0] = tasks.start[task]
@@ -255,7 +254,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                 travel[link] = 0.0
                 for j in range(dof):
                     travel[link] += links.motion_radii[link, j] * moved[j]
-            again = False
+            split_needed = False
             for o in range(obstacles):
                 posed = False
                 speed = 0.0
@@ -268,12 +267,12 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                         posed = True
                     grown = tracks.growth[o] * max(time, 0.0)
                     lost = travel[link] + speed + tracks.growth[o] * half
-                    asked = max(least, tightness * best[0])
-                    enough = grown + lost + max(asked, best[0] if tightness > 0 else 0.0)
-                    clear = _clearance(links, frames, link, tracks, o, rotation, xyz, enough) - grown
+                    required = max(least, tightness * best[0])
+                    cutoff = grown + lost + max(required, best[0] if tightness > 0 else 0.0)
+                    clear = _clearance(links, frames, link, tracks, o, rotation, xyz, cutoff) - grown
                     clear = min(clear, CLEARANCE_CAP + lost)
                     if clear <= least or depth == MAX_HALVINGS:
-                        left.append((start, stop, link, o))
+                        remaining.append((start, stop, link, o))
                         pairs[size, link, o] = False
                         continue
                     best[0] = min(best[0], clear)
@@ -281,8 +280,8 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                         certified = min(certified, clear - lost)
                         pairs[size, link, o] = False
                     else:
-                        again = True
-            if again:
+                        split_needed = True
+            if split_needed:
                 pairs[size + 1] = pairs[size]
                 starts[size + 1] = start
                 stops[size + 1] = time
@@ -290,7 +289,7 @@ def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
                 stops[size] = stop
                 depths[size] = depths[size + 1] = depth + 1
                 size += 2
-    return certified, left
+    return certified, remaining
 
 
 @kernel(nogil=True)
@@ -322,10 +321,10 @@ def free_at_times(links, tracks, q, times, least):
                     if not out[i, k]:
                         k += 1
                         continue
-                    asked = least + tracks.growth[o] * max(times[k], 0.0)
+                    required = least + tracks.growth[o] * max(times[k], 0.0)
                     spare = (
-                        _clearance(links, frames, link, tracks, o, rotations[o, k], places[o, k], asked)
-                        - asked
+                        _clearance(links, frames, link, tracks, o, rotations[o, k], places[o, k], required)
+                        - required
                     )
                     out[i, k] = spare >= 0
                     until = times[k] + max(spare, 0.0) / max(speeds[o], 1e-9)

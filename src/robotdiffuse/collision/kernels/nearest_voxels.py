@@ -34,16 +34,16 @@ def nearest_voxels(run):
                         squares[i, j, k] = square
                         holders[i, j, k] = run[i, j, last]
     longest = max(nx, ny)
-    kept = np.empty(longest, np.int32)
+    envelope = np.empty(longest, np.int32)
     since = np.empty(longest, np.int32)
     before = np.empty(longest, np.int32)
-    whose = np.empty(longest, np.int32)
+    owners = np.empty(longest, np.int32)
     for i in range(nx):
         for k in range(nz):
-            _nearest_in_line(squares[i, :, k], holders[i, :, k], kept, since, before, whose)
+            _nearest_in_line(squares[i, :, k], holders[i, :, k], envelope, since, before, owners)
     for j in range(ny):
         for k in range(nz):
-            _nearest_in_line(squares[:, j, k], holders[:, j, k], kept, since, before, whose)
+            _nearest_in_line(squares[:, j, k], holders[:, j, k], envelope, since, before, owners)
     return squares, holders
 
 
@@ -67,8 +67,8 @@ def _nearest_in_line(squares, holders, kept, since, before, whose):
         from_here = 0
         if top >= 0:
             s = kept[top]
-            ahead = np.float64(u * u - s * s + before[u] - before[s])
-            from_here = 1 + int(ahead / np.float64(2 * (u - s)) + _ROUNDED)
+            offset = np.float64(u * u - s * s + before[u] - before[s])
+            from_here = 1 + int(offset / np.float64(2 * (u - s)) + _ROUNDED)
         if from_here < n:
             top += 1
             kept[top] = u

@@ -1,8 +1,8 @@
 """Compiled queries to point clouds: a grid of distances answers most of them, the points themselves the rest.
 
-For the centre of each voxel the grid holds the index of the nearest point and the distance to its centre.
+For the center of each voxel the grid holds the index of the nearest point and the distance to its center.
 Both are exact within a band around the points; beyond it, the distance is a lower bound and the point only
-nearly the nearest. A query at distance e from its voxel's centre knows the distance to within e. If that is
+nearly the nearest. A query at distance e from its voxel's center knows the distance to within e. If that is
 not enough, it computes the distances to points in the cells around. `point_cloud_grid.py` builds the arrays,
 which are fields of SceneArrays.
 """
@@ -35,7 +35,7 @@ _SLACK = np.float32(1e-5)
 
 @kernel(fastmath=True)
 def make_grid(points, starts, run, low, voxel, shape, band, known):
-    """For every voxel centre the distance to the nearest point, and the index of that point.
+    """For every voxel center the distance to the nearest point, and the index of that point.
 
     Both are exact below `band` [m]; beyond, the distance is a lower bound, and the point is near the nearest
     one where there may be one within `known` [m], else -1. Points starts[b] to starts[b + 1] lie in the voxel
@@ -52,7 +52,7 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
             for k in range(nz):
                 v = (i * ny + j) * nz + k
                 b = holders[i, j, k]
-                # no voxel with points is nearer, and no point is more than `blur` from its voxel's centre
+                # no voxel with points is nearer, and no point is more than `blur` from its voxel's center
                 lower = voxel * np.sqrt(np.float32(squares[i, j, k])) - blur
                 distances[v] = max(band, lower)
                 if lower >= known:
@@ -97,16 +97,16 @@ def _balls(points, starts):
 
 @inner_kernel(fastmath=True)
 def _blur(points, low, voxel):
-    """Largest distance of a point from the centre of its voxel [m]."""
-    most = _ZERO
+    """Largest distance of a point from the center of its voxel [m]."""
+    max_square = _ZERO
     for p in range(len(points)):
         square = _ZERO
         for axis in range(3):
             at = (points[p, axis] - low[axis]) / voxel
             off = at - np.floor(at) - _HALF
             square += off * off
-        most = max(most, square)
-    return voxel * np.sqrt(most) + _SLACK
+        max_square = max(max_square, square)
+    return voxel * np.sqrt(max_square) + _SLACK
 
 
 @inner_kernel(fastmath=True)
@@ -115,11 +115,11 @@ def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
     nx, ny, nz = shape
     for b in range(len(balls)):
         x, y, z, radius = balls[b]
-        wide = band + radius
+        reach = band + radius
         px = (x - low[0]) / voxel
         py = (y - low[1]) / voxel
         pz = (z - low[2]) / voxel
-        span = wide / voxel
+        span = reach / voxel
         i0 = max(int(px - span), 0)
         i1 = min(int(px + span) + 1, nx)
         j0 = max(int(py - span), 0)
@@ -134,7 +134,7 @@ def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
                 cy = low[1] + (np.float32(j) + _HALF) * voxel
                 base = (cx - x) * (cx - x) + (cy - y) * (cy - y)
                 at = (i * ny + j) * nz + k0
-                if base >= wide * wide or not _any_closer(distances, at, n, base, pz - zero, voxel, radius):
+                if base >= reach * reach or not _any_closer(distances, at, n, base, pz - zero, voxel, radius):
                     continue
                 for p in range(starts[b], starts[b + 1]):
                     dx = cx - points[p, 0]
@@ -192,16 +192,16 @@ def _ask_grid(x, y, z, radius, scene):
     oy = fy - cy
     oz = fz - cz
     out = (ox * ox + oy * oy + oz * oz) * (voxel * voxel)
-    inner = maximum(g - e, _ZERO)
+    grid_distance = maximum(g - e, _ZERO)
     free = radius + (frame[5] + _SLACK)
-    near = inner * inner + out < free * free
+    near = grid_distance * grid_distance + out < free * free
     inside = (g + e + sqrt(out) < radius + (frame[6] - _SLACK)) & (g < band)
     return near, near & inside
 
 
 @allocation_free()
 def far_from_points(scene, x0, x1, y0, y1, z0, z1, radius):
-    """Whether a look-up in the middle of a box excludes that a sphere with its centre in the box touches a
+    """Whether a look-up in the middle of a box excludes that a sphere with its center in the box touches a
     point."""
     lower, _, _ = _look_up(scene, _HALF * (x0 + x1), _HALF * (y0 + y1), _HALF * (z0 + z1))
     dx = x1 - x0
@@ -218,7 +218,7 @@ def near_points(x, y, z, radius, scene):
 
 @allocation_free()
 def _near_by_eight(x, y, z, radius, scene):
-    """Mask of the lanes whose sphere may touch a point, from the eight voxels around its centre.
+    """Mask of the lanes whose sphere may touch a point, from the eight voxels around its center.
 
     The bound of the voxel on the side away from the nearest point is almost exact.
     """
@@ -349,12 +349,12 @@ def _look_up(scene, x, y, z):
     ex = cx - np.float32(ix) - _HALF
     ey = cy - np.float32(iy) - _HALF
     ez = cz - np.float32(iz) - _HALF
-    inner = max(scene.grid[index] - voxel * np.sqrt(ex * ex + ey * ey + ez * ez), _ZERO)
+    grid_distance = max(scene.grid[index] - voxel * np.sqrt(ex * ex + ey * ey + ez * ez), _ZERO)
     ox = fx - cx
     oy = fy - cy
     oz = fz - cz
     out = voxel * voxel * (ox * ox + oy * oy + oz * oz)
-    return np.sqrt(inner * inner + out) - frame[5] - _SLACK, out, scene.nearest[index]
+    return np.sqrt(grid_distance * grid_distance + out) - frame[5] - _SLACK, out, scene.nearest[index]
 
 
 @allocation_free(fastmath=True)
@@ -416,7 +416,7 @@ def points_lower_bound(scene, x, y, z):
 def near_point(scene, x, y, z, limit):
     """Distance to a nearly nearest point, at most `limit`, and its gradient.
 
-    It is the nearest of the points stored in the eight voxels around, and too far by a few millimetres at
+    It is the nearest of the points stored in the eight voxels around, and too far by a few millimeters at
     most. It serves for gradients, where an exact search would take too long.
     """
     best = limit

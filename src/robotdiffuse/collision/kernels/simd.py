@@ -102,14 +102,14 @@ _define_operator(
 
 def _elementwise(name: str, count: int) -> Any:
     """An elementwise LLVM intrinsic of one or two arguments, each lanes or a float32."""
-    known = (LANES, types.float32)
+    lane_types = (LANES, types.float32)
 
     def generated(context: Any, *args: Any) -> Any:
         def codegen(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-            given = [context.cast(builder, v, t, LANES) for v, t in zip(values, args, strict=True)]
-            return _call(builder, name, given)
+            casted = [context.cast(builder, v, t, LANES) for v, t in zip(values, args, strict=True)]
+            return _call(builder, name, casted)
 
-        return (LANES(*args), codegen) if all(arg in known for arg in args) else None
+        return (LANES(*args), codegen) if all(arg in lane_types for arg in args) else None
 
     if count == 1:
         return _operation(lambda context, a: generated(context, a))
@@ -171,8 +171,8 @@ def load(_context: Any, array: Any, row: Any, part: Any) -> Any:
     """Lanes loaded from array[row, 16 * part :] of a C-contiguous float32 array."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        where = _address(context, builder, sig.args[0], *args)
-        return builder.load(builder.bitcast(where, _VECTOR.as_pointer()), align=_ALIGN, typ=_VECTOR)
+        pointer = _address(context, builder, sig.args[0], *args)
+        return builder.load(builder.bitcast(pointer, _VECTOR.as_pointer()), align=_ALIGN, typ=_VECTOR)
 
     return (LANES(array, row, part), codegen) if _holds_floats(array, 2) else None
 
@@ -182,8 +182,8 @@ def store(_context: Any, array: Any, row: Any, part: Any, value: Any) -> Any:
     """Stores lanes to array[row, 16 * part :] of a C-contiguous float32 array."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        where = _address(context, builder, sig.args[0], *args[:3])
-        builder.store(args[3], builder.bitcast(where, _VECTOR.as_pointer()), align=_ALIGN)
+        pointer = _address(context, builder, sig.args[0], *args[:3])
+        builder.store(args[3], builder.bitcast(pointer, _VECTOR.as_pointer()), align=_ALIGN)
         return context.get_dummy_value()
 
     return (
@@ -200,10 +200,15 @@ def gather(_context: Any, array: Any, index: Any) -> Any:
         places: Any = builder.gep(data, [builder.fptosi(args[1], _INTEGERS)], source_etype=_FLOAT)
         places.type = ir.VectorType(ir.PointerType(), W)  # llvmlite does not infer it for vectors of indices
         everywhere = ir.Constant(ir.VectorType(ir.IntType(1), W), [1] * W)
-        given = [places, ir.Constant(ir.IntType(32), _ALIGN), everywhere, ir.Constant(_VECTOR, ir.Undefined)]
-        kind = ir.FunctionType(_VECTOR, [value.type for value in given])
+        operands = [
+            places,
+            ir.Constant(ir.IntType(32), _ALIGN),
+            everywhere,
+            ir.Constant(_VECTOR, ir.Undefined),
+        ]
+        kind = ir.FunctionType(_VECTOR, [value.type for value in operands])
         name = f"llvm.masked.gather.v{W}f32.v{W}p0"
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), given)
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), operands)
 
     return (LANES(array, index), codegen) if _holds_floats(array, 1) and index == LANES else None
 
@@ -225,9 +230,9 @@ def lanes_with_bit(_context: Any, a: Any, bit: Any) -> Any:
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         numbers = builder.fptosi(args[0], _INTEGERS)
         single = builder.insert_element(ir.Constant(_INTEGERS, ir.Undefined), args[1], ir.Constant(_BITS, 0))
-        wanted = builder.shuffle_vector(single, ir.Constant(_INTEGERS, ir.Undefined), _EVERYWHERE)
-        there = builder.and_(numbers, wanted)
-        return _mask(builder, builder.icmp_unsigned("!=", there, ir.Constant(_INTEGERS, [0] * W)))
+        mask = builder.shuffle_vector(single, ir.Constant(_INTEGERS, ir.Undefined), _EVERYWHERE)
+        masked = builder.and_(numbers, mask)
+        return _mask(builder, builder.icmp_unsigned("!=", masked, ir.Constant(_INTEGERS, [0] * W)))
 
     return (types.int64(a, bit), codegen) if a == LANES and bit == types.int32 else None
 

@@ -100,7 +100,7 @@ REFINEMENTS = (0.25, 0.1)
 """Standard deviations of the configurations around the best ones, in rounds after the first [rad]."""
 # Number of the best ones, and of configurations around each of them.
 REFINED = 12
-NEIGHBOURS = 15
+NEIGHBORS = 15
 MAX_VOXELS = 1500
 """Most swept voxels from which looks are scored."""
 FULL_COST_LENGTH = 8.0
@@ -181,7 +181,7 @@ def best_looks(
             tree.grow(targets, LONGEST_STEP * rng.random(TARGETS) ** 2)
     score = scored(tree.configurations)
     for spread in REFINEMENTS:
-        best = tree.configurations[np.argsort(-score, kind="stable")[:REFINED]].repeat(NEIGHBOURS, axis=0)
+        best = tree.configurations[np.argsort(-score, kind="stable")[:REFINED]].repeat(NEIGHBORS, axis=0)
         tree.grow(best + spread * rng.standard_normal(best.shape), np.full(len(best), np.inf))
         score = np.concatenate([score, scored(tree.configurations[len(score) :])])
     for number in np.argsort(-score, kind="stable"):

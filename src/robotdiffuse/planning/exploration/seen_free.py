@@ -31,7 +31,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape
 
 COVER_RADIUS = MAP.edge * 3**0.5 / 2
-"""Radius of the ball around a voxel's centre that covers the voxel [m]."""
+"""Radius of the ball around a voxel's center that covers the voxel [m]."""
 MIN_FREE_SHARE = 0.8
 """Searches fail where a smaller part of what the arm fills at the goal, and not at the start, was seen free:
 see benchmarks/results/exploring.txt."""
@@ -78,7 +78,7 @@ def least_unknown(known: OccupancyMap, goals: Configurations) -> Configuration:
 
 
 def reaches_outside(robot: Robot, q: Configuration) -> bool:
-    """Whether the arm reaches out of the map: centres of its covering spheres lie outside."""
+    """Whether the arm reaches out of the map: centers of its covering spheres lie outside."""
     low, high = _ends_of_map()
     centers = placed_spheres(robot, q)[:, :3]
     return bool(((centers < low) | (centers > high)).any())
@@ -120,7 +120,7 @@ class GoalSeen:
         self._views = views
         self._required = required
         self._unseen: dict[tuple[float, ...], Points] = {}
-        """Centres of the balls that no view has shown to be free, by configuration [m]."""
+        """Centers of the balls that no view has shown to be free, by configuration [m]."""
         self.taken: list[Configuration] = []
         """Configurations of the views since the goal was set."""
 
@@ -143,7 +143,7 @@ class GoalSeen:
         return best_goal
 
     def unseen(self, start: Configuration, q: Configuration) -> Points:
-        """The centres of the balls at a configuration that nothing has shown to be free [m]. start: where the
+        """The centers of the balls at a configuration that nothing has shown to be free [m]. start: where the
         arm is."""
         key = _key(q)
         if key not in self._unseen:
@@ -192,7 +192,7 @@ class GoalSeen:
         return balls
 
     def _distances(self, balls: Points, q: Configuration) -> Float32[ndarray, "n"]:
-        """Signed distances of the balls' centres to the arm's covering spheres at a configuration [m]."""
+        """Signed distances of the balls' centers to the arm's covering spheres at a configuration [m]."""
         return sphere_distances(balls, placed_spheres(self._robot, q).astype(np.float32))
 
 

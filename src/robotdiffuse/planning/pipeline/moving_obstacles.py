@@ -79,12 +79,12 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
         if came[now, places - 1] != UNREACHED:
             return now
         for i in range(places):
-            rests = came[now, i] != UNREACHED and clear[cell[i], now + 1]
-            if rests and came[now + 1, i] == UNREACHED:
+            can_wait = came[now, i] != UNREACHED and clear[cell[i], now + 1]
+            if can_wait and came[now + 1, i] == UNREACHED:
                 came[now + 1, i] = WAITED
         for m in range(len(source)):
-            there = now + first[m + 1] - first[m] - 1
-            if came[now, source[m]] == UNREACHED or there >= ticks or came[there, target[m]] != UNREACHED:
+            arrival = now + first[m + 1] - first[m] - 1
+            if came[now, source[m]] == UNREACHED or arrival >= ticks or came[arrival, target[m]] != UNREACHED:
                 continue
             free = True
             for k in range(first[m + 1] - first[m] - 1):
@@ -94,7 +94,7 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
                     free = False
                     break
             if free:
-                came[there, target[m]] = m
+                came[arrival, target[m]] = m
     return -1
 
 
@@ -144,7 +144,7 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
     context.begin_search()
     rng = np.random.default_rng(request.seed)
     attempts = 0
-    tried = 0
+    attempted_paths = 0
     horizon = 0.0
     reason = ""
     while attempts == 0 or context.remaining > 0:
@@ -155,30 +155,30 @@ def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanR
             scene = scene.with_shapes([*scene.shapes, *standing])
         limit = max(PATH_TIME_FRACTION * (request.time_limit - context.elapsed), 1e-3)
         of_path = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
-        found = plan_path(solver, replace(still, scene=scene), of_path)
+        result = plan_path(solver, replace(still, scene=scene), of_path)
         attempts += 1
-        if found.path is None or found.trajectory is None:
-            if tried == 0 and scene is problem.scene:
-                return found
+        if result.path is None or result.trajectory is None:
+            if attempted_paths == 0 and scene is problem.scene:
+                return result
             continue
-        tried += 1
-        horizon = max(horizon, found.trajectory.duration)
+        attempted_paths += 1
+        horizon = max(horizon, result.trajectory.duration)
         for clearance in (context.clearance, 0.0):
             try:
                 with context.deadline():
-                    timed = _timed(context, problem, collision, found, clearance)
+                    timed = _timed(context, problem, collision, result, clearance)
             except OutOfTimeError as error:
-                if tried == 1:
+                if attempted_paths == 1:
                     return context.out_of_time(error)
-                tried -= 1  # the last path was not tried in time
+                attempted_paths -= 1  # the last path was not tried in time
                 break
             if timed is None:
                 continue
             report = context.validator.trajectory(timed)
             if report.violation is None:
-                return _solved(context, found, timed, report.scene_clearance, report.self_clearance)
+                return _solved(context, result, timed, report.scene_clearance, report.self_clearance)
             reason = f"; last: {report.violation.message}"
-    paths = "one path" if tried == 1 else f"{tried} paths"
+    paths = "one path" if attempted_paths == 1 else f"{attempted_paths} paths"
     return context.fail(
         Status.TIMEOUT,
         f"no timing of {paths}, with waits and retreats, passes the moving obstacles{reason}",
@@ -210,8 +210,10 @@ def _stops(problem: Problem, path: Path) -> list[int]:
     rows = range(len(path.positions))
     stops = [0]
     for goal in problem.waypoints:
-        there = (i for i in rows[stops[-1] :] if goal_error(problem.robot, goal, path.positions[i]) is None)
-        stops.append(next(there))
+        reaching = (
+            i for i in rows[stops[-1] :] if goal_error(problem.robot, goal, path.positions[i]) is None
+        )
+        stops.append(next(reaching))
     return stops[1:]
 
 
@@ -230,7 +232,7 @@ def _timed(
     validator = verifier(replace(problem, moving=()))
     if path.length < MIN_DISTANCE:
         return time_parameterize(robot, path, lambda _: True, validator.collision_free, context.timing)
-    rests = StopGraph(
+    graph = StopGraph(
         robot,
         path,
         lambda t: validator.trajectory(t).valid,
@@ -243,8 +245,8 @@ def _timed(
         _stops(problem, path),
     )
     links = compile_links(robot)[1]
-    s, configurations = rests.sample(links.motion_radii.max(axis=0), GRID_TRAVEL)
-    longest = sum(motion.ticks for motion in rests.motions if motion.target == motion.source + 1) // len(
+    s, configurations = graph.sample(links.motion_radii.max(axis=0), GRID_TRAVEL)
+    longest = sum(motion.ticks for motion in graph.motions if motion.target == motion.source + 1) // len(
         SPEED_FACTORS
     )
     count = int(DURATION_FACTOR * longest + EXTRA_TIME / GRID_STEP)
@@ -254,15 +256,15 @@ def _timed(
     needed = clearance + (GRID_TRAVEL + speed * GRID_STEP) / 2
     clear = free_at_times(links, collision.tracks, configurations, times, needed)
     cells = list[ndarray]()
-    for motion in rests.motions:
+    for motion in graph.motions:
         check_timing("the grid of times")
-        cells.append(rests.nearest_samples(motion, configurations))
+        cells.append(graph.nearest_samples(motion, configurations))
     way, reached = earliest(
         clear,
-        np.searchsorted(s, rests.stops),
-        np.array([motion.source for motion in rests.motions]),
-        np.array([motion.target for motion in rests.motions]),
+        np.searchsorted(s, graph.stops),
+        np.array([motion.source for motion in graph.motions]),
+        np.array([motion.target for motion in graph.motions]),
         np.cumsum([0] + [len(of_motion) for of_motion in cells]),
         np.concatenate(cells),
     )
-    return rests.trajectory([rests.motions[m] if m >= 0 else m for m in way]) if reached else None
+    return graph.trajectory([graph.motions[m] if m >= 0 else m for m in way]) if reached else None

@@ -36,7 +36,7 @@ from robotdiffuse.validation.validator import verifier
 BLEND_FRACTION = 0.9
 """Part of a blend that is used; the rest covers what lies between the places that are validated."""
 MAX_DEVIATION_PER_BLEND = 10.0
-"""First corner deviation that is tried, per metre of blend [rad/m]: some joints move the frame only a
+"""First corner deviation that is tried, per meter of blend [rad/m]: some joints move the frame only a
 little."""
 # Each corner deviation that is tried is this factor of the last, up to this many times.
 DEVIATION_FACTOR = 0.9

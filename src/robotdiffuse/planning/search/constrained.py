@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import overload
 
-from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
+from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.problems.constraint_kernel import evaluate, make_work, proved
@@ -98,11 +98,11 @@ def _extended(space, limits, trees, tree, near, q, longest, scratch):
         if trees.sizes[tree] + MAX_PIECES > trees.nodes.shape[1]:
             return -1
         count = between(space, limits, origin, end, MAX_STEP_FACTOR * min(gap, longest), scratch)
-        here = near
+        last = near
         for i in range(count):
-            cost = trees.costs[tree, here] + distance(trees.nodes[tree, here], limits.out[i])
-            here = rrt_kernel.add(trees, tree, limits.out[i], cost, here)
-        return here if count else -1
+            cost = trees.costs[tree, last] + distance(trees.nodes[tree, last], limits.out[i])
+            last = rrt_kernel.add(trees, tree, limits.out[i], cost, last)
+        return last if count else -1
 
     return extended
 
@@ -116,8 +116,8 @@ def _straight(limits, a, b):
     evaluate(rows, a, 0, work)
     evaluate(rows, b, 1, work)
     for m in range(len(limits.kept)):
-        most = max(work.values[0, m], work.values[1, m]) + MAX_GROWTH * rows.tolerance[m]
-        limits.growing[m] = min(limits.kept[m], most)
+        limit = max(work.values[0, m], work.values[1, m]) + MAX_GROWTH * rows.tolerance[m]
+        limits.growing[m] = min(limits.kept[m], limit)
     return proved(rows, limits.growing, a, b, MIN_PROOF_PIECE, work)[1] < 0
 
 
@@ -134,33 +134,33 @@ def between(space, limits, a, b, most, scratch):
     Returns their number; 0 if none was found, or it is longer than `most` [rad].
     """
     stack = limits.stack
-    here = limits.here
+    current = limits.here
     stack[0] = b
-    here[:] = a
+    current[:] = a
     top = 1
     count = 0
-    done = 0.0
+    length = 0.0
     while top > 0:
         target = stack[top - 1]
-        gap = distance(here, target)
-        if done + gap > most:
+        gap = distance(current, target)
+        if length + gap > most:
             return 0
-        if _straight(limits, here, target):
-            if count == MAX_PIECES or not motion_free(space, here, target, scratch.block, scratch.work):
+        if _straight(limits, current, target):
+            if count == MAX_PIECES or not motion_free(space, current, target, scratch.block, scratch.work):
                 return 0
             limits.out[count] = target
-            here[:] = target
+            current[:] = target
             top = top - 1
             count = count + 1
-            done = done + gap
+            length = length + gap
             continue
         if top == MAX_DEPTH or gap < MIN_PIECE:
             return 0
         middle = stack[top]
-        middle[:] = 0.5 * (here + target)
+        middle[:] = 0.5 * (current + target)
         if not project(limits.rows, limits.kept, middle, limits.work):
             return 0
-        if max(distance(here, middle), distance(middle, target)) > MAX_DRIFT * gap:
+        if max(distance(current, middle), distance(middle, target)) > MAX_DRIFT * gap:
             return 0
         top += 1
     return count
@@ -194,8 +194,8 @@ def simplify(space, limits, path, rounds, tries, state):
         count = between(space, limits, points[i], points[k], SHORTCUT_GAIN * before, scratch)
         lost += 1
         if count > 0:
-            found = np.concatenate((points[i : i + 1], limits.out[:count]))
-            points = np.concatenate((points[:i], _finer(found), points[k + 1 :]))
+            shortcut = np.concatenate((points[i : i + 1], limits.out[:count]))
+            points = np.concatenate((points[:i], _finer(shortcut), points[k + 1 :]))
             lost = 0
     points = _skipped(space, limits, points, scratch)
     for _ in range(rounds):
@@ -232,10 +232,10 @@ def _skipped(space, limits, path, scratch):
         if i == len(path) - 1:
             return out[:n].copy()
         following = i + 1
-        ahead = 2
-        while i + ahead < len(path) and _usable(space, limits, path[i], path[i + ahead], scratch):
-            following = i + ahead
-            ahead = ahead + max(1, ahead // 2)
+        skip = 2
+        while i + skip < len(path) and _usable(space, limits, path[i], path[i + skip], scratch):
+            following = i + skip
+            skip = skip + max(1, skip // 2)
         i = following
 
 

@@ -18,8 +18,8 @@ from typing import Annotated
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.kernels.random import random_state
 from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.loading import loading

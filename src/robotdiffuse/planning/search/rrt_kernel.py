@@ -6,7 +6,7 @@ bidirectional RRT search", 2005. T. S. Wilson, W. Thomason, Z. Kingston and J. D
 Almost-surely asymptotically optimal planning with RRT-Connect", RA-L 2025; samples as in J. D. Gammell, S. S.
 Srinivasa and T. D. Barfoot, "Informed RRT*", IROS 2014.
 
-Edges are straight motions where `limits` is None. Under path constraints it is `constrained_kernel.Limits`,
+Edges are straight motions where `limits` is None. Under path constraints it is `constrained.Limits`,
 for which that module defines `keep` and `extended`.
 """
 
@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import random
 from robotdiffuse.collision.kernels.lane_collision import make_workspace
 from robotdiffuse.collision.kernels.motions import distance, motion_free
+from robotdiffuse.collision.kernels.random import random
 from robotdiffuse.collision.kernels.simd import W, lane, load
 from robotdiffuse.core.kernels import allocation_free, inner_kernel, kernel
 
@@ -124,6 +124,10 @@ def extended_straight(space, trees, tree, near, q, longest, bound, scratch):
 def search(space, limits, trees, bound, longest, iterations, state):
     """Grow both trees for a number of iterations, or until they hold a path shorter than `bound` [rad].
 
+    RRT_CONNECT_PLANNER of Kuffner and LaValle (figure 5), with balanced trees in place of SWAP. With a
+    bound, which is c_max of AORRTC, the trees grow in the space of configurations and costs: T_a is `tree`,
+    T_b is `other_tree`.
+
     limits: None for straight edges, else those of path constraints.
     bound: infinite for RRT-Connect, and under path constraints.
     longest: largest extension [rad].
@@ -140,48 +144,61 @@ def search(space, limits, trees, bound, longest, iterations, state):
     bounded = bound < INFINITE
     shares = goal_shares(start, goals, bound)
     for _ in range(iterations):
+        # T_a is the smaller tree
         tree = 0 if sizes[0] <= sizes[1] else 1
-        other = 1 - tree
-        allowed = bound
+        other_tree = 1 - tree
+        # x_rand, and c_rand, the cost at which T_a may reach it
+        c_rand = bound
         if bounded:
+            # from the hyperspheroid of a goal, chosen by volume (Informed RRT*)
             u = random(state)
             g = 0
             while g < len(goals) - 1 and u > shares[g]:
                 g += 1
             sample_within(space, start, goals[g], bound, sample, state)
-            least = _to_roots(trees, tree, sample)
-            allowed = least + random(state) * (bound - _to_roots(trees, other, sample) - least)
+            # c_rand is uniform from the least cost-to-come to what the least cost-to-go leaves of c_max
+            g_hat = _to_roots(trees, tree, sample)
+            h_hat = _to_roots(trees, other_tree, sample)
+            c_rand = g_hat + random(state) * (bound - h_hat - g_hat)
         else:
             sample_box(space, sample, state)
+        # EXTEND(T_a, x_rand): x_near and x_new
         if limits is None:
-            near = nearest(trees, tree, sample, allowed)
-            here = extended_straight(space, trees, tree, near, sample, longest, bound, scratch)
-            if here >= 0 and bounded:
-                _lower_cost(space, trees, tree, here, scratch, state)
+            x_near = nearest(trees, tree, sample, c_rand)
+            x_new = extended_straight(space, trees, tree, x_near, sample, longest, bound, scratch)
+            if x_new >= 0 and bounded:
+                _lower_cost(space, trees, tree, x_new, scratch, state)
         else:
             if not keep(limits, sample):
                 continue
-            near = nearest(trees, tree, sample, allowed)
-            here = extended(space, limits, trees, tree, near, sample, longest, scratch)
-        if here < 0:
+            x_near = nearest(trees, tree, sample, c_rand)
+            x_new = extended(space, limits, trees, tree, x_near, sample, longest, scratch)
+        # Trapped
+        if x_new < 0:
             continue
-        cost = costs[tree, here]
+        c_new = costs[tree, x_new]
         for j in range(len(sample)):
-            sample[j] = nodes[tree, here, j]
-        near = nearest(trees, other, sample, bound - cost)
+            sample[j] = nodes[tree, x_new, j]
+        # CONNECT(T_b, x_new): T_b may reach x_new at a cost of up to c_max - c_new
+        x_near = nearest(trees, other_tree, sample, bound - c_new)
         while True:
-            gap = distance(nodes[other, near], sample)
-            if costs[other, near] + gap + cost >= bound:
+            gap = distance(nodes[other_tree, x_near], sample)
+            # no path through this edge is shorter than c_max
+            if costs[other_tree, x_near] + gap + c_new >= bound:
                 break
             if limits is None:
-                there = extended_straight(space, trees, other, near, sample, longest, INFINITE, scratch)
+                x_connect = extended_straight(
+                    space, trees, other_tree, x_near, sample, longest, INFINITE, scratch
+                )
             else:
-                there = extended(space, limits, trees, other, near, sample, longest, scratch)
-            if there < 0:
+                x_connect = extended(space, limits, trees, other_tree, x_near, sample, longest, scratch)
+            # Trapped
+            if x_connect < 0:
                 break
+            # Reached: the trees meet
             if gap <= longest:
-                return _joined(trees, tree, here, there)
-            near = there
+                return _joined(trees, tree, x_new, x_connect)
+            x_near = x_connect
     return np.empty((0, nodes.shape[2]), nodes.dtype)
 
 
@@ -198,21 +215,21 @@ def extend(space, trees, targets, longest):
 @allocation_free(inline="always")
 def add(trees, tree, q, cost, parent):
     """Add a node to a tree, which must not be full; returns the node."""
-    here = trees.sizes[tree]
+    node = trees.sizes[tree]
     dof = len(q)
     for j in range(dof):
-        trees.nodes[tree, here, j] = q[j]
-        if here % W == 0:
-            trees.columns[tree * dof + j, here : here + W] = _NOWHERE
-        trees.columns[tree * dof + j, here] = q[j]
-    trees.costs[tree, here] = cost
-    trees.parents[tree, here] = parent
-    trees.children[tree, here] = -1
+        trees.nodes[tree, node, j] = q[j]
+        if node % W == 0:
+            trees.columns[tree * dof + j, node : node + W] = _NOWHERE
+        trees.columns[tree * dof + j, node] = q[j]
+    trees.costs[tree, node] = cost
+    trees.parents[tree, node] = parent
+    trees.children[tree, node] = -1
     if parent >= 0:
-        trees.siblings[tree, here] = trees.children[tree, parent]
-        trees.children[tree, parent] = here
+        trees.siblings[tree, node] = trees.children[tree, parent]
+        trees.children[tree, parent] = node
     trees.sizes[tree] += 1
-    return here
+    return node
 
 
 @allocation_free()
@@ -259,47 +276,49 @@ def _root_count(trees, tree):
 
 @allocation_free(fastmath=True)
 def _to_roots(trees, tree, q):
-    """Distance to the nearest root, a lower bound of the cost of q [rad]."""
-    least = np.float32(1e9)
+    """g_hat of the tree: distance to the nearest root, a lower bound of the cost of q [rad]."""
+    g_hat = np.float32(1e9)
     for r in range(_root_count(trees, tree)):
-        least = min(least, distance(trees.nodes[tree, r], q))
-    return least
+        g_hat = min(g_hat, distance(trees.nodes[tree, r], q))
+    return g_hat
 
 
 @allocation_free()
-def nearest(trees, tree, q, allowed):
-    """The nearest node, by position and cost, of those that reach q at a cost of at most `allowed`.
+def nearest(trees, tree, q, c_rand):
+    """The node nearest to (q, c_rand), by position and cost, of those that reach q at a cost of at most
+    c_rand.
 
-    The cost of q is taken to be `allowed`. Without a bound, the nearest node by position; if no node reaches
-    q, the nearest root.
+    Without a bound, the nearest node by position; if no node reaches q, the nearest root.
     """
-    bounded = allowed < INFINITE
+    bounded = c_rand < INFINITE
     best = INFINITE
-    where = -1
+    x_near = -1
+    # the nodes by lanes of W
     for part in range((trees.sizes[tree] + W - 1) // W):
-        apart = _squared(trees, tree, part, q)
+        square = _squared(trees, tree, part, q)
         if bounded:
-            late = allowed - load(trees.costs, tree, part)
-            both = apart + late * late
-            near = (both < best) & ~(late < _ZERO) & ~(late * late < apart)
+            # the cost that is left for the edge must be at least its length
+            slack = c_rand - load(trees.costs, tree, part)
+            total = square + slack * slack
+            nearer = (total < best) & ~(slack < _ZERO) & ~(slack * slack < square)
         else:
-            both = apart
-            near = both < best
+            total = square
+            nearer = total < best
         i = 0
-        while near != 0:
-            if near & 1 and lane(both, i) < best:
-                best = lane(both, i)
-                where = W * part + i
-            near = near >> 1
+        while nearer != 0:
+            if nearer & 1 and lane(total, i) < best:
+                best = lane(total, i)
+                x_near = W * part + i
+            nearer = nearer >> 1
             i = i + 1
-    if where >= 0:
-        return where
+    if x_near >= 0:
+        return x_near
     for n in range(_root_count(trees, tree)):
-        apart = distance(trees.nodes[tree, n], q)
-        if apart < best:
-            best = apart
-            where = n
-    return where
+        gap = distance(trees.nodes[tree, n], q)
+        if gap < best:
+            best = gap
+            x_near = n
+    return x_near
 
 
 @allocation_free(inner=False)
@@ -307,23 +326,25 @@ def nearest_few(trees, tree, q, index, squares):
     """Write the nodes nearest to q to `index`, the nearest first, and their squared distances to `squares`;
     returns their number, fewer than len(index) only in a smaller tree."""
     count = 0
-    worst = _FAR
+    cutoff = _FAR
     for part in range((trees.sizes[tree] + W - 1) // W):
-        apart = _squared(trees, tree, part, q)
-        near = apart < worst
+        square = _squared(trees, tree, part, q)
+        nearer = square < cutoff
         i = 0
-        while near != 0:
-            if near & 1 and lane(apart, i) < worst:
+        while nearer != 0:
+            if nearer & 1 and lane(square, i) < cutoff:
+                # insertion into the sorted list
                 count = min(count + 1, len(index))
                 at = count - 1
-                while at > 0 and squares[at - 1] > lane(apart, i):
+                while at > 0 and squares[at - 1] > lane(square, i):
                     index[at] = index[at - 1]
                     squares[at] = squares[at - 1]
                     at -= 1
-                index[at], squares[at] = W * part + i, lane(apart, i)
+                index[at] = W * part + i
+                squares[at] = lane(square, i)
                 if count == len(index):
-                    worst = squares[count - 1]
-            near = near >> 1
+                    cutoff = squares[count - 1]
+            nearer = nearer >> 1
             i = i + 1
     return count
 
@@ -342,21 +363,23 @@ def _squared(trees, tree, part, q):
 
 @allocation_free()
 def _lower_cost(space, trees, tree, leaf, scratch, state):
-    """Give a leaf a parent through which its cost is lower: draws such parents until an edge collides."""
-    q = trees.nodes[tree, leaf]
+    """Give a leaf a parent through which its cost is lower: AORRTC's resampling of c_rand, which ends when
+    the parent stays the same, the cost does not fall or an edge collides."""
+    x_new = trees.nodes[tree, leaf]
     parent = trees.parents[tree, leaf]
-    cost = trees.costs[tree, leaf]
-    least = _to_roots(trees, tree, q)
-    while cost > least:
-        other = nearest(trees, tree, q, least + random(state) * (cost - least))
-        through = trees.costs[tree, other] + distance(trees.nodes[tree, other], q)
-        if other == parent or through >= cost:
+    c_new = trees.costs[tree, leaf]
+    g_hat = _to_roots(trees, tree, x_new)
+    while c_new > g_hat:
+        c_rand = g_hat + random(state) * (c_new - g_hat)
+        x_near = nearest(trees, tree, x_new, c_rand)
+        cost = trees.costs[tree, x_near] + distance(trees.nodes[tree, x_near], x_new)
+        if x_near == parent or cost >= c_new:
             break
-        if not motion_free(space, trees.nodes[tree, other], q, scratch.block, scratch.work):
+        if not motion_free(space, trees.nodes[tree, x_near], x_new, scratch.block, scratch.work):
             break
-        parent = other
-        cost = through
-    rewire(trees, tree, leaf, parent, cost)
+        parent = x_near
+        c_new = cost
+    rewire(trees, tree, leaf, parent, c_new)
 
 
 @allocation_free()
@@ -372,10 +395,11 @@ def goal_shares(start, goals, bound):
     shares = np.empty(len(goals), np.float32)
     total = _ZERO
     for g in range(len(goals)):
-        straight = distance(start, goals[g])
-        if straight < bound:
-            flat = np.sqrt(_ONE - (straight / bound) ** 2)
-            total += flat ** np.float32(len(start) - 1)
+        c_min = distance(start, goals[g])
+        if c_min < bound:
+            # ratio of the short axes to the long one
+            flatness = np.sqrt(_ONE - (c_min / bound) ** 2)
+            total += flatness ** np.float32(len(start) - 1)
         shares[g] = total
     return shares / max(total, np.float32(1e-30))
 
@@ -383,26 +407,29 @@ def goal_shares(start, goals, bound):
 @allocation_free(inner=False)
 def sample_within(space, start, goal, bound, q, state):
     """Sample q uniformly in the prolate hyperspheroid of paths from the start to a goal shorter than `bound`,
-    clamped to the limits."""
+    clamped to the limits (algorithm 2, Sample, of Informed RRT*: `bound` is c_max)."""
     dof = len(q)
-    straight = distance(start, goal)
-    across = _HALF * np.sqrt(max(bound * bound - straight * straight, _ZERO))
+    c_min = distance(start, goal)
+    # L: half axes c_max / 2 and sqrt(c_max^2 - c_min^2) / 2
+    half_axis = _HALF * np.sqrt(max(bound * bound - c_min * c_min, _ZERO))
+    # SampleUnitNBall: a normal direction, and a radius u^(1/n)
     norm = _ZERO
     for j in range(dof):
         q[j] = _normal(state)
         norm += q[j] * q[j]
     scale = random(state) ** (_ONE / np.float32(dof)) / np.sqrt(max(norm, np.float32(1e-12)))
     for j in range(dof):
-        q[j] *= scale * (_HALF * bound if j == 0 else across)
-    # Householder reflection of the first axis onto the direction of the goal
+        q[j] *= scale * (_HALF * bound if j == 0 else half_axis)
+    # C, the rotation to the world frame, is a Householder reflection of the first axis onto the goal's
+    # direction; the center is halfway
     along = _ZERO
     total = _ZERO
     for j in range(dof):
-        v = (_ONE if j == 0 else _ZERO) - (goal[j] - start[j]) / max(straight, np.float32(1e-9))
+        v = (_ONE if j == 0 else _ZERO) - (goal[j] - start[j]) / max(c_min, np.float32(1e-9))
         along += v * q[j]
         total += v * v
     for j in range(dof):
-        v = (_ONE if j == 0 else _ZERO) - (goal[j] - start[j]) / max(straight, np.float32(1e-9))
+        v = (_ONE if j == 0 else _ZERO) - (goal[j] - start[j]) / max(c_min, np.float32(1e-9))
         turned = q[j] - (np.float32(2.0) * along / total * v if total > np.float32(1e-9) else _ZERO)
         q[j] = min(max(turned + _HALF * (start[j] + goal[j]), space.lower[j]), space.upper[j])
 
@@ -430,10 +457,10 @@ def branch(trees, tree, node):
 
 
 @inner_kernel()
-def _joined(trees, tree, here, there):
-    """The path from the start to a goal through two nodes at the same place, `here` in `tree` and `there` in
+def _joined(trees, tree, x_new, x_connect):
+    """The path from the start to a goal through two nodes at the same place, x_new in `tree` and x_connect in
     the other."""
-    first, second = (here, there) if tree == 0 else (there, here)
+    first, second = (x_new, x_connect) if tree == 0 else (x_connect, x_new)
     forth = branch(trees, 0, first)
     back = branch(trees, 1, trees.parents[1, second])
     path = np.empty((len(forth) + len(back), forth.shape[1]), forth.dtype)

@@ -10,7 +10,7 @@ The parts of the paper's section on data sets, and where they are here:
 - *RRT\\**: choose-parent and rewiring among the k nearest nodes, k = e (1 + 1/d) ln n, which asymptotic
   optimality needs (S. Karaman and E. Frazzoli, IJRR 2011; `add_node`). The authors rewire within a
   fixed radius of 1.2 and have choose-parent commented out.
-- *Node security defence*: nodes and edges keep a safety distance to obstacles; near a start or goal that is
+- *Node security defense*: nodes and edges keep a safety distance to obstacles; near a start or goal that is
   itself closer it is relaxed in steps (`collision.kernels.motions.padding_near`), and if no path is
   found, the whole distance is lowered in steps. The authors enlarge the obstacles by 5 cm. The distance kept
   is recorded.
@@ -31,8 +31,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.compiled import random, random_state
 from robotdiffuse.collision.kernels.motions import distance, motion_free, motions_free, path_length
+from robotdiffuse.collision.kernels.random import random, random_state
 from robotdiffuse.core.kernels import allocation_free, kernel
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings
@@ -51,8 +51,8 @@ GOAL_BIAS = np.float32(0.1)
 """Part of the samples that are at a goal, while it is not reached."""
 GAIN = np.float32(1e-4)
 """A cost must fall by more than this part to count; less is rounding."""
-NEIGHBOURS = 64
-"""Largest number of near neighbours; e (1 + 1 / dof) ln n is below it up to 10^8 nodes of 7 joints."""
+NEIGHBORS = 64
+"""Largest number of near neighbors; e (1 + 1 / dof) ln n is below it up to 10^8 nodes of 7 joints."""
 REMAINING_EXCESS = np.float32(0.5)
 """Part of a goal's present excess over the straight line that is expected to remain."""
 MIN_PROMISE = np.float32(0.03)
@@ -147,11 +147,11 @@ def _draw(space, trees, goals, g, state, out):
 @allocation_free()
 def _remaining(trees, goals, q, best):
     """A lower bound of the way from q to any goal that may still improve."""
-    least = INFINITE
+    h_hat = INFINITE
     for g in range(len(goals.at)):
         if _is_open(trees, goals, g, best):
-            least = min(least, distance(q, goals.at[g]))
-    return least
+            h_hat = min(h_hat, distance(q, goals.at[g]))
+    return h_hat
 
 
 @allocation_free()
@@ -159,18 +159,21 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
     """RRT*'s extension to q: the cheapest free way from the near nodes; then those near nodes that q reaches
     more cheaply are hung under it. Returns the node; -1 if q is of no use or cannot be reached.
 
-    index, gaps: memory for the near nodes and their distances.
+    Extend of RRT* (Karaman and Frazzoli, IJRR 2011, algorithm 6) with q as x_new.
+
+    index, gaps: memory for the near nodes X_near and their distances.
     """
     # k of k-nearest RRT*: S. Karaman and E. Frazzoli, IJRR 2011, e (1 + 1 / d) ln n
-    most = np.ceil(np.e * (1.0 + 1.0 / len(q)) * np.log(trees.sizes[0] + 1.0))
-    count = nearest_few(trees, 0, q, index[: min(int(most), NEIGHBOURS)], gaps)
+    k_nearest = np.ceil(np.e * (1.0 + 1.0 / len(q)) * np.log(trees.sizes[0] + 1.0))
+    count = nearest_few(trees, 0, q, index[: min(int(k_nearest), NEIGHBORS)], gaps)
     nodes = trees.nodes[0]
     costs = trees.costs[0]
     best = _best_cost(trees, goals)
     remaining = _remaining(trees, goals, q, best)
     for i in range(count):
         gaps[i] = np.sqrt(gaps[i])
-    # parents in the order of cost: mostly the first is free; a negative distance marks those in collision
+    # x_min, the parent of least cost. Parents are tried in the order of cost: mostly the first is free; a
+    # negative distance marks those in collision
     while True:
         chosen = -1
         cost = INFINITE
@@ -186,6 +189,7 @@ def add_node(space, trees, goals, q, scratch, index, gaps):
             break
         gaps[chosen] = -_ONE - gaps[chosen]
     node = add(trees, 0, q, cost, parent)
+    # rewire: x_new becomes the parent of the near nodes that it reaches more cheaply
     for i in range(count):
         near = index[i]
         through = cost + gaps[i]
@@ -224,27 +228,28 @@ def grow(space, trees, goals, longest, iterations, state):
     path can be shortened."""
     dof = trees.nodes.shape[2]
     scratch = rrt_kernel.make_scratch(space, trees.nodes)
-    sample = np.empty(dof, np.float32)
-    index = np.empty(NEIGHBOURS, np.int32)
-    gaps = np.empty(NEIGHBOURS, np.float32)
-    _grow(space, trees, goals, longest, iterations, state, scratch, sample, index, gaps)
+    x_rand = np.empty(dof, np.float32)
+    index = np.empty(NEIGHBORS, np.int32)
+    gaps = np.empty(NEIGHBORS, np.float32)
+    _grow(space, trees, goals, longest, iterations, state, scratch, x_rand, index, gaps)
 
 
 @allocation_free()
-def _grow(space, trees, goals, longest, iterations, state, scratch, sample, index, gaps):
-    new = scratch.end
+def _grow(space, trees, goals, longest, iterations, state, scratch, x_rand, index, gaps):
+    x_new = scratch.end
     for _ in range(iterations):
         if trees.sizes[0] + len(goals.at) >= trees.nodes.shape[1]:
             return
         g = draw_goal(trees, goals, state)
         if g < 0:
             return
-        _draw(space, trees, goals, g, state, sample)
-        near = trees.nodes[0, rrt_kernel.nearest(trees, 0, sample, INFINITE)]
-        share = min(longest / max(distance(near, sample), np.float32(1e-6)), _ONE)
-        for j in range(len(new)):
-            new[j] = near[j] + share * (sample[j] - near[j])
-        node = add_node(space, trees, goals, new, scratch, index, gaps)
+        _draw(space, trees, goals, g, state, x_rand)
+        x_nearest = trees.nodes[0, rrt_kernel.nearest(trees, 0, x_rand, INFINITE)]
+        # Steer
+        share = min(longest / max(distance(x_nearest, x_rand), np.float32(1e-6)), _ONE)
+        for j in range(len(x_new)):
+            x_new[j] = x_nearest[j] + share * (x_rand[j] - x_nearest[j])
+        node = add_node(space, trees, goals, x_new, scratch, index, gaps)
         if node >= 0:
             _try_goals(space, trees, goals, node, g, longest, scratch)
 

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.compiled import random, random_state
 from robotdiffuse.collision.kernels.lane_collision import make_workspace
 from robotdiffuse.collision.kernels.motions import Space, motion_free
+from robotdiffuse.collision.kernels.random import random, random_state
 from robotdiffuse.collision.kernels.simd import W
 from robotdiffuse.core.kernels import inner_kernel, kernel
 from robotdiffuse.core.types import Configuration, Configurations
@@ -274,8 +274,12 @@ class TimeOptimization:
     def optimal(self) -> bool:
         """Whether no motion to any goal can be faster by more than OPTIMALITY_TOLERANCE."""
         best = self.best
-        most = (1 + OPTIMALITY_TOLERANCE) * self._bound
-        return best is not None and best.time <= ESTIMATE_ERROR * most and self._least_time(best) <= most
+        threshold = (1 + OPTIMALITY_TOLERANCE) * self._bound
+        return (
+            best is not None
+            and best.time <= ESTIMATE_ERROR * threshold
+            and self._least_time(best) <= threshold
+        )
 
     def fastest(self) -> list[Candidate]:
         """The candidates, ordered by the exact time of the fastest motion without limits of jerk."""
@@ -294,9 +298,9 @@ class TimeOptimization:
     def improve(self, space: Space) -> None:
         """Spend ATTEMPTS on one of the candidates."""
         self._turn += 1
-        others = len(self.candidates) - 1
+        runners_up = len(self.candidates) - 1
         turn, rest = divmod(self._turn, BEST_TURNS + 1)
-        chosen = self.candidates[1 + turn % others if others and rest == 0 else 0]
+        chosen = self.candidates[1 + turn % runners_up if runners_up and rest == 0 else 0]
         self._improve(space, chosen, ATTEMPTS)
         self._sort()
 
@@ -310,7 +314,7 @@ class TimeOptimization:
         return least_time(line, *self._limits, *self._intervals)
 
     def _improve(self, space: Space, candidate: Candidate, attempts: int) -> None:
-        found = reduce_time(
+        reduced = reduce_time(
             space,
             candidate.path,
             candidate.deviations,
@@ -320,12 +324,12 @@ class TimeOptimization:
             attempts,
             self._state,
         )
-        candidate.path, candidate.deviations, candidate.time = found[0], found[1], float(found[2])
+        candidate.path, candidate.deviations, candidate.time = reduced[0], reduced[1], float(reduced[2])
         self.attempts += attempts
 
     def _sort(self) -> None:
-        short = [candidate for candidate in self.candidates if candidate.length <= self._longest]
-        ordered = sorted(short or self.candidates, key=lambda candidate: candidate.time)
+        short_candidates = [candidate for candidate in self.candidates if candidate.length <= self._longest]
+        ordered = sorted(short_candidates or self.candidates, key=lambda candidate: candidate.time)
         self.candidates = ordered[:MAX_CANDIDATES]
         if not self.times or self.candidates[0].time < self.times[-1][1]:
             self.times.append((self.attempts, self.candidates[0].time))

@@ -122,7 +122,7 @@ class Furniture(Ranges, ABC):
     turn: Range = (-0.3, 0.3)
     """Rotation of the furniture about the vertical axis; 0 faces the base [rad]."""
     reach: Positive = 0.8
-    """Maximum distance of the centres of regions from the shoulder; other regions are left out [m]."""
+    """Maximum distance of the centers of regions from the shoulder; other regions are left out [m]."""
     objects: tuple[Natural, Natural] = (0, 4)
     """Minimum and maximum number of loose objects."""
     object_width: PositiveRange = (0.05, 0.12)

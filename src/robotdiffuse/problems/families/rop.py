@@ -53,7 +53,7 @@ class Rop(Ranges):
     """The paper's spheres have a radius of 0.2, and its planner inflates them to 0.25: a margin of 5 cm."""
     cube_side: PositiveRange = (0.2, 0.2)
     x: Range = (-1.0, 1.0)
-    """Coordinates of the obstacles' centres."""
+    """Coordinates of the obstacles' centers."""
     y: Range = (-1.0, 1.0)
     z: Range = (0.1, 1.0)
     yaw: bool = False

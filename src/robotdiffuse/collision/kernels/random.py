@@ -1,22 +1,9 @@
-"""Shared by compiled code: the parent frame of a joint, and random numbers."""
+"""Random numbers of compiled code."""
 
 import numpy as np
-from numba.core import types
-from numba.extending import overload
 from numpy import ndarray
 
 from robotdiffuse.core.kernels import allocation_free
-
-
-def parent_of(parents, j):
-    """The parent frame of joint j. `parents` is None for a chain; code for chains is compiled separately, so
-    that support for trees costs them nothing."""
-    return j if parents is None else parents[j]
-
-
-@overload(parent_of, inline="always")
-def _parent_of(parents, j):
-    return (lambda parents, j: j) if parents is types.none else (lambda parents, j: parents[j])
 
 
 def random_state(seed: int, attempt: int = 0) -> ndarray:
