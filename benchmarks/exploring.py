@@ -49,11 +49,11 @@ from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.exploration.explorer import Explorer
 from robotdiffuse.planning.exploration.simulated import explore, measured, taken, wrist_camera
 from robotdiffuse.planning.exploration.steps import (
-    CHANCE,
     DONE,
     LOOK,
+    PROBABILISTIC,
     STRICT,
-    STRICT_THEN_CHANCE,
+    STRICT_THEN_PROBABILISTIC,
     ExplorerSettings,
     Step,
 )
@@ -88,16 +88,16 @@ class Method:
 METHODS = {
     "strict": Method(STRICT),
     "strict, goal seen": Method(STRICT, see_goal=True),
-    "chance": Method(CHANCE),
-    "strict, then chance": Method(STRICT_THEN_CHANCE),
+    "probabilistic": Method(PROBABILISTIC),
+    "strict, then probabilistic": Method(STRICT_THEN_PROBABILISTIC),
     "strict, no network": Method(STRICT, predict=False),
-    "chance, no network": Method(CHANCE, predict=False),
+    "probabilistic, no network": Method(PROBABILISTIC, predict=False),
     "strict, frontier looks": Method(STRICT, frontier=True),
-    "chance, frontier looks": Method(CHANCE, frontier=True),
+    "probabilistic, frontier looks": Method(PROBABILISTIC, frontier=True),
     "strict, no free zone": Method(STRICT, free_zone=False),
-    "chance, no free zone": Method(CHANCE, free_zone=False),
+    "probabilistic, no free zone": Method(PROBABILISTIC, free_zone=False),
     "strict, no standing camera": Method(STRICT, standing=False),
-    "chance, no standing camera": Method(CHANCE, standing=False),
+    "probabilistic, no standing camera": Method(PROBABILISTIC, standing=False),
 }
 MAX_PROBLEMS = 10_000
 """Of a family."""
@@ -219,7 +219,7 @@ def run(arguments: argparse.Namespace) -> None:
                 if (family, number, method, arguments.noise) in done:
                     continue
                 if not warm:
-                    play(problem, family, number, CHANCE, arguments.noise)
+                    play(problem, family, number, PROBABILISTIC, arguments.noise)
                     warm = True
                 row = play(problem, family, number, method, arguments.noise)
                 place = {"family": family, "number": number, "method": method, "noise": arguments.noise}

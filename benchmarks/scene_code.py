@@ -7,7 +7,7 @@ Prints benchmarks/results/scene_code.txt and draws scene_code.png. After an inte
 continues; parts and rows can run side by side. Problems and motions are of the family rop. The networks
 have no clearances as inputs and are sampled without guidance, so all they know of the scene is its code:
 
-- oracle: kind, centre, size and turn of each true obstacle, through a perceptron that sums over obstacles and
+- oracle: kind, center, size and turn of each true obstacle, through a perceptron that sums over obstacles and
   is trained along;
 - tokens: points of the cloud, which the waypoints attend to, in place of one vector (config `points`);
 - pointnet: PointNet, trained along;
@@ -90,7 +90,7 @@ DECISIVE = 10.0
 
 
 def obstacle_numbers(scenes: PackedScenes) -> Float32[Tensor, "n slots 9"]:
-    """Of each obstacle: whether it is a sphere, whether it is a cube, centre, half width [m], sine and cosine
+    """Of each obstacle: whether it is a sphere, whether it is a cube, center, half width [m], sine and cosine
     of four times its turn about the vertical, and 1 if it exists; a cube is the same after a quarter turn."""
     kinds = scenes.kinds
     params = scenes.params
@@ -114,7 +114,7 @@ class ObstacleCode(Encoder):
     """z = MLP(sum over obstacles of MLP(numbers of the obstacle)): the order of obstacles does not matter."""
 
     OCTAVES = 3
-    """Wavelengths (4 m, 2 m, 1 m) of the sines and cosines of the centre that are further inputs."""
+    """Wavelengths (4 m, 2 m, 1 m) of the sines and cosines of the center that are further inputs."""
 
     def __init__(self, settings: EncoderSettings) -> None:
         super().__init__(settings)

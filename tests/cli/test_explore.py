@@ -43,7 +43,7 @@ def test_explore_writes_a_replay_a_strip_and_a_recording(
         (["--out", "seen.gif"], ".html, .png"),
         (["--record", "seen.bag"], ".mcap"),
         (["--policy", "bold"], "unknown explorer.policy"),
-        (["--policy", "chance", "--see-goal"], "it needs policy 'strict'"),
+        (["--policy", "probabilistic", "--see-goal"], "it needs policy 'strict'"),
         (["--live", "--out", "seen.html"], "--live writes no files; leave out --out, --view and --record"),
         (["--speed", "2"], "add --live"),
         (["--live", "--port", "0", "--host", "no such host"], "--host is 'no such host'"),

@@ -48,7 +48,7 @@ def explorer(policy: str = "strict", seen: bool = True, noise: DepthNoise | None
     return out
 
 
-@pytest.mark.parametrize("policy", ("strict", "chance", "strict_then_chance"))
+@pytest.mark.parametrize("policy", ("strict", "probabilistic", "strict_then_probabilistic"))
 def test_the_loop_ends_and_strict_motions_do_not_collide(policy: str) -> None:
     events = list(explore(PROBLEM, explorer(policy)))
     strict = [event for event in events if event.step.policy == "strict"]
@@ -56,7 +56,7 @@ def test_the_loop_ends_and_strict_motions_do_not_collide(policy: str) -> None:
     assert not events[-1].free or (events[-1].step.kind in ("done", "stuck") and events[-1].step.reason)
     moved = [event.step for event in events if event.step.motion is not None]
     assert all(step.policy in policy for step in moved)
-    stated = [step.confidence for step in moved if step.policy == "chance"]
+    stated = [step.confidence for step in moved if step.policy == "probabilistic"]
     assert all(value is None or value >= 0.98 for value in stated)
 
 
@@ -245,8 +245,8 @@ def test_where_no_look_can_be_reached_the_arm_leaves_a_goal_by_the_way_in() -> N
 
 
 def test_without_the_network_a_motion_through_space_seen_free_is_certain_enough() -> None:
-    """Under `chance` the arm never stopped looking: the highest confidence was a rate of 0.82."""
-    settings = ExplorerSettings(policy="chance", predict=False, time_limit=1.0)
+    """Under `probabilistic` the arm never stopped looking: the highest confidence was a rate of 0.82."""
+    settings = ExplorerSettings(policy="probabilistic", predict=False, time_limit=1.0)
     one = rd.Explorer(PANDA, [wrist_camera(PANDA)], rd.Scene([FLOOR]), ZONE, settings)
     one.observe(camera_beside(PROBLEM, None, 0))
     one.set_goal(PROBLEM.start + 0.02)
@@ -303,8 +303,8 @@ def test_a_thing_at_the_surface_of_a_goal_is_seen_as_free_by_no_view() -> None:
 
 
 def test_a_goal_is_seen_by_strict_alone() -> None:
-    with pytest.raises(InputError, match=r"explorer.see_goal is true and explorer.policy 'chance'"):
-        ExplorerSettings(policy="chance", see_goal=True)
+    with pytest.raises(InputError, match=r"explorer.see_goal is true and explorer.policy 'probabilistic'"):
+        ExplorerSettings(policy="probabilistic", see_goal=True)
 
 
 @pytest.mark.parametrize("name", ["waypoints", "moving"])

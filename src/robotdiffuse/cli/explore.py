@@ -122,13 +122,13 @@ def add_explore(commands: argparse._SubParsersAction) -> None:
     option(
         parser,
         "--policy POLICY",
-        "strict: only through space that was seen free; chance: where the stated confidence is high; "
-        "strict_then_chance (default: strict)",
+        "strict: only through space that was seen free; probabilistic: where the stated confidence is high; "
+        "strict_then_probabilistic (default: strict)",
         default="strict",
     )
     options(
         parser,
-        ("--confidence P", "minimum confidence for policy chance (default: 0.98)", float, 0.98),
+        ("--confidence P", "minimum confidence for policy probabilistic (default: 0.98)", float, 0.98),
         (
             "--see-goal",
             "go only to goals at which all of the arm's surface was seen to be free (policy strict)",

@@ -73,11 +73,11 @@ def test_a_pause_holds_the_arm_and_a_restart_begins_anew(session: ExplorationSes
     assert session.state.configuration is held
     with pytest.raises(InputError, match=r"unknown explorer\.policy 'bold'"):
         session.restart(policy="bold")
-    session.restart(policy="chance", noise=True)
+    session.restart(policy="probabilistic", noise=True)
     assert session.state.configuration.tolist() == HOME.tolist() and not session.state.acts
-    assert (session.state.settings.policy, session.state.noise) == ("chance", True)
+    assert (session.state.settings.policy, session.state.noise) == ("probabilistic", True)
     state = until(session, lambda state: state.explorer is not None and state.phase == WAITING)
-    assert state.explorer is not None and state.explorer.settings.policy == "chance"
+    assert state.explorer is not None and state.explorer.settings.policy == "probabilistic"
 
 
 def test_an_error_is_shown_and_a_restart_helps(

@@ -6,12 +6,12 @@ and ends; seen points count there too. With `see_goal` the arm's surface at the 
 as well (`seen_free.GoalSeen`). So the promise is as good as the map: in a scene that does not change,
 with a camera whose poses and errors are as stated, such a motion meets nothing.
 
-**Chance.** The arm goes if the motion's stated `confidence` is high enough, and looks first if it is not. It
-follows from the predicted probability of all voxels that the map does not know and the motion sweeps, but for
-those that the arm fills where it begins and ends.
+**Probabilistic.** The arm goes if the motion's stated `confidence` is high enough, and otherwise looks first.
+The confidence follows from the predicted probability of all voxels that the map does not know and the motion
+sweeps, but for those that the arm fills where it begins and ends.
 
 Looks are chosen by what a tentative motion, planned among what was seen alone, would sweep unseen. A look's
-own motion is subject to the same policy; by chance, too, a strict one comes first.
+own motion is subject to the same policy; under the probabilistic one, too, a strict motion comes first.
 """
 
 from collections.abc import Iterable, Sequence
@@ -45,12 +45,12 @@ from robotdiffuse.planning.exploration.seen_free import (
     reaches_outside,
 )
 from robotdiffuse.planning.exploration.steps import (
-    CHANCE,
     DONE,
     GO,
     LOOK,
+    PROBABILISTIC,
     STRICT,
-    STRICT_THEN_CHANCE,
+    STRICT_THEN_PROBABILISTIC,
     STUCK,
     ArmCamera,
     ExplorerSettings,
@@ -177,7 +177,11 @@ class Explorer:
         scene = self.scene.with_shapes([*self.scene.shapes, *seen])
         problem = Problem(self.robot, scene, q, self._goal)
         self._seed += TENTATIVE_MOTIONS  # what one step's searches did not find, those of the next one may
-        policies = (STRICT, CHANCE) if self.settings.policy == STRICT_THEN_CHANCE else (self.settings.policy,)
+        policies = (
+            (STRICT, PROBABILISTIC)
+            if self.settings.policy == STRICT_THEN_PROBABILISTIC
+            else (self.settings.policy,)
+        )
         step = Step(STUCK, "")
         for policy in policies:
             step = self._step(problem, policy)
@@ -226,7 +230,7 @@ class Explorer:
             if isinstance(joint_goals, PlanResult):
                 return Step(STUCK, joint_goals.reason, policy)
             problem = replace(problem, goal=JointGoal(self._goal_seen.best(problem.start, joint_goals)[None]))
-        predicted = self.predicted() if policy == CHANCE else None
+        predicted = self.predicted() if policy == PROBABILISTIC else None
         may_look = bool(self.cameras) and self._looks < self.settings.max_looks
         limit = quick = self.settings.time_limit
         if may_look and policy == STRICT:
@@ -253,7 +257,7 @@ class Explorer:
         return self._good(motion, policy) and not self._goal_seen.missing(motion)
 
     def _go(self, motion: PlanResult, policy: str) -> Step:
-        stated = motion.confidence if policy == CHANCE else None
+        stated = motion.confidence if policy == PROBABILISTIC else None
         free = "through space seen free alone"
         if stated is not None:
             free = f"that is free with a probability of {stated:.3f}"
@@ -269,7 +273,7 @@ class Explorer:
         """A look at what a tentative motion sweeps unseen, or why there is none. `motion`: the one to the
         goal that does not keep to the policy."""
         why = self._goal_seen.missing(motion) or motion.reason
-        if motion.solved and policy == CHANCE:
+        if motion.solved and policy == PROBABILISTIC:
             why = "the motion has no confidence, since nothing was measured"
             if motion.confidence is not None:
                 why = (
@@ -285,7 +289,7 @@ class Explorer:
             return Step(STUCK, f"no motion among what was seen: {tentative.reason}", policy)
         safe_motion = None
         under = policy
-        if policy == CHANCE and predicted is not None:
+        if policy == PROBABILISTIC and predicted is not None:
             safe_motion = self._with_confidence(tentative, predicted)
         elif not to_view.any():
             safe_motion = self._within_seen_free(problem, tentative.path.positions, "as seen")
@@ -293,12 +297,12 @@ class Explorer:
         if safe_motion is not None and self._may_go(safe_motion, under):
             return self._go(safe_motion, under)
         predicted = self.predicted() if predicted is None else predicted
-        # a look has many ways: by chance, too, it takes one through space seen free if there is any
-        policies = (STRICT, CHANCE) if self.settings.policy == CHANCE else (policy,)
+        # a look has many ways: under either policy it takes one through space seen free if there is any
+        policies = (STRICT, PROBABILISTIC) if self.settings.policy == PROBABILISTIC else (policy,)
         for under in policies:
             way = self._way_to_look(problem, under, to_view, predicted)
             if way is not None:
-                stated = way.confidence if under == CHANCE else None
+                stated = way.confidence if under == PROBABILISTIC else None
                 self._looked_for |= to_view
                 why += "; look at unseen space on the way"
                 return Step(LOOK, why, under, way, stated, wanted=to_view)
@@ -324,7 +328,7 @@ class Explorer:
                     way = self._along(allowed, waypoints, "look")
                 else:
                     look = replace(problem, goal=JointGoal(waypoints[-1:]))
-                    way = self._by_chance(look, predicted, self.settings.time_limit, to_goal=False)
+                    way = self._probabilistic(look, predicted, self.settings.time_limit, to_goal=False)
                 if way is not None and self._good(way, policy):
                     return way
         return None
@@ -396,8 +400,8 @@ class Explorer:
     ) -> PlanResult:
         """A motion to the problem's goal by a policy, found within a time limit [s]. If the arm may look
         first, a strict one is not searched for where there hardly is one."""
-        if policy == CHANCE:
-            return self._by_chance(problem, predicted, limit)
+        if policy == PROBABILISTIC:
+            return self._probabilistic(problem, predicted, limit)
         goals = self._goals(problem)
         if isinstance(goals, PlanResult):
             return goals
@@ -411,7 +415,7 @@ class Explorer:
         why = "" if result.status is Status.TIMEOUT else f": {result.reason}"
         return replace(result, reason=f"no motion through space seen free alone was found{why}")
 
-    def _by_chance(
+    def _probabilistic(
         self, problem: Problem, predicted: Probabilities | None, limit: float, to_goal: bool = True
     ) -> PlanResult:
         """A motion among what was seen and predicted, with its confidence.

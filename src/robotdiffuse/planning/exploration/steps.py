@@ -57,18 +57,18 @@ LOOK = "look"
 DONE = "done"
 STUCK = "stuck"
 STRICT = "strict"
-CHANCE = "chance"
-STRICT_THEN_CHANCE = "strict_then_chance"
-POLICIES = (STRICT, CHANCE, STRICT_THEN_CHANCE)
+PROBABILISTIC = "probabilistic"
+STRICT_THEN_PROBABILISTIC = "strict_then_probabilistic"
+POLICIES = (STRICT, PROBABILISTIC, STRICT_THEN_PROBABILISTIC)
 
 
 @dataclass(frozen=True)
 class ExplorerSettings(Settings, name="explorer"):
     policy: Annotated[str, OneOf(POLICIES)] = STRICT
-    """strict: only through space seen free; chance: where the stated confidence is high enough;
-    strict_then_chance: the latter where the former leads nowhere."""
+    """strict: only through space seen free; probabilistic: where the stated confidence is high enough;
+    strict_then_probabilistic: the latter where the former leads nowhere."""
     confidence: Annotated[float, Bound(least=0.0, most=1.0)] = 0.98
-    """Least stated confidence of motions by chance."""
+    """Minimum stated confidence of motions under the probabilistic policy."""
     time_limit: Positive = 1.0
     """Time limit of each search [s]."""
     max_looks: Natural = 8
@@ -76,8 +76,8 @@ class ExplorerSettings(Settings, name="explorer"):
     look_attempts: Count = 4
     """Looks to which a motion is searched for in a step, the most useful first."""
     predict: bool = True
-    """Whether the occupancy completion network weighs looks, and chances; it does where it covers the arm's
-    reach."""
+    """Whether the occupancy completion network weighs views and gives confidences; it does so where it covers
+    the arm's reach."""
     see_goal: bool = False
     """Whether all of the arm's surface at the goal must have been seen free before it goes there; for policy
     strict. It takes more looks, and fails where something is nearer to the goal than about 1 cm."""
@@ -102,12 +102,12 @@ class Step:
     observe; done: the arm is at the goal; stuck: see `reason`."""
     reason: str
     policy: str = ""
-    """The policy that the motion keeps, "strict" or "chance"."""
+    """The policy that the motion keeps, "strict" or "probabilistic"."""
     motion: PlanResult | Any = None
     """Solved. A strict motion is certified against all that was not seen free; `motion.problem` holds these
     obstacles."""
     confidence: float | None = None
-    """Stated probability that a motion by chance is free."""
+    """Stated probability that a motion is free, under the probabilistic policy."""
     seen: Scene | None = None
     """The known scene and the points that the kept views saw; None where nothing was planned."""
     wanted: Voxels | None = None

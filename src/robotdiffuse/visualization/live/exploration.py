@@ -27,7 +27,14 @@ from robotdiffuse.planning.exploration.simulated import (
     explore,
     simulated_explorer,
 )
-from robotdiffuse.planning.exploration.steps import CHANCE, DONE, LOOK, POLICIES, STRICT, ExplorerSettings
+from robotdiffuse.planning.exploration.steps import (
+    DONE,
+    LOOK,
+    POLICIES,
+    PROBABILISTIC,
+    STRICT,
+    ExplorerSettings,
+)
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import reach
@@ -77,7 +84,7 @@ SPEEDS = (0.1, 10.0)
 """Bounds of the slider of the speed."""
 PROMISES = {
     STRICT: "only through space seen free",
-    CHANCE: "where the stated confidence is high enough",
+    PROBABILISTIC: "where the stated confidence is high enough",
 }
 """Policies in plain words."""
 
