@@ -143,7 +143,7 @@ class GuidedPrior(ExportedPlanner[GuidedPriorSettings]):
         start, goals = shared_out(*start_goal.rows(), samples)
         space = search_space(start_goal.checker, SAMPLE_RESOLUTION)
         closest: tuple[int, float, ndarray] | None = None
-        """Of the samples that collide: segments in collision, length [rad] and waypoints."""
+        """The best sample so far that collides: its segments in collision, length [rad] and waypoints."""
         batches = 0
         while context.remaining > 0:
             trajectories = self.draw(

@@ -86,7 +86,7 @@ class Bounds:
     clearance: Values
     """In the middles of the stretches [m], at most CLEARANCE_CAP."""
     displacement: Values
-    """Of any point of the link from the middle to anywhere on the stretch [m]."""
+    """Displacement of any point of the link from the middle to anywhere on the stretch [m]."""
 
 
 class Prover:

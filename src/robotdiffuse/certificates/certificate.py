@@ -207,7 +207,7 @@ class Field(NamedTuple):
     read: Callable[[str, Any], Any]
     write: Callable[[Any], Any] = lambda value: value
     attribute: str = ""
-    """Of `Certificate`, where it has another name."""
+    """The attribute of `Certificate`, where it has another name."""
 
 
 NUMBERS = Field(_vector, lambda array: array.tolist())

@@ -286,7 +286,7 @@ def torque_bounds(problem: Problem, motion: Path | Trajectory, samples: Values) 
 
 
 def _states(motion: Path | Trajectory, samples: Values) -> tuple[ndarray, Values, ndarray]:
-    """Of the m stretches of a motion from each sample to the next: positions, velocities and accelerations
+    """The m stretches of a motion from each sample to the next: positions, velocities, accelerations
     at their starts and ends [2, 3, m, dof]; their durations [s], 1 for a path; and the `Bound` of each of the
     three [3, 3, m, dof], with derivatives by time (of paths, which are at rest, by the share of the way)."""
     cubics = cubics_of(motion)

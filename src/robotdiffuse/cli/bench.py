@@ -231,7 +231,7 @@ def run_confirm(arguments: argparse.Namespace) -> int:
 FIGURE_PROBLEMS = 60
 """Most problems of the plot of success against denoising steps."""
 FIGURE_AZIMUTH = -0.9
-"""Of the camera of figure 1, the same for all noise levels [rad]."""
+"""Azimuth of the camera of figure 1, the same for all noise levels [rad]."""
 
 
 def add_reproduce(commands: argparse._SubParsersAction) -> None:

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 NO_VALUE = "–"
 WIDTH = 150
-"""Of tables without a terminal [characters]."""
+"""Width of tables without a terminal [characters]."""
 MIN_TEXT_WIDTH = 20
-"""Of the texts of pairs in narrow terminals [characters]."""
+"""Minimum width of the texts of pairs in narrow terminals [characters]."""
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ RESOLUTION = 0.02
 WAYPOINTS = 254
 DOF = 7
 CONDITION_NUMBERS = 23
-"""Of robot.npz."""
+"""Numbers of a condition in robot.npz."""
 SPHERE_RADIUS = 0.25
 """[m]; that of the authors' planner. Their loader and viewer use 0.2, which leaves a margin of 5 cm."""
 END_TOLERANCE = 1e-4

@@ -54,7 +54,7 @@ class RopBatch:
     goal: Float32[Tensor, "n dof"]
     """The goal that was reached: the last waypoint, scaled too."""
     target_pose: Float32[Tensor, "n 7"]
-    """Of the robot's tip in the base frame, wxyz_xyz."""
+    """Pose of the robot's tip in the base frame, wxyz_xyz."""
     obstacle_kinds: Int8[Tensor, "n slots"]
     """As in `PackedScenes`."""
     obstacle_params: Float32[Tensor, "n slots 10"]

@@ -151,7 +151,7 @@ def check_format(file: FilePath, found: object) -> None:
 # Shards
 
 COMPRESSION_LEVEL = 3
-"""Of Zstandard."""
+"""Level of Zstandard."""
 
 SPLITS = ("train", "validation", "test")
 SPLIT_PERCENT = (90, 5, 5)

@@ -47,7 +47,7 @@ class BenchSettings(Settings):
     out: FilePath
     """Folder for problems and results."""
     time_limit: Positive = 1.0
-    """Of a call [s]."""
+    """Time limit of a call [s]."""
     seeds: Count = 1
     """Calls on each problem, with seeds 0, 1, ..."""
     count: Count | None = None
@@ -181,7 +181,7 @@ class Preset:
     planners: tuple[str, ...]
     problems: tuple[str, ...]
     limits: tuple[float, ...]
-    """Of a call [s]."""
+    """Time limit of a call [s]."""
     count: int
     """Problems of each set."""
     equal_time: bool = True

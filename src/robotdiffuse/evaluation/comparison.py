@@ -138,7 +138,7 @@ class Outcome:
     returned: float
     """Time at which the planner returns [s]; the limit for anytime planners and without a path."""
     joint_length: float
-    """Of the best path by then [rad]; NaN without one."""
+    """Length of the best path by then [rad]; NaN without one."""
     link_length: float
     """The paper's path length [m], scaled by the joint lengths if the path by then is not the returned one;
     NaN without a path."""
@@ -250,7 +250,7 @@ class Row:
     timed: str
     """The sessions that made the calls, and the calls at a time in these."""
     measures: dict[str, Mean]
-    """Of the returned motions, by the names of METRICS."""
+    """Measures of the returned motions, by the names of METRICS."""
     memory: float
     """Peak memory of the process [MB]."""
     failures: Counter[str]

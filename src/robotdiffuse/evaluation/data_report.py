@@ -38,7 +38,7 @@ SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
 SAMPLED_MOTIONS = 20_000
 """Motions, spread evenly over the set, whose larger arrays are kept for the plots."""
 SAMPLED_WAYPOINTS = 24
-"""Of each of these motions, spread evenly."""
+"""Waypoints of each of these motions, spread evenly."""
 ARRAYS_OF_ALL = ("cost", "clearance", "end_clearance", "safety_distance", "line_free", "detour", "family")
 """Arrays that are kept of all motions."""
 ARRAYS_OF_SAMPLE = ("goal_costs", "trajectories")

@@ -26,8 +26,9 @@ STANDSTILL = 1e-6
 CUTOFF = 10.0
 THRESHOLD = 0.05
 PADDING = 4
-"""Of the spectral arc length, from its paper: highest frequency [Hz]; least amplitude as a share of that at
-frequency 0; zeros are appended up to 2 to the power PADDING times the length, or up to twice as many."""
+"""Parameters of the spectral arc length, from its paper: highest frequency [Hz]; least amplitude as a share
+of that at frequency 0; zeros are appended up to 2 to the power PADDING times the length, or up to twice as
+many."""
 BENDING_SAMPLES = 129
 """Evenly spaced places of a path that bending is measured at."""
 DIGITS = 7

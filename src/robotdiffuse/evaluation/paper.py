@@ -67,7 +67,7 @@ JOINT = "rop_joint"
 """Problem sets: the same scenes and starts, with a pose or one configuration as the goal."""
 GOALS = {POSE: "a pose with ten configurations", JOINT: "one configuration"}
 STREAM = 1_000
-"""Of random numbers, beside those of the held-out problems of the families."""
+"""The stream of random numbers, apart from those of the held-out problems of the families."""
 
 
 def draw_problem(number: int) -> dict[str, Problem]:
@@ -125,8 +125,8 @@ def write_problems(out: FilePath, count: int, report: Say) -> None:
 
 
 def straight_line_shares(count: int, family: Rop = ROP) -> dict[str, int]:
-    """Of `count` problems with ten goal configurations by the position alone, as the authors draw them, the
-    number with a free straight line: to the first, to the nearest, to any. family: the obstacles."""
+    """How many of `count` problems have a free straight line to the first, to the nearest and to any of their
+    ten goal configurations, which reach a position, as the authors draw them. family: the obstacles."""
     robot = load_robot("panda")
     names = ("a single goal", "the nearest of ten goals", "any of ten goals")
     shares: dict[str, int] = dict.fromkeys(names, 0)
@@ -238,9 +238,9 @@ class Table1Settings:
     out: FilePath
     """Folder of the bench."""
     problems: int = 300
-    """Of each kind of goal."""
+    """Problems of each kind of goal."""
     time_limit: float = 10.0
-    """Of a call [s]; RRT* uses all of it."""
+    """Time limit of a call [s]; RRT* uses all of it."""
     paper_weights: str | None = None
     """Folder with weights of config `paper`, `points` or another one without clearances as inputs, for two
     rows of single samples: under guidance, as the paper's own row, and without it."""
@@ -250,7 +250,7 @@ class Table1Settings:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Of the table; without clearances as inputs only with weights for it."""
+        """The rows of the table; the one without clearances as inputs only with weights for it."""
         if self.paper_weights is None:
             return ROWS
         title = _title(self.paper_weights)

@@ -118,7 +118,7 @@ GRACE = 20.0
 """A process that has not answered this long after the time limit is killed [s]; validating and timing the
 motion take part of it."""
 RESTARTS_TIMEOUT_FACTOR = 20.0
-"""Of the time limit, for restarts: the time for timing each path does not count."""
+"""Timeout of planners that restart, in time limits: the time for timing each path does not count."""
 RUNS_PER_TASK = 20
 """Runs of one planner that a node of a cluster makes with one start of the process."""
 

@@ -32,7 +32,7 @@ SETTINGS: dict[Any, Any] = {
     "figure.constrained_layout.use": True,
 }
 PANEL_HEIGHT = 2.4
-"""Of histograms [inch]."""
+"""Height of histograms [inch]."""
 
 Histograms = dict[str, tuple[ndarray, Mapping[str, ndarray]]]
 """For each panel by its label, the edges of bins and the values by name."""

@@ -52,14 +52,14 @@ class Record:
     """Name of the planner or other method."""
     problem_set: str
     name: str
-    """Of the problem, in its set."""
+    """Name of the problem in its set."""
     family: str
     trivial: bool
     seed: int
     time_limit: float
     """[s]"""
     status: str
-    """Of `types.Status`, or crashed, overran, exception."""
+    """A value of `types.Status`, or crashed, overran, exception."""
     reason: str
     time: float
     """Planning time, with validation and without timing the trajectory [s]."""
@@ -79,7 +79,8 @@ class Record:
     reference: float | None = None
     """Length of the shortest known path [rad], see `held_out.Case`."""
     measures: dict[str, float] = field(default_factory=dict)
-    """Of the returned motion, by the names of `metrics.METRICS`; in files they are fields of the line."""
+    """Measures of the returned motion, by the names of `metrics.METRICS`; in files they are fields of the
+    line."""
     memory: float | None = None
     """Peak memory of the planner's process so far [MB]."""
     run: str = ""
@@ -103,7 +104,7 @@ class Record:
 
     @property
     def joint_length(self) -> float | None:
-        """Of the returned path [rad]."""
+        """Length of the returned path [rad]."""
         return self.measures.get("joint_length")
 
     @property

@@ -36,7 +36,7 @@ ENCODINGS = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 0.001)}
 """Types of the pixels of depth images, and meters per unit (REP 118)."""
 Stamped = TypeVar("Stamped", bound=tuple[float, Any])
 MAX_SIZE = 64 * 10**9
-"""Of recordings [bytes]."""
+"""Largest recording [bytes]."""
 MAX_GAP = 0.1
 """Joint states and transforms are interpolated between two that are at most this far from the image [s]."""
 

@@ -58,7 +58,7 @@ except ImportError:
 FLOAT32 = 7
 """foxglove.PackedElementField.FLOAT32"""
 MAX_UNPACKED = 128 * MEGABYTE
-"""Of a chunk, and of the messages of a motion [bytes]."""
+"""Largest size of a chunk, and of the messages of a motion [bytes]."""
 CHUNK_HEADER = 1 + 8 + 3 * 8 + 4
 """Bytes of a chunk before the name of its compression: opcode, length, times, size and checksum."""
 FRAME_HEADER = 32

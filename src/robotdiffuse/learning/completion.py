@@ -40,7 +40,7 @@ from robotdiffuse.scenes.scene import Scene
 
 Packed = UInt8[ndarray, "56 56 32"]
 SHOULDER = (0.0, 0.0, 0.33)
-"""Of a Panda, in the base frame [m]."""
+"""The shoulder of a Panda, in the base frame [m]."""
 REACH = 1.0
 """Voxels count within this distance of the shoulder [m]: no point of a Panda gets farther."""
 

@@ -169,8 +169,8 @@ class MotionModelSettings(ModelParts, name="model"):
         "gradient_unit": 2.0,
     }
     encoder: Annotated[str, OneOf(ENCODERS)] | None = "point_autoencoder"
-    """Of the scene. None for a prior, which has neither scene nor start and goal as its condition; it finds
-    start and goal in the noisy trajectory, whose ends they are."""
+    """Encoder of the scene. None for a prior, which has neither scene nor start and goal as its condition; it
+    finds start and goal in the noisy trajectory, whose ends they are."""
     encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = field(
         default_factory=PointAutoencoderSettings
     )

@@ -90,7 +90,7 @@ class MPiNetsNetworkSettings(NetworkSettings, name="mpinets"):
     robot_points: Count = 12
     """Points of each moving link at the current configuration (paper: 2,048 in all)."""
     target_points: Count = 6
-    """Of these, the first so many are also given at the goal (paper: 128 in all, of the gripper)."""
+    """So many of these points, the first, are also given at the goal (paper: 128 in all, of the gripper)."""
     region: VisibleRegion = field(default_factory=VisibleRegion)
     """The region in which points of the scene count."""
     centres: tuple[Count, Count] = (96, 24)

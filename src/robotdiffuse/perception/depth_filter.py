@@ -97,19 +97,15 @@ def depth_spread(depth: Float32[ndarray, "h w"]) -> float:
     for _ in range(ORDER):
         differences = np.diff(differences, axis=1)
         seen = seen[:, 1:] & seen[:, :-1]
-    absolute_differences = np.abs(differences[seen])
-    return (
-        float(np.median(absolute_differences)) / DIFFERENCE_PER_SPREAD
-        if len(absolute_differences) >= MIN_DIFFERENCES
-        else 0.0
-    )
+    found = np.abs(differences[seen])
+    return float(np.median(found)) / DIFFERENCE_PER_SPREAD if len(found) >= MIN_DIFFERENCES else 0.0
 
 
 def grown_for_noise(
     spheres: Float[ndarray, "n 4"], T_base_camera: Pose, spread: float
 ) -> Float[ndarray, "n 4"]:
     """The arm's spheres, in the base frame, enlarged by the noise of depth where they are."""
-    depth = (spheres[:, :3] - T_base_camera[:3, 3]) @ T_base_camera[:3, 2]
+    ahead = (spheres[:, :3] - T_base_camera[:3, 3]) @ T_base_camera[:3, 2]
     grown = spheres.copy()
-    grown[:, 3] += MARGIN_SPREADS * spread * np.maximum(depth, 0.0) ** 2
+    grown[:, 3] += MARGIN_SPREADS * spread * np.maximum(ahead, 0.0) ** 2
     return grown

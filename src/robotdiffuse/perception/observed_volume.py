@@ -42,7 +42,7 @@ MIN_POINT_FRACTION = np.float32(0.03)
 """Minimum fraction of a voxel's pixels with points in it for it to be observed occupied: excludes
 outliers."""
 FLYING_PIXEL_STEP = np.float32(0.03)
-"""A flying pixel is nearer than one neighbor and farther than the opposite one by at least this [m]..."""
+"""A flying pixel is nearer than one neighbour and farther than the opposite one by at least this [m]..."""
 FLYING_PIXEL_WIDTHS = np.float32(4.0)
 """... or, if that is more, by this many widths of a pixel at its distance."""
 BLOCK = 4
@@ -109,7 +109,7 @@ def _min_pooled(depth, factor):
     """Minimum depth of blocks of pixels, and the summed-area table of missing returns."""
     h = (depth.shape[0] + factor - 1) // factor
     w = (depth.shape[1] + factor - 1) // factor
-    min_depth = np.full((h, w), MAX_DEPTH, np.float32)
+    least = np.full((h, w), MAX_DEPTH, np.float32)
     missing = np.zeros((h + 1, w + 1), np.int32)
     nearest = np.empty(depth.shape[1], np.float32)
     lost = np.empty(depth.shape[1], np.int32)
@@ -119,16 +119,16 @@ def _min_pooled(depth, factor):
         for v in range(block * factor, min((block + 1) * factor, depth.shape[0])):
             row = depth[v]
             for u in range(depth.shape[1]):
-                measured = row[u] > _ZERO
-                nearest[u] = min(nearest[u], row[u] if measured else MAX_DEPTH)
-                lost[u] += np.int32(0) if measured else np.int32(1)
+                known = row[u] > _ZERO
+                nearest[u] = min(nearest[u], row[u] if known else MAX_DEPTH)
+                lost[u] += np.int32(0) if known else np.int32(1)
         total = np.int32(0)
         for u in range(depth.shape[1]):
             cell = u // factor
-            min_depth[block, cell] = min(min_depth[block, cell], nearest[u])
+            least[block, cell] = min(least[block, cell], nearest[u])
             total += lost[u]
             missing[block + 1, cell + 1] = missing[block, cell + 1] + total
-    return min_depth, missing
+    return least, missing
 
 
 @kernel(fastmath=FASTMATH)
@@ -159,12 +159,12 @@ def _rectangle_minimum(table, v0, v1, u0, u1):
     while 2 << k <= min(v1 - v0, u1 - u0) + 1 and k + 1 < len(table):
         k += 1
     step = 1 << k
-    min_depth = MAX_DEPTH
+    least = MAX_DEPTH
     for v in range(v0, v1 + step, step):
         row = table[k, max(v0, min(v, v1 - step + 1))]
         for u in range(u0, u1 + step, step):
-            min_depth = min(min_depth, row[max(u0, min(u, u1 - step + 1))])
-    return min_depth
+            least = min(least, row[max(u0, min(u, u1 - step + 1))])
+    return least
 
 
 @kernel(fastmath=FASTMATH)
@@ -221,18 +221,16 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
     counts[:] = 0
     _count_points(raw, arm, intrinsics, T, low, voxel, counts)
     factor = max(1, int(intrinsics[0] / POOLED_FOCAL_LENGTH))
-    min_depth, missing = _min_pooled(raw, factor)
-    table = _minimum_table(min_depth, 6)
+    least, missing = _min_pooled(raw, factor)
+    table = _minimum_table(least, 6)
     for i in range(0, nx, BLOCK):
         for j in range(0, ny, BLOCK):
             for k in range(0, nz, BLOCK):
                 first = (i, j, k)
                 end = (min(i + BLOCK, nx), min(j + BLOCK, ny), min(k + BLOCK, nz))
-                block_state = _state_of_block(
-                    first, intrinsics, T, low, voxel, raw.shape, factor, table, missing
-                )
-                if block_state >= 0:
-                    state[i : end[0], j : end[1], k : end[2]] = block_state
+                whole = _state_of_block(first, intrinsics, T, low, voxel, raw.shape, factor, table, missing)
+                if whole >= 0:
+                    state[i : end[0], j : end[1], k : end[2]] = whole
                     behind[i : end[0], j : end[1], k : end[2]] = _ZERO
                 else:
                     _carve_block(
@@ -280,11 +278,11 @@ def _state_of_block(first, intrinsics, T, low, voxel, size, factor, table, missi
         du += abs(T[c, 0] - x * T[c, 2])
         dv += abs(T[c, 1] - y * T[c, 2])
     # no rectangle of a voxel, which is a little larger than the voxel in the image, reaches beyond this
-    half_width = middle * voxel / near * (_ONE + ez / near)
+    wide = middle * voxel / near * (_ONE + ez / near)
     u = fx * x + cx
     v = fy * y + cy
-    du = fx * half_width * du + PIXEL_SLACK
-    dv = fy * half_width * dv + PIXEL_SLACK
+    du = fx * wide * du + PIXEL_SLACK
+    dv = fy * wide * dv + PIXEL_SLACK
     h, w = size
     if (
         u + du < -_HALF
@@ -436,17 +434,17 @@ def merged(volumes: Sequence[ObservedVolume]) -> ObservedVolume:
     """What several volumes tell together: a voxel is occupied, or else free, if any of them says so."""
     occupied, free, shadow = (np.zeros(SHAPE, np.bool_) for _ in range(3))
     out = np.ones(SHAPE, np.bool_)
-    depth_behind = np.full(SHAPE, np.inf, np.float32)
+    behind = np.full(SHAPE, np.inf, np.float32)
     for volume in volumes:
         occupied |= volume.occupied
         free |= volume.free
         shadow |= volume.shadow
         out &= volume.out_of_view
-        np.copyto(depth_behind, volume.behind, where=(volume.behind > 0) & (volume.behind < depth_behind))
+        np.copyto(behind, volume.behind, where=(volume.behind > 0) & (volume.behind < behind))
     free &= ~occupied
-    observed = free | occupied
-    depth_behind[~np.isfinite(depth_behind) | observed] = 0.0
-    return ObservedVolume(occupied, free, shadow & ~observed, out, depth_behind)
+    known = free | occupied
+    behind[~np.isfinite(behind) | known] = 0.0
+    return ObservedVolume(occupied, free, shadow & ~known, out, behind)
 
 
 def _observed(view: DepthView, robot: Robot, start: Configuration) -> ObservedVolume:
@@ -480,7 +478,7 @@ def carve_view(
     spheres[:, :3] = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
     spheres[:, 3] += arm_margin
     state = np.empty(grid.shape, np.uint8)
-    depth_behind = np.empty(grid.shape, np.float32)
+    behind = np.empty(grid.shape, np.float32)
     counts = np.empty(grid.shape, np.int32)
     carve(
         depth,
@@ -489,7 +487,7 @@ def carve_view(
         spheres.astype(np.float32),
         *grid.frame,
         state,
-        depth_behind,
+        behind,
         counts,
     )
-    return state, depth_behind, counts
+    return state, behind, counts

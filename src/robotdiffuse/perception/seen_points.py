@@ -17,7 +17,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 SAME_SURFACE_PIXELS, SAME_SURFACE_FRACTION = np.float32(4.0), np.float32(0.01)
-"""Neighboring pixels are on the same surface if their depths differ by less than this many widths of a pixel
+"""Neighbouring pixels are on the same surface if their depths differ by less than this many widths of a pixel
 at that depth, or by less than this fraction of the depth."""
 MAX_DEPTH = np.float32(1e6)
 """Larger depths are no returns [m]."""
@@ -119,26 +119,26 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
     x = np.empty(w, np.float32)
     y = np.empty(w, np.float32)
     z = np.empty(w, np.float32)
-    valid = np.empty(w, np.bool_)
+    kept = np.empty(w, np.bool_)
     cell = np.empty(w, np.int64)
-    # cells of the row of pixels above: most points are in the cell of a neighboring pixel
-    slots = np.full(w + 1, -1, np.int64)
+    # cells of the row of pixels above: most points are in the cell of a neighbouring pixel
+    known = np.full(w + 1, -1, np.int64)
     rows = np.zeros(w + 1, np.int32)
     for v in range(h):
         b = (np.float32(v) - cy) / fy
-        _place_row(around[v : v + 3], b, fx, cx, T, reach, voxel, x, y, z, valid, cell)
+        _place_row(around[v : v + 3], b, fx, cx, T, reach, voxel, x, y, z, kept, cell)
         for u in range(w):
-            if not valid[u]:
+            if not kept[u]:
                 continue
             if count >= len(sums):
                 return -1
             if _in_box(box, x[u], y[u], z[u]) and _within(x[u], y[u], z[u], *columns):
                 continue
-            if slots[u] == cell[u]:
+            if known[u] == cell[u]:
                 rows[u + 1] = rows[u]
-            elif slots[u + 1] != cell[u]:
+            elif known[u + 1] != cell[u]:
                 rows[u + 1], count = _row(keys, cells, count, cell[u])
-            slots[u + 1] = cell[u]
+            known[u + 1] = cell[u]
             _add(sums, rows[u + 1], x[u], y[u], z[u])
     return count
 
@@ -147,7 +147,7 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
 def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
     """Computes the points of a row of pixels, their cells, and which of them to keep.
 
-    Points within reach are kept, except flying pixels: those with fewer than two of their eight neighbors on
+    Points within reach are kept, except flying pixels: those with fewer than two of their eight neighbours on
     the same surface. At edges, sensors mix the depths of the near and the far surface.
     around [3, w + 2]: the row above, the row and the row below, with one more pixel at either end.
     """
@@ -158,7 +158,7 @@ def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
     ry = T[1, 1] * b + T[1, 2]
     rz = T[2, 1] * b + T[2, 2]
     pixel = SAME_SURFACE_PIXELS / fx
-    max_square = reach * reach
+    most = reach * reach
     for u in range(len(x)):
         d = middle[u + 1]
         a = (np.float32(u) - cx) / fx
@@ -173,7 +173,7 @@ def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
             alike += np.int32(abs(row[u + 2] - d) < jump)
         x[u], y[u], z[u], cell[u] = px, py, pz, _key(px, py, pz, voxel)
         # the pixel itself is one of three
-        kept[u] = (alike > 2) & (d > _ZERO) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= max_square)
+        kept[u] = (alike > 2) & (d > _ZERO) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= most)
 
 
 @kernel(nogil=True)
@@ -183,14 +183,14 @@ def supported(keys, cells, sums, count, least):
     for at in range(len(keys)):
         if keys[at] == -1:
             continue
-        is_supported = sums[cells[at], 3] >= least
+        enough = sums[cells[at], 3] >= least
         for i in range(-1, 2):
             for j in range(-1, 2):
                 for k in range(-1, 2):
-                    if not is_supported:
+                    if not enough:
                         near = _slot(keys, keys[at] + (i << 42) + (j << 21) + k)
-                        is_supported = keys[near] != -1 and sums[cells[near], 3] >= least
-        out[cells[at]] = is_supported
+                        enough = keys[near] != -1 and sums[cells[near], 3] >= least
+        out[cells[at]] = enough
     return out
 
 
@@ -231,13 +231,13 @@ def sphere_distances(points, spheres):
 
 @kernel(nogil=True, fastmath={"contract", "reassoc", "nnan", "nsz"})
 def _nearest(at, x, y, z, radii):
-    distance = np.float32(np.inf)
+    least = np.float32(np.inf)
     for s in range(len(x)):
         dx = at[0] - x[s]
         dy = at[1] - y[s]
         dz = at[2] - z[s]
-        distance = min(distance, np.sqrt(dx * dx + dy * dy + dz * dz) - radii[s])
-    return distance
+        least = min(least, np.sqrt(dx * dx + dy * dy + dz * dz) - radii[s])
+    return least
 
 
 @kernel(nogil=True)
@@ -309,8 +309,8 @@ def seen_points(
             if count < 0:
                 break
         if count >= 0:
-            supported_cells = supported(keys, cells, sums, count, np.float32(_min_cell_points(views, voxel)))
-            return sums[:count, :3][supported_cells] / sums[:count, 3:][supported_cells]
+            kept = supported(keys, cells, sums, count, np.float32(_min_cell_points(views, voxel)))
+            return sums[:count, :3][kept] / sums[:count, 3:][kept]
         capacity *= 4
 
 

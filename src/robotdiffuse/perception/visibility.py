@@ -16,7 +16,7 @@ from robotdiffuse.robots.kinematic_tree import once_per_robot
 from robotdiffuse.robots.robot import Robot
 
 OCCLUSION_START = np.float32(2.0)
-"""Voxels nearer to a voxel than this do not hide it, in edges: its neighbors are as unknown as it is."""
+"""Voxels nearer to a voxel than this do not hide it, in edges: its neighbours are as unknown as it is."""
 MIN_VISIBILITY = np.float32(0.02)
 """Smaller probabilities of seeing through count as zero."""
 ARM_CELL = 16
@@ -53,14 +53,14 @@ def seen_weights(robot, configurations, poses, intrinsics, size, reach, voxels, 
             dy = oy - y
             dz = oz - z
             x_away, y_away, z_away = in_camera(T, dx, dy, dz)
-            forward = -z_away
-            if forward <= one or forward * edge > reach:
+            ahead = -z_away
+            if ahead <= one or ahead * edge > reach:
                 continue
-            u = -fx * x_away / forward + cx
-            v = -fy * y_away / forward + cy
+            u = -fx * x_away / ahead + cx
+            v = -fy * y_away / ahead + cy
             if not (-half <= u < size[1] - half and -half <= v < size[0] - half):
                 continue
-            if arm[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < forward * edge:
+            if arm[int(v + half) // ARM_CELL, int(u + half) // ARM_CELL] < ahead * edge:
                 continue
             far = np.sqrt(dx * dx + dy * dy + dz * dz)
             dx = dx / far
@@ -121,7 +121,7 @@ def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
     its pixels are behind the ball; a few pixels may have none.
 
     depth: float32[h, w], infinite where nothing is in range, and not above 0 without a return; intrinsics fx,
-    fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centers, and their radius [m]; noise: how far
+    fy, cx, cy; T [4, 4]: T_base_camera; balls [n, 3]: their centres, and their radius [m]; noise: how far
     behind a ball a return must lie, at a distance of 1 m; it grows with the square of the distance [m];
     border: pixels around the projection that count too. All numbers are float32; seen bool[n].
     """
@@ -145,8 +145,8 @@ def see_through(depth, intrinsics, T, balls, radius, noise, border, seen):
         v1 = np.ceil(fy * (y + radius) / (near if y > -radius else far) + cy) + border
         if u0 < _ZERO or v0 < _ZERO or u1 > np.float32(w - 1) or v1 > np.float32(h - 1):
             continue
-        min_return = min(far + noise * far * far, MAX_DEPTH * _HALF)
-        seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), min_return)
+        behind = min(far + noise * far * far, MAX_DEPTH * _HALF)
+        seen[n] = _all_behind(raw, int(v0), int(v1), int(u0), int(u1), behind)
 
 
 @kernel(nogil=True)
@@ -154,13 +154,13 @@ def _all_behind(depth, v0, v1, u0, u1, least):
     """Whether all returns of a rectangle of pixels, whose bounds are inclusive, are deeper than `least`, and
     no more pixels than may are without one."""
     lost = 0
-    max_lost = MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
+    most = MAX_LOST_FRACTION * (v1 + 1 - v0) * (u1 + 1 - u0)
     for v in range(v0, v1 + 1):
         for u in range(u0, u1 + 1):
             if depth[v, u] > least:
                 continue
             lost += 1
-            if depth[v, u] > _ZERO or lost > max_lost:
+            if depth[v, u] > _ZERO or lost > most:
                 return False
     return True
 
@@ -198,7 +198,7 @@ BALL_RADIUS = BALL_CELL * 3**0.5 / 2 + SAMPLE_DISTANCE
 
 
 def surface_balls(robot: Robot, q: Configuration) -> Points:
-    """The centers of balls of BALL_RADIUS that cover the surface of moving links and of what they hold, at a
+    """The centres of balls of BALL_RADIUS that cover the surface of moving links and of what they hold, at a
     configuration, in the base frame [m]."""
     placed = [
         points @ T[:3, :3].T + T[:3, 3]
@@ -209,7 +209,7 @@ def surface_balls(robot: Robot, q: Configuration) -> Points:
 
 @once_per_robot
 def _balls_by_frame(robot: Robot) -> list[Points]:
-    """The balls' centers by frame, in its coordinates; none in that of the base."""
+    """The balls' centres by frame, in its coordinates; none in that of the base."""
     parts = [part for of_link in parts_of(robot).values() for part in of_link]
     out = [np.zeros((0, 3)) for _ in range(robot.dof + 1)]
     for frame in range(1, robot.dof + 1):

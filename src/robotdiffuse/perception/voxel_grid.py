@@ -44,7 +44,7 @@ class VoxelGrid:
     shape: tuple[int, int, int]
     """Number of voxels along x, y and z."""
     edge: float
-    """Of a voxel [m]."""
+    """Edge of a voxel [m]."""
 
     @property
     def frame(self) -> tuple[Float32[ndarray, "3"], np.float32]:

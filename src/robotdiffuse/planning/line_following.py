@@ -47,7 +47,8 @@ HERE = 1e-5
 SAME = 1e-5
 """Largest difference from the configuration that a line is followed to, of each joint [rad] or [m]."""
 TOLERANCES = 1e-9, 1e-9
-"""Of the poses of a curve [m], [rad]: its second derivative takes them by the square of the steps."""
+"""Tolerances of the poses of a curve [m], [rad]: its second derivative takes them by the square of the
+steps."""
 ROUND = InverseKinematicsSettings(max_rounds=1)
 
 

@@ -28,7 +28,7 @@ from robotdiffuse.processes.workers import (
 from robotdiffuse.robots.robot import Robot
 
 PlannerArguments = tuple[str, Settings | Mapping[str, object] | None, str | None]
-"""Of `load_planner`: name, settings, weights."""
+"""Arguments of `load_planner`: name, settings, weights."""
 PROBLEMS_PER_TASK = 20
 """Problems that a node of a cluster plans with one loaded planner."""
 

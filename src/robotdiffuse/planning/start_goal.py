@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 GOAL_TIME_FRACTION = 0.5
-"""Of several goals, no more are tried after this part of the time limit, once one is free or none was at the
-first try."""
+"""Fraction of the time limit after which no more of several goals are tried, once one is free or none was at
+the first try."""
 NEAR_POSE_FRACTIONS = (0.1, 0.3, 0.9)
 """Where a pose cannot be reached exactly, parts of the validator's tolerances to reach it within, in turn."""
 # Rounds of seeds for that, and number of configurations for each of several poses.

@@ -125,7 +125,7 @@ class OnPlane(FrameConstraint):
     point: GivenVector
     """A point of the plane [m]."""
     normal: GivenVector
-    """Of any length."""
+    """A vector of any length."""
     tolerance: float
     """Maximum distance from the plane, on either side [m]."""
 
@@ -139,7 +139,7 @@ class OnLine(FrameConstraint):
     point: GivenVector
     """A point of the line [m]."""
     direction: GivenVector
-    """Of any length."""
+    """A vector of any length."""
     tolerance: float
     """Maximum distance from the line [m]."""
 

@@ -105,7 +105,7 @@ class Worker:
         self._arguments = arguments
         self._running: tuple[BaseProcess, Connection] | None = None
         self._number = 0
-        """Of the last call in the process."""
+        """Number of the last call in the process."""
         self._closed = False
         self.ready = False
         """Whether the process is prepared."""

@@ -29,7 +29,7 @@ class PackedScenes:
 
     kinds: Int8[ndarray, "n k"]
     params: Float32[ndarray, "n k 10"]
-    """Of a sphere: center, radius; of a box: center, size, wxyz; padded with zeros."""
+    """Parameters of a sphere: center, radius; of a box: center, size, wxyz; padded with zeros."""
     floors: Float[ndarray, "n 6"] | None = None
     """Center and size of each floor, zeros for scenes without a floor; None: no scene has one. Floors are
     not obstacles: point clouds do not contain them, and `turned` does not turn them."""

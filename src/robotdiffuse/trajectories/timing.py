@@ -34,7 +34,7 @@ MIN_DEVIATION = 2e-4
 MAX_TIMINGS = 8
 """Times that a motion is timed and validated before it stops at every corner."""
 MAX_SLOWER_TIMINGS = 4
-"""Of these, the first ones, which may lower the accelerations of a motion whose corners are each free."""
+"""The first of these timings, which may lower the accelerations of a motion whose corners are each free."""
 CORNER_SAMPLES = 17
 """Configurations of a rounded corner that are checked."""
 CORNER_PLACES = np.linspace(-1, 1, CORNER_SAMPLES)

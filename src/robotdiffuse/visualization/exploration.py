@@ -53,7 +53,7 @@ GAP_COLOR = (0xFF, 0xFF, 0xFF)
 UNKNOWN_ALPHA = 0.27
 PREDICTED_ALPHA = 0.55
 SHARE_COLORS = ((0x8A, 0x93, 0xA0), UNKNOWN)
-"""Of the labels of the shares that were seen free, and unknown."""
+"""Colors of the labels of the shares that were seen free, and unknown."""
 CAPTION_SIZE = 1.7
 FADE = (0.7, 0.95)
 """Where moments fade behind their caption, and how much; see `faded_below`."""

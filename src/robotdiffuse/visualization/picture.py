@@ -46,7 +46,7 @@ CAPTION_COLOR = (0xF2, 0xF4, 0xF6)
 COMPARED = ((0xE3, 0xA8, 0x12), (0xCF, 0x33, 0x3B), (0x2F, 0x6F, 0xD0), (0x8B, 0x55, 0xB8))
 """sRGB colours of the traces of several motions in one picture."""
 MOVED_ALPHA = 0.22
-"""Of moving obstacles along their way."""
+"""Opacity of moving obstacles along their way."""
 TRACE_STEPS = 240
 """Configurations along a motion of which the trace is drawn."""
 WHITE = (0xFF, 0xFF, 0xFF)
@@ -77,7 +77,8 @@ class PictureSettings:
     ghosts: int = 5
     """Number of see-through arms from the start towards the goal."""
     azimuth: float | None = None
-    """Of the camera, from the x axis of the base [rad]; None: from where most of the motion can be seen."""
+    """Azimuth of the camera, from the x axis of the base [rad]; None: from where most of the motion can be
+    seen."""
     shell: float = 0.0
     """Thickness of the see-through safety shell about the arm [m]; 0: none."""
 

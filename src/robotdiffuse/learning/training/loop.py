@@ -142,7 +142,8 @@ def on_cpu(module: Module) -> Module:
 FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder", "device")
 """Settings that may differ between the parts of one run."""
 BAR_WIDTH = 24
-"""Of the progress bar [characters]: with its figures it fits into 80; a line that wraps is printed again."""
+"""Width of the progress bar [characters]: with its figures it fits into 80; a line that
+wraps is printed again."""
 LOG_EVERY = 50
 """Steps per row of log.csv."""
 LOG_COLUMNS = ("step", "samples", "minutes", "learning_rate", "loss", "validation", "success", "skipped")
@@ -163,7 +164,7 @@ class TrainingTask(ABC):
     """A network in training: its loss, its validation, and the files that it leaves."""
 
     settings: Any
-    """Of a subclass of `TrainingSettings`."""
+    """Settings, of a subclass of `TrainingSettings`."""
     processes: Processes
     title: str
     """Name in progress and messages."""

@@ -56,7 +56,7 @@ class RecordedAct:
     """[s]"""
     step: Step
     configuration: Configuration
-    """Of the arm before the step."""
+    """Configuration of the arm before the step."""
     predicted: Probabilities | None
     """The probability that each voxel is occupied, when the step was chosen; None without the network."""
     T_base_camera: Pose | None
@@ -68,7 +68,7 @@ class RecordedAct:
 
     @property
     def waypoints(self) -> Configurations:
-        """Of the motion; without one, the configuration."""
+        """Waypoints of the motion; without one, the configuration."""
         return _waypoints(self.step, self.configuration)
 
     @property
@@ -91,7 +91,7 @@ class RecordedExplorer(Explorer):
 
     @property
     def duration(self) -> float:
-        """Of all motions so far [s]."""
+        """Duration of all motions so far [s]."""
         return self.acts[-1].begins + self.acts[-1].duration if self.acts else 0.0
 
     def observe(self, view: DepthView, stamp: float = 0.0) -> None:
@@ -168,7 +168,7 @@ class Event:
 
     step: Step
     configuration: Configuration
-    """Of the arm after the step."""
+    """Configuration of the arm after the step."""
     violation: str = ""
     """Why the validator refuses the motion in the true scene; "" if it accepts it, and without a motion."""
 

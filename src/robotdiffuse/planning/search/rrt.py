@@ -80,8 +80,8 @@ END_MARGIN = 1e-6
 """Under path constraints, tolerances are widened to the values at the start and the goals, plus this
 margin."""
 PATHS_TO_FIND = 2
-"""Of RRT-Connect, and under path constraints, with until "converged": number of paths to find; the best is
-returned."""
+"""Number of paths that RRT-Connect, or any search under path constraints, finds with until "converged"; the
+best is returned."""
 STRAIGHT_EXCESS = 0.02
 """Under path constraints, a path is the shortest if it exceeds the straight line by no more than this
 part."""
@@ -358,7 +358,7 @@ class ConstrainedSearch(AnytimeSearch):
         self.context = context
         self.limits = constrained.make_limits(constraints.rows, tolerances)
         self.cost = np.inf
-        """Of the best path: its estimated duration [s]; its length [rad] if that is the objective."""
+        """Cost of the best path: its estimated duration [s], or its length [rad] if that is the objective."""
         self._speed_limits = scaled_limits(context.problem.robot, context.timing)
         super().__init__(
             start_goal,

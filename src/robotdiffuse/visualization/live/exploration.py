@@ -74,9 +74,10 @@ PAUSED = "paused"
 STEPPING = "stepping"
 RUNNING = "running"
 CLEAR_OPACITY = 0.6
-"""Of predicted voxels, and of those that a look is to show."""
+"""Opacity of predicted voxels, and of those that a view is to show."""
 UNKNOWN_OPACITY = 0.2
-"""Of the boundary of unknown space, which is drawn where it faces the viewer: it never hides the arm."""
+"""Opacity of the boundary of unknown space, which is drawn where it faces the viewer, so that it never hides
+the arm."""
 # Length of the pyramid of the camera on the arm [m], and its colour.
 CAMERA_SIZE = 0.12
 CAMERA_COLOR = (40, 48, 58)
@@ -99,9 +100,9 @@ class ExplorationState:
     mode: str = PAUSED
     phase: str = WAITING
     speed: float = 1.0
-    """Of motions, as a multiple of their own."""
+    """Speed of motions, as a multiple of their own."""
     explorer: RecordedExplorer | None = None
-    """Of which others read the cameras and the known scene; its thread changes the rest."""
+    """The explorer; other threads read its cameras and known scene, its own thread changes the rest."""
     acts: tuple[RecordedAct, ...] = ()
     """Steps so far; while moving the last one is under way."""
     known: RecordedView | None = None
