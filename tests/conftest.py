@@ -17,7 +17,7 @@ from jaxtyping import install_import_hook
 APART = ("learning", "robots", "scenes")
 """Packages whose tests need little of the compiled code of searches."""
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
-_KERNELS = r"robotdiffuse\.(collision\.kernels\.compiled|core\.kernels)"
+_KERNELS = r"robotdiffuse\.(collision\.kernels\.random|core\.kernels)"
 COMPILED = re.compile(rf"^\s*(import numba\b|from numba\b|from {_KERNELS} import)", re.MULTILINE)
 """In modules with compiled functions, which must stay undecorated: they are left out of the hook."""
 
