@@ -99,10 +99,10 @@ def creased(
     repeats = counts[owner]
     mine = np.repeat(np.arange(len(owner)), repeats)
     within = np.arange(len(mine)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-    other = first[owner[mine]] + within
+    partner = first[owner[mine]] + within
     face = corner // 3
-    alike = np.einsum("ij,ij->i", unit[face[mine]], unit[face[other]]) > np.cos(CREASE_ANGLE)
-    summed = [np.bincount(mine[alike], area[face[other[alike]], i], minlength=len(owner)) for i in range(3)]
+    alike = np.einsum("ij,ij->i", unit[face[mine]], unit[face[partner]]) > np.cos(CREASE_ANGLE)
+    summed = [np.bincount(mine[alike], area[face[partner[alike]], i], minlength=len(owner)) for i in range(3)]
     normals = np.stack(summed, axis=1).astype(np.float64)  # integers if no face has an area
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     keys = np.column_stack([owner, np.round(normals * 100), np.round(colors[face] * 255)]).astype(np.int64)

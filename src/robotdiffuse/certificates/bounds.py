@@ -133,8 +133,8 @@ class Prover:
         pairs = []
         for i, a in enumerate(self.links):
             for b in self.links[i + 1 :]:
-                apart = (moved[a] != moved[b]).any()
-                if apart and frozenset((a, b)) not in self.robot.allowed_collisions:
+                relative_motion = (moved[a] != moved[b]).any()
+                if relative_motion and frozenset((a, b)) not in self.robot.allowed_collisions:
                     pairs.append(Claim(a, b) if level[a] > level[b] else Claim(b, a))
         return (*moving, *pairs)
 
@@ -155,9 +155,9 @@ class Prover:
         if len(within):
             edges = np.column_stack([first[within], last[within] + 1]).ravel()
             rows = np.concatenate([self.q, self.q[-1:]])
-            most = np.maximum.reduceat(rows, edges)[::2]
-            least = np.minimum.reduceat(rows, edges)[::2]
-            beyond = np.maximum(most - q[within], q[within] - least)
+            upper = np.maximum.reduceat(rows, edges)[::2]
+            lower = np.minimum.reduceat(rows, edges)[::2]
+            beyond = np.maximum(upper - q[within], q[within] - lower)
             spans[within] = np.maximum(spans[within], beyond)
         return spans + self.deviations(start, stop)
 
@@ -171,27 +171,31 @@ class Prover:
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
         """Bounds of stretches, by `planes` for those that `by_planes` marks, else by the spheres."""
-        ends, which = np.unique(
+        ends, inverse_indices = np.unique(
             np.column_stack([stretches.start, stretches.stop]), axis=0, return_inverse=True
         )
-        which = which.ravel()
+        inverse_indices = inverse_indices.ravel()
         middle = (ends[:, 0] + ends[:, 1]) / 2
         spans = self.spans(ends[:, 0], ends[:, 1], middle)
         postures = self.linkage.place(self.at(middle))
-        clearance = np.full(len(which), CLEARANCE_CAP)
-        displacement = np.zeros(len(which))
+        clearance = np.full(len(inverse_indices), CLEARANCE_CAP)
+        displacement = np.zeros(len(inverse_indices))
         for pairs in (False, True):
             is_pair = np.array([claim.against != SCENE for claim in self.claims], bool)
             rows = np.flatnonzero(is_pair[stretches.claim] == pairs)
             if len(rows):
-                found = self._by_spheres(stretches.claim[rows], which[rows], postures, spans, pairs)
-                clearance[rows], displacement[rows] = found
+                pair_bounds = self._by_spheres(
+                    stretches.claim[rows], inverse_indices[rows], postures, spans, pairs
+                )
+                clearance[rows], displacement[rows] = pair_bounds
         marked = np.flatnonzero(by_planes)
         if len(marked):
             off = self.deviations(ends[:, 0], ends[:, 1])
-            ways = [(_steps(self, *ends[k]), off[k]) for k in which[marked]]
-            found = self._by_planes(stretches, marked, planes, postures, which, ways, displacement[marked])
-            clearance[marked], displacement[marked] = found
+            ways = [(_steps(self, *ends[k]), off[k]) for k in inverse_indices[marked]]
+            pair_bounds = self._by_planes(
+                stretches, marked, planes, postures, inverse_indices, ways, displacement[marked]
+            )
+            clearance[marked], displacement[marked] = pair_bounds
         return Bounds(clearance, displacement)
 
     def _expand(self, links: ndarray) -> tuple[ndarray, ndarray, ndarray]:
@@ -224,51 +228,53 @@ class Prover:
         went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
         clearance = np.full(len(links), CLEARANCE_CAP)
         if distances is not None:
-            apart = distances(row, at, centers) - radius
-            clearance = np.minimum(np.minimum.reduceat(apart, begin), CLEARANCE_CAP)
+            gaps = distances(row, at, centers) - radius
+            clearance = np.minimum(np.minimum.reduceat(gaps, begin), CLEARANCE_CAP)
         return clearance, np.maximum.reduceat(went, begin)
 
     def _by_spheres(
         self, claim: ndarray, posture: ndarray, postures: Postures, spans: ndarray, pairs: bool
     ) -> tuple[ndarray, ndarray]:
-        further = np.array([self._of[c.link] for c in self.claims])[claim]
-        moved = self._moved[further]
+        farther = np.array([self._of[c.link] for c in self.claims])[claim]
+        moved = self._moved[farther]
         if not pairs:
 
             def to_scene(row: ndarray, at: ndarray, centers: ndarray) -> ndarray:
-                apart = self.obstacles.distances(centers)
+                gaps = self.obstacles.distances(centers)
                 if self.may_touch.any():
-                    apart[self.may_touch[further[row]]] = CLEARANCE_CAP
-                return apart.min(axis=1, initial=CLEARANCE_CAP)
+                    gaps[self.may_touch[farther[row]]] = CLEARANCE_CAP
+                return gaps.min(axis=1, initial=CLEARANCE_CAP)
 
-            return self._ball_bounds(further, moved, posture, postures, spans, to_scene)
+            return self._ball_bounds(farther, moved, posture, postures, spans, to_scene)
         nearer = np.array([self._of.get(c.against, 0) for c in self.claims])[claim]
         alone = self._moved[nearer] & ~moved
-        others = np.zeros(len(claim))
+        near_displacement = np.zeros(len(claim))
         some = np.flatnonzero(alone.any(axis=1))
         if len(some):
-            others[some] = self._ball_bounds(nearer[some], alone[some], posture[some], postures, spans)[1]
+            near_displacement[some] = self._ball_bounds(
+                nearer[some], alone[some], posture[some], postures, spans
+            )[1]
         clearance, went = self._ball_bounds(
-            further,
+            farther,
             moved & ~self._moved[nearer],
             posture,
             postures,
             spans,
             lambda row, at, centers: self._to_links(postures, at, centers, nearer[row]),
         )
-        return clearance, went + others
+        return clearance, went + near_displacement
 
     def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
         """Distances of points to the spheres of one link each [m]."""
-        found = np.empty(len(at))
+        distances = np.empty(len(at))
         step = MAX_ARRAY_SIZE // 64
         for first in range(0, len(at), step):
             some = slice(first, first + step)
             row, ball, begin = self._expand(link[some])
-            others = _placed_points(postures.T[at[some][row], link[some][row]], self._balls[ball, :3])
-            apart = np.sqrt(((centers[some][row] - others) ** 2).sum(axis=1)) - self._balls[ball, 3]
-            found[some] = np.minimum.reduceat(apart, begin)
-        return found
+            other_centers = _placed_points(postures.T[at[some][row], link[some][row]], self._balls[ball, :3])
+            gaps = np.sqrt(((centers[some][row] - other_centers) ** 2).sum(axis=1)) - self._balls[ball, 3]
+            distances[some] = np.minimum.reduceat(gaps, begin)
+        return distances
 
     def _by_planes(
         self,
@@ -289,8 +295,8 @@ class Prover:
         normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
         for plane in planes:
             normals.setdefault(plane[:3], []).append(plane.normal)
-        least = np.full(len(marked), CLEARANCE_CAP)
-        left = np.full(len(marked), CLEARANCE_CAP)
+        clearance = np.full(len(marked), CLEARANCE_CAP)
+        margin = np.full(len(marked), CLEARANCE_CAP)
         places = [(self.claims[stretches.claim[i]], postures.T[which[i]]) for i in marked]
         standing = [placed(self.parts[claim.link], T[self._of[claim.link]]) for claim, T in places]
         in_scene = [k for k, (claim, _) in enumerate(places) if claim.against == SCENE]
@@ -300,23 +306,23 @@ class Prover:
             mine = self._moved[self._of[claim.link]]
             theirs = np.zeros(len(self.linkage.slides), bool)
             if claim.against != SCENE:
-                other = self._moved[self._of[claim.against]]
-                mine, theirs = mine & ~other, other & ~mine
+                moved_other = self._moved[self._of[claim.against]]
+                mine, theirs = mine & ~moved_other, moved_other & ~mine
             mine = np.flatnonzero(mine)
             theirs = np.flatnonzero(theirs)
             at, (way, off) = which[marked[k]], ways[k]
             for p, part in enumerate(standing[k]):
                 bodies = self.others(claim, T, part)
                 if claim.against == SCENE:
-                    apart = next(to_scene) - part.radius
-                    apart[self.may_touch[self._of[claim.link]]] = CLEARANCE_CAP
+                    ball_gaps = next(to_scene) - part.radius
+                    ball_gaps[self.may_touch[self._of[claim.link]]] = CLEARANCE_CAP
                 else:
-                    apart = self.balls_apart(part, bodies)
-                apart, along = apart.copy(), apart - displacement[k]
+                    ball_gaps = self.balls_apart(part, bodies)
+                ball_gaps, along = ball_gaps.copy(), ball_gaps - displacement[k]
                 for o, body in enumerate(bodies):
-                    shown = normals.get((int(marked[k]), p, o))
-                    if shown is not None:
-                        n = np.array(shown)
+                    known_normal = normals.get((int(marked[k]), p, o))
+                    if known_normal is not None:
+                        n = np.array(known_normal)
                         n /= np.sqrt((n**2).sum(axis=1, keepdims=True))
                         axes = postures.origins[at], postures.axes[at]
                         nearer = self.linkage.approach(*axes, part.vertices, mine, way, n, off)
@@ -328,14 +334,14 @@ class Prover:
                             against = (heights + comes).max(axis=1) - heights.max(axis=1)
                         widest = gaps(part, body, n).max(axis=-1)
                         remaining = (gaps(part, body, n, nearer) - against).max(axis=-1)
-                        least_of = np.maximum(apart[o], widest)
+                        least_of = np.maximum(ball_gaps[o], widest)
                         left_of = np.maximum(along[o], remaining)
                         beyond = PLANE_RANGE if isinstance(body, Surface) else CLEARANCE_CAP
-                        apart[o] = max(apart[o], least_of.min(initial=beyond))
+                        ball_gaps[o] = max(ball_gaps[o], least_of.min(initial=beyond))
                         along[o] = max(along[o], left_of.min(initial=beyond - displacement[k]))
-                least[k] = min(least[k], apart.min(initial=CLEARANCE_CAP))
-                left[k] = min(left[k], along.min(initial=CLEARANCE_CAP))
-        return least, least - left
+                clearance[k] = min(clearance[k], ball_gaps.min(initial=CLEARANCE_CAP))
+                margin[k] = min(margin[k], along.min(initial=CLEARANCE_CAP))
+        return clearance, clearance - margin
 
     def others(self, claim: Claim, T: ndarray, part: Part) -> Sequence[Rounded | Surface | Part]:
         """The bodies that a part of a link is checked against; of a surface only the elements that are
@@ -347,19 +353,19 @@ class Prover:
     def balls_apart(self, part: Part, bodies: Sequence[Rounded | Surface | Part]) -> Float[ndarray, "bodies"]:
         """Distances of the ball around a part to the obstacles, or to the balls around parts of a link
         [m]."""
-        others = [body for body in bodies if isinstance(body, Part)]
-        if not others:
+        parts_of_link = [body for body in bodies if isinstance(body, Part)]
+        if not parts_of_link:
             return self.obstacles.distances(part.center[None])[0] - part.radius
-        centers = np.array([other.center for other in others])
-        radii = [other.radius for other in others]
+        centers = np.array([near_body.center for near_body in parts_of_link])
+        radii = [near_body.radius for near_body in parts_of_link]
         return np.sqrt(((part.center - centers) ** 2).sum(axis=1)) - part.radius - radii
 
 
 def _steps(prover: Prover, start: float, stop: float) -> JointRows:
     """Differences from the middle of a stretch to its start, its stop and the waypoints between."""
-    inner = np.arange(int(np.floor(start)) + 1, int(np.ceil(stop)))
+    waypoints_between = np.arange(int(np.floor(start)) + 1, int(np.ceil(stop)))
     ends = prover.at(np.array([start, (start + stop) / 2, stop]))
-    return np.concatenate([ends[[0, 2]], prover.q[inner]]) - ends[1]
+    return np.concatenate([ends[[0, 2]], prover.q[waypoints_between]]) - ends[1]
 
 
 def gaps(
@@ -453,24 +459,24 @@ class MovingProver(Prover):
         postures = self.linkage.place(self.at(middle))
         rows = np.arange(len(self.times))
         begin, at, end = (np.interp(s, rows, self.times) for s in (stretches.start, middle, stretches.stop))
-        further = np.array([self._of[claim.link] for claim in self.claims])[stretches.claim]
+        links = np.array([self._of[claim.link] for claim in self.claims])[stretches.claim]
         number = {one.name: i for i, one in enumerate(self.moving)}
-        which = np.array([number[claim.against] for claim in self.claims])[stretches.claim]
-        speed, known, stands = (
-            np.array(values)[which]
+        obstacle_indices = np.array([number[claim.against] for claim in self.claims])[stretches.claim]
+        speed, bounded, stands = (
+            np.array(values)[obstacle_indices]
             for values in zip(
                 *((one.top_speed, one.known, one.track[1][0]) for one in self.moving), strict=True
             )
         )
-        obstacle = speed * np.where(known, np.maximum(at - begin, end - at), np.maximum(end, 0.0))
-        T = np.array([self.moving[i].pose(time) for i, time in zip(which, at, strict=True)])
+        obstacle = speed * np.where(bounded, np.maximum(at - begin, end - at), np.maximum(end, 0.0))
+        T = np.array([self.moving[i].pose(time) for i, time in zip(obstacle_indices, at, strict=True)])
 
         def distances(row: ndarray, _: ndarray, centers: ndarray) -> Values:
             local = np.einsum("nji,nj->ni", T[row, :3, :3], centers - T[row, :3, 3])
-            apart = self.obstacles.distances(_placed_points(stands[row], local))
-            return apart[np.arange(len(row)), which[row]]
+            obstacle_distances = self.obstacles.distances(_placed_points(stands[row], local))
+            return obstacle_distances[np.arange(len(row)), obstacle_indices[row]]
 
-        posture = np.arange(len(which))
-        moved = self._moved[further]
-        clearance, went = self._ball_bounds(further, moved, posture, postures, spans, distances)
+        posture = np.arange(len(obstacle_indices))
+        moved = self._moved[links]
+        clearance, went = self._ball_bounds(links, moved, posture, postures, spans, distances)
         return Bounds(clearance, went + obstacle)

@@ -76,10 +76,10 @@ def load_certificate(file: str | FilePath) -> Certificate:
     with reading(file):
         if record.get("version") != VERSION:
             raise InputError(f"version is {shown(record.get('version'))}; this version reads {VERSION}")
-        known = {"is", "version", *FIELDS}
-        unknown = sorted(record.keys() - known)
+        field_names = {"is", "version", *FIELDS}
+        unknown = sorted(record.keys() - field_names)
         if unknown:
-            raise InputError(f"{unknown[0]} is unknown; the fields are {', '.join(sorted(known))}")
+            raise InputError(f"{unknown[0]} is unknown; the fields are {', '.join(sorted(field_names))}")
         values = {
             field.attribute or name: field.read(name, record[name])
             for name, field in FIELDS.items()
@@ -137,18 +137,18 @@ def _proof(_: str, record: list[dict[str, Any]] | None) -> StretchProof | None:
     begin = 0
     for k, entry in enumerate(record):
         claims.append(Claim(str(entry["link"]), str(entry["against"])))
-        found = {name: _vector(name, entry[name]) for name in STRETCH_FIELDS if name != "by_planes"}
-        count = len(found["start"])
-        if any(len(values) != count for values in found.values()):
+        values_by_name = {name: _vector(name, entry[name]) for name in STRETCH_FIELDS if name != "by_planes"}
+        count = len(values_by_name["start"])
+        if any(len(values) != count for values in values_by_name.values()):
             raise InputError(f"proof of {claims[-1].link}: its columns must have equal lengths")
         marked = np.zeros(count)
         marked[[int(i) for i in entry["by_planes"]]] = 1
-        for name, values in (("claim", np.full(count, k)), ("by_planes", marked), *found.items()):
+        for name, values in (("claim", np.full(count, k)), ("by_planes", marked), *values_by_name.items()):
             columns[name].append(values)
-        for stretch, part, other, *normal in entry["planes"]:
+        for stretch, part, partner, *normal in entry["planes"]:
             if not 0 <= int(stretch) < count:
                 raise InputError(f"proof of {claims[-1].link}: it has no stretch {shown(stretch)}")
-            plane = Plane(begin + int(stretch), int(part), int(other), tuple(map(float, normal)))  # type: ignore[arg-type]
+            plane = Plane(begin + int(stretch), int(part), int(partner), tuple(map(float, normal)))  # type: ignore[arg-type]
             if len(normal) != 3 or not 0 < math.hypot(*normal) < math.inf:
                 raise InputError(f"proof of {claims[-1].link}: {shown(normal)} is not the normal of a plane")
             planes.append(plane)
@@ -162,7 +162,7 @@ def _proof(_: str, record: list[dict[str, Any]] | None) -> StretchProof | None:
 
 
 def _named_bounds(_: str, rows: list[Any]) -> tuple[tuple[str, float], ...]:
-    return tuple((str(name), _number(str(name), most)) for name, most in rows)
+    return tuple((str(name), _number(str(name), limit)) for name, limit in rows)
 
 
 def _hashes(name: str, value: object) -> dict[str, str]:

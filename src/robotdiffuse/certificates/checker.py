@@ -70,32 +70,32 @@ def check(
         from robotdiffuse.problems.files import problem_from_record
 
         problem = problem_from_record(certificate.problem)
-    found = [
+    errors = [
         *differences("robot", certificate.robot_parts, robot_parts(problem.robot)),
         *differences("scene", certificate.scene_parts, scene_parts(problem.scene)),
         *differences("requests", certificate.request_parts, request_parts(problem)),
     ]
-    for name, most in asdict(at_most).items():
+    for name, limit in asdict(at_most).items():
         stated = getattr(certificate.tolerances, name)
-        if not stated <= most:
-            found.append(f"tolerances: {name} is {stated:g}, looser than {most:g}")
+        if not stated <= limit:
+            errors.append(f"tolerances: {name} is {stated:g}, looser than {limit:g}")
         if not stated >= 0:
-            found.append(f"tolerances: {name} is {stated:g}; it must not be negative")
+            errors.append(f"tolerances: {name} is {stated:g}; it must not be negative")
     if certificate.robot != problem.robot.name:
-        found.append(f"robot: it is {problem.robot.name}, not {certificate.robot}")
+        errors.append(f"robot: it is {problem.robot.name}, not {certificate.robot}")
     if certificate.motion_hash != hash_of(certificate.motion):
-        found.append("motion: it is not the one that was certified: its hash differs")
+        errors.append("motion: it is not the one that was certified: its hash differs")
     with np.errstate(
         over="ignore", invalid="ignore", divide="ignore"
     ):  # non-finite values become differences
-        found += _cover_errors(problem.robot)
+        errors += _cover_errors(problem.robot)
         misplaced = place_errors(problem, certificate)
-        found += misplaced
+        errors += misplaced
         if not misplaced:
-            found += requirement_errors(problem, certificate)
-            found += _proof_errors(problem, certificate)
-            found += _moving_proof_errors(problem, certificate)
-    return Findings(tuple(found))
+            errors += requirement_errors(problem, certificate)
+            errors += _proof_errors(problem, certificate)
+            errors += _moving_proof_errors(problem, certificate)
+    return Findings(tuple(errors))
 
 
 def _cover_errors(robot: Robot) -> Iterator[str]:
@@ -105,8 +105,8 @@ def _cover_errors(robot: Robot) -> Iterator[str]:
             continue
         spheres = robot.spheres[link]
         corners = np.concatenate([mesh.vertices for mesh in meshes])
-        apart = np.linalg.norm(corners[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]
-        beyond = float(apart.min(axis=1).max())
+        gaps = np.linalg.norm(corners[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]
+        beyond = float(gaps.min(axis=1).max())
         if not beyond <= COVER_TOLERANCE:
             yield f"robot: the meshes of {link} stick out of its spheres by {beyond:.2g} m"
 
@@ -157,12 +157,12 @@ def _bound_errors(
     """Differences in stretches and bounds. `kinds` marks the stretches of each kind of clearance; `stated`
     holds the clearance that the proof states for each kind [m]."""
     stretches = proof.stretches
-    known = {claim: k for k, claim in enumerate(prover.claims)}
+    claim_indices = {claim: k for k, claim in enumerate(prover.claims)}
     for claim in proof.claims:
-        if claim not in known:
+        if claim not in claim_indices:
             yield f"proof: {describe_claim(claim)} needs no proof"
             return
-    for missing in known.keys() - set(proof.claims):
+    for missing in claim_indices.keys() - set(proof.claims):
         yield f"proof: {describe_claim(missing)} is missing"
     if len(set(proof.claims)) < len(proof.claims):
         yield "proof: it contains a claim twice"
@@ -179,33 +179,37 @@ def _bound_errors(
     not_unit = np.flatnonzero(~(np.abs(lengths - 1) <= NORMAL_TOLERANCE))
     if len(not_unit):
         i = int(not_unit[0])
-        where = _place(proof, proof.planes[i].stretch)
-        yield f"proof: a plane of {where} has a normal of length {lengths[i]:g}, not 1"
+        location = _place(proof, proof.planes[i].stretch)
+        yield f"proof: a plane of {location} has a normal of length {lengths[i]:g}, not 1"
         return
-    own = np.array([known[claim] for claim in proof.claims])[stretches.claim]
-    bounds = prover.bounds(stretches._replace(claim=own), proof.by_planes, list(proof.planes))
-    for what in ("clearance", "displacement"):
-        written = getattr(proof, what)
-        right = getattr(bounds, what)
+    claims = np.array([claim_indices[claim] for claim in proof.claims])[stretches.claim]
+    bounds = prover.bounds(stretches._replace(claim=claims), proof.by_planes, list(proof.planes))
+    for quantity in ("clearance", "displacement"):
+        written = getattr(proof, quantity)
+        right = getattr(bounds, quantity)
         off = np.flatnonzero(~(np.abs(written - right) <= BOUND_TOLERANCE))
         if len(off):
             i = int(off[0])
             more = f" ({len(off) - 1} more)" if len(off) > 1 else ""
-            yield f"proof: {what} of {_place(proof, i)} is {right[i]:.6f} m, not {written[i]:.6f} m{more}"
-    left = bounds.clearance - bounds.displacement
-    for what, which in kinds.items():
-        least = stated[what]
-        if not 0 < least <= CLEARANCE_CAP:
-            rule = "not positive" if not least > 0 else f"more than the {CLEARANCE_CAP:g} m that are measured"
-            yield f"proof: its {what} clearance is {least:g} m, which is {rule}"
-        unproved = np.flatnonzero(which & ~(left >= least - BOUND_TOLERANCE))
+            yield f"proof: {quantity} of {_place(proof, i)} is {right[i]:.6f} m, not {written[i]:.6f} m{more}"
+    margin = bounds.clearance - bounds.displacement
+    for quantity, marked in kinds.items():
+        stated_clearance = stated[quantity]
+        if not 0 < stated_clearance <= CLEARANCE_CAP:
+            rule = (
+                "not positive"
+                if not stated_clearance > 0
+                else f"more than the {CLEARANCE_CAP:g} m that are measured"
+            )
+            yield f"proof: its {quantity} clearance is {stated_clearance:g} m, which is {rule}"
+        unproved = np.flatnonzero(marked & ~(margin >= stated_clearance - BOUND_TOLERANCE))
         if len(unproved):
             i = int(unproved[0])
-            yield f"proof: {_place(proof, i)} is clear by {left[i]:.6f} m, not by {least:.6f} m"
-        nothing = np.flatnonzero(which & ~(left > 0))
+            yield f"proof: {_place(proof, i)} is clear by {margin[i]:.6f} m, not by {stated_clearance:.6f} m"
+        nothing = np.flatnonzero(marked & ~(margin > 0))
         if len(nothing):
             i = int(nothing[0])
-            yield f"proof: {_place(proof, i)} is not shown to be free: {left[i]:.6f} m are left"
+            yield f"proof: {_place(proof, i)} is not shown to be free: {margin[i]:.6f} m are left"
 
 
 def _gaps(proof: StretchProof, last: float) -> Iterator[str]:

@@ -93,27 +93,27 @@ class Linkage:
 
     def _up_to(self, link: str) -> list[Joint]:
         """Joints from the base to a link, parents first."""
-        found = list[Joint]()
+        chain = list[Joint]()
         above = {joint.child: joint for joint in self.robot.joints}
         while link in above:
-            found.append(above[link])
+            chain.append(above[link])
             link = above[link].parent
-        return found[::-1]
+        return chain[::-1]
 
     def levers(self, link: str, q: Configurations) -> Float[ndarray, "joints"]:
         """Upper bounds on the distance of a link's origin from the axes of the planned joints that move it,
         in order [m]; 1 for a joint that slides. `q` holds the extreme positions of a motion."""
-        found = list[float]()
+        bounds = list[float]()
         length = 0.0
         for joint in reversed(self._up_to(link)):
             j = self._planned.get(joint.name)
             if j is not None:
-                found.append(1.0 if self.slides[j] else length)
+                bounds.append(1.0 if self.slides[j] else length)
             if joint.kind == "prismatic":
                 far = self.robot.locked.get(joint.name, 0.0) if j is None else q[:, j]
                 length += float(np.abs(far).max())
             length += float(np.linalg.norm(joint.T_parent_joint[:3, 3]))
-        return np.array(found[::-1])
+        return np.array(bounds[::-1])
 
     def rates(
         self, postures: Postures, link: str
@@ -170,22 +170,22 @@ class Linkage:
         sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), because the second derivative of the point by joints j <= k
         is at most its greatest distance L_k from axis k.
         """
-        which = moved_by.tolist()
+        moving_joints = moved_by.tolist()
         off = np.broadcast_to(off, steps.shape[1])
         spans = np.abs(steps).max(axis=0) + off
-        rates = np.cross(axes[which, None], points[None] - origins[which, None])
-        rates[self.slides[which]] = axes[which, None][self.slides[which]]
+        rates = np.cross(axes[moving_joints, None], points[None] - origins[moving_joints, None])
+        rates[self.slides[moving_joints]] = axes[moving_joints, None][self.slides[moving_joints]]
         lengths = np.sqrt((rates**2).sum(axis=2))
-        along = np.moveaxis(rates @ normals.T, 2, 1).reshape(len(which), -1)
-        towards = off[which] @ np.abs(along) - (steps[:, which] @ along).min(axis=0)
+        along = np.moveaxis(rates @ normals.T, 2, 1).reshape(len(moving_joints), -1)
+        towards = off[moving_joints] @ np.abs(along) - (steps[:, moving_joints] @ along).min(axis=0)
         towards = towards.reshape(len(normals), len(points))
         went = np.zeros(len(points))
         rest = np.zeros(len(points))
-        for i in reversed(range(len(which))):
-            j = which[i]
+        for i in reversed(range(len(moving_joints))):
+            j = moving_joints[i]
             arm = lengths[i] if self.slides[j] else lengths[i] + went
             went = went + spans[j] * arm
-            rest += spans[j] * arm * (spans[j] / 2 + spans[which[:i]].sum())
+            rest += spans[j] * arm * (spans[j] / 2 + spans[moving_joints[:i]].sum())
         return np.minimum(np.maximum(towards, 0.0) + rest, went)
 
 
@@ -245,9 +245,9 @@ class Cubics(NamedTuple):
         """The greatest absolute velocity of each, which is at an end or where the acceleration is 0."""
         curve = self.end - self.start
         share = np.clip(np.divide(-self.start, curve, out=np.zeros_like(curve), where=curve != 0), 0.0, 1.0)
-        inner = self.velocities + self.steps * share * (self.start + share * curve / 2)
+        extremal = self.velocities + self.steps * share * (self.start + share * curve / 2)
         last = self.velocities + self.steps * (self.start + self.end) / 2
-        return np.maximum(np.abs(inner), np.maximum(np.abs(self.velocities), np.abs(last)))
+        return np.maximum(np.abs(extremal), np.maximum(np.abs(self.velocities), np.abs(last)))
 
     @property
     def turns(self) -> Configurations:
@@ -271,10 +271,10 @@ class Cubics(NamedTuple):
         among which are those of all rows: an eighth of its greatest acceleration times the square of the
         time."""
         row = self.rows(times[:-1])
-        most = 0.0
+        max_acceleration = 0.0
         for end in (times[:-1], times[1:]):
-            most = np.maximum(most, np.abs(self.at(row, end - self.times[row])[2]))
-        return most * np.diff(times)[:, None] ** 2 / 8
+            max_acceleration = np.maximum(max_acceleration, np.abs(self.at(row, end - self.times[row])[2]))
+        return max_acceleration * np.diff(times)[:, None] ** 2 / 8
 
     def jumps(self) -> JointRows:
         """By how much the acceleration jumps at each row; before and after the motion it is 0."""

@@ -72,14 +72,14 @@ class Obstacles:
 
     def distances(self, points: Points) -> Float[ndarray, "n obstacles"]:
         """Distances of points to each obstacle [m], at most CLEARANCE_CAP; 0 or less inside."""
-        found = np.full((len(points), len(self.bodies)), CLEARANCE_CAP)
+        distances_to_each = np.full((len(points), len(self.bodies)), CLEARANCE_CAP)
         step = max(MAX_ARRAY_SIZE // max(3 * len(self._at), 1), 1)
         for first in range(0, len(points), step):
             some = slice(first, first + step)
-            found[some, self._at] = np.minimum(self._to_rounded(points[some]), CLEARANCE_CAP)
+            distances_to_each[some, self._at] = np.minimum(self._to_rounded(points[some]), CLEARANCE_CAP)
         for i, index in self._indices.items():
-            found[:, i] = index.distances(points)
-        return found
+            distances_to_each[:, i] = index.distances(points)
+        return distances_to_each
 
     def near(self, center: Vector, radius: float) -> tuple[Rounded | Surface, ...]:
         """The bodies; a surface is reduced to elements near a ball, at least to those within PLANE_RANGE."""
@@ -132,28 +132,32 @@ class _Index:
     def distances(self, points: Points) -> Values:
         """Distances to the nearest element [m], at most CLEARANCE_CAP: exact where it is near, else to a ball
         around it."""
-        found = np.full(len(points), CLEARANCE_CAP)
+        nearest = np.full(len(points), CLEARANCE_CAP)
         for tree, rows, size in self._classes:
             to_middle = tree.query(points)[0]
-            near = (to_middle <= EXACT_TRIANGLE_RANGE * size) & (to_middle - size < found)
+            near = (to_middle <= EXACT_TRIANGLE_RANGE * size) & (to_middle - size < nearest)
             if len(self.surface.corners[0]) == 1:
                 near[:] = False
-            found = np.where(near, found, np.minimum(found, to_middle - size))
-            which = np.flatnonzero(near)
-            within = tree.query_ball_point(points[which], to_middle[which] + size)
+            nearest = np.where(near, nearest, np.minimum(nearest, to_middle - size))
+            near_points = np.flatnonzero(near)
+            within = tree.query_ball_point(points[near_points], to_middle[near_points] + size)
             counts = np.array([len(some) for some in within], int)
-            for some in np.array_split(np.arange(len(which)), counts.sum() * 9 // MAX_ARRAY_SIZE + 1):
+            for some in np.array_split(np.arange(len(near_points)), counts.sum() * 9 // MAX_ARRAY_SIZE + 1):
                 if len(some):
-                    of = np.repeat(which[some], counts[some])
+                    of = np.repeat(near_points[some], counts[some])
                     triangles = self.surface.corners[rows[np.concatenate(within[some]).astype(int)]]
-                    np.minimum.at(found, of, _to_triangles(points[of], triangles))
-        return np.minimum(found - self.surface.radius, CLEARANCE_CAP)
+                    np.minimum.at(nearest, of, _to_triangles(points[of], triangles))
+        return np.minimum(nearest - self.surface.radius, CLEARANCE_CAP)
 
     def near(self, center: Vector, reach: float) -> Surface:
         """The elements that come within a distance of a point, and possibly others."""
         reach += self.surface.radius
-        found = [rows[tree.query_ball_point(center, reach + size)] for tree, rows, size in self._classes]
-        return self.surface._replace(corners=self.surface.corners[np.sort(np.concatenate(found).astype(int))])
+        element_rows = [
+            rows[tree.query_ball_point(center, reach + size)] for tree, rows, size in self._classes
+        ]
+        return self.surface._replace(
+            corners=self.surface.corners[np.sort(np.concatenate(element_rows).astype(int))]
+        )
 
 
 def _by_size(corners: Float[ndarray, "m c 3"]) -> Iterator[tuple[ndarray, ndarray, float]]:

@@ -118,9 +118,9 @@ def robot_parts(robot: Robot) -> dict[str, str]:
     }
     for joint in robot.joints:
         numbers = [joint.T_parent_joint, joint.axis, *(getattr(joint, name) for name in LIMITS)]
-        held = robot.locked.get(joint.name)
-        names = [joint.name, joint.kind, joint.parent, joint.child, held is None]
-        parts[f"joint {joint.name}"] = _hash(names, *numbers, 0.0 if held is None else held)
+        locked_value = robot.locked.get(joint.name)
+        names = [joint.name, joint.kind, joint.parent, joint.child, locked_value is None]
+        parts[f"joint {joint.name}"] = _hash(names, *numbers, 0.0 if locked_value is None else locked_value)
     for link, spheres in robot.spheres.items():
         parts[f"spheres of {link}"] = _hash(link, spheres)
     for link, meshes in robot.meshes.items():
@@ -146,10 +146,10 @@ def request_parts(problem: Problem) -> dict[str, str]:
         carried = problem.payload
         links = sorted(robot.inertias)
         rows = [robot.inertias[link].values for link in links]
-        own = [carried.mass, *carried.com, *carried.moments]
+        payload_numbers = [carried.mass, *carried.com, *carried.moments]
         T_world_base = problem.T_world_base
         stands = np.eye(4) if T_world_base is None else T_world_base
-        parts["payload"] = _hash([carried.link, *links], own, stands, robot.effort, rows)
+        parts["payload"] = _hash([carried.link, *links], payload_numbers, stands, robot.effort, rows)
     for one in problem.moving:
         ways = [np.zeros(0) if v is None else v for v in (one.velocity, one.times, one.poses, one.max_speed)]
         parts[f"moving {one.name}"] = _hash(one.shape.kind, *_numbers(one.shape), *ways)

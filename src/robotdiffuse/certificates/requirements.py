@@ -95,25 +95,25 @@ def constraint_bounds(problem: Problem, q: Configurations, chord: float) -> list
     linkage = Linkage(problem.robot)
     q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
     placed = {frame: linkage.place(q, frame) for frame in {one.frame for one in problem.constraints}}
-    found = []
+    bounds_of_constraints = []
     for one in problem.constraints:
         along = _frame_motion(linkage, placed[one.frame], q, one.frame)
         name = f"{one.kind} of {one.frame}"
         if isinstance(one, AxisCone):
             cosines = along.R @ one.axis @ one.direction
-            least = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
-            bounds = np.arccos(np.clip(least, -1.0, 1.0)) + chord * along.joints
-            found.append(ConstraintBound(name, one.angle, bounds))
+            min_cosine = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
+            bounds = np.arccos(np.clip(min_cosine, -1.0, 1.0)) + chord * along.joints
+            bounds_of_constraints.append(ConstraintBound(name, one.angle, bounds))
             continue
         ends = _line_poses(problem, linkage, one) if isinstance(one, CartesianLine) else ()
-        apart = _distances(along.p, *_box(one, *ends))
-        bounds = np.maximum(apart[1:], apart[:-1]) + along.sag + chord * along.slack
+        distances_to_box = _distances(along.p, *_box(one, *ends))
+        bounds = np.maximum(distances_to_box[1:], distances_to_box[:-1]) + along.sag + chord * along.slack
         limit = 0.0 if isinstance(one, PositionBox) else one.tolerance
-        found.append(ConstraintBound(name, limit, bounds))
+        bounds_of_constraints.append(ConstraintBound(name, limit, bounds))
         if isinstance(one, CartesianLine) and one.angle is not None:
             bounds = _angle_bounds(along, chord, *ends)
-            found.append(ConstraintBound(f"{name}, its angle", one.angle, bounds))
-    return found
+            bounds_of_constraints.append(ConstraintBound(f"{name}, its angle", one.angle, bounds))
+    return bounds_of_constraints
 
 
 def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
@@ -140,9 +140,11 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
         stop = cubics.steps[:, 0]
         allowed = one.speed * (1 + slack)
         for _ in range(MAX_HALVINGS):
-            most = np.maximum(*(_frame_speeds(linkage, cubics, one.frame, row, at) for at in (start, stop)))
-            open_ = ~(most + bends[row] * (stop - start) ** 2 / 8 <= allowed)
-            if not open_.any() or not (most <= allowed).all() or open_.sum() > MAX_OPEN:
+            max_speeds = np.maximum(
+                *(_frame_speeds(linkage, cubics, one.frame, row, at) for at in (start, stop))
+            )
+            open_ = ~(max_speeds + bends[row] * (stop - start) ** 2 / 8 <= allowed)
+            if not open_.any() or not (max_speeds <= allowed).all() or open_.sum() > MAX_OPEN:
                 break
             row = row[open_]
             low = start[open_]
@@ -151,12 +153,12 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
             stop = np.append((low + high) / 2, high)
             row = np.tile(row, 2)
         if open_.any():
-            how = (
+            finding = (
                 "is not shown to be slow enough"
-                if most.max() <= allowed
-                else f"moves at {most.max():.4g} m/s"
+                if max_speeds.max() <= allowed
+                else f"moves at {max_speeds.max():.4g} m/s"
             )
-            lines.append(f"motion: {one.frame} {how}; {one.speed:g} m/s is allowed")
+            lines.append(f"motion: {one.frame} {finding}; {one.speed:g} m/s is allowed")
     return lines
 
 
@@ -219,9 +221,9 @@ def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tupl
             raise InputError(f"cartesian_line of {line.frame}: the goals put it at different poses")
         return start[k], ends[0]
     for pose in poses_of(goal):
-        other = linkage.links.index(pose.frame)
-        if not pose.tolerant and (linkage.moved[k] == linkage.moved[other]).all():
-            return start[k], pose.T_base_frame @ np.linalg.inv(start[other]) @ start[k]
+        goal_link = linkage.links.index(pose.frame)
+        if not pose.tolerant and (linkage.moved[k] == linkage.moved[goal_link]).all():
+            return start[k], pose.T_base_frame @ np.linalg.inv(start[goal_link]) @ start[k]
     raise InputError(f"cartesian_line of {line.frame}: the goal does not determine one pose of it")
 
 
@@ -232,21 +234,21 @@ def _angle_bounds(along: _FrameMotion, chord: float, *ends: Pose) -> Values:
     way = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(way))
     turn = T_goal[:3, :3] @ T_start[:3, :3].T
-    whole = float(_angles(turn[None], np.eye(3))[0])
+    total_angle = float(_angles(turn[None], np.eye(3))[0])
     K = cross_matrix(np.linalg.eigh(turn + turn.T)[1][:, -1])
     K = K if (turn * K).sum() >= 0 else -K  # the axis, not its opposite
     if length < MIN_LINE_LENGTH:  # the frame turns in place: the nearest orientation on its way
         turned = along.R @ T_start[:3, :3].T
         sines = (turned * K).sum(axis=(1, 2))
         cosines = -(turned * (K @ K)).sum(axis=(1, 2))
-        angles = np.clip(np.arctan2(sines, cosines), 0.0, whole)[:, None, None]
+        angles = np.clip(np.arctan2(sines, cosines), 0.0, total_angle)[:, None, None]
         reach = 0.0
     else:
         share = np.clip((along.p - T_start[:3, 3]) @ way / length**2, 0.0, 1.0)
-        angles = (share * whole)[:, None, None]
-        reach = whole / length
-    wanted = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
-    off = _angles(along.R, wanted)
+        angles = (share * total_angle)[:, None, None]
+        reach = total_angle / length
+    target_rotations = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
+    off = _angles(along.R, target_rotations)
     return (off[1:] + off[:-1] + along.turn + reach * along.went) / 2 + chord * (
         along.joints + reach * along.slack
     )
@@ -374,9 +376,9 @@ def _newton_euler(
         needed, w, dw, pull = turning[link]
         for body in carried.get(link, ()):
             arm, inertia = of_body(body, link, needed)
-            own = body.mass * (pull + cross(dw, arm) + cross(w, cross(w, arm)))
-            force[link] = force[link] + own
-            moment[link] = moment[link] + inertia(dw) + cross(w, inertia(w)) + cross(arm, own)
+            body_force = body.mass * (pull + cross(dw, arm) + cross(w, cross(w, arm)))
+            force[link] = force[link] + body_force
+            moment[link] = moment[link] + inertia(dw) + cross(w, inertia(w)) + cross(arm, body_force)
         if j is not None:
             loads[j] = axes[link], force[link] if slides[j] else moment[link]
         force[joint.parent] = force[joint.parent] + force[link]
@@ -392,8 +394,8 @@ def _second_derivative_bounds(problem: Problem, bounds: ndarray) -> JointRows:
     slides = Linkage(robot).slides
 
     def of_joint(joint: Joint, j: int | None, seen: Bound) -> tuple[Any, ...]:
-        held = joint.motion(robot.locked.get(joint.name, 0.0)) if j is None else np.eye(4)
-        arm = _rotating(float(np.linalg.norm((joint.T_parent_joint @ held)[:3, 3])), seen)
+        fixed_motion = joint.motion(robot.locked.get(joint.name, 0.0)) if j is None else np.eye(4)
+        arm = _rotating(float(np.linalg.norm((joint.T_parent_joint @ fixed_motion)[:3, 3])), seen)
         if j is None:
             return arm, None, None, None, seen
         axis = _rotating(1.0, seen)
@@ -405,8 +407,8 @@ def _second_derivative_bounds(problem: Problem, bounds: ndarray) -> JointRows:
         return arm, axis, _product(speed, axis), _product(bent, axis), seen
 
     def of_body(body: Inertia, _: str, seen: Bound) -> tuple[Bound, Callable[[Bound], Bound]]:
-        most = float(np.linalg.eigvalsh(body.moments)[-1])
-        inertia = most * np.stack([still[0] + 1, 2 * seen[0], 2 * seen[1] + 4 * seen[0] ** 2])
+        max_moment = float(np.linalg.eigvalsh(body.moments)[-1])
+        inertia = max_moment * np.stack([still[0] + 1, 2 * seen[0], 2 * seen[1] + 4 * seen[0] ** 2])
         return _rotating(float(np.linalg.norm(body.com)), seen), lambda w: _product(inertia, w)
 
     at_base = still, still, still, np.stack([still[0] + GRAVITY, *still[1:]])
@@ -422,12 +424,12 @@ def _rotating(length: float, seen: Bound) -> Bound:
 def _masses(problem: Problem) -> dict[str, list[Inertia]]:
     """The inertias of each link, with the payload's."""
     payload = problem.payload
-    found = {link: [of] for link, of in problem.robot.inertias.items()}
+    inertias = {link: [of] for link, of in problem.robot.inertias.items()}
     assert payload is not None
     if payload.mass > MIN_MASS:
         link = payload.link or problem.robot.tip
-        found.setdefault(link, []).append(Inertia(payload.mass, payload.com, np.diag(payload.moments)))
-    return found
+        inertias.setdefault(link, []).append(Inertia(payload.mass, payload.com, np.diag(payload.moments)))
+    return inertias
 
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
@@ -480,7 +482,7 @@ def not_checked(problem: Problem, motion: Path | Trajectory) -> list[str]:
         "start_velocity": path and problem.start_velocity is not None,
         "what no view has seen": problem.views,
     }
-    return [what for what, unchecked in parts.items() if unchecked]
+    return [description for description, unchecked in parts.items() if unchecked]
 
 
 def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
@@ -537,10 +539,10 @@ def cubic_jerks(robot: Robot, motion: Path | Trajectory) -> JointValues | None:
     if isinstance(motion, Path) or len(motion.times) < 2:
         return None
     cubics = cubics_of(motion)
-    most = np.where(robot.acceleration > 0, robot.acceleration, cubics.pulls.max(axis=0))
+    limits = np.where(robot.acceleration > 0, robot.acceleration, cubics.pulls.max(axis=0))
     written = motion.accelerations
     off = np.maximum(np.abs(written[:-1] - cubics.start), np.abs(written[1:] - cubics.end))
-    if not (cubics.jumps() <= JUMP * most).all() or not (off <= JUMP * most).all():
+    if not (cubics.jumps() <= JUMP * limits).all() or not (off <= JUMP * limits).all():
         return None
     return cubics.jerks.max(axis=0)
 
@@ -553,11 +555,11 @@ def _jerk_errors(robot: Robot, motion: Trajectory, certificate: MotionProof) -> 
     if [name for name, _ in certificate.jerks] != [*motion.joint_names]:
         yield "jerks: their joints are not those of the motion"
         return
-    most = cubic_jerks(robot, motion)
-    if most is None:
+    max_jerks = cubic_jerks(robot, motion)
+    if max_jerks is None:
         yield "jerks: accelerations jump, or are not those of the cubics"
         return
-    for name, jerk in zip(stated, most, strict=True):
+    for name, jerk in zip(stated, max_jerks, strict=True):
         if not jerk <= stated[name] * (1 + BOUND_TOLERANCE) + MIN_JERK:
             yield f"jerks: that of {name} is {jerk:.6g}, not {stated[name]:.6g}"
 
@@ -582,12 +584,12 @@ def _waypoint_errors(problem: Problem, motion: Path | Trajectory, tolerances: To
             places = np.concatenate([*within, rows[-1:]])
         places = places[places >= after]
         q = np.column_stack([np.interp(places, rows, joint) for joint in motion.positions.T])
-        there = np.flatnonzero(at_goal(robot, goal, q, tolerances, blend))
-        if not len(there):
-            what = f"pass within {blend:g} of" if blend else "stop at"
-            yield f"motion: it does not {what} waypoints[{k}] after those before it"
+        reached = np.flatnonzero(at_goal(robot, goal, q, tolerances, blend))
+        if not len(reached):
+            requirement = f"pass within {blend:g} of" if blend else "stop at"
+            yield f"motion: it does not {requirement} waypoints[{k}] after those before it"
             return
-        after = float(places[there[0]])
+        after = float(places[reached[0]])
 
 
 def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
@@ -602,9 +604,9 @@ def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
     if [name for name, _ in stated] != [*problem.robot.joint_names]:
         yield "torques: their joints are not those of the robot"
         return
-    most = torque_bounds(problem, motion, certificate.torque_samples).max(axis=0)
+    max_torques = torque_bounds(problem, motion, certificate.torque_samples).max(axis=0)
     allowed = problem.robot.effort * (1 + certificate.tolerances.rate_slack)
-    yield from _stated_errors("torques", stated, most, allowed)
+    yield from _stated_errors("torques", stated, max_torques, allowed)
 
 
 def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
@@ -612,13 +614,13 @@ def _constraint_errors(problem: Problem, certificate: MotionProof) -> Iterator[s
     if not problem.constraints and not certificate.constraints:
         return
     q = configurations(certificate.motion, certificate.between)
-    shown = constraint_bounds(problem, q, certificate.tolerances.chord)
-    if [one.name for one in shown] != [name for name, _ in certificate.constraints]:
+    bounds = constraint_bounds(problem, q, certificate.tolerances.chord)
+    if [one.name for one in bounds] != [name for name, _ in certificate.constraints]:
         yield "constraints: they are not those of the problem"
         return
-    most = [float(one.bounds.max()) for one in shown]
-    limits = [one.limit for one in shown]
-    yield from _stated_errors("constraints", certificate.constraints, most, limits)
+    max_values = [float(one.bounds.max()) for one in bounds]
+    limits = [one.limit for one in bounds]
+    yield from _stated_errors("constraints", certificate.constraints, max_values, limits)
 
 
 def _stated_errors(
@@ -655,7 +657,7 @@ def _rate_errors(
     # velocities of cubics contain up to 3/2 of the mean velocity, accelerations 6 of it over the step
     blur = 6 * unsure / step**2
     yield from _agreement_errors(robot, motion, cubics, begins, blur)
-    for what, values, limit, room in (
+    for quantity, values, limit, room in (
         ("velocity", v, speed, 0.0),
         ("mean velocity between rows", np.diff(q, axis=0) / step, speed, unsure / np.maximum(step, MIN_TIME)),
         ("acceleration", a, pull, 0.0),
@@ -663,12 +665,12 @@ def _rate_errors(
         ("velocity along its cubics", cubics.speeds, speed, 1.5 * unsure / step),
         ("acceleration along its cubics", cubics.pulls, pull, blur),
     ):
-        yield from _exceeded(robot, what, np.abs(values), limit, share * limit + room)
+        yield from _exceeded(robot, quantity, np.abs(values), limit, share * limit + room)
     beyond = _furthest(motion, share, unsure, speed)
-    how = "it gets {:.3g} further than {:.4g} allows"
-    yield from _exceeded(robot, "mean velocity from one row to another", beyond, speed, unsure, how)
-    fine = step.min(initial=np.inf) < AVERAGING_WINDOWS[0]
-    for window in AVERAGING_WINDOWS if fine else AVERAGING_WINDOWS[:1]:
+    message = "it gets {:.3g} further than {:.4g} allows"
+    yield from _exceeded(robot, "mean velocity from one row to another", beyond, speed, unsure, message)
+    fine_steps = step.min(initial=np.inf) < AVERAGING_WINDOWS[0]
+    for window in AVERAGING_WINDOWS if fine_steps else AVERAGING_WINDOWS[:1]:
         # before the first row the arm moves at its start velocity, and after the last it stands still
         at = np.concatenate([[times[0] - window], times, [times[-1] + window]])
         rows = np.concatenate([q[:1] - window * begins, q, q[-1:]])
@@ -676,21 +678,21 @@ def _rate_errors(
         last = np.searchsorted(at, times + window, side="left")
         before = (times - at[first])[:, None]
         after = (at[last] - times)[:, None]
-        apart = (before + after) / 2
+        spacing = (before + after) / 2
         # from the mean velocity before a row to that after it: a value that the joint must have reached
-        bent = np.abs((rows[last] - q) / after - (q - rows[first]) / before) / apart
+        bent = np.abs((rows[last] - q) / after - (q - rows[first]) / before) / spacing
         outside = ((first == 0) * 1.0 + (last == len(at) - 1))[:, None]
         room = unsure / before + unsure / after + outside * tolerances.rate_slack * speed
-        what = "mean acceleration by its positions"
-        lines = [*_exceeded(robot, what, bent, pull, share * pull + room / apart)]
+        quantity = "mean acceleration by its positions"
+        lines = [*_exceeded(robot, quantity, bent, pull, share * pull + room / spacing)]
         yield from lines
         if lines:
             break
-    known = np.where(speed > 0, speed, np.abs(v).max(axis=0, initial=0.0))
+    reference_speed = np.where(speed > 0, speed, np.abs(v).max(axis=0, initial=0.0))
     off = np.abs(np.stack([v[0] - begins, v[-1]]))
-    if (off > tolerances.rate_slack * known + tolerances.rest).any():
-        how = "at the problem's start_velocity, or end" if begins.any() else "and end"
-        yield f"motion: it does not begin {how} at rest"
+    if (off > tolerances.rate_slack * reference_speed + tolerances.rest).any():
+        message = "at the problem's start_velocity, or end" if begins.any() else "and end"
+        yield f"motion: it does not begin {message} at rest"
 
 
 def _exceeded(
@@ -704,8 +706,8 @@ def _exceeded(
     """A line for each joint with a limit some of whose values are not within what is allowed."""
     over = ~(values <= allowed) & (limit > 0)
     for j in np.flatnonzero(over.any(axis=0)):
-        most = how.format(values[over[:, j], j].max(), limit[j])
-        yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {most}"
+        excess = how.format(values[over[:, j], j].max(), limit[j])
+        yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {excess}"
 
 
 def _furthest(motion: Trajectory, share: float, unsure: float, speed: JointValues) -> JointRows:
@@ -718,11 +720,11 @@ def _furthest(motion: Trajectory, share: float, unsure: float, speed: JointValue
     step = np.diff(motion.times)[:, None]
     q = motion.positions
     allowed = np.zeros_like(q)
-    most = share * speed * step + unsure * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
-    np.cumsum(most, axis=0, out=allowed[1:])
+    max_travel = share * speed * step + unsure * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
+    np.cumsum(max_travel, axis=0, out=allowed[1:])
     # largest excess over all earlier rows, by a running minimum
-    ahead = np.stack([q, -q]) - allowed
-    return (ahead - np.minimum.accumulate(ahead, axis=1)).max(axis=(0, 1))[None]
+    advance = np.stack([q, -q]) - allowed
+    return (advance - np.minimum.accumulate(advance, axis=1)).max(axis=(0, 1))[None]
 
 
 def _agreement_errors(
@@ -755,25 +757,25 @@ def at_goal(
     if isinstance(goal, JointGoal):
         off = goal.positions - q[:, None]
         off = np.where(robot.continuous, np.arctan2(np.sin(off), np.cos(off)), off)
-        there = (np.abs(off) <= tolerances.goal_tolerance).all(axis=2)
-        return (there | (np.linalg.norm(off, axis=2) <= blend)).any(axis=1)
+        within_distance = (np.abs(off) <= tolerances.goal_tolerance).all(axis=2)
+        return (within_distance | (np.linalg.norm(off, axis=2) <= blend)).any(axis=1)
     linkage = Linkage(robot)
     T_goal = goal.T_base_frame
     T = linkage.place(q).T[:, linkage.links.index(goal.frame)]
     xyz = (T[:, :3, 3] - T_goal[:3, 3]) @ T_goal[:3, :3]
     turn = T_goal[:3, :3].T @ T[:, :3, :3]
     if goal.xyz_tolerance is None:
-        there = np.linalg.norm(xyz, axis=1) <= max(tolerances.goal_distance, blend)
+        within_distance = np.linalg.norm(xyz, axis=1) <= max(tolerances.goal_distance, blend)
     else:
         beyond = np.maximum(np.abs(xyz) - goal.xyz_tolerance - tolerances.goal_slack, 0.0)
-        there = np.linalg.norm(beyond, axis=1) <= blend
+        within_distance = np.linalg.norm(beyond, axis=1) <= blend
     if goal.rpy_tolerance is None:
         angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1.0, 1.0))
-        return there & (angle <= tolerances.goal_angle + tolerances.goal_slack)
+        return within_distance & (angle <= tolerances.goal_angle + tolerances.goal_slack)
     roll = np.arctan2(turn[:, 2, 1], turn[:, 2, 2])
     pitch = np.arcsin(np.clip(-turn[:, 2, 0], -1.0, 1.0))
     yaw = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
     ways = np.stack([(roll, pitch, yaw), (roll + np.pi, np.pi - pitch, yaw + np.pi)])
     ways = (ways + np.pi) % (2 * np.pi) - np.pi
     allowed = (goal.rpy_tolerance + tolerances.goal_slack)[:, None]
-    return there & (np.abs(ways) <= allowed).all(axis=1).any(axis=0)
+    return within_distance & (np.abs(ways) <= allowed).all(axis=1).any(axis=0)

@@ -100,13 +100,13 @@ class PlaneFinder:
         T_base_link = T[links.index(claim.link)]
         for p, part in enumerate(placed(prover.parts[claim.link], T_base_link)):
             bodies = prover.others(claim, T, part)
-            apart = prover.balls_apart(part, bodies)
+            ball_gaps = prover.balls_apart(part, bodies)
             first = self._parts[claim.link][p]
             first = first._replace(T=T_base_link @ first.T)
             if claim.against == SCENE:
-                apart[prover.may_touch[links.index(claim.link)]] = np.inf
+                ball_gaps[prover.may_touch[links.index(claim.link)]] = np.inf
             for o, body in enumerate(bodies):
-                if apart[o] >= needed:
+                if ball_gaps[o] >= needed:
                     continue
                 if isinstance(body, Surface):
                     yield from ((p, o, normal) for normal in _around(first, part, body, needed))
@@ -125,15 +125,15 @@ class PlaneFinder:
 def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterator[Normal]:
     """Planes that together separate all near elements of a surface by `needed`, starting with the nearest
     one."""
-    shown = np.full(len(surface.corners), -np.inf)
+    shown_gaps = np.full(len(surface.corners), -np.inf)
     order = np.argsort(np.sqrt(((surface.corners - part.center) ** 2).sum(axis=-1)).min(axis=1))
-    asked = np.zeros(len(order), bool)
+    tried_elements = np.zeros(len(order), bool)
     for _ in range(MAX_PLANES):
-        left = order[(shown[order] < needed) & ~asked[order]]
-        if not len(left):
+        open_elements = order[(shown_gaps[order] < needed) & ~tried_elements[order]]
+        if not len(open_elements):
             return
-        element = int(left[0])
-        asked[element] = True
+        element = int(open_elements[0])
+        tried_elements[element] = True
         corners = surface.corners[element]
         if len(corners) == 3:
             second = _Body(coal_convex(corners, np.array([[0, 1, 2], [0, 2, 1]])), np.eye(4))
@@ -142,7 +142,7 @@ def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterat
         normal = _normal(first, second)
         if normal is None:
             return
-        shown = np.maximum(shown, gaps(part, surface, np.array([normal]))[:, 0])
+        shown_gaps = np.maximum(shown_gaps, gaps(part, surface, np.array([normal]))[:, 0])
         yield normal
 
 
@@ -222,7 +222,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     report = verify(problem, motion, settings)
     if report.violation is not None:
         raise NotValidError(f"the motion is not valid: {report.violation.line}")
-    least = {
+    required = {
         SCENE: CLEARANCE_SHARE * (report.scene_clearance or 0.0),
         "": CLEARANCE_SHARE * (report.self_clearance or 0.0),
     }
@@ -239,8 +239,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     if problem.constraints:
 
         def of_constraints(places: Values) -> tuple[Any, ...]:
-            shown = constraint_bounds(problem, configurations(motion, places), tolerances.chord)
-            names, limits, each = zip(*shown, strict=True)
+            bounds = constraint_bounds(problem, configurations(motion, places), tolerances.chord)
+            names, limits, each = zip(*bounds, strict=True)
             return names, np.column_stack(each), limits
 
         between, bounds = _refined(motion, between, of_constraints, "path constraints")
@@ -254,12 +254,12 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         )
     q = configurations(motion, between)
     off = deviations(motion, between)
-    proof, left = _prove(Prover(problem.robot, problem.scene, q, off), least)
+    proof, margins = _prove(Prover(problem.robot, problem.scene, q, off), required)
     moving = None
     if problem.moving and isinstance(motion, Trajectory):
         times = places_of(motion, between)
-        moving, others = _prove(MovingProver(problem.robot, problem.moving, q, times, off), {"": 0.0})
-        left[SCENE] = min(left[SCENE], *others.values())  # an obstacle may be called "scene"
+        moving, moving_margins = _prove(MovingProver(problem.robot, problem.moving, q, times, off), {"": 0.0})
+        margins[SCENE] = min(margins[SCENE], *moving_margins.values())  # an obstacle may be called "scene"
     jerks = cubic_jerks(problem.robot, motion)
     return Certificate(
         problem.robot.name,
@@ -269,8 +269,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         tolerances,
         motion,
         between,
-        left[SCENE],
-        left[""],
+        margins[SCENE],
+        margins[""],
         proof,
         _record(problem),
         request_parts(problem),
@@ -338,13 +338,13 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
     targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + ROUNDING_RESERVE
     in_time = isinstance(prover, MovingProver)
     tools = None if in_time else PlaneFinder(prover)
-    done = list[StretchProof]()
+    proofs = list[StretchProof]()
     total = 0
-    while len(todo.claim) or not done:  # robots without bodies have nothing to prove
+    while len(todo.claim) or not proofs:  # robots without bodies have nothing to prove
         n = len(todo.claim)
-        found = prover.bounds(todo, np.zeros(n, bool), [])
-        clearance = _down(found.clearance)
-        displacement = _up(found.displacement)
+        bounds = prover.bounds(todo, np.zeros(n, bool), [])
+        clearance = _down(bounds.clearance)
+        displacement = _up(bounds.displacement)
         by_planes = np.zeros(n, bool)
         planes = list[Plane]()
         target = targets[todo.claim]
@@ -357,10 +357,10 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
             rows = np.flatnonzero(close)
             planes = tools.planes(todo, rows, displacement[rows] + target[rows])
             number = {row: k for k, row in enumerate(rows.tolist())}
-            own = [plane._replace(stretch=number[plane.stretch]) for plane in planes]
-            again = prover.bounds(todo.some(rows), np.ones(len(rows), bool), own)
-            better = _down(again.clearance)
-            less = _up(again.displacement)
+            numbered_planes = [plane._replace(stretch=number[plane.stretch]) for plane in planes]
+            tighter = prover.bounds(todo.some(rows), np.ones(len(rows), bool), numbered_planes)
+            better = _down(tighter.clearance)
+            less = _up(tighter.displacement)
             by_planes[rows] = better - less > clearance[rows] - displacement[rows]
             chosen = by_planes[rows]
             clearance[rows[chosen]] = better[chosen]
@@ -368,18 +368,18 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[
             _check_parts_are_apart(prover, todo.some(rows[better <= 0]))
         proved = clearance - displacement >= target
         number = np.cumsum(proved) - 1
-        kept = tuple(
+        kept_planes = tuple(
             plane._replace(stretch=int(number[plane.stretch]))
             for plane in planes
             if proved[plane.stretch] and by_planes[plane.stretch]
         )
         columns = by_planes[proved], clearance[proved], displacement[proved]
-        done.append(StretchProof(prover.claims, todo.some(proved), *columns, kept))
+        proofs.append(StretchProof(prover.claims, todo.some(proved), *columns, kept_planes))
         total += n
         if total > MAX_STRETCHES:
             raise InputError(f"no proof of less than {MAX_STRETCHES:,} stretches was found for the motion")
         todo = _cut(todo, clearance, displacement, target, ~proved)
-    return _join(prover, done)
+    return _join(prover, proofs)
 
 
 def _check_parts_are_apart(prover: Prover, stretches: Stretches) -> None:
@@ -399,8 +399,10 @@ def _cut(
     """The stretches that are not proved, each split into as many parts as its displacement requires."""
     spare = np.maximum(clearance - target, displacement / MAX_SPLIT)
     # where spheres are too coarse, parts are made short enough for planes
-    asked = np.where(clearance < PLANES_BELOW, displacement / PLANES_DISPLACEMENT, 1.2 * displacement / spare)
-    parts = np.clip(np.ceil(asked), 2, MAX_SPLIT).astype(int)
+    split_factor = np.where(
+        clearance < PLANES_BELOW, displacement / PLANES_DISPLACEMENT, 1.2 * displacement / spare
+    )
+    parts = np.clip(np.ceil(split_factor), 2, MAX_SPLIT).astype(int)
     rows = []
     for i in np.flatnonzero(which).tolist():
         low = float(todo.start[i])
@@ -432,15 +434,15 @@ def _join(prover: Prover, done: list[StretchProof]) -> tuple[StretchProof, dict[
         for name in ("clearance", "displacement", "by_planes")
     )
     stretches = Stretches(claim[order], start[order], stop[order])
-    left = clearance - displacement
+    margins = clearance - displacement
     of_scene = np.array([c.against == SCENE for c in prover.claims], bool)[stretches.claim]
-    least = {
-        SCENE: float(_down(left[of_scene]).min(initial=CLEARANCE_CAP)),
-        "": float(_down(left[~of_scene]).min(initial=CLEARANCE_CAP)),
+    lowest = {
+        SCENE: float(_down(margins[of_scene]).min(initial=CLEARANCE_CAP)),
+        "": float(_down(margins[~of_scene]).min(initial=CLEARANCE_CAP)),
     }
     planes.sort()
     proof = StretchProof(prover.claims, stretches, by_planes, clearance, displacement, tuple(planes))
-    return proof, least
+    return proof, lowest
 
 
 def _down(values: Values) -> Values:

@@ -38,11 +38,11 @@ class Parser(argparse.ArgumentParser):
     """An argument parser that reports errors in one line, and each command its own."""
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[override]
-        known, unknown = super().parse_known_args(args, namespace)
+        arguments, unknown = super().parse_known_args(args, namespace)
         if unknown:
             similar = suggestion(unknown[0].partition("=")[0], self._option_string_actions)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{similar}")
-        return known, unknown
+        return arguments, unknown
 
     def error(self, message: str) -> NoReturn:
         choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)

@@ -92,13 +92,13 @@ def run_schema(arguments: argparse.Namespace) -> int:
 
 
 def run_completion(arguments: argparse.Namespace) -> int:
-    found = {"": (list(arguments.parsers), ["--help", "--version"])}
+    words_by_command = {"": (list(arguments.parsers), ["--help", "--version"])}
     for name, parser in arguments.parsers.items():
-        found |= _words(parser, f" {name}")
-    paths = "|".join(f'"{path}"' for path in found if path)
+        words_by_command |= _words(parser, f" {name}")
+    paths = "|".join(f'"{path}"' for path in words_by_command if path)
     cases = "\n".join(
         f"""    "{path}") words="{" ".join(words)}" options="{" ".join(options)}" ;;"""
-        for path, (words, options) in found.items()
+        for path, (words, options) in words_by_command.items()
     )
     script = SCRIPT.format(paths=paths, cases=cases)
     print(

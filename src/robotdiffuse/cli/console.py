@@ -105,9 +105,9 @@ def clearances(motion: "PlanResult | Report | Certificate", asked: float | None 
     """The certified clearances to the scene, beside the requested one [m], and between links."""
     if motion.scene_clearance is None or motion.self_clearance is None:
         return _certified(getattr(motion, "min_clearance", None) or 0.0)
-    wanted = "" if asked is None else f" (asked: {1e3 * asked:g} mm)"
+    requested = "" if asked is None else f" (asked: {1e3 * asked:g} mm)"
     between = f", {_certified(motion.self_clearance)} between links"
-    return f"{_certified(motion.scene_clearance)} to the scene{wanted}{between}"
+    return f"{_certified(motion.scene_clearance)} to the scene{requested}{between}"
 
 
 def _certified(clearance: float) -> str:

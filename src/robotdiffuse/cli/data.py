@@ -191,18 +191,20 @@ def run_generate(arguments: argparse.Namespace) -> int:
         raise InputError(
             "--workers sets the processes on this machine; --cluster always uses all cores of the cluster"
         )
-    known = {field.name for field in fields(GenerationSettings)}
-    given = {name: value for name, value in vars(arguments).items() if name in known and value is not None}
+    field_names = {field.name for field in fields(GenerationSettings)}
+    options = {
+        name: value for name, value in vars(arguments).items() if name in field_names and value is not None
+    }
     if arguments.planner is not None and arguments.planner != GenerationSettings.planner:
-        given["search"] = SEARCHES.defaults(arguments.planner)
-    settings = GenerationSettings(**given)
+        options["search"] = SEARCHES.defaults(arguments.planner)
+    settings = GenerationSettings(**options)
     if arguments.safety_distance is not None:
         search = replace(settings.search, safety_distance=arguments.safety_distance)
         settings = replace(settings, search=search)
     with progress("trajectories") as update:
         workers = arguments.workers or os.cpu_count() or 1
-        made = generate(settings, Path(arguments.out), workers, arguments.cluster, update)
-    print(f"{made:,} trajectories of {settings.waypoints} waypoints in {arguments.out}")
+        count = generate(settings, Path(arguments.out), workers, arguments.cluster, update)
+    print(f"{count:,} trajectories of {settings.waypoints} waypoints in {arguments.out}")
     return 0
 
 
@@ -278,9 +280,9 @@ def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "I
 def run_export(arguments: argparse.Namespace) -> int:
     from robotdiffuse.datasets.external import export_npz
 
-    made, left_out = export_npz(arguments.folder, arguments.file)
-    others = f"; left out {left_out:,}, whose scenes are not exactly two spheres" if left_out else ""
-    print(f"wrote {arguments.file}: {made:,} motions{others}")
+    count, left_out = export_npz(arguments.folder, arguments.file)
+    left_out_text = f"; left out {left_out:,}, whose scenes are not exactly two spheres" if left_out else ""
+    print(f"wrote {arguments.file}: {count:,} motions{left_out_text}")
     return 0
 
 
@@ -288,6 +290,8 @@ def run_import(arguments: argparse.Namespace) -> int:
     from robotdiffuse.datasets.external import import_npz
 
     with progress("importing motions") as update:
-        made = import_npz(arguments.file, arguments.out, arguments.robot, arguments.radius, update)
-    print(f"{made:,} motions in {arguments.out}; validate them with: robotdiffuse data check {arguments.out}")
+        count = import_npz(arguments.file, arguments.out, arguments.robot, arguments.radius, update)
+    print(
+        f"{count:,} motions in {arguments.out}; validate them with: robotdiffuse data check {arguments.out}"
+    )
     return 0

@@ -83,13 +83,13 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         ("--ignore-joints", IGNORE_JOINTS),
         ("--next-view", "propose a camera pose that shows most of the unknown space that the motion crosses"),
     )
-    for what in ("velocity", "acceleration"):
+    for rate in ("velocity", "acceleration"):
         parser.add_argument(
-            f"--{what}-scaling",
+            f"--{rate}-scaling",
             type=share,
             default=1.0,
             metavar="X",
-            help=f"fraction of the robot's {what} limits to use, from 0.001 to 1 (default: 1)",
+            help=f"fraction of the robot's {rate} limits to use, from 0.001 to 1 (default: 1)",
         )
     option(
         parser,
@@ -331,9 +331,9 @@ def explore_shelf(problem: "Problem", outputs: list[Path]) -> int:
     from robotdiffuse.problems.problem import Problem
     from robotdiffuse.scenes.scene import Scene
 
-    others = [shape for shape in problem.scene.shapes if shape.name != FLOOR.name]
+    obstacles = [shape for shape in problem.scene.shapes if shape.name != FLOOR.name]
     start = READY if READY in problem.robot.poses else problem.start
-    problem = Problem(problem.robot, Scene([FLOOR, *others]), start, problem.goal)
+    problem = Problem(problem.robot, Scene([FLOOR, *obstacles]), start, problem.goal)
     print("The arm knows the floor, and sees the rest by a camera at its tip and one beside it.")
     explorer, arrived = simulate(problem, ExplorerSettings(time_limit=EXPLORE_TIME_LIMIT), None, 0)
     looks = sum(act.step.kind == LOOK for act in explorer.acts)
@@ -363,8 +363,8 @@ def shelf_problem(robot: str) -> "Problem":
     with Spinner(f"drawing a problem for {arm.name}"):
         for _ in range(MAX_DRAWS):
             problem = family.draw(arm, rng).problem(arm)
-            found = search.plan(problem, DRAW_TIME_LIMIT, until=FIRST)
-            if found.solved and found.stage != "straight_line":
+            result = search.plan(problem, DRAW_TIME_LIMIT, until=FIRST)
+            if result.solved and result.stage != "straight_line":
                 return problem
     return problem
 

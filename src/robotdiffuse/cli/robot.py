@@ -221,7 +221,7 @@ def print_robot(robot: "Robot") -> None:
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
     joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]
     spheres = sum(len(rows) for rows in robot.spheres.values())
-    meshes = sum(len(pieces) for pieces in robot.meshes.values())
+    meshes = sum(len(link_meshes) for link_meshes in robot.meshes.values())
     ends = [("tip", tip) for tip in robot.tips] if robot.other_tips else []
     pairs = [("base", robot.base), *ends] if ends else [("base, tip", f"{robot.base}, {robot.tip}")]
     if robot.root not in ("", robot.base):

@@ -89,8 +89,8 @@ def served_robots(names: Sequence[str]) -> "dict[str, Robot]":
     robots = {name: load_robot(name) for name in ROBOTS}
     for name in names:
         robot = load_robot(name)
-        known = name if name in known_robots() else robot.name
-        if known in robots:
-            raise InputError(f"robot {shown(name)} has the name {known} of another robot")
-        robots[known] = robot
+        request_name = name if name in known_robots() else robot.name
+        if request_name in robots:
+            raise InputError(f"robot {shown(name)} has the name {request_name} of another robot")
+        robots[request_name] = robot
     return robots

@@ -29,9 +29,9 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
         run_verify,
     )
     option(parser, "motion MOTION", "file (.json, .csv, .yaml, .mcap), or the folder of a ROS 2 bag")
-    where = parser.add_mutually_exclusive_group()
+    group = parser.add_mutually_exclusive_group()
     options(
-        where,
+        group,
         ("--problem FILE", "problem file (default: the problem in the result or .mcap file)"),
         (
             "--scene FILE",
@@ -61,7 +61,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
     problem, motions, notes = _read(arguments)
     for note in (*problem.notes, *notes, *contact_notes(problem.scene)):
         print(f"note: {note}")
-    valid = all([_validated(problem, what, motion, arguments.all) for what, motion in motions.items()])
+    valid = all([_validated(problem, label, motion, arguments.all) for label, motion in motions.items()])
     if out is not None and valid:
         from robotdiffuse.certificates.search import certify
 
@@ -83,12 +83,12 @@ def _validated(
         jerk = "" if report.jerk_share is None else f"; {_jerk(report.jerk_share)}"
         print(f"{what}: valid, clearance certified {clearances(report)}{jerk}")
         return True
-    found = (report.violation,)
+    shown_violations = (report.violation,)
     if everything:
         from robotdiffuse.validation.validator import violations
 
-        found = violations(problem, motion) or found
-    for violation in found:
+        shown_violations = violations(problem, motion) or shown_violations
+    for violation in shown_violations:
         print(f"{what}: not valid: {violation.line}")
     return False
 
@@ -129,7 +129,7 @@ def _read(
 
         result, problem = read_solved(arguments.motion)
         both = {"path": result.path, "trajectory": result.trajectory}
-        return problem, {what: motion for what, motion in both.items() if motion is not None}, ()
+        return problem, {label: motion for label, motion in both.items() if motion is not None}, ()
     recorded = read_motion(arguments.motion, arguments.topic)
     more = ()
     if alone:
@@ -147,8 +147,8 @@ def _read(
         fit = motion_of_robot(recorded, problem.robot)
     except InputError as error:
         raise InputError(f"{arguments.motion}: {error}") from None
-    what = "trajectory" if isinstance(fit.motion, Trajectory) else "path"
-    return problem, {what: fit.motion}, (*more, *fit.notes)
+    label = "trajectory" if isinstance(fit.motion, Trajectory) else "path"
+    return problem, {label: fit.motion}, (*more, *fit.notes)
 
 
 HOLDS = 0
@@ -192,16 +192,16 @@ def run_check(arguments: argparse.Namespace) -> int:
         problem = problem_from_record(certificate.problem)
     for note in () if problem is None else contact_notes(problem.scene):
         print(f"note: {note}")
-    found = certificate.check(problem).differences
+    differences = certificate.check(problem).differences
     if problem is not None:
         print(f"robot: {described(problem.robot)}")
         print(f"problem: {arguments.problem or 'the one in the certificate'}")
         print(f"not checked: {'; '.join(not_checked(problem, certificate.motion))}")
-    for line in found:
+    for line in differences:
         print(line)
-    if not found:
+    if not differences:
         print(f"holds: {clearances(certificate)}")
-    return FAILS if found else HOLDS
+    return FAILS if differences else HOLDS
 
 
 def described(robot: "Robot") -> str:
@@ -213,8 +213,8 @@ def described(robot: "Robot") -> str:
     name = robot.name if robot.source is None else f"{robot.name} from {robot.source}"
     if robot.name not in ROBOTS:
         return f"{name}, not bundled: the proof holds for the shapes and joints in its files"
-    held = {joint: value for joint, value in robot.locked.items() if joint not in robot.joint_names}
-    bundled = load_robot(DATA / robot.name, held)
+    locked = {joint: value for joint, value in robot.locked.items() if joint not in robot.joint_names}
+    bundled = load_robot(DATA / robot.name, locked)
     changes = differences("robot", robot_parts(bundled), robot_parts(robot))
     if not changes:
         return f"{name}, the bundled one"

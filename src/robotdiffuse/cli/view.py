@@ -193,13 +193,16 @@ def _read_several(files: list[str]) -> "tuple[Problem, dict[str, PlanResult]]":
     from robotdiffuse.problems.files import problem_record
 
     names = [Path(file).stem for file in files]
-    (result, problem), *others = map(read_solved, files)
+    (result, problem), *further_results = map(read_solved, files)
     if len(set(names)) < len(names):
         raise InputError(f"results are {', '.join(files)}; two have the same name")
-    for name, (_, other) in zip(names[1:], others, strict=True):
-        if problem_record(other)["scene"] != problem_record(problem)["scene"] or other.robot != problem.robot:
+    for name, (_, other_problem) in zip(names[1:], further_results, strict=True):
+        if (
+            problem_record(other_problem)["scene"] != problem_record(problem)["scene"]
+            or other_problem.robot != problem.robot
+        ):
             raise InputError(f"{name} is of another robot or scene than {names[0]}; results must share both")
-    return problem, dict(zip(names, (result, *(one for one, _ in others)), strict=True))
+    return problem, dict(zip(names, (result, *(one for one, _ in further_results)), strict=True))
 
 
 def add_simulate(commands: argparse._SubParsersAction) -> None:
@@ -237,16 +240,16 @@ def run_simulate(arguments: argparse.Namespace) -> int:
     if result.trajectory is None:
         raise InputError(f"{arguments.result} holds a path without times; a replay needs a trajectory")
     robot, scene = problem.standing()
-    done = replay(robot, scene, result.trajectory, moving=problem.moving_in_world)
+    executed = replay(robot, scene, result.trajectory, moving=problem.moving_in_world)
     for name in (one.name for one in problem.moving if not one.known):
         print(f"note: the motion of {name} is not known; it stands still here")
-    print_replay(problem.robot.name, result.trajectory.duration, done)
-    rates = np.gradient(done.positions, done.times, axis=0)
-    motion = Trajectory(done.joint_names, done.times, done.positions, rates, 0 * rates)
+    print_replay(problem.robot.name, result.trajectory.duration, executed)
+    rates = np.gradient(executed.positions, executed.times, axis=0)
+    motion = Trajectory(executed.joint_names, executed.times, executed.positions, rates, 0 * rates)
     for file in outputs:
         draw(problem, replace(result, trajectory=motion), file)
         print(f"wrote {file}")
-    return SOLVED if done.free else NO_PLAN
+    return SOLVED if executed.free else NO_PLAN
 
 
 def print_replay(robot: str, duration: float, done: "Replay") -> None:
@@ -261,8 +264,8 @@ def print_replay(robot: str, duration: float, done: "Replay") -> None:
             ("", "maximum", "RMS"),
             [
                 *(
-                    (f"error of {name}", f"{1e3 * most:.3f} mrad", f"{1e3 * rms:.3f} mrad")
-                    for name, most, rms in zip(
+                    (f"error of {name}", f"{1e3 * max_error:.3f} mrad", f"{1e3 * rms:.3f} mrad")
+                    for name, max_error, rms in zip(
                         done.joint_names, done.max_errors, done.rms_errors, strict=True
                     )
                 ),

@@ -101,15 +101,15 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
         labels = [label + of for label in specs for of in ("", RESTARTED)[: 1 + settings.equal_time]]
         files = {label: RecordFile(record_path(settings.out, label)) for label in labels}
         todo = open_runs({label: file.records for label, file in files.items()}, cases, settings)
-        wanted = len(cases) * settings.seeds
+        total = len(cases) * settings.seeds
         for label in specs:
-            done(label, wanted - sum(run.method == label for run in todo), wanted)
+            done(label, total - sum(run.method == label for run in todo), total)
         about = (settings.equal_time, session, settings.out / "logs")
         if settings.cluster is None:
             results = on_this_machine(specs, todo, settings.workers, *about)
         else:
             results = on_cluster(specs, todo, settings.cluster, *about)
-        return keep_records(todo, results, files, lambda label, left: done(label, wanted - left, wanted))
+        return keep_records(todo, results, files, lambda label, left: done(label, total - left, total))
 
 
 def open_runs(
@@ -118,13 +118,13 @@ def open_runs(
     """The runs that the records, by planner, do not answer."""
     answered: set[tuple[str, str, str, int]] = set()
     for label in settings.specs:
-        again = {record.key for record in records.get(label + RESTARTED, ())}
+        restarted = {record.key for record in records.get(label + RESTARTED, ())}
         for record in records.get(label, ()):
-            same = record.time_limit == settings.time_limit
-            enough = same or (record.time_limit < settings.time_limit and record.ended_by_itself)
+            same_limit = record.time_limit == settings.time_limit
+            is_answered = same_limit or (record.time_limit < settings.time_limit and record.ended_by_itself)
             if settings.equal_time and record.restartable:
-                enough = same and record.key in again
-            if enough:
+                is_answered = same_limit and record.key in restarted
+            if is_answered:
                 answered.add((label, *record.case))
     runs = runs_of(cases, settings.specs, range(settings.seeds), settings.time_limit)
     return [t for t in runs if (t.method, t.case.problem_set, t.case.name, t.seed) not in answered]
@@ -133,8 +133,10 @@ def open_runs(
 def _check_weights(settings: BenchSettings, sessions: Sequence[Mapping[str, Any]]) -> None:
     """Raise InputError if a planner of this name was run here with other weights: its records would mix."""
     for label, spec in settings.specs.items():
-        known = [session["weights"][label] for session in sessions if label in session.get("weights", {})]
-        if any(hashes != spec.weights_hashes for hashes in known):
+        recorded_hashes = [
+            session["weights"][label] for session in sessions if label in session.get("weights", {})
+        ]
+        if any(hashes != spec.weights_hashes for hashes in recorded_hashes):
             raise InputError(
                 f"{settings.out} has records of {label} with other weights than those in {spec.weights}; "
                 "rename the folder of the weights, or use another folder for the results"

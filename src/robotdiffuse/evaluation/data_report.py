@@ -113,10 +113,10 @@ def read_figures(folder: str | FilePath) -> DataFigures:
         shard = read_shard(folder, index, (*ARRAYS_OF_ALL, *ARRAYS_OF_SAMPLE, *ARRAYS_OF_SCENES))
         rows = slice(-motions % step, None, step)
         motions += len(shard)
-        taken = {name: shard[name] for name in ARRAYS_OF_ALL}
-        taken["goal_costs"] = shard["goal_costs"][rows]
-        taken["trajectories"] = shard["trajectories"][rows, waypoints]
-        for name, array in taken.items():
+        shard_arrays = {name: shard[name] for name in ARRAYS_OF_ALL}
+        shard_arrays["goal_costs"] = shard["goal_costs"][rows]
+        shard_arrays["trajectories"] = shard["trajectories"][rows, waypoints]
+        for name, array in shard_arrays.items():
             parts.setdefault(name, []).append(array)
         for i in split_of(scenes_of(manifest, shard)):
             splits[SPLITS[i]] += 1
@@ -139,8 +139,8 @@ def facts(data: DataFigures) -> list[tuple[str, str]]:
     distance = f"{100 * data.safety_distance:.3g} cm"
     clearance = data.all["clearance"] + SAFETY_TOLERANCE
     ends = data.all["end_clearance"].min(axis=1)
-    kept = clearance >= np.minimum(data.safety_distance, ends)
-    apart = clearance[ends >= data.safety_distance]
+    keeps_distance = clearance >= np.minimum(data.safety_distance, ends)
+    clearance_between = clearance[ends >= data.safety_distance]
     return [
         ("motions", f"{data.trajectories:,}{planned}"),
         (
@@ -150,10 +150,10 @@ def facts(data: DataFigures) -> list[tuple[str, str]]:
         (f"in {data.shards:,} shards", size_in_words(data.bytes)),
         ("splits", ", ".join(f"{count:,} {name}" for name, count in data.splits.items())),
         ("problems solved", f"{_share(solved)}; of {counts['tried']:,} tried {lost}"),
-        (f"come no closer than {distance} or than their ends", _share(kept)),
+        (f"come no closer than {distance} or than their ends", _share(keeps_distance)),
         (
             f"keep {distance} all along, where both ends have it",
-            _share(apart >= data.safety_distance) if len(apart) else NO_VALUE,
+            _share(clearance_between >= data.safety_distance) if len(clearance_between) else NO_VALUE,
         ),
         (
             "goals reached per problem",

@@ -59,8 +59,8 @@ class PlannerSpec:
         Raises InputError for an unknown planner or setting, listing the known ones, and for a value out of
         bounds.
         """
-        whole, *settings = text.split(":")
-        name, at, folder = whole.partition("@")
+        planner_text, *settings = text.split(":")
+        name, at, folder = planner_text.partition("@")
         PLANNERS.entry(name)
         spec = cls(name, str(folder_of(folder).resolve()) if at else None, tuple(settings))
         spec.request()
@@ -102,8 +102,8 @@ class PlannerSpec:
 
     def _settings(self) -> Settings:
         weights = () if self.weights is None else (f"weights={self.weights}",)
-        own = (text for text in self.settings if not _of_call(text))
-        return planner_settings(self.name, (*weights, *own))
+        setting_texts = (text for text in self.settings if not _of_call(text))
+        return planner_settings(self.name, (*weights, *setting_texts))
 
 
 def _of_call(text: str) -> bool:

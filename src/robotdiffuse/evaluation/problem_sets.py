@@ -92,22 +92,24 @@ def _set(text: str, count: int | None, folder: FilePath, report: Report) -> list
     family = text.removesuffix(NONTRIVIAL_SUFFIX)
     if family in FAMILIES:
         finder = search if text.endswith(NONTRIVIAL_SUFFIX) else None
-        wanted = 100 if count is None else count
-        return _of_set(case_file(folder, family).held_out(family, wanted, validator, finder, report), name)
-    kept = case_file(folder, name)
+        case_count = 100 if count is None else count
+        return _of_set(
+            case_file(folder, family).held_out(family, case_count, validator, finder, report), name
+        )
+    case_store = case_file(folder, name)
     place = FilePath(text)
     source = folder / f"{name}.source.json"
     about = {"source": str(place.resolve()), "sha256": _content_hash(place)}
-    if not len(kept):
+    if not len(case_store):
         cases = _read_place(place, name, report)
         write_atomically(source, json.dumps(about), make_folder=True)
-        kept.fill(cases)
-    elif source.is_file() and (known := read_json(source))["sha256"] != about["sha256"]:
+        case_store.fill(cases)
+    elif source.is_file() and (stored := read_json(source))["sha256"] != about["sha256"]:
         raise InputError(
-            f"{folder} has problems called {name} that were read from {known['source']}; those in {text} are "
-            "others: rename them, or use another folder"
+            f"{folder} has problems called {name} that were read from {stored['source']}; those in {text} "
+            "are others: rename them, or use another folder"
         )
-    return _of_set(kept.cases()[:count], name)
+    return _of_set(case_store.cases()[:count], name)
 
 
 def _content_hash(place: FilePath) -> str:

@@ -43,8 +43,8 @@ from robotdiffuse.robots.robot import Robot
 
 def versions() -> dict[str, str]:
     """Versions of this package and of PyTorch, and the date, for the description of a checkpoint."""
-    made = datetime.now(UTC).strftime("%Y-%m-%d")
-    return {"robotdiffuse": __version__, "torch": torch.__version__, "made": made}
+    date = datetime.now(UTC).strftime("%Y-%m-%d")
+    return {"robotdiffuse": __version__, "torch": torch.__version__, "made": date}
 
 
 def write_tensors(file: FilePath, tensors: dict[str, Tensor], notes: dict[str, Any]) -> str:
@@ -112,7 +112,7 @@ def _save(module: SavedModule, folder: FilePath, stem: str, about: dict[str, Any
 def _load(name: str, folder: FilePath) -> Any:
     """The network of a folder, frozen. Raises InputError if a file is missing or damaged."""
     about = read_description(folder, name)
-    where = f"{folder / name}.json"
+    location = f"{folder / name}.json"
     weights = folder / f"{name}.safetensors"
     checked_bytes(weights, about.get("weights_sha256"), f"{name}.json")
     robots: list[RobotIdentity] = []
@@ -123,14 +123,14 @@ def _load(name: str, folder: FilePath) -> Any:
         kind = table.load(entry)
         settings = table.settings(entry)
         if table is NETWORKS:
-            robots = [RobotIdentity.from_json(about.get("robot"), f"{where}: robot")]
-    made = settings.from_json(about.get("settings"), f"{where}: settings")
+            robots = [RobotIdentity.from_json(about.get("robot"), f"{location}: robot")]
+    loaded_settings = settings.from_json(about.get("settings"), f"{location}: settings")
     try:
-        network = kind(*robots, made)
+        network = kind(*robots, loaded_settings)
     except (RuntimeError, TypeError, MemoryError, OverflowError) as error:
         # PyTorch's errors for impossible sizes
         raise InputError(
-            f"{where}: no network can be made from these settings: {shortened(str(error))}"
+            f"{location}: no network can be made from these settings: {shortened(str(error))}"
         ) from None
     try:
         network.load_state_dict(read_tensors(weights)[0])

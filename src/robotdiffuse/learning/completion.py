@@ -237,8 +237,8 @@ def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> Sample
             grazing=strength * usual.grazing,
         )
         views = [noise.applied(_without_infinity(view) if hide_far else view, rng) for view in views]
-    seen, behind = pack(observe(views, robot, q))
-    return Sample(seen, behind, pack_fine(true_voxels(scene)))
+    seen, depth_behind = pack(observe(views, robot, q))
+    return Sample(seen, depth_behind, pack_fine(true_voxels(scene)))
 
 
 def _without_infinity(view: DepthView) -> DepthView:
@@ -249,8 +249,8 @@ def _without_infinity(view: DepthView) -> DepthView:
 
 def draw_samples(families: Sequence[str], robot: Robot, seeds: Sequence[int]) -> Samples:
     """A sample for each seed."""
-    drawn = [draw_sample(families, robot, np.random.default_rng(seed)) for seed in seeds]
-    return Samples(*(np.stack(arrays) for arrays in zip(*drawn, strict=True)))
+    samples = [draw_sample(families, robot, np.random.default_rng(seed)) for seed in seeds]
+    return Samples(*(np.stack(arrays) for arrays in zip(*samples, strict=True)))
 
 
 Completion = Callable[[ndarray, ndarray], ndarray]

@@ -110,12 +110,14 @@ class CompletionNetwork(SavedModule):
     def forward(self, seen: Packed, behind: Packed) -> Float[Tensor, "n 28 28 16 64"]:
         """Logits of the voxels of 2 cm, grouped by cells of 8 cm and within them by voxels of 4 cm."""
         features = self.features(seen, behind)
-        fine = self.before[0](self.first(features))
-        middle = self.before[1](self.down[0](torch.relu(fine)))
+        features_2cm = self.before[0](self.first(features))
+        middle = self.before[1](self.down[0](torch.relu(features_2cm)))
         bottleneck = self.middle(self.down[1](torch.relu(middle)))
         middle = self.after[0](middle + _shuffled(self.up[0](torch.relu(bottleneck))))
-        fine = self.after[1](fine + _shuffled(self.up[1](torch.relu(middle))) + self.skip(features))
-        return self.last(torch.relu(fine)).permute(0, 2, 3, 4, 1)
+        features_2cm = self.after[1](
+            features_2cm + _shuffled(self.up[1](torch.relu(middle))) + self.skip(features)
+        )
+        return self.last(torch.relu(features_2cm)).permute(0, 2, 3, 4, 1)
 
     def probabilities(self, seen: Packed, behind: Packed) -> Float[Tensor, "n 112 112 64"]:
         """Probability of each voxel of 2 cm; 0 in voxels that were seen free, and beyond REACH."""

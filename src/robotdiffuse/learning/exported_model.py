@@ -67,18 +67,20 @@ class ExportedModel(MotionModel):
     def __init__(self, folder: FilePath, name: str) -> None:
         """name: in NETWORKS. Raises InputError, naming the file, if one is missing or damaged."""
         about = read_description(folder, name)
-        where = str(folder / f"{name}.json")
-        robot = RobotIdentity.from_json(about.get("robot"), f"{where}: robot")
-        super().__init__(robot, MotionModelSettings.from_json(about.get("settings"), f"{where}: settings"))
+        location = str(folder / f"{name}.json")
+        robot = RobotIdentity.from_json(about.get("robot"), f"{location}: robot")
+        super().__init__(robot, MotionModelSettings.from_json(about.get("settings"), f"{location}: settings"))
         parts = exported_files(folder, name, about)
         needed = {".onnx"} if self.settings.encoder is None else {".onnx", ".encoder.onnx"}
         if parts.keys() != needed:
-            raise InputError(f"{where} names the ONNX files {sorted(parts)}; it must name {sorted(needed)}")
+            raise InputError(
+                f"{location} names the ONNX files {sorted(parts)}; it must name {sorted(needed)}"
+            )
         networks = {ending: OnnxNetwork(data, f"{folder / name}{ending}") for ending, data in parts.items()}
         self._denoiser, self._encoder = networks[".onnx"], networks.get(".encoder.onnx")
         initial = Statistics.without_data(self.waypoints, self.dof)
         self._statistics = initial._replace(**read_arrays(folder, name, about, Statistics._fields))
-        self._check_sizes(where)
+        self._check_sizes(location)
 
     def _check_sizes(self, where: str) -> None:
         """Raises InputError unless networks and statistics fit the description."""

@@ -56,8 +56,8 @@ class MotionNetwork(Network, MotionModel):
         MotionModel.__init__(self, robot, settings)
         fitted = settings.target != "limits"
         for name, values in Statistics.without_data(self.waypoints, self.dof)._asdict().items():
-            kept = fitted and (name != "residual_mean" or settings.target == "absolute")
-            self.register_buffer(name, torch.from_numpy(values), persistent=kept)
+            persistent = fitted and (name != "residual_mean" or settings.target == "absolute")
+            self.register_buffer(name, torch.from_numpy(values), persistent=persistent)
         self.encoder = (
             None if settings.encoder is None else make_encoder(settings.encoder, settings.encoder_settings)
         )
@@ -155,13 +155,13 @@ class MotionNetwork(Network, MotionModel):
         }
         if self.null_condition is not None:
             inputs["dropped"] = torch.zeros(3, dtype=torch.bool)
-        found = {".onnx": exported(self, self.denoise, inputs, {name: {0: "batch"} for name in inputs})}
+        files = {".onnx": exported(self, self.denoise, inputs, {name: {0: "batch"} for name in inputs})}
         if self.encoder is not None:
             settings = self.encoder.settings
             cloud = {"cloud": torch.rand(1, settings.cloud, 3)}
             axes = {"cloud": {1: "points"}} if settings.any_size else {}
-            found[".encoder.onnx"] = exported(self.encoder, self.encoder.code_of_ordered, cloud, axes)
-        return found
+            files[".encoder.onnx"] = exported(self.encoder, self.encoder.code_of_ordered, cloud, axes)
+        return files
 
     def joints_at(
         self,

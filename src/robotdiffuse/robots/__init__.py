@@ -79,10 +79,10 @@ def _read(folder: Path, source: str | None) -> Robot:
 def _state(file: Path) -> tuple[int, int, int] | None:
     """Modification time, size and inode of a file, to detect changes; None if it does not exist."""
     try:
-        found = file.stat()
+        status = file.stat()
     except (OSError, ValueError):
         return None
-    return found.st_mtime_ns, found.st_size, found.st_ino
+    return status.st_mtime_ns, status.st_size, status.st_ino
 
 
 @lru_cache
@@ -114,20 +114,20 @@ def _from_urdf(urdf: Path) -> Robot:
     tree = UrdfTree(urdf, {})
     source = str(urdf.resolve())
     digest = tree.digest
-    made: dict[str, Robot] = {}
+    robots: dict[str, Robot] = {}
     for name, folder in _added().items():
         try:
             if _digest(folder, _state(folder / ROBOT_FILE)) == digest:
-                made[name] = _read(folder, source)
+                robots[name] = _read(folder, source)
         except InputError:
             continue  # the damaged folder of another robot must not matter here
-    if len({(robot_fingerprint(robot), json.dumps(robot.poses)) for robot in made.values()}) > 1:
+    if len({(robot_fingerprint(robot), json.dumps(robot.poses)) for robot in robots.values()}) > 1:
         raise InputError(
-            f"{urdf} was added as {', '.join(made)}, which differ in joints, limits, spheres, allowed pairs "
-            f"or poses; use one of these names instead, or delete the others in {user_robots()}"
+            f"{urdf} was added as {', '.join(robots)}, which differ in joints, limits, spheres, allowed "
+            f"pairs or poses; use one of these names instead, or delete the others in {user_robots()}"
         )
-    if made:
-        return next(iter(made.values()))
+    if robots:
+        return next(iter(robots.values()))
     report = add_robot(urdf, out=user_robots() / f"{tree.name}-{digest[:8]}")
     note = f"spheres were fitted to {urdf.name} ({report.sphere_count}) and stored in {report.folder}"
     return replace(report.robot, notes=(*report.robot.notes, note), source=source)

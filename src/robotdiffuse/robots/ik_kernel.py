@@ -247,10 +247,10 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
     A = np.zeros((6, 6))
     y = np.zeros(6)
     step = np.zeros(dof)
-    held = np.zeros(dof, dtype=np.bool_)
+    fixed = np.zeros(dof, dtype=np.bool_)
     trial = np.empty(dof)
-    found = np.empty((len(known) + wanted, dof))
-    found[: len(known)] = known
+    solutions = np.empty((len(known) + wanted, dof))
+    solutions[: len(known)] = known
     count = len(known)
     used = 0
     for s in range(len(seeds)):
@@ -261,7 +261,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
         damping = INITIAL_DAMPING
         checked = cost
         solved = False
-        fresh = True
+        new_seed = True
         for iteration in range(max_iterations):
             position = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
             rotation = np.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2) / rotation_weight
@@ -272,20 +272,20 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
                 if cost > REQUIRED_PROGRESS * REQUIRED_PROGRESS * checked:
                     break
                 checked = cost
-            if fresh:
+            if new_seed:
                 _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J)
-                fresh = False
+                new_seed = False
             # hold joints that the step would push through a limit, and solve for the others again
-            held[:] = False
-            damped_step(J, error, damping * cost, rows, frame, held, A, y, step)
-            again = False
+            fixed[:] = False
+            damped_step(J, error, damping * cost, rows, frame, fixed, A, y, step)
+            limit_hit = False
             for j in range(frame):
                 if kinds[j] != CONTINUOUS and (
                     (q[j] <= lower[j] and step[j] < 0.0) or (q[j] >= upper[j] and step[j] > 0.0)
                 ):
-                    held[j] = again = True
-            if again:
-                damped_step(J, error, damping * cost, rows, frame, held, A, y, step)
+                    fixed[j] = limit_hit = True
+            if limit_hit:
+                damped_step(J, error, damping * cost, rows, frame, fixed, A, y, step)
             for j in range(dof):
                 trial[j] = q[j]
                 if j < frame:
@@ -299,7 +299,7 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
                 error[:] = trial_error
                 cost = trial_cost
                 damping = max(damping * DAMPING_DECREASE, MIN_DAMPING)
-                fresh = True
+                new_seed = True
             else:
                 damping *= DAMPING_INCREASE
         if not solved:
@@ -307,12 +307,12 @@ def solve_seeds(seeds, known, wanted, chain, target, parameters):
         for j in range(dof):
             if kinds[j] == CONTINUOUS:
                 q[j] = min(max((q[j] + np.pi) % TURN - np.pi, lower[j]), upper[j])
-        if _is_new(q, found, count, kinds, min_distance):
-            found[count] = q
+        if _is_new(q, solutions, count, kinds, min_distance):
+            solutions[count] = q
             count += 1
-            if count == len(found):
+            if count == len(solutions):
                 break
-    return found[len(known) : count], used
+    return solutions[len(known) : count], used
 
 
 @kernel()
@@ -331,11 +331,11 @@ def follow(start, goal, steer, longest, targets, chain, parameters):
         seed[0] = rows[k]
         if steer:
             seed[0] += (goal - rows[k]) / (len(targets) - k)
-        found = solve_seeds(seed, none, 1, chain, targets[k], parameters)[0]
-        if len(found) == 0:
+        solutions = solve_seeds(seed, none, 1, chain, targets[k], parameters)[0]
+        if len(solutions) == 0:
             return rows[: k + 1].copy()
         for j in range(dof):
-            step = found[0, j] - rows[k, j]
+            step = solutions[0, j] - rows[k, j]
             if chain.kinds[j] == CONTINUOUS:
                 step -= TURN * np.round(step / TURN)
             if abs(step) > longest:

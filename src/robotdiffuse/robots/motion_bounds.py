@@ -20,23 +20,23 @@ def sliding_maximum(support, first, width):
     """Largest value [n, rows, columns] among `width` longitudes, beginning `first` after each longitude."""
     n, rows, columns = support.shape
     out = np.empty_like(support)
-    wide = np.empty(columns)
+    maxima = np.empty(columns)
     next_wide = np.empty(columns)
     for i in range(n):
         for row in range(rows):
             for k in range(columns):
-                wide[k] = support[i, row, (k + first) % columns]
-            done = 1
-            while done < width:  # maxima over 2 n neighbours from maxima over n
-                shift = min(done, width - done)
+                maxima[k] = support[i, row, (k + first) % columns]
+            covered = 1
+            while covered < width:  # maxima over 2 n neighbours from maxima over n
+                shift = min(covered, width - covered)
                 for k in range(columns - shift):
-                    next_wide[k] = max(wide[k], wide[k + shift])
+                    next_wide[k] = max(maxima[k], maxima[k + shift])
                 for k in range(columns - shift, columns):
-                    next_wide[k] = max(wide[k], wide[k + shift - columns])
-                wide, next_wide = next_wide, wide
-                done += shift
+                    next_wide[k] = max(maxima[k], maxima[k + shift - columns])
+                maxima, next_wide = next_wide, maxima
+                covered += shift
             for k in range(columns):  # assigning the array would compile Numba's messages on shapes
-                out[i, row, k] = wide[k]
+                out[i, row, k] = maxima[k]
     return out
 
 
@@ -82,8 +82,8 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     axis is convex, so using the support function, which is that of the convex hull, loses nothing.
     """
     links = [link for link in robot.link_names if link in robot.spheres]
-    known = motion_radii(robot.bare) if robot.bare is not None else np.zeros((0, robot.dof))
-    links = links[len(known) :]  # attached bodies come last
+    bare_radii = motion_radii(robot.bare) if robot.bare is not None else np.zeros((0, robot.dof))
+    links = links[len(bare_radii) :]  # attached bodies come last
     frames = np.array([robot.link_frame(link) for link in links], dtype=int)
     radii = np.zeros((len(links), robot.dof))
     directions = _directions()
@@ -120,7 +120,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
         h = interpolated(h.reshape(len(moved), -1), *interpolation, r)
         support[moved] = h.reshape(-1, ROWS, COLUMNS) + directions @ offset[:3, 3]
         farthest[moved] = r + np.linalg.norm(offset[:3, 3])
-    radii = np.concatenate([known, radii])
+    radii = np.concatenate([bare_radii, radii])
     radii.setflags(write=False)
     return radii
 

@@ -38,16 +38,16 @@ def load_visual(robot: Robot) -> dict[str, tuple[VisualMesh, ...]]:
     robot that was planned for. It may be smaller on links that no planned joint moves.
     """
     bundled = _read_bundled(robot.name)
-    drawn: dict[str, tuple[VisualMesh, ...]] = {}
+    meshes: dict[str, tuple[VisualMesh, ...]] = {}
     colors = {body.name: TOOL_COLOR if body.tool else HELD_COLOR for body in robot.attached}
     for link in robot.link_names:
         collision = _collision_geometry(robot, link, colors.get(link, LINK_COLOR))
         visual = bundled.get(link)
         if visual is not None and (not collision or _agree(visual, collision, robot.link_frame(link) > 0)):
-            drawn[link] = (visual,)
+            meshes[link] = (visual,)
         elif collision:
-            drawn[link] = collision
-    return drawn
+            meshes[link] = collision
+    return meshes
 
 
 def _collision_geometry(robot: Robot, link: str, color: tuple[int, int, int]) -> tuple[VisualMesh, ...]:

@@ -41,17 +41,19 @@ def check_fields(
     Raises InputError unless it is a mapping with all required and no unknown fields.
     """
     required = tuple(required)
-    known = tuple(dict.fromkeys((*required, *optional)))
+    field_names = tuple(dict.fromkeys((*required, *optional)))
     if not isinstance(data, dict):
-        raise InputError(f"{where} is {shown(data)}; it must be a mapping with the fields {', '.join(known)}")
-    if "rpy" in data and "wxyz" in known:
+        raise InputError(
+            f"{where} is {shown(data)}; it must be a mapping with the fields {', '.join(field_names)}"
+        )
+    if "rpy" in data and "wxyz" in field_names:
         data = _without_rpy(where, data)
     for name in data:
-        if name not in known:
-            raise unknown_name(f"field of {where}:", name, known)
+        if name not in field_names:
+            raise unknown_name(f"field of {where}:", name, field_names)
     missing = [name for name in required if name not in data]
     if missing:
-        raise InputError(f"{where} has no {' and no '.join(missing)}; known fields: {', '.join(known)}")
+        raise InputError(f"{where} has no {' and no '.join(missing)}; known fields: {', '.join(field_names)}")
     return data
 
 
@@ -81,16 +83,16 @@ def read_scene(
     shapes: list[Shape] = []
     notes: list[str] = []
     for i, entry in enumerate(entries):
-        where = f"{field}[{i}]"
+        location = f"{field}[{i}]"
         if not isinstance(entry, dict) or len(entry) != 1:
             raise InputError(
-                f"{where} is {shown(entry)}; it must be one shape, e.g. {{sphere: {{...}}}}; "
+                f"{location} is {shown(entry)}; it must be one shape, e.g. {{sphere: {{...}}}}; "
                 f"known: {', '.join(SHAPES)}"
             )
         [(kind, values)] = entry.items()
         if kind not in SHAPES:
-            raise unknown_name(f"shape in {where}:", kind, SHAPES)
-        shapes.append(_shape(f"{where}.{kind}", SHAPES[kind], values, folder, notes))
+            raise unknown_name(f"shape in {location}:", kind, SHAPES)
+        shapes.append(_shape(f"{location}.{kind}", SHAPES[kind], values, folder, notes))
     return Scene(shapes, contacts), tuple(notes)  # type: ignore[arg-type]
 
 

@@ -140,9 +140,9 @@ class AccessControl:
         host = request.headers.get("host", "")
         if self.settings.on_loopback and not _is_local(host):
             return _error(421, f"the host is {shown(host)}; this server is known as localhost")
-        given = request.headers.get("authorization", "")
+        authorization = request.headers.get("authorization", "")
         token = self.settings.token
-        if token and not secrets.compare_digest(given.encode(), f"Bearer {token}".encode()):
+        if token and not secrets.compare_digest(authorization.encode(), f"Bearer {token}".encode()):
             return _error(
                 401, "the header Authorization must be: Bearer TOKEN", **{"WWW-Authenticate": "Bearer"}
             )
@@ -283,12 +283,12 @@ def _add_requests(app: FastAPI, pool: WorkerPool, settings: ServeSettings) -> No
 
 
 def _add_lists(app: FastAPI, pool: WorkerPool, robots: dict[str, Robot]) -> None:
-    known = [robot_info(name, robot) for name, robot in robots.items()]
+    entries = [robot_info(name, robot) for name, robot in robots.items()]
     errors = _errors(401, 421)
 
     @app.get("/robots", summary="List the robots that problems may name", responses=errors)
     async def list_robots() -> list[RobotInfo]:
-        return known
+        return entries
 
     @app.get("/planners", summary="List the planners that requests may name", responses=errors)
     async def list_planners() -> list[PlannerInfo]:
@@ -382,9 +382,9 @@ async def read_body(request: Request, pool: WorkerPool, kind: str) -> bytes:
     """The body of a request. Raises RequestError if it is too large or not of Content-Type `kind`, or if too
     much data of other requests is arriving. `Connection` ends requests that arrive slowly."""
     max_size = pool.settings.max_request_size
-    given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if given != kind:
-        raise RequestError(415, f"Content-Type is {shown(given)}; it must be {kind}")
+    content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if content_type != kind:
+        raise RequestError(415, f"Content-Type is {shown(content_type)}; it must be {kind}")
     too_large = RequestError(
         413, f"the request is too large: it may have {max_size} bytes", Connection="close"
     )

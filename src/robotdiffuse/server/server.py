@@ -90,8 +90,10 @@ async def _serve(
         if task.cancelled() or task.exception() is not None:
             server.should_exit = True
         else:
-            others = settings.workers - 1
-            starting_too = f"; {others} more {'is' if others == 1 else 'are'} starting" if others else ""
+            remaining = settings.workers - 1
+            starting_too = (
+                f"; {remaining} more {'is' if remaining == 1 else 'are'} starting" if remaining else ""
+            )
             say(f"ready, with 1 worker{starting_too}")
 
     say(f"listening on {_address(listener)}; loading compiled code (about a minute on a new machine)")

@@ -83,8 +83,8 @@ def prepare(robots: dict[str, Robot], settings: ServeSettings) -> bool:
     """Set up a new worker process. Returns whether it compiled code: then another one that loads the code
     from the cache takes its place, so that all workers give the same numbers, bit for bit."""
     accept(robots, settings)
-    most = settings.max_worker_memory
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    memory_limit = settings.max_worker_memory
+    resource.setrlimit(resource.RLIMIT_DATA, (memory_limit, memory_limit))
     # service managers signal all processes; the server ends its workers itself
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     return warm_up()
@@ -133,8 +133,8 @@ def _answer_of(state: _State, endpoint: str, body: bytes) -> Answer:
     except Cancelled:
         raise
     except MemoryError:
-        most = f"{state.settings.max_worker_memory / MEGABYTE:.0f} MB"
-        return failed(TOO_LARGE, f"the request needs more memory than a worker may use, {most}")
+        limit_text = f"{state.settings.max_worker_memory / MEGABYTE:.0f} MB"
+        return failed(TOO_LARGE, f"the request needs more memory than a worker may use, {limit_text}")
     except BaseException as error:  # a SystemExit of a planner would end the server's event loop
         traceback.print_exc(file=sys.stderr)
         return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
@@ -171,12 +171,12 @@ def _record(body: bytes) -> object:
 
 def _problem(state: _State, record: Any) -> Problem:
     """The problem of a request. Raises InputError if it is wrong or too large."""
-    for name, most in MAX_ENTRIES.items() if isinstance(record, dict) else ():
+    for name, max_entries in MAX_ENTRIES.items() if isinstance(record, dict) else ():
         value = record.get(name)
         if name == "goal" and isinstance(value, dict) and len(value) == 1:
             [value] = value.values()
-        if isinstance(value, list | dict) and len(value) > most:
-            raise InputError(f"problem.{name} has {len(value)} entries; a request may have {most}")
+        if isinstance(value, list | dict) and len(value) > max_entries:
+            raise InputError(f"problem.{name} has {len(value)} entries; a request may have {max_entries}")
     return problem_from_record(record, state.robots)
 
 
@@ -184,11 +184,11 @@ def answer_plan(state: _State, body: bytes) -> Answer:
     """The answer to a request to plan. Raises InputError for a bad request."""
     began = time.monotonic()
     requested = check_fields("the request", _record(body), ("problem",), ARGUMENTS)
-    given = {name: value for name, value in requested.items() if name in CALL_ARGUMENTS}
-    request = PlanRequest(**given)
+    call_arguments = {name: value for name, value in requested.items() if name in CALL_ARGUMENTS}
+    request = PlanRequest(**call_arguments)
     if request.time_limit > state.settings.max_time_limit:
-        most = f"it must be at most {state.settings.max_time_limit:g} s here"
-        raise InputError(f"time_limit is {shown(request.time_limit)}; {most}")
+        rule = f"it must be at most {state.settings.max_time_limit:g} s here"
+        raise InputError(f"time_limit is {shown(request.time_limit)}; {rule}")
     rate = requested.get("rate")
     if rate is not None:
         check_sample_rate(rate)
@@ -203,7 +203,7 @@ def answer_plan(state: _State, body: bytes) -> Answer:
     planner.prepare(problem.robot)
     _warm_up_once(planner, problem, requested["problem"]["robot"])
     allow(limit - reading)
-    result: PlanResult = planner.plan(problem, **given)
+    result: PlanResult = planner.plan(problem, **call_arguments)
     record = result.record()
     if rate is not None and result.trajectory is not None:
         motion = _resampled(problem, result.trajectory, rate)

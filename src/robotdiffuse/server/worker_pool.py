@@ -70,8 +70,8 @@ class WorkerPool:
     def admit(self, count: int) -> Iterator[None]:
         """Count `count` requests as admitted within the block. Raises QueueFullError if the queue lacks
         room."""
-        most = self.settings.workers + self.settings.queue
-        if self.admitted + count > most:
+        capacity = self.settings.workers + self.settings.queue
+        if self.admitted + count > capacity:
             waiting = self.admitted / self.settings.workers
             raise QueueFullError(max(1.0, waiting * self._request_seconds))
         self.admitted += count

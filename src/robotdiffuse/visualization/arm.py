@@ -88,8 +88,8 @@ def facts(
     rows = []
     if result is not None:
         rows.append(("status", result.status.value.replace("_", " ")))
-        same = result.stage in ("", result.planner)
-        rows.append(("planner", result.planner if same else f"{result.planner} · {result.stage}"))
+        same_planner = result.stage in ("", result.planner)
+        rows.append(("planner", result.planner if same_planner else f"{result.planner} · {result.stage}"))
         rows.append(("planning time", f"{1e3 * result.planning_time:.0f} ms"))
     rows.append(("path length", f"{length:.2f} rad"))
     if result is not None and result.min_clearance is not None:

@@ -118,13 +118,13 @@ def best_view(
     near = np.linalg.norm(obstacles.vertices - middle, axis=1) < MAX_FRAMING_DISTANCE
     points = np.concatenate([moving, obstacles.vertices[near]])
     points = points[ConvexHull(points, qhull_options="QJ").vertices]
-    small = (160, max(1, 160 * size[1] // size[0]))
+    thumbnail_size = (160, max(1, 160 * size[1] // size[0]))
     best = _direction(0.0, ELEVATIONS[0])
     best_score = -1.0
     around = np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS) if azimuth is None else np.array([azimuth])
     for elevation in ELEVATIONS:
         for angle in around:
-            camera = framed(points, _direction(angle, elevation), small, free)
+            camera = framed(points, _direction(angle, elevation), thumbnail_size, free)
             score = _score(camera, arm, ghosts, trace, obstacles)
             if score > best_score:
                 best = _direction(angle, elevation)
@@ -153,8 +153,8 @@ def _score(
     hidden, _, _ = drawn_by(camera, obstacles)
     score = 0.0
     for part, weight in ((arm, 1.0), (ghosts, 0.5)):
-        drawn, _, _ = drawn_by(camera, part)
-        score += weight * float((drawn > hidden).sum() / max(1, (drawn > 0).sum()))
+        nearness, _, _ = drawn_by(camera, part)
+        score += weight * float((nearness > hidden).sum() / max(1, (nearness > 0).sum()))
     pixels = camera.project(trace)
     column = pixels[:, 0].astype(int)
     row = pixels[:, 1].astype(int)

@@ -85,12 +85,12 @@ def shares(known: RecordedView) -> list[tuple[str, str]]:
 
 def moments(explorer: RecordedExplorer) -> list[Moment]:
     """All acts for which something was known, in order."""
-    known = []
+    recorded = []
     for number, act in enumerate(explorer.acts):
         before = [view for view in explorer.views if view.act < number]
         if before:
-            known.append(Moment(number + 1, act, before[-1]))
-    return known
+            recorded.append(Moment(number + 1, act, before[-1]))
+    return recorded
 
 
 def title(act: RecordedAct) -> str:
@@ -171,9 +171,9 @@ def faces_between(inside: Voxels, outside: Voxels) -> tuple[Int[ndarray, "n"], B
         backward = forward.copy()
         forward[tuple(before)] = inside[tuple(before)] & outside[tuple(after)]
         backward[tuple(before)] = outside[tuple(before)] & inside[tuple(after)]
-        found = np.flatnonzero(forward | backward)
-        numbers.append(found + axis * inside.size)
-        first.append(forward.reshape(-1)[found])
+        faces = np.flatnonzero(forward | backward)
+        numbers.append(faces + axis * inside.size)
+        first.append(forward.reshape(-1)[faces])
     return np.concatenate(numbers), np.concatenate(first)
 
 
@@ -205,13 +205,13 @@ def write_exploration_picture(
     moment. Raises InputError for another ending or a file that cannot be written.
     """
     path = check_output(file, (".png",))
-    shown = moments(explorer)
-    chosen = _chosen(len(shown))
-    whole = np.concatenate([moment.act.waypoints for moment in shown])
+    all_moments = moments(explorer)
+    chosen = _chosen(len(all_moments))
+    waypoints = np.concatenate([moment.act.waypoints for moment in all_moments])
     size = settings.width, settings.height
-    camera = view_of_motion(DrawnArm(explorer.robot), drawables(scene), whole, size, MARGINS)
-    known = in_known_scene(explorer)
-    tiles = [_tile(explorer, shown[i], known, camera, settings) for i in chosen]
+    camera = view_of_motion(DrawnArm(explorer.robot), drawables(scene), waypoints, size, MARGINS)
+    in_scene = in_known_scene(explorer)
+    tiles = [_tile(explorer, all_moments[i], in_scene, camera, settings) for i in chosen]
     save_png(_joined(tiles), path)
 
 
@@ -231,10 +231,10 @@ def _tile(
 ) -> Image.Image:
     robot = explorer.robot
     act = moment.act
-    shown = shown_voxels(moment.known, act, known)
+    voxels = shown_voxels(moment.known, act, known)
     occupied, predicted, unknown = (
         faces_surface(*pair, color)
-        for pair, color in zip(shown.layers, (OBSERVED, WHITE, WHITE), strict=True)
+        for pair, color in zip(voxels.layers, (OBSERVED, WHITE, WHITE), strict=True)
     )
     clear = [
         ClearSurface(unknown, linear(UNKNOWN), UNKNOWN_ALPHA),
@@ -244,13 +244,13 @@ def _tile(
     motion = act.trajectory or Path(robot.joint_names, act.waypoints)
     pixels, _ = render(robot, explorer.scene, motion, settings, camera, added=(occupied, *look), clear=clear)
     image = Image.fromarray(faded_below(pixels, *FADE))
-    drawn = {
+    legend = {
         "occupied": OBSERVED,
         **({} if act.predicted is None else {"predicted": ASSUMED}),
         **({"next look": LOOK_COLOR} if look else {}),
     }
-    facts = [*shares(moment.known), *((name, "") for name in drawn)]
-    colors = (*SHARE_COLORS, *drawn.values())
+    facts = [*shares(moment.known), *((name, "") for name in legend)]
+    colors = (*SHARE_COLORS, *legend.values())
     caption(image, f"{moment.number}  {title(moment.act)}", facts, colors, CAPTION_SIZE)
     return image
 

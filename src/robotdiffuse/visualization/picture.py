@@ -131,8 +131,8 @@ def write_comparison(
     path = check_output(file, (".png",))
     if not 0 < len(motions) <= len(COMPARED):
         raise InputError(f"{len(motions)} motions; a picture shows 1 to {len(COMPARED)}")
-    first, *others = motions.values()
-    pixels, _ = render(robot, scene, first, settings or PictureSettings(), others=others, moving=moving)
+    first, *further = motions.values()
+    pixels, _ = render(robot, scene, first, settings or PictureSettings(), others=further, moving=moving)
     figures = [", ".join(v for k, v in facts(m, None) if v != "untimed") for m in motions.values()]
     captions = list(zip(motions, figures, strict=True))
     write_captioned(pixels, path, title or robot.name, captions, COMPARED)
@@ -188,7 +188,9 @@ def render(
         size = settings.width, settings.height
         faint = join([ghost for ghost, _ in ghosts])
         camera = best_view(goal, faint, traces[0], surroundings, size, MARGINS, settings.azimuth)
-    big = Camera(camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height)
+    large_camera = Camera(
+        camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height
+    )
     colors = [(color, color) for color in COMPARED] if others else [(START, GOAL)]
     tubes = [tube(points, *of) for points, of in zip(traces, colors, strict=False)]
     over = []
@@ -197,13 +199,13 @@ def render(
         # the first obstacle is drawn over the others
         for one in reversed([one for one in obstacles if one.moving is not None and one.moving.known]):
             over += [ClearSurface(one.surface_at(time), linear(one.color), MOVED_ALPHA) for time in times]
-    ghosts.sort(key=lambda ghost: -float(np.linalg.norm(ghost[0].vertices.mean(0) - big.eye)))
+    ghosts.sort(key=lambda ghost: -float(np.linalg.norm(ghost[0].vertices.mean(0) - large_camera.eye)))
     for ghost, share in ghosts:
         color = linear(START) * (1 - share) + linear(GOAL) * share
         over.append(ClearSurface(ghost, color, 0.50 if share == 0 else 0.26))
     if settings.shell:
         over.append(ClearSurface(_shell(arm, q[-1], settings.shell), linear(SHELL_COLOR), SHELL_ALPHA))
-    image = _paint(big, join([goal, surroundings, *tubes, *added]), [*clear, *over])
+    image = _paint(large_camera, join([goal, surroundings, *tubes, *added]), [*clear, *over])
     s = SUPERSAMPLING
     image = image.reshape(settings.height, s, settings.width, s, 3).mean(axis=(1, 3))
     return _to_srgb(image), camera
@@ -248,9 +250,9 @@ def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Flo
     lattice = light_lattice(LIGHT_SPACING, *seen, view, ground[0], sky, key)
     shade(image, lattice, LIGHT_SPACING, *seen, colors, view, ground, background, sky, key, light)
     for one in clear:
-        own, shown, screen = drawn_by(camera, one.surface)
+        nearness, face_ids, screen = drawn_by(camera, one.surface)
         arrays = one.surface.faces, one.surface.normals, _linear_array(one.surface.colors)
-        blend_ghost(image, near, own, shown, screen, *arrays, view, toward, one.tint, one.alpha)
+        blend_ghost(image, near, nearness, face_ids, screen, *arrays, view, toward, one.tint, one.alpha)
     return image
 
 
@@ -382,15 +384,15 @@ def caption(
     enlarged: factor of the size of the letters."""
     scale = enlarged * image.width / 1600
     pen = ImageDraw.Draw(image)
-    big = ImageFont.load_default(max(8, 30 * scale))
-    small = ImageFont.load_default(max(7, 19 * scale))
-    left = 44 * scale
+    title_font = ImageFont.load_default(max(8, 30 * scale))
+    label_font = ImageFont.load_default(max(7, 19 * scale))
+    pen_x = 44 * scale
     bottom = image.height - 40 * scale
-    pen.text((left, bottom - 30 * scale), title, fill=(0x22, 0x2B, 0x38), font=big, anchor="ls")
+    pen.text((pen_x, bottom - 30 * scale), title, fill=(0x22, 0x2B, 0x38), font=title_font, anchor="ls")
     for i, (label, value) in enumerate(facts):
         for text, fill, gap in (
             (label, colors[i] if colors else (0x8A, 0x93, 0xA0), 7),
             (value, (0x3A, 0x45, 0x54), 22),
         ):
-            pen.text((left, bottom), text, fill=fill, font=small, anchor="ls")
-            left += small.getlength(text) + gap * scale
+            pen.text((pen_x, bottom), text, fill=fill, font=label_font, anchor="ls")
+            pen_x += label_font.getlength(text) + gap * scale

@@ -61,7 +61,7 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
     framed = scene.with_shapes([*scene.shapes, *near_poses])  # what the camera shows
     arm = DrawnArm(robot)
     marks = [*_colliding_links(arm, states, list(validities.values())), *_axes(T_world_poses)]
-    facts = [(what, state.reason or "free") for what, state in validities.items()]
+    facts = [(label, state.reason or "free") for label, state in validities.items()]
     if result is not None and all(validities.values()):
         facts = [("reason", shortened(result.reason))]
     status = "" if result is None else f" · {result.status.value.replace('_', ' ')}"

@@ -183,19 +183,19 @@ def _gathered(lattice, spacing, row, column, depth, nx, ny, nz, solid):
     y = row / spacing
     x = column / spacing
     top = int(y)
-    left = int(x)
+    first_column = int(x)
     sky = 0.0
     key = 0.0
     total = 0.0
     for i in range(2):
         for j in range(2):
-            if top + i >= lattice.shape[0] or left + j >= lattice.shape[1]:
+            if top + i >= lattice.shape[0] or first_column + j >= lattice.shape[1]:
                 continue
-            at = lattice[top + i, left + j]
+            at = lattice[top + i, first_column + j]
             alike = nx * at[1] + ny * at[2] + nz * at[3]
             if (at[6] > 0.5) != solid or alike < 0.96 or (solid and abs(at[0] - depth) > 0.015 * depth):
                 continue
-            weight = (1 - abs(y - top - i)) * (1 - abs(x - left - j))
+            weight = (1 - abs(y - top - i)) * (1 - abs(x - first_column - j))
             sky += weight * at[4]
             key += weight * at[5]
             total += weight
@@ -274,11 +274,13 @@ def shade(
                 stripe = max(0.4 * _grid(x, y, 0.25, 0.003, footprint), _grid(x, y, 1.0, 0.005, footprint))
             for c in range(3):
                 if solid:
-                    own = u * colors[faces[f, 0], c] + v * colors[faces[f, 1], c] + t * colors[faces[f, 2], c]
+                    base_color = (
+                        u * colors[faces[f, 0], c] + v * colors[faces[f, 1], c] + t * colors[faces[f, 2], c]
+                    )
                 else:
-                    own = base[c] + stripe * (line[c] - base[c])
+                    base_color = base[c] + stripe * (line[c] - base[c])
                 lit = light[0][c] * q + light[1][c] * s + light[2][c] * (0.5 - 0.5 * nz)
-                image[row, column, c] += mix * (own * lit + gloss - image[row, column, c])
+                image[row, column, c] += mix * (base_color * lit + gloss - image[row, column, c])
 
 
 @kernel()
@@ -304,6 +306,6 @@ def blend_ghost(image, solid, near, ident, screen, faces, normals, colors, camer
             bright = 0.62 + 0.38 * max(0.0, (nx * toward[0] + ny * toward[1] + nz * toward[2]) / length)
             cover = min(1.0, alpha * (0.7 + 1.1 * (1 - abs(facing)) ** 2))
             for c in range(3):
-                own = u * colors[i, c] + v * colors[j, c] + t * colors[k, c]
-                value = bright * tint[c] * (0.45 + 0.55 * own)
+                base_color = u * colors[i, c] + v * colors[j, c] + t * colors[k, c]
+                value = bright * tint[c] * (0.45 + 0.55 * base_color)
                 image[row, column, c] += cover * (value - image[row, column, c])

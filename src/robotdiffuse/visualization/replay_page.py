@@ -131,10 +131,10 @@ def _thinned(
     times: Float[ndarray, "n"], positions: Float[ndarray, "n dof"]
 ) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
     """At most MAX_ROW_RATE rows per second and MAX_ROWS in all; shorter motions stay unchanged."""
-    most = int(min(MAX_ROWS, max(2, np.ceil(MAX_ROW_RATE * times[-1]) + 1)))
-    if len(times) <= most:
+    max_rows = int(min(MAX_ROWS, max(2, np.ceil(MAX_ROW_RATE * times[-1]) + 1)))
+    if len(times) <= max_rows:
         return times, positions
-    at = np.linspace(0, times[-1], most)
+    at = np.linspace(0, times[-1], max_rows)
     return at, interpolated(at, times, positions)
 
 
@@ -193,14 +193,14 @@ def page_surface(name: str, surface: Surface, color: Color) -> dict[str, Any]:
 def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:
     """Geometry in base64: 16-bit vertices, 8-bit normals and colours."""
     low, step, vertices = _quantised(surface.vertices)
-    wide = len(surface.vertices) >= 2**16
+    wide_indices = len(surface.vertices) >= 2**16
     packed = {
         "low": low,
         "step": step,
         "vertices": vertices,
         "normals": _base64(np.round(127 * surface.normals).astype(np.int8)),
-        "faces": _base64(surface.faces.astype("<u4" if wide else "<u2")),
-        "wide": wide,
+        "faces": _base64(surface.faces.astype("<u4" if wide_indices else "<u2")),
+        "wide": wide_indices,
     }
     return (
         packed | {"colors": _base64(np.round(255 * surface.colors).astype(np.uint8))} if colored else packed

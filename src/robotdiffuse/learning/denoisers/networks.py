@@ -296,9 +296,9 @@ class ResidualBlock(nn.Module):
         self, x: Float[Tensor, "batch waypoints inputs"], condition: Conditions
     ) -> Float[Tensor, "batch waypoints outputs"]:
         scale, shift = self.film(condition)[:, None].float().chunk(2, -1)
-        inner = self.norm_second(self.first(functional.silu(self.norm_first(x))).float())
-        inner = functional.silu(inner * (1 + scale) + shift)
-        return self.skip(x).float() + self.second(inner)
+        hidden = self.norm_second(self.first(functional.silu(self.norm_first(x))).float())
+        hidden = functional.silu(hidden * (1 + scale) + shift)
+        return self.skip(x).float() + self.second(hidden)
 
 
 class UNet(Denoiser):

@@ -169,13 +169,13 @@ class CompletionTask(TrainingTask):
         """The network that training begins with."""
         network = CompletionNetwork(settings.network)
         if settings.weights is not None:
-            given = load_completion(None if settings.weights == BUNDLED_WEIGHTS else settings.weights)
-            if given.settings != settings.network:
+            pretrained = load_completion(None if settings.weights == BUNDLED_WEIGHTS else settings.weights)
+            if pretrained.settings != settings.network:
                 raise InputError(
-                    f"weights {settings.weights} are of a network of {shown(given.settings.to_json())}; the"
-                    f" training is of {shown(settings.network.to_json())}"
+                    f"weights {settings.weights} are of a network of {shown(pretrained.settings.to_json())}; "
+                    f"the training is of {shown(settings.network.to_json())}"
                 )
-            network.load_state_dict(given.state_dict())
+            network.load_state_dict(pretrained.state_dict())
         return network
 
     def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
@@ -247,8 +247,8 @@ class CompletionTask(TrainingTask):
         truth = folded(torch.from_numpy(samples.truth)).reshape(-1)[counted].numpy()
         device = self.processes.device
         with self.processes.autocast():
-            seen, behind = (torch.from_numpy(a).to(device) for a in (samples.seen, samples.behind))
-            logits = self.module(seen, behind)
+            seen, depth_behind = (torch.from_numpy(a).to(device) for a in (samples.seen, samples.behind))
+            logits = self.module(seen, depth_behind)
         rows = logits.reshape(-1, 8).index_select(0, counted.to(device))
         return rows.float(), torch.from_numpy(unpack_fine(truth)).to(device), counted
 
@@ -258,14 +258,14 @@ class CompletionTask(TrainingTask):
 
     def _predictions(self, samples: Samples) -> tuple[Probabilities, Truth, Truth]:
         """Logits and truth of the predicted voxels, and which of them are unknown and above the ground."""
-        found: list[tuple[ndarray, ndarray, ndarray]] = []
+        predictions: list[tuple[ndarray, ndarray, ndarray]] = []
         for part in _split(samples):
             hidden = ((part.seen & OCCUPIED) == 0) & self._above
             with torch.no_grad():
                 logits, truth, counted = self._rows(part, self._counts(part))
             unknown = folded(torch.from_numpy(hidden)).reshape(-1)[counted].numpy().repeat(8)
-            found.append((logits.cpu().numpy().ravel(), truth.cpu().numpy().ravel(), unknown))
-        logits, truth, unknown = (np.concatenate(parts) for parts in zip(*found, strict=True))
+            predictions.append((logits.cpu().numpy().ravel(), truth.cpu().numpy().ravel(), unknown))
+        logits, truth, unknown = (np.concatenate(parts) for parts in zip(*predictions, strict=True))
         return logits, truth, unknown
 
 
@@ -282,18 +282,18 @@ def fitted_temperature(logits: Probabilities, truth: Truth) -> float:
     def loss(log_t: float) -> float:
         return float(np.logaddexp(0, sign * logits * np.float32(np.exp(-log_t))).mean())
 
-    found: Any = minimize_scalar(loss, bounds=(-1.5, 1.5), method="bounded")
-    return float(np.exp(found.x))
+    optimum: Any = minimize_scalar(loss, bounds=(-1.5, 1.5), method="bounded")
+    return float(np.exp(optimum.x))
 
 
 def reliability(p: Probabilities, truth: Truth) -> list[list[float]]:
     """By bin of the predicted probability: its mean, the share of true voxels, and their number."""
-    which = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
-    count = np.bincount(which, minlength=CALIBRATION_BINS)
-    predicted, found = (
-        np.bincount(which, values, CALIBRATION_BINS) / np.maximum(count, 1) for values in (p, truth)
+    bin_indices = np.minimum((p * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
+    count = np.bincount(bin_indices, minlength=CALIBRATION_BINS)
+    predicted, true_share = (
+        np.bincount(bin_indices, values, CALIBRATION_BINS) / np.maximum(count, 1) for values in (p, truth)
     )
-    rows = zip(predicted.tolist(), found.tolist(), count.tolist(), strict=True)
+    rows = zip(predicted.tolist(), true_share.tolist(), count.tolist(), strict=True)
     return [[round(a, 4), round(b, 4), float(n)] for a, b, n in rows]
 
 

@@ -169,13 +169,15 @@ class ArmDistance:
         at = centres.movedim(-1, 0).flatten(2).contiguous()
         obstacles = _obstacles(scenes).to(at)
         with torch.no_grad():  # only the distance to the nearest obstacle has a gradient
-            slot, least = _nearest(at, obstacles, scenes.kinds > 0)
+            slot, nearest_distance = _nearest(at, obstacles, scenes.kinds > 0)
         rows = torch.arange(len(slot), device=slot.device)[:, None]
-        distance = torch.where(least < MAX_DISTANCE, _distance(at, obstacles[:, rows, slot]), MAX_DISTANCE)
+        distance = torch.where(
+            nearest_distance < MAX_DISTANCE, _distance(at, obstacles[:, rows, slot]), MAX_DISTANCE
+        )
         if scenes.floors is not None:
             top = torch.from_numpy(scenes.floors[:, 2] + scenes.floors[:, 5] / 2).to(at)[:, None]
-            there = torch.from_numpy(scenes.floors.any(1)).to(at.device)[:, None]
-            distance = torch.where(there, torch.minimum(distance, at[2] - top), distance)
+            has_floor = torch.from_numpy(scenes.floors.any(1)).to(at.device)[:, None]
+            distance = torch.where(has_floor, torch.minimum(distance, at[2] - top), distance)
         return distance.view(centres.shape[:-1]) - self._radii
 
 
@@ -193,15 +195,15 @@ def _nearest(
     at: Float[Tensor, "3 n points"], obstacles: Float[Tensor, "16 n slots"], present: Bool[ndarray, "n slots"]
 ) -> tuple[Int64[Tensor, "n points"], Float[Tensor, "n points"]]:
     """The slot of the obstacle nearest to each point, and its distance [m], at most MAX_DISTANCE."""
-    least = torch.full_like(at[0], MAX_DISTANCE)
-    slot = torch.zeros_like(least, dtype=torch.int64)
+    min_distance = torch.full_like(at[0], MAX_DISTANCE)
+    slot = torch.zeros_like(min_distance, dtype=torch.int64)
     for j in np.flatnonzero(present.any(0)):
         rows = torch.from_numpy(np.flatnonzero(present[:, j])).to(at.device)
         distance = _distance(at[:, rows], obstacles[:, rows, j, None])
-        before = least[rows]
+        before = min_distance[rows]
         slot[rows] = torch.where(distance < before, int(j), slot[rows])
-        least[rows] = torch.minimum(distance, before)
-    return slot, least
+        min_distance[rows] = torch.minimum(distance, before)
+    return slot, min_distance
 
 
 def _distance(

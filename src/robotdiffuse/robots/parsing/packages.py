@@ -56,9 +56,9 @@ class Packages:
         start = self.urdf.resolve().parent
         if not filename.startswith("package://"):
             name = filename.removeprefix("file://")
-            for found in (start / name, start / unquote(name)):
-                if is_file(found):
-                    return found
+            for resolved in (start / name, start / unquote(name)):
+                if is_file(resolved):
+                    return resolved
             raise InputError(
                 f"{self.urdf}: mesh file {shown(filename)} does not exist; add it, or remove its element"
             )
@@ -97,7 +97,7 @@ def is_xacro(file: Path, root: ET.Element) -> bool:
 def with_prefixes(text: bytes) -> bytes:
     """The XML with undeclared namespace prefixes declared, which simulators' elements such as <drake:member>
     often lack."""
-    used = {found for pair in NAMESPACE_PREFIX.findall(text) for found in pair if found}
+    used = {prefix for pair in NAMESPACE_PREFIX.findall(text) for prefix in pair if prefix}
     missing = sorted(name for name in used - {b"xml", b"xmlns"} if b"xmlns:" + name not in text)
     declared = b"".join(b' xmlns:%s="%s"' % (name, name) for name in missing)
     return text.replace(b"<robot", b"<robot" + declared, 1) if missing else text

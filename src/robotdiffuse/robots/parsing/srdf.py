@@ -64,20 +64,20 @@ class Srdf:
         if group not in self.groups or group in within:
             raise unknown_name(f"group in {self.path}", group, self.groups)
         content = self.groups[group]
-        known = {joint.name for joint in above.values()}
+        joint_names = {joint.name for joint in above.values()}
         for name in content.joints:
-            if name not in known:
-                raise unknown_name(f"joint of group {group} in {self.path}", name, known)
-        found = set(content.joints)
-        found |= {above[link].name for link in content.links if link in above}
+            if name not in joint_names:
+                raise unknown_name(f"joint of group {group} in {self.path}", name, joint_names)
+        names = set(content.joints)
+        names |= {above[link].name for link in content.links if link in above}
         for base, tip in content.chains:
             link = tip
             while link != base:
                 if link not in above:
                     raise InputError(f"{self.path}: group {group}: no joints lead from {base} to {tip}")
-                found.add(above[link].name)
+                names.add(above[link].name)
                 link = above[link].parent
-        return found.union(*(self._named(name, above, (*within, group)) for name in content.groups))
+        return names.union(*(self._named(name, above, (*within, group)) for name in content.groups))
 
     def resting(self) -> dict[str, float]:
         """Values of joints in the poses named in `REST_POSES` [rad] or [m], the first pose that has the
@@ -105,8 +105,8 @@ def srdf_beside(urdf: str | Path, robot: str) -> Path | None:
     none."""
     urdf = Path(urdf)
     names = dict.fromkeys((urdf.name.split(".")[0], robot))
-    found = (urdf.parent / folder / f"{name}.srdf" for name in names for folder in SRDF_FOLDERS)
-    return next((file for file in found if is_file(file)), None)
+    candidates = (urdf.parent / folder / f"{name}.srdf" for name in names for folder in SRDF_FOLDERS)
+    return next((file for file in candidates if is_file(file)), None)
 
 
 def read_srdf(file: str | Path) -> Srdf:
@@ -189,8 +189,8 @@ class Arm:
     def name(self) -> str:
         """The common prefix of the names of the joints after the last branching, or else the tip."""
         columns = zip(*self.joints[-self.own :], strict=False)
-        same = takewhile(lambda letters: len({*letters}) == 1, columns)
-        common = "".join(letters[0] for letters in same).rstrip(SUFFIX_CHARACTERS)
+        common_letters = takewhile(lambda letters: len({*letters}) == 1, columns)
+        common = "".join(letters[0] for letters in common_letters).rstrip(SUFFIX_CHARACTERS)
         return common.removesuffix("joint").rstrip("_-/ ") or self.tip
 
 
@@ -222,10 +222,10 @@ class JointTree:
 
     def arms(self) -> list[Arm]:
         """The arms below the base, or else the longest chains of movable joints."""
-        found = self._arms_from(self.base, (), 0)
-        own = [arm for arm in found if arm.own >= MIN_ARM_JOINTS]
-        longest = max((len(arm.joints) for arm in found), default=0)
-        return own or [arm for arm in found if len(arm.joints) == longest]
+        chains = self._arms_from(self.base, (), 0)
+        arms_with_joints = [arm for arm in chains if arm.own >= MIN_ARM_JOINTS]
+        longest = max((len(arm.joints) for arm in chains), default=0)
+        return arms_with_joints or [arm for arm in chains if len(arm.joints) == longest]
 
     def _arms_from(self, link: str, chain: tuple[str, ...], own: int) -> list[Arm]:
         """Arms that continue a chain of joints at a link; `own` of its joints come after the last
@@ -285,8 +285,10 @@ def planned_joints(
     elif group is not None or tip is None:
         arms = JointTree(base, joints).arms()
         groups = [] if srdf is None else list(srdf.groups)
-        found = _one_arm(file, arms, groups) if group is None else _named_arms(file, arms, group, groups)
-        tips = [tip] if tip else [arm.tip for arm in found] or [base]
+        selected_arms = (
+            _one_arm(file, arms, groups) if group is None else _named_arms(file, arms, group, groups)
+        )
+        tips = [tip] if tip else [arm.tip for arm in selected_arms] or [base]
     else:
         tips = [tip]
     leading = [joint for end in tips for joint in chain(above, end) if joint.kind in MOVING_KINDS]

@@ -77,11 +77,11 @@ class Arm:
             if len(surface.faces) == 0 or (i == 0 and color is not None):
                 continue
             parts = surface.by_color if color is None else [(color, surface)]
-            for k, (own, part) in enumerate(parts):
+            for k, (part_color, part) in enumerate(parts):
                 if opacity is not None:
                     vertices = part.vertices + opacity / GHOST_OPACITY * GHOST_OFFSET * part.normals
                     part = replace(part, vertices=vertices)
-                add_surface(server, f"/{name}/{i}/{k}", part, own, opacity)
+                add_surface(server, f"/{name}/{i}/{k}", part, part_color, opacity)
 
     def show(self, q: Float[ndarray, "dof"] | None) -> None:
         """Show the arm in a configuration; hide it for None."""
@@ -128,10 +128,10 @@ class Obstacles:
             self._nodes.pop(name)[1].remove()
         for one in obstacles:
             key = _appearance(one.shape), one.color, one.name == selected
-            known = self._nodes.get(one.name)
-            if known is None or known[0] != key:
-                if known is not None:
-                    known[1].remove()
+            drawn_node = self._nodes.get(one.name)
+            if drawn_node is None or drawn_node[0] != key:
+                if drawn_node is not None:
+                    drawn_node[1].remove()
                 self._nodes[one.name] = key, self._draw(one, one.name == selected)
             place(self._nodes[one.name][1], one.frame(time))
 
@@ -142,14 +142,14 @@ class Obstacles:
         if selected:
             r, g, b = (round(c + HIGHLIGHT * (255 - c)) for c in color)
             color = r, g, b
-        own = obstacle.own
+        obstacle_frame = obstacle.own
         node = f"/obstacles/{name.encode().hex()}"  # viser takes slashes in names for a tree
-        if isinstance(own.shape, PointCloud):
-            points = thinned(own.shape.points).astype(np.float32)
+        if isinstance(obstacle_frame.shape, PointCloud):
+            points = thinned(obstacle_frame.shape.points).astype(np.float32)
             return self._server.scene.add_point_cloud(
-                node, points, color, point_size=2 * own.shape.point_radius
+                node, points, color, point_size=2 * obstacle_frame.shape.point_radius
             )
-        handle = add_surface(self._server, node, own.surface, color)
+        handle = add_surface(self._server, node, obstacle_frame.surface, color)
         handle.on_click(lambda _event: self._clicked(name))
         return handle
 
@@ -161,8 +161,8 @@ def _appearance(shape: Shape) -> object:
     if isinstance(shape, PointCloud):
         points = shape.points - shape.bounds.mean(axis=0)
         return "points", shape.point_radius, np.round(points, 6).tobytes()
-    known = dimensions(shape)
-    return (shape.kind, *known.items()) if known else id(shape)
+    sizes = dimensions(shape)
+    return (shape.kind, *sizes.items()) if sizes else id(shape)
 
 
 def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | None) -> None:

@@ -231,9 +231,9 @@ class ExplorationSession:
             at = min(at + speed * (now - last), act.duration)
             last = now
             if at > 0:
-                taken = [view for view in views if view.time <= act.begins + at]
+                taken_views = [view for view in views if view.time <= act.begins + at]
                 q = act.trajectory.at(at).positions
-                self._update(run, configuration=q, known=taken[-1])
+                self._update(run, configuration=q, known=taken_views[-1])
 
     def _update(self, run: int, **changes: Any) -> ExplorationState:
         with self._changed:
@@ -392,13 +392,13 @@ class ExplorationPage:
         if known is None:
             return
         occupied, predicted, unknown = shown_voxels(known, act, self._known_scene).layers
-        wanted = None if under_way is None else under_way.step.wanted
-        wanted = np.zeros_like(known.free) if wanted is None else wanted & known.unknown
+        to_view = None if under_way is None else under_way.step.wanted
+        to_view = np.zeros_like(known.free) if to_view is None else to_view & known.unknown
         nothing = np.zeros_like(known.free), known.free
         for name, (inside, outside), color, opacity in (
             ("occupied", occupied, OBSERVED, None),
             ("predicted", predicted, ASSUMED, CLEAR_OPACITY),
-            ("wanted", (wanted, ~wanted), LOOK_COLOR, CLEAR_OPACITY),
+            ("wanted", (to_view, ~to_view), LOOK_COLOR, CLEAR_OPACITY),
             ("unknown", unknown if self._unknown.value else nothing, UNKNOWN, UNKNOWN_OPACITY),
         ):
             surface = faces_surface(inside, outside, color)
@@ -441,8 +441,8 @@ def exploration_badge(state: ExplorationState) -> Validity:
     if not state.acts or state.phase == CHOOSING:
         first = "a new machine compiles first, for about a minute"
         lines = () if state.acts else (first,)
-        what = f"choosing step {len(state.acts) + 1}" if state.phase == CHOOSING else "not begun"
-        return Validity(PENDING, what, (*lines, *_shares(state)))
+        title = f"choosing step {len(state.acts) + 1}" if state.phase == CHOOSING else "not begun"
+        return Validity(PENDING, title, (*lines, *_shares(state)))
     act = state.acts[-1]
     number = len(state.acts)
     headline = _title(number, act)

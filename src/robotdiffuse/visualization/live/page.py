@@ -147,9 +147,9 @@ class Page:
             if new("candidates", state.candidates):
                 draw_candidates(self.server, self._drawn, state.candidates)
             answer = state.answer
-            shown = answer if state.options.trees else None
-            if (answer is not None or not state.options.trees) and new("trees", shown):
-                draw_trees(self.server, self._drawn, () if shown is None else shown.trees)
+            tree_answer = answer if state.options.trees else None
+            if (answer is not None or not state.options.trees) and new("trees", tree_answer):
+                draw_trees(self.server, self._drawn, () if tree_answer is None else tree_answer.trees)
 
     def _new_robot(self, robot: Robot) -> None:
         for arm in self._arms.values():
@@ -423,9 +423,9 @@ class Panel:
             set_value(self._sizes[of], value)
 
     def _size_slider(self, name: str, dimension: str, value: float) -> Any:
-        most = max(MAX_DIMENSION, value)
+        max_size = max(MAX_DIMENSION, value)
         slider = self._server.gui.add_slider(
-            dimension, min=min(MIN_DIMENSION, value), max=most, step=0.005, initial_value=value
+            dimension, min=min(MIN_DIMENSION, value), max=max_size, step=0.005, initial_value=value
         )
         self._on(slider, lambda event: self._session.resize_obstacle(name, dimension, event.target.value))
         return slider
@@ -453,9 +453,9 @@ class Panel:
 
     def show_time(self, at: float, duration: float) -> None:
         """Set the time slider [s]."""
-        most = max(np.ceil(100 * duration) / 100, 0.01)
-        if self._slider.max != most:
-            self._slider.max = most
+        max_time = max(np.ceil(100 * duration) / 100, 0.01)
+        if self._slider.max != max_time:
+            self._slider.max = max_time
         self._slider.value = round(at, 2)
 
     def show_playing(self, playing: bool) -> None:

@@ -94,10 +94,10 @@ class PageServer(viser.ViserServer):
         # viser prints its own address; other threads' output is left alone
         with rich.get_console().capture():
             super().__init__(host, port, verbose=False)
-        inner = self._websock_server
+        websock = self._websock_server
 
         async def check(client: infra.WebsockClientConnection) -> None:
-            connection = inner._live_connections[client.client_id]
+            connection = websock._live_connections[client.client_id]
             request = connection.request
             assert request is not None, "it was answered"
             headers = request.headers
@@ -107,8 +107,8 @@ class PageServer(viser.ViserServer):
             if not (alone and may_connect(request.path, hosts[0], origins[0], self.token)):
                 await connection.close(POLICY_VIOLATION)
 
-        inner.on_client_connect(check)
-        inner.disconnect_all_clients()  # who came before; browsers connect again by themselves
+        websock.on_client_connect(check)
+        websock.disconnect_all_clients()  # who came before; browsers connect again by themselves
 
     @property
     def url(self) -> str:

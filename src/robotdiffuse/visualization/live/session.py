@@ -178,8 +178,8 @@ class Session:
         with self._lock:
             old = self._state
             new = _opened(problem, self._state.options)
-            same = old.problem.robot is new.problem.robot
-            self._state = replace(new, version=old.version, motion=old.motion if same else None)
+            same_robot = old.problem.robot is new.problem.robot
+            self._state = replace(new, version=old.version, motion=old.motion if same_robot else None)
             self._goal_task.submit(new.goal_pose)
             self._changed()
 
@@ -290,8 +290,8 @@ class Session:
             return
         validation = _validated(state.problem, state.motion, state.version)
         with self._lock:
-            known = self._state.validation
-            newer = known is not None and known.version > validation.version
+            current_validation = self._state.validation
+            newer = current_validation is not None and current_validation.version > validation.version
             if self._state.motion is not state.motion or newer:
                 return
             self._state = replace(self._state, validation=validation)
@@ -300,9 +300,9 @@ class Session:
     def _find_goal_configuration(self, T_base_frame: Float[ndarray, "4 4"]) -> None:
         """Find a configuration at the goal, close to the previous one."""
         state = self._state
-        known = state.goal_configuration
+        previous = state.goal_configuration
         robot = state.problem.robot
-        near = state.problem.start if known is None else known
+        near = state.problem.start if previous is None else previous
         q = _configuration_at(robot, state.goal_frame, T_base_frame, near)
         with self._lock:
             if self._state.problem.robot is not robot:
@@ -323,8 +323,8 @@ class Session:
         result, failure, seconds = self._solve(state)
         validation = None
         now = self._state
-        same = now.problem.robot is state.problem.robot
-        if same and result is not None and result.trajectory is not None:
+        same_robot = now.problem.robot is state.problem.robot
+        if same_robot and result is not None and result.trajectory is not None:
             validation = _validated(now.problem, result, now.version)
             seconds = (*seconds, ("validating again", validation.seconds))
         with self._lock:
@@ -334,8 +334,8 @@ class Session:
                     self._state, planning=False, answer=result, failure=failure, seconds=seconds
                 )
             # an outdated motion is still shown if it is free in the current scene
-            same = self._state.problem.robot is state.problem.robot
-            if same and validation is not None and (current or _free(validation)):
+            same_robot = self._state.problem.robot is state.problem.robot
+            if same_robot and validation is not None and (current or _free(validation)):
                 self._state = replace(self._state, motion=result, validation=validation)
                 if validation.version != self._state.version:
                     self._validation_task.submit(self._state.version)
@@ -357,7 +357,7 @@ class Session:
                 self._planners[options.planner] = planner
             began = time.perf_counter()
             result = planner.plan(problem, options.time_limit)
-            whole = time.perf_counter() - began
+            total_time = time.perf_counter() - began
         except InputError as error:
             return None, str(error), ()
         except Exception as error:  # the page survives any error of a planner
@@ -365,7 +365,7 @@ class Session:
         seconds = [("first path", result.progress[0][0])] if result.progress else []
         seconds += [("planning", result.planning_time)]
         if result.solved:
-            seconds += [("timing", max(0.0, whole - result.planning_time))]
+            seconds += [("timing", max(0.0, total_time - result.planning_time))]
         return result, "", tuple(seconds)
 
     def _draw_candidates(self, version: int) -> None:
@@ -384,8 +384,10 @@ def _configuration_at(
     robot: Robot, link: str, T_base_link: Float[ndarray, "4 4"], near: Float[ndarray, "dof"]
 ) -> Float[ndarray, "dof"] | None:
     rng = np.random.default_rng(0)
-    found = inverse_kinematics(robot, link, T_base_link, 1, rng=rng, settings=QUICK_IK, near=near, rest=near)
-    return found[0] if len(found) else None
+    solutions = inverse_kinematics(
+        robot, link, T_base_link, 1, rng=rng, settings=QUICK_IK, near=near, rest=near
+    )
+    return solutions[0] if len(solutions) else None
 
 
 def _opened(problem: Problem, options: PageOptions) -> State:
@@ -450,14 +452,14 @@ def dimensions(shape: Shape) -> dict[str, float]:
 def resized(shape: Shape, dimension: str, value: float) -> Shape:
     """The shape with one of its `dimensions` changed. Raises InputError for another name and values out of
     bounds."""
-    known = dimensions(shape)
-    if dimension not in known:
-        raise unknown_name(f"dimension of {shape.name}:", dimension, known)
+    sizes = dimensions(shape)
+    if dimension not in sizes:
+        raise unknown_name(f"dimension of {shape.name}:", dimension, sizes)
     if not MIN_DIMENSION <= value <= MAX_DIMENSION:
-        size, least, most = distinct(value, MIN_DIMENSION, MAX_DIMENSION)
-        raise InputError(f"{dimension} of {shape.name} is {size} m; it must be {least} to {most} m")
+        size, min_text, max_text = distinct(value, MIN_DIMENSION, MAX_DIMENSION)
+        raise InputError(f"{dimension} of {shape.name} is {size} m; it must be {min_text} to {max_text} m")
     if isinstance(shape, Box):
-        size = np.array([value if name == dimension else old for name, old in known.items()])
+        size = np.array([value if name == dimension else old for name, old in sizes.items()])
         return replace(shape, size=size)
     return replace(shape, **{dimension: value})  # type: ignore[type-var]
 
@@ -496,9 +498,9 @@ def validity(state: State) -> Validity:
             *more,
         )
         return Validity(VALID, f"free, clearance at least {_distance(report.min_clearance)}", lines)
-    what = "collides" if violation.kind in COLLISIONS else "not valid"
+    title = "collides" if violation.kind in COLLISIONS else "not valid"
     when = f"at {violation.time:.2f} s of {trajectory.duration:.2f} s"
-    return Validity(INVALID, f"{what}: {violation.message}", (when, *more))
+    return Validity(INVALID, f"{title}: {violation.message}", (when, *more))
 
 
 def _to_obstacles(state: State, report: Report) -> str:
@@ -582,10 +584,10 @@ def _check_contained(data: object, robot: Robot) -> None:
     """Raises InputError if the data of a problem file names files."""
     if not isinstance(data, dict):
         return  # the problem reader rejects it
-    given = data.get("robot")
-    known = known_robots()
-    if isinstance(given, str) and given not in known and given != robot.source:
-        raise unknown_name("robot", given, known)
+    robot_name = data.get("robot")
+    robot_names = known_robots()
+    if isinstance(robot_name, str) and robot_name not in robot_names and robot_name != robot.source:
+        raise unknown_name("robot", robot_name, robot_names)
     if isinstance(data.get("scene"), str):
         raise InputError(f"scene is {shown(data['scene'])}; {NO_FILES}")
     parts: list[object] = [data]

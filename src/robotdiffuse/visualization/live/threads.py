@@ -63,9 +63,9 @@ class Changes:
 
     def new(self, what: str, *values: object) -> bool:
         """Whether values differ from the last ones; of arrays and such the identity counts."""
-        known = self._shown.get(what)
+        last_values = self._shown.get(what)
         self._shown[what] = values
-        return known is None or not all(map(_same, known, values))
+        return last_values is None or not all(map(_same, last_values, values))
 
     def forget(self, *names: str) -> None:
         """Values of these names are new the next time."""
