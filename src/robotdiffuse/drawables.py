@@ -1,4 +1,4 @@
-"""What is drawn of a robot and of obstacles: surfaces and colours, over time.
+"""What is drawn of a robot and of obstacles: surfaces and colors, over time.
 
 Pictures, replays, the live page, recordings for Rerun and Foxglove, and PyBullet's cameras draw these.
 """
@@ -22,7 +22,7 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape
 
 Color = tuple[int, int, int]
 """sRGB."""
-# Colours of the start and goal of a motion; the trace fades from one to the other.
+# Colors of the start and goal of a motion; the trace fades from one to the other.
 START = (0x4F, 0x7F, 0xD9)
 GOAL = (0x10, 0xA3, 0x7F)
 OBSTACLES = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
@@ -31,7 +31,7 @@ FURNITURE = (0xCD, 0xC0, 0xAC)
 OBSERVED = (0x4F, 0x7C, 0xAC)
 ASSUMED = (0xB9, 0x8A, 0xD9)
 FURNITURE_SIZE = 0.7
-"""Obstacles with a longer side than this count as furniture, with its own colour [m]."""
+"""Obstacles with a longer side than this count as furniture, with its own color [m]."""
 CREASE_ANGLE = np.radians(38)
 """Edges with a larger angle between their faces are drawn sharp [rad]."""
 MAX_SIZE = 60_000
@@ -40,7 +40,7 @@ MAX_SIZE = 60_000
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles with a normal and an sRGB colour (0 to 1) at each vertex."""
+    """Triangles with a normal and an sRGB color (0 to 1) at each vertex."""
 
     vertices: Float[ndarray, "v 3"]
     normals: Float[ndarray, "v 3"]
@@ -54,7 +54,7 @@ class Surface:
 
     @property
     def by_color(self) -> list[tuple[Color, "Surface"]]:
-        """The surface split by the colours of its faces."""
+        """The surface split by the colors of its faces."""
         colors, number = np.unique(np.round(255 * self.colors).astype(int), axis=0, return_inverse=True)
         of_face = number.reshape(-1)[self.faces[:, 0]]
         parts = []
@@ -79,7 +79,7 @@ def join(surfaces: Sequence[Surface]) -> Surface:
 
 
 def painted(color: Color, count: int) -> Float[ndarray, "n 3"]:
-    """A colour for each of `count` vertices or faces."""
+    """A color for each of `count` vertices or faces."""
     return np.tile(np.array(color) / 255.0, (count, 1))
 
 

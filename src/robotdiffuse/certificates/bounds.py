@@ -218,7 +218,7 @@ class Prover:
     ) -> tuple[ndarray, ndarray]:
         """Clearances of the balls of links and upper bounds on their displacement by the joints `moved` [m].
 
-        distances: from each ball's row in `links`, its posture and its centre; None: only displacement.
+        distances: from each ball's row in `links`, its posture and its center; None: only displacement.
         """
         row, ball, begin = self._expand(links)
         at = posture[row]

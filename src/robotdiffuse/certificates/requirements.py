@@ -185,7 +185,7 @@ def _frame_motion(linkage: Linkage, postures: Postures, q: ndarray, frame: str) 
 
 
 def _box(constraint: Constraint, *ends: Pose) -> tuple[Vector, Rotation, Vector]:
-    """Centre, rotation and half sizes, which may be 0 or infinite, of where a frame's origin may be; between
+    """Center, rotation and half sizes, which may be 0 or infinite, of where a frame's origin may be; between
     the ends of a Cartesian line."""
     if isinstance(constraint, PositionBox):
         T = constraint.T_base_box
@@ -347,7 +347,7 @@ def _newton_euler(
     of_joint: by the joint, its number and what is needed of the parent: the arm from the parent's origin to
         the child's; None, or the axis, and the joint's velocity and acceleration along it; and what is needed
         of the child.
-    of_body: the arm to a body's centre of mass, and the product with its inertia.
+    of_body: the arm to a body's center of mass, and the product with its inertia.
     cross: the cross product.
     """
     robot = problem.robot

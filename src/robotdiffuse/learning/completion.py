@@ -57,7 +57,7 @@ class CompletionSettings(Settings, name="completion"):
 
 
 def voxel_centers() -> Float[ndarray, "56 56 32 3"]:
-    """Centres of the voxels of an observed volume [m]."""
+    """Centers of the voxels of an observed volume [m]."""
     axes = [(np.arange(n) + 0.5) * VOXEL + low for n, low in zip(SHAPE, LOW, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 

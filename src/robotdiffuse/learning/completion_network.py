@@ -3,7 +3,7 @@ occupied.
 
 A U-Net of residual blocks. The input's voxels of 4 cm are folded into blocks of 2 x 2 x 2, so that nothing is
 computed at their full resolution: the finest cells have 8 cm, and each predicts its 4 x 4 x 4 voxels of 2 cm.
-There is no normalisation, nor anything else that needs single precision: one such layer would slow training
+There is no normalization, nor anything else that needs single precision: one such layer would slow training
 in bf16 several times. Features are the last axis in memory, which is the fast layout for bf16.
 """
 
@@ -28,7 +28,7 @@ CHANNELS = 7
 """Occupied, free, shadow of the arm, out of view, depth behind a surface, height, distance from the base's
 axis."""
 DEPTH_SCALE = DEPTH_STEP / 0.5
-"""Stored depths behind surfaces are multiplied by this: half a metre becomes 1."""
+"""Stored depths behind surfaces are multiplied by this: half a meter becomes 1."""
 
 
 def _position_inputs() -> Float[Tensor, "28 28 16 16"]:

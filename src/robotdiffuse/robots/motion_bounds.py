@@ -27,7 +27,7 @@ def sliding_maximum(support, first, width):
             for k in range(columns):
                 maxima[k] = support[i, row, (k + first) % columns]
             covered = 1
-            while covered < width:  # maxima over 2 n neighbours from maxima over n
+            while covered < width:  # maxima over 2 n neighbors from maxima over n
                 shift = min(covered, width - covered)
                 for k in range(columns - shift):
                     next_wide[k] = max(maxima[k], maxima[k + shift])

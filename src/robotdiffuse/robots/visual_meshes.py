@@ -23,7 +23,7 @@ TOOL_COLOR = (0xB0, 0xB6, 0xBE)
 
 @dataclass(frozen=True, eq=False)
 class VisualMesh(Value):
-    """A triangle mesh in the frame of its link [m], with one sRGB colour per face."""
+    """A triangle mesh in the frame of its link [m], with one sRGB color per face."""
 
     vertices: Float[ndarray, "v 3"]
     faces: Int[ndarray, "f 3"]

@@ -57,7 +57,7 @@ from robotdiffuse.server.worker_pool import QueueFullError, WorkerPool
 
 ABOUT = (
     "Motion planning for redundant robot arms; every motion in an answer passed the validator.\n\n"
-    "Units: metres, radians, seconds; quaternions wxyz. Problems are those of problem files in JSON. They "
+    "Units: meters, radians, seconds; quaternions wxyz. Problems are those of problem files in JSON. They "
     "name a robot of /robots and contain all other data, because the server reads no files.\n\n"
     'An error is one line of JSON: {"error": "..."}. The header X-Request-ID names a request, so that '
     "DELETE /requests/{name} can cancel it; closing the connection cancels it too."

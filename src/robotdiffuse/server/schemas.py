@@ -60,7 +60,7 @@ class PlanRequest(_Request):
 
 
 class PathMotion(_Request):
-    """Waypoints; radians, metres for prismatic joints."""
+    """Waypoints; radians, meters for prismatic joints."""
 
     joint_names: list[str] = Field(examples=[JOINT_NAMES])
     positions: Rows = Field(examples=[WAYPOINTS])

@@ -38,9 +38,9 @@ from robotdiffuse.visualization.replay_page import page_data, page_shapes, page_
 LIKELY = 0.5
 """Voxels of unknown space that are occupied with a larger probability are shown as predicted."""
 UNKNOWN = (0x6E, 0x7B, 0x8C)
-"""sRGB colour of the boundary of unknown space."""
+"""sRGB color of the boundary of unknown space."""
 LOOK_COLOR = (0xD9, 0x8A, 0x12)
-"""sRGB colour of the pyramid that shows where a camera looks."""
+"""sRGB color of the pyramid that shows where a camera looks."""
 FRUSTUM_DEPTH = 0.25
 """Length of the pyramid that shows where a camera looks [m]."""
 READING_TIME = 1.5
@@ -200,7 +200,7 @@ def write_exploration_picture(
     """Write the moments of an exploration as one .png: at most MAX_MOMENTS, the first and the last included.
 
     Each shows the arm's motion among what was known when it was chosen: voxels seen occupied (blue),
-    predicted ones (violet), the boundary of unknown space (grey, see-through), and at the end of a look what
+    predicted ones (violet), the boundary of unknown space (gray, see-through), and at the end of a look what
     the camera will see (a pyramid). scene: the true one, from which the view is chosen. settings: of each
     moment. Raises InputError for another ending or a file that cannot be written.
     """

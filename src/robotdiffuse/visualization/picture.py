@@ -42,9 +42,9 @@ TUBE_RADIUS = 0.006
 GROUND_RADIUS = 3.2
 """Radius of the visible ground [m]."""
 CAPTION_COLOR = (0xF2, 0xF4, 0xF6)
-"""Colour to which the picture fades behind the caption."""
+"""Color to which the picture fades behind the caption."""
 COMPARED = ((0xE3, 0xA8, 0x12), (0xCF, 0x33, 0x3B), (0x2F, 0x6F, 0xD0), (0x8B, 0x55, 0xB8))
-"""sRGB colours of the traces of several motions in one picture."""
+"""sRGB colors of the traces of several motions in one picture."""
 MOVED_ALPHA = 0.22
 """Opacity of moving obstacles along their way."""
 TRACE_STEPS = 240
@@ -62,7 +62,7 @@ class ClearSurface:
 
     surface: Surface
     tint: Float[ndarray, "3"]
-    """Linear colour."""
+    """Linear color."""
     alpha: float
 
 
@@ -125,8 +125,8 @@ def write_comparison(
 ) -> None:
     """Write a picture of several motions by name, of one arm in one scene, as .png.
 
-    The arm is that of the first motion; each motion has a trace of its own colour. Raises InputError as
-    `write_picture` does, and for more motions than there are colours.
+    The arm is that of the first motion; each motion has a trace of its own color. Raises InputError as
+    `write_picture` does, and for more motions than there are colors.
     """
     path = check_output(file, (".png",))
     if not 0 < len(motions) <= len(COMPARED):
@@ -172,7 +172,7 @@ def render(
     """The picture without its caption, uint8 [height, width, 3], and the camera that took it.
 
     camera: where to look from; without one, from where most of the motion can be seen.
-    others: further motions, of which the trace is drawn; all traces then have the colours COMPARED.
+    others: further motions, of which the trace is drawn; all traces then have the colors COMPARED.
     added, clear: further surfaces in the base frame, solid and see-through.
     moving: obstacles that are solid where they are at the start, and see-through later.
     """
@@ -234,7 +234,7 @@ def _ball(center: Float[ndarray, "3"], radius: float, color: Color, subdivisions
 
 
 def _paint(camera: Camera, solid: Surface, clear: Sequence[ClearSurface]) -> Float[ndarray, "h w 3"]:
-    """Linear colours of the solid surfaces with the see-through ones over them, in their order."""
+    """Linear colors of the solid surfaces with the see-through ones over them, in their order."""
     near, ident, screen = drawn_by(camera, solid)
     image = np.zeros((*near.shape, 3), np.float32)
     view = (camera.eye, camera.rays())
@@ -314,7 +314,7 @@ def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tup
 
 
 def tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
-    """A round tube along a polyline, coloured from the first to the last colour, with spheres at both
+    """A round tube along a polyline, colored from the first to the last color, with spheres at both
     ends."""
     balls = [_ball(points[i], 2.2 * TUBE_RADIUS, color, 2) for i, color in ((0, first), (-1, last))]
     n = len(points)
@@ -346,7 +346,7 @@ def tube(points: Float[ndarray, "n 3"], first: Color, last: Color) -> Surface:
 
 
 def linear(rgb: Color) -> Float[ndarray, "3"]:
-    """The linear colour of an sRGB colour."""
+    """The linear color of an sRGB color."""
     return _linear_array(np.array(rgb) / 255.0)
 
 
@@ -355,7 +355,7 @@ def _linear_array(srgb: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
 
 
 def _to_srgb(image: Float[ndarray, "h w 3"]) -> np.ndarray:
-    """Linear colours as sRGB bytes; highlights roll off smoothly."""
+    """Linear colors as sRGB bytes; highlights roll off smoothly."""
     knee = 0.75
     over = np.maximum(image - knee, 0)
     image = np.minimum(image, knee) + (1 - knee) * (1 - np.exp(-over / (1 - knee)))
@@ -380,7 +380,7 @@ def caption(
     colors: Sequence[Color] = (),
     enlarged: float = 1.0,
 ) -> None:
-    """Write title and figures in the lower left corner. colors: of the labels; without any, grey.
+    """Write title and figures in the lower left corner. colors: of the labels; without any, gray.
     enlarged: factor of the size of the letters."""
     scale = enlarged * image.width / 1600
     pen = ImageDraw.Draw(image)

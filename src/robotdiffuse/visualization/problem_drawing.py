@@ -31,12 +31,12 @@ from robotdiffuse.visualization.picture import (
 from robotdiffuse.visualization.replay_page import page_data, page_shapes, page_surface, page_text
 
 COLLIDING = (0xD0, 0x1F, 0x2B)
-"""sRGB colour of links that collide."""
+"""sRGB color of links that collide."""
 OFFSET = 0.0015
-"""Offset of these along their normals, so that they cover the arm in its own colours [m]."""
+"""Offset of these along their normals, so that they cover the arm in its own colors [m]."""
 START_ALPHA = 0.5
 AXES = ((0xC9, 0x3C, 0x3C), (0x3C, 0x9A, 0x4B), (0x3C, 0x64, 0xC9))
-"""sRGB colours of the axes of goal poses."""
+"""sRGB colors of the axes of goal poses."""
 AXIS_LENGTH = 0.12
 """[m]"""
 UNREACHED = StateValidity("no configuration within the joint limits")
@@ -101,7 +101,7 @@ def _goal_state(problem: Problem) -> tuple[Float[ndarray, "dof"] | None, StateVa
 def _colliding_links(
     arm: DrawnArm, states: Float[ndarray, "n dof"], validities: list[StateValidity]
 ) -> list[tuple[Surface, Color]]:
-    """The surfaces of the links that collide in each state, and their colour."""
+    """The surfaces of the links that collide in each state, and their color."""
     robot = arm.robot
     links = link_surfaces(arm.robot)
     marks = []
@@ -114,7 +114,7 @@ def _colliding_links(
 
 
 def _raised(surface: Surface) -> Surface:
-    """The surface in the colour of collisions, a little larger."""
+    """The surface in the color of collisions, a little larger."""
     _, corner = np.unique(surface.vertices, axis=0, return_inverse=True)  # edges have a vertex on each side
     corner = corner.reshape(-1)
     normals = np.stack([np.bincount(corner, column) for column in surface.normals.T], axis=1)
@@ -131,7 +131,7 @@ def _goal_poses(problem: Problem) -> list[Float[ndarray, "4 4"]]:
 
 
 def _axes(poses: list[Float[ndarray, "4 4"]]) -> list[tuple[Surface, Color]]:
-    """The axes of poses, and their colours."""
+    """The axes of poses, and their colors."""
     axes = []
     for T in poses:
         for axis, color in enumerate(AXES):

@@ -220,13 +220,13 @@ def shade(
     key,
     light,
 ):
-    """Compute the linear colour of every pixel of the solid surfaces and the ground.
+    """Compute the linear color of every pixel of the solid surfaces and the ground.
 
     camera: (eye[3], rays[3, 3]) so that the ray through pixel (x, y) is rays @ (x, y, 1), with z-depth 1.
     lattice, spacing: from light_lattice. At edges, where the lattice does not fit, a pixel uses a quarter of
     the lights itself, a different quarter for each pixel in a square of four. ground: (height, radius, base
-    colour[3], line colour[3]); background: (top colour[3], bottom colour[3]); sky, key: (maps, axes, scale,
-    center, size, bias); light: colours[3] of key, sky and bounce.
+    color[3], line color[3]); background: (top color[3], bottom color[3]); sky, key: (maps, axes, scale,
+    center, size, bias); light: colors[3] of key, sky and bounce.
     """
     h, w = near.shape
     eye, rays = camera

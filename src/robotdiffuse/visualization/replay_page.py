@@ -177,7 +177,7 @@ def _shape(obstacle: Drawable) -> dict[str, Any]:
         return page_surface(shape.name, obstacle.surface, color)
     record: dict[str, Any] = {"kind": shape.kind, "name": shape.name, "color": color}
     if isinstance(shape, PointCloud):
-        low, step, points = _quantised(thinned(shape.points))
+        low, step, points = _quantized(thinned(shape.points))
         return record | {"radius": shape.point_radius, "low": low, "step": step, "points": points}
     for name in ("center", "size", "wxyz", "radius", "height"):
         if hasattr(shape, name):
@@ -186,13 +186,13 @@ def _shape(obstacle: Drawable) -> dict[str, Any]:
 
 
 def page_surface(name: str, surface: Surface, color: Color) -> dict[str, Any]:
-    """A surface in the base frame for the page, in one colour."""
+    """A surface in the base frame for the page, in one color."""
     return {"kind": "mesh", "name": name, "color": color, "surface": _packed(surface, colored=False)}
 
 
 def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:
-    """Geometry in base64: 16-bit vertices, 8-bit normals and colours."""
-    low, step, vertices = _quantised(surface.vertices)
+    """Geometry in base64: 16-bit vertices, 8-bit normals and colors."""
+    low, step, vertices = _quantized(surface.vertices)
     wide_indices = len(surface.vertices) >= 2**16
     packed = {
         "low": low,
@@ -207,7 +207,7 @@ def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:
     )
 
 
-def _quantised(points: Float[ndarray, "n 3"]) -> tuple[list[float], float, str]:
+def _quantized(points: Float[ndarray, "n 3"]) -> tuple[list[float], float, str]:
     """Lowest corner, step and the points as 16-bit multiples of the step in base64."""
     if len(points) == 0:
         return [0.0, 0.0, 0.0], 1.0, ""

@@ -98,13 +98,13 @@ def attend(
 
 
 def start_small(layer: nn.Linear, layers: int) -> None:
-    """Initialise the last layer of a residual branch, one of `layers` in a row."""
+    """Initialize the last layer of a residual branch, one of `layers` in a row."""
     nn.init.normal_(layer.weight, std=0.02 / (2 * layers) ** 0.5)
     nn.init.zeros_(layer.bias)
 
 
 def start_at_zero(layer: nn.Linear) -> None:
-    """Initialise the last layer of a network to zero."""
+    """Initialize the last layer of a network to zero."""
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
 

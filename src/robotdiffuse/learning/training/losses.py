@@ -79,7 +79,7 @@ POINT_UNIT = 0.1
 MAX_DISTANCE = 1.0
 """Largest distance that is computed [m]; also the distance to an empty scene."""
 SAFE_DISTANCE = 0.05
-"""S of the hinge h in L_collision [m]: distances below it are penalised."""
+"""S of the hinge h in L_collision [m]: distances below it are penalized."""
 EPSILON = 1e-12
 """Added to squared lengths [m^2], so that their root has a gradient everywhere."""
 
@@ -182,7 +182,7 @@ class ArmDistance:
 
 
 def _obstacles(scenes: PackedScenes) -> Float[Tensor, "16 n slots"]:
-    """Centre, half edges, radius and rotation of the obstacles; a sphere is a box of size 0 with a radius."""
+    """Center, half edges, radius and rotation of the obstacles; a sphere is a box of size 0 with a radius."""
     box = (scenes.kinds == BOX)[..., None]
     sphere = (scenes.kinds == SPHERE)[..., None]
     centre, size, wxyz = np.split(scenes.params, (3, 6), -1)

@@ -40,7 +40,7 @@ TREE_WIDTH = 0.0028
 GHOST_OPACITY = 0.3
 """Opacity of the start and goal arms."""
 HIGHLIGHT = 0.35
-"""Amount of white in the colour of the selected obstacle."""
+"""Amount of white in the color of the selected obstacle."""
 
 
 def add_surface(
@@ -50,7 +50,7 @@ def add_surface(
     color: Color,
     opacity: float | None = None,
 ) -> viser.MeshHandle:
-    """Draw a surface in one colour."""
+    """Draw a surface in one color."""
     vertices = surface.vertices.astype(np.float32)
     faces = surface.faces.astype(np.uint32)
     return server.scene.add_mesh_simple(name, vertices, faces, color=color, opacity=opacity)
@@ -67,7 +67,7 @@ class Arm:
         color: Color | None = None,
         opacity: float | None = None,
     ) -> None:
-        """Draw in the robot's own colours, or in one colour, see-through and without the base."""
+        """Draw in the robot's own colors, or in one color, see-through and without the base."""
         self._server = server
         self._drawn = drawn
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, visible=False)
@@ -166,7 +166,7 @@ def _appearance(shape: Shape) -> object:
 
 
 def draw_trace(server: viser.ViserServer, arm: DrawnArm, motion: Trajectory | None) -> None:
-    """Draw the trace of the tool, coloured from start to goal."""
+    """Draw the trace of the tool, colored from start to goal."""
     if motion is None:
         server.scene.remove_by_name("/trace")
         return
@@ -187,7 +187,7 @@ def draw_candidates(server: viser.ViserServer, arm: DrawnArm, candidates: Candid
 
 
 def draw_trees(server: viser.ViserServer, arm: DrawnArm, trees: tuple[Tree, ...]) -> None:
-    """Draw the tool traces along the edges of both search trees, in the colours of start and goal."""
+    """Draw the tool traces along the edges of both search trees, in the colors of start and goal."""
     for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
         edges = [] if tree is None else _edges(arm, tree)
         colors = [np.array(color, float)] * len(edges)
@@ -204,7 +204,7 @@ def _edges(arm: DrawnArm, tree: Tree) -> list[Float[ndarray, "points 3"]]:
 
 
 def candidate_color(clearance: float) -> Float[ndarray, "3"]:
-    """Colour of a candidate by its clearance [m]; sRGB, 0 to 255."""
+    """Color of a candidate by its clearance [m]; sRGB, 0 to 255."""
     if clearance <= 0:
         return np.array(RED, float)
     share = min(clearance / SAFE_CLEARANCE, 1.0)
@@ -214,9 +214,9 @@ def candidate_color(clearance: float) -> Float[ndarray, "3"]:
 def draw_lines(
     server: viser.ViserServer, name: str, lines: list[ndarray], colors: list[ndarray], width: float
 ) -> None:
-    """Draw polylines, each in one colour or with a colour for each point; remove the node without any.
+    """Draw polylines, each in one color or with a color for each point; remove the node without any.
 
-    `width` [m]; colours in sRGB, converted because viser expects linear ones.
+    `width` [m]; colors in sRGB, converted because viser expects linear ones.
     """
     if not lines:
         server.scene.remove_by_name(name)

@@ -78,7 +78,7 @@ CLEAR_OPACITY = 0.6
 UNKNOWN_OPACITY = 0.2
 """Opacity of the boundary of unknown space, which is drawn where it faces the viewer, so that it never hides
 the arm."""
-# Length of the pyramid of the camera on the arm [m], and its colour.
+# Length of the pyramid of the camera on the arm [m], and its color.
 CAMERA_SIZE = 0.12
 CAMERA_COLOR = (40, 48, 58)
 SPEEDS = (0.1, 10.0)

@@ -62,7 +62,7 @@ GIZMO_SIZE = 0.23
 SMALL_GIZMO_SIZE = 0.16
 BADGE_COLORS = {VALID: "#0f8f6f", INVALID: "#c92f2f", NO_MOTION: "#b26a00", PENDING: "#6b7684"}
 JOINT_COLORS = ("#4f7fd9", "#10a37f", "#d97b5c", "#8a63d2", "#c2a23a", "#4fa3b8", "#c96a9a", "#7a8794")
-"""Colours of joints in the plot."""
+"""Colors of joints in the plot."""
 NO_OBSTACLE = "(none)"
 """Option of the dropdown for no selected obstacle."""
 PLOTS = ("position", "velocity", "acceleration")
@@ -525,7 +525,7 @@ def _send(event: viser.GuiEvent, name: str, content: bytes) -> None:
 
 
 def badge_html(validity: Validity, planning: bool = False) -> str:
-    """A coloured box with a headline and lines."""
+    """A colored box with a headline and lines."""
     lines = "".join(f"<div>{html.escape(line)}</div>" for line in validity.lines)
     busy = " · planning" if planning and validity.kind != PENDING else ""
     return (

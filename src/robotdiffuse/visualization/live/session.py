@@ -50,7 +50,7 @@ NEW_OBSTACLES: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
     "cylinder": lambda center, size: Cylinder(center, 0.75 * size, 3 * size),
     "capsule": lambda center, size: Capsule(center, 0.75 * size, 2.5 * size),
 }
-"""Makers of new obstacles, by kind, from their centre and the radius of a sphere of similar size [m]."""
+"""Makers of new obstacles, by kind, from their center and the radius of a sphere of similar size [m]."""
 # Bounds of a dimension [m].
 MIN_DIMENSION = 0.01
 MAX_DIMENSION = 2.0
@@ -224,7 +224,7 @@ class Session:
         self._start_task.submit(T_base_tip)
 
     def add_obstacle(self, kind: str, center: Float[ndarray, "3"] | None = None) -> str:
-        """Add an obstacle and return its name. Default centre [m]: in front of the arm, at half its reach."""
+        """Add an obstacle and return its name. Default center [m]: in front of the arm, at half its reach."""
         with self._lock:
             if kind not in NEW_OBSTACLES:
                 raise unknown_name("kind of obstacle", kind, NEW_OBSTACLES)

@@ -115,7 +115,7 @@ document.body.append(steps);
 startArm.group.visible = false;
 $("toggles").firstChild.setAttribute("aria-pressed", false);
 
-// Toggles of the layers, with their colour, before the others.
+// Toggles of the layers, with their color, before the others.
 const first = $("toggles").firstChild;
 const before = (name, objects, rgb) => {
   toggle(name, objects);
