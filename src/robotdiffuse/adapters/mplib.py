@@ -2,7 +2,7 @@
 
 Methods, arguments and results are those of MPlib 0.1 and 0.2, over `rd.Workspace`. Poses are seven numbers
 (x, y, z, and a quaternion w, x, y, z), objects with `p` and `q` such as `sapien.Pose`, or 4 x 4 matrices.
-Where MPlib says that a plan failed, `status` says why.
+Where MPlib reports that a plan failed, `status` holds the reason.
 """
 
 import hashlib

@@ -26,7 +26,7 @@ from robotdiffuse.core.types import (
 PROBLEM_ENDINGS = (".yaml", ".yml", ".jsonl")
 """Endings of problem files that no result has."""
 NO_PROBLEM = "without its problem"
-"""How the note begins that says why a result was saved without its problem."""
+"""Beginning of the note with the reason why a result was saved without its problem."""
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
 
 

@@ -93,7 +93,7 @@ class ModelSampler(ExportedPlanner[SamplerSettings]):
     ) -> Trajectories:
         """A batch of samples under guidance, divided among the nearest goals.
 
-        code: the scene, as by `encode`; None: the condition is hidden, for weights that allow it.
+        code: the scene embedding of `encode`; None: the condition is hidden, for weights that allow it.
         clearances: the model's clearance inputs; None: the true ones of the checker's scene.
         constraints: of the path, one more cost of the guidance.
         """

@@ -60,16 +60,15 @@ def plan_many(
         workers: Number of processes; None: one for each core.
         cluster: "ray": the Ray cluster that RAY_ADDRESS names, or one started here, in place of processes.
             Problems of a lost node are planned again on another.
-        progress: Called after each problem, in whatever order they end, with the numbers done and in all.
+        progress: Called after each problem, in the order in which they end, with the numbers done and in all.
         request: Arguments of `rd.plan`, the same for all problems: time_limit, seed, until, ...
 
     Returns:
         An iterator over the results in the order of the problems, each as soon as those before it are there.
 
     Raises:
-        InputError: At once, for an unknown planner, settings or weights that do not fit it, unknown arguments
-            or
-            arguments out of bounds, a number of workers below 1, and an unknown cluster.
+        InputError: At once, for an unknown planner, settings or weights that do not fit it, unknown
+            arguments or arguments out of bounds, a number of workers below 1, and an unknown cluster.
     """
     check_not_importing()
     if isinstance(problems, str) or not isinstance(problems, Iterable):

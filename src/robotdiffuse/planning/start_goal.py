@@ -158,7 +158,7 @@ def images(robot: Robot, start: Configuration, goal: Configuration) -> list[Conf
 
 
 def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
-    """The start and the goals for a search of this call, or the result that says why there are none.
+    """The start and the goals for a search of this call, or the failed result if there are none.
 
     For poses, up to `pose_goals.GOAL_COUNT` configurations by inverse kinematics. Goals whose covering
     spheres are free are preferred; if there are none, those whose exact meshes are free are used. Of several
@@ -254,7 +254,7 @@ def _too_heavy(context: PlanningContext, q: Configuration) -> str | None:
 
 
 def _goals(context: PlanningContext, goal: Goal, checker: CollisionChecker) -> Configurations | PlanResult:
-    """The free configurations of a goal, or of any of several goals; or the result that says why there are
+    """The free configurations of a goal, or of any of several goals; or the failed result if there are
     none."""
     if isinstance(goal, AnyGoal):
         return _any_goals(context, goal.goals, checker)

@@ -181,7 +181,7 @@ def _one_shape(where: str, entry: dict[str, Any], folder: Path, notes: list[str]
 def equipped(robot: Robot, values: dict[str, Any], folder: Path, notes: list[str]) -> Robot:
     """The robot with the tool and the attached objects of a problem file; adds to the notes.
 
-    Raises InputError that names the field, for unknown fields and whatever `Robot.attach` does not accept.
+    Raises InputError that names the field, for unknown fields and what `Robot.attach` does not accept.
     """
     if values.get("tool") is not None:
         tool = check_fields("tool", values["tool"], ("link",), TOOL_FIELDS)

@@ -71,7 +71,7 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
     Raises:
         InputError: One line that names the file and the field, for unknown or missing fields and shapes,
             values
-            of the wrong type, and whatever `rd.Problem` does not accept.
+            of the wrong type, and what `rd.Problem` does not accept.
     """
     file = file_name(file, "problem file")
     check_type("index", index, Integral, "a whole number from 0 on")

@@ -47,8 +47,8 @@ def write_problem(problem: Problem, file: str | FilePath, result: PlanResult | N
 
     The arm is drawn at the start and at the goal; in pictures the start is see-through, on pages the goal.
     Links that collide are red, and goal poses have axes. Of several goals, the first free one is drawn, or
-    else the first. Moving obstacles are where they begin. `result` says why there is no motion. Raises
-    InputError for another ending or a file that cannot be written.
+    else the first. Moving obstacles are where they begin. `result` holds the reason for the missing
+    motion. Raises InputError for another ending or a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm", ".png"))
     goal, validity = _goal_state(problem)
