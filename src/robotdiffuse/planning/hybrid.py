@@ -117,8 +117,8 @@ class RobotDiffuseSettings(GuidedSamplingSettings, name="robotdiffuse"):
     benchmarks/results/guidance.txt."""
     guidance_scale: float = 0.0
     """Scale of classifier-free guidance. At 0 the condition is hidden, and the scene embedding is not
-    computed: with it paths are as long, see benchmarks/results/network_inputs.txt. Weights that cannot do without their
-    condition are then sampled with 1."""
+    computed: with it paths are as long, see benchmarks/results/network_inputs.txt. Weights that cannot do
+    without their condition are then sampled with 1."""
     network_share: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
     """Part of the work that goes to batches, of the network or of smooth noise; a batch counts as BATCH_WORK
     iterations of search."""
