@@ -38,11 +38,13 @@ NO_GEOMETRY = frozenset(
     )
     for what in things
 )
-"""Elements of Collada without geometry: a damaged one would lose the geometry beside it."""
+"""Elements of Collada without geometry. They are removed: trimesh drops the geometry beside a damaged one."""
 BYTES_PER_USE = 30_000
-"""What each use of a part of a geometry in a Collada scene counts as, besides its indices [bytes]."""
+"""Memory that a use of a part of a geometry in a Collada scene counts as, in addition to its indices
+[bytes]."""
 MAX_ACCESSED = 20_000_000
-"""Most elements of all accessors of a glTF file, since those without a buffer take no bytes of the file."""
+"""Maximum number of elements of all accessors of a glTF file: those without a buffer take no bytes in the
+file."""
 
 # trimesh logs a traceback of each error that it raises; without a handler that goes to standard error
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -85,7 +87,7 @@ def read_triangles(
         elif ending in (".glb", ".gltf"):
             up = "Y_UP"
             _check_accessors(content)
-            options = {"resolver": _beside(path)}
+            options = {"resolver": _buffer_resolver(path)}
         if ending in (".glb", ".gltf", ".obj"):
             options["skip_materials"] = True
         with np.errstate(all="ignore"):
@@ -182,8 +184,8 @@ def _check_accessors(content: bytes) -> None:
         raise InputError(f"its accessors hold more than {MAX_ACCESSED:,} elements")
 
 
-def _beside(mesh: Path) -> Any:
-    """Opens for trimesh the buffers that a glTF file names: regular files alone."""
+def _buffer_resolver(mesh: Path) -> Any:
+    """A resolver with which trimesh opens the buffers that a glTF file names; they must be regular files."""
     from trimesh.resolvers import FilePathResolver
 
     class RegularFiles(FilePathResolver):

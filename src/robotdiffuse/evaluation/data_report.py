@@ -32,7 +32,7 @@ QUANTITIES = {
     "detour": Column("detour", "", ".3f"),
     "clearance": Column("clearance", "[cm]", ".3f", scale=100.0),
 }
-"""Arrays that are shown of every motion, and their columns."""
+"""Arrays whose values are shown for all motions, and their columns."""
 SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
 """Quantiles of each quantity over the motions."""
 SAMPLED_MOTIONS = 20_000
@@ -234,7 +234,7 @@ def data_report(data: DataFigures, name: str) -> Report:
         f"Motions by family; the search keeps {distance} away from the ends. Detours: without trivial ones",
         plots.histograms(_motions(data), 3),
     )
-    caption = "Goals per problem, and what the others cost over the best one"
+    caption = "Goals per problem, and the excess cost of the others over the best one"
     report.plot("goals.svg", caption, plots.histograms(_goals(data), 2))
     q = data.sample["trajectories"]
     joints: plots.Histograms = {

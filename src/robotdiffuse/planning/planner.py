@@ -87,8 +87,8 @@ class Planner(ABC, Generic[PlannerSettings]):
     def warm_up(self, problem: Problem, until: str = CONVERGED) -> list[PlanResult]:
         """Load or compile the code of later calls now, for programs that cannot wait in a first call.
 
-        A first call loads by itself what it needs, and does not count it as its time, but takes longer.
-        `until` is that of the calls to come.
+        Without it, the first call loads what it needs: the call takes longer, but its planning time excludes
+        the loading. until: the value that later calls will have.
 
         Returns the results of the calls that it makes: without obstacles, with balls on the straight line,
         and a very short one with one small obstacle of each kind in the problem's scene.
@@ -103,7 +103,7 @@ class Planner(ABC, Generic[PlannerSettings]):
         goal = problem.goal
         load_coal(robot)
         results = [call(Problem(robot, Scene(), start, goal), EASY_TIME_LIMIT)]
-        # around a ball in the way there are corners, whose timing has code of its own
+        # a ball on the line leads to a path with corners, whose timing is separate compiled code
         ends = [] if results[0].path is None else [results[0].path.positions[-1]]
         on_line = [start + share * (end - start) for end in ends for share in (0.5, 0.35)]
         for q in on_line:
@@ -120,8 +120,8 @@ class Planner(ABC, Generic[PlannerSettings]):
 
     @abstractmethod
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
-        """Search from the start to a goal until `context.finish` accepts a path; `context.unsolved`
-        without."""
+        """Search from the start to a goal until `context.finish` accepts a path; return
+        `context.unsolved()` if none is found."""
 
 
 def pipeline_for(problem: Problem) -> Callable[[Solver, Problem, PlanRequest], PlanResult]:

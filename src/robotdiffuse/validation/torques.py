@@ -1,7 +1,7 @@
 """Torques and speeds along motions: finds the first one beyond its limit, or proves that there is none.
 
 A motion consists of pieces with cubic or straight positions and smooth torques. Torques, or speeds of frames,
-are computed at both ends of a piece. Where the bound on their second derivative (see robots/torque_bounds.py)
+are computed at both ends of a piece. Where the bound on their second derivative (see robots/dynamics.py)
 allows one beyond its limit in between, the piece is halved.
 """
 
@@ -17,11 +17,11 @@ from robotdiffuse.robots.dynamics import Dynamics, Stretches
 from robotdiffuse.trajectories.cubics import Cubics
 
 RESOLUTION = 1e-3
-"""Halving ends where a value is known up to this share of its limit; if it may exceed the limit, it counts
-so."""
+"""A piece is not halved further once its values are known to this fraction of their limits; a value that may
+still exceed its limit counts as beyond it."""
 MAX_OPEN_PIECES = 100_000
-"""Open pieces at most; if there are more, as in motions with very many turns, they count as beyond the
-limit."""
+"""Maximum number of open pieces; if there are more, as in motions with very many turns, they count as beyond
+the limit."""
 PLACE_RESOLUTION = 1 / 64
 """The place where a value first exceeds its limit is located to this share of a piece."""
 States = tuple[JointRows, JointRows, JointRows]
@@ -98,19 +98,22 @@ def first_beyond(
     states: Callable[[ndarray, ndarray], States],
     slack: float,
 ) -> Excess | None:
-    """As `first_excess`, for k `values` of states, such as torques; `bends` are bounds on their second
-    derivatives along each piece, by the share."""
+    """The first of k `values` of states, such as torques, that exceeds its limit by more than a share
+    `slack`; None if it is proved that none does.
+
+    bends: bounds on the second derivatives of the values along each piece, by the share.
+    """
     allowed = limits * (1 + slack)
     count = len(bends)
     piece = np.arange(count)
     low = np.zeros(count)
     high = np.ones(count)
 
-    def looked(piece: ndarray, share: ndarray) -> ndarray:
+    def magnitudes(piece: ndarray, share: ndarray) -> ndarray:
         return np.abs(values(*states(piece, share)))
 
-    at_low = looked(piece, low)
-    at_high = looked(piece, high)
+    at_low = magnitudes(piece, low)
+    at_high = magnitudes(piece, high)
     places: list[ndarray] = [np.zeros(0)]
     beyond: list[ndarray] = [np.zeros((0, len(allowed)))]
     while len(piece):
@@ -132,7 +135,7 @@ def first_beyond(
         low = low[halved]
         high = high[halved]
         middle = (low + high) / 2
-        at_middle = looked(piece, middle)
+        at_middle = magnitudes(piece, middle)
         at_low = at_low[halved]
         at_high = at_high[halved]
         at_low = np.concatenate([at_low, at_middle])

@@ -48,7 +48,7 @@ class Rop(Ranges):
     obstacles: tuple[Natural, Natural] = (2, 2)
     """Minimum and maximum number of obstacles, inclusive."""
     kinds: tuple[Annotated[str, OneOf(KINDS)], ...] = KINDS
-    """Kinds of obstacles, one of which is chosen for each: sphere, box (a cube)."""
+    """Kinds of obstacles to choose from: sphere, box (a cube)."""
     sphere_radius: PositiveRange = (0.25, 0.25)
     """The paper's spheres have a radius of 0.2, and its planner inflates them to 0.25: a margin of 5 cm."""
     cube_side: PositiveRange = (0.2, 0.2)
@@ -152,7 +152,8 @@ class Rop(Ranges):
         target: str,
         rng: Generator,
     ) -> SampledProblem | None:
-        # one call for two or two calls for one: same distribution, but rng is used differently
+        # one call for two configurations, or two calls for one each: the distribution is the same, but not
+        # the use of rng
         each = (2,) if target == CONFIGURATION else (1, 1)
         ends = [uniform_configurations(robot, self.region, checker, count, rng) for count in each]
         if sum(map(len, ends)) < 2:
